@@ -1,0 +1,436 @@
+/* Exact backprojection: adds to every pixel x the sum over channels
+ *
+ *     I(x) += sum_i s_i(rho_i(x)) exp(+j 2 pi cycles_i(x)),
+ *
+ * with s_i interpolated between samples by TAPS polynomial weights. No absolute range enters: the
+ * host refers every (tile, channel) pair, in float64, to the tile's centre, and the kernels only add
+ * the difference t in samples between a pixel's range and its tile centre's.
+ *
+ * Build options
+ *   WIDTH      lanes of a work-item (common.h); they form a block of BLOCK_COLUMNS x BLOCK_ROWS
+ *              pixels, and a work-item computes four such blocks, one below the other.
+ *   TILE       pixels along a tile's side, 16 or a multiple.
+ *   TAPS       2, 4, 6 or 8 samples per interpolation.
+ *   LOOKUP     how samples are fetched: LOOKUP_GATHER, or from a window of 32 samples per component
+ *              held in registers, LOOKUP_PERMUTE (AVX-512 compilers with the builtin) or
+ *              LOOKUP_SHUFFLE (OpenCL's shuffle2). The window serves when all lanes' samples lie
+ *              within 32; the host checks that.
+ *   BISTATIC   receiver positions differ from the transmitter's.
+ *   MOVING     receivers move at `velocity` (in units of the sound speed) during the echo's flight.
+ *
+ * Buffers
+ *   samples    float, each line with `pitch` samples including its zero margins: WIDTH > 1 a plane
+ *              of real parts, then one of imaginary parts, [channels][2][pitch]; WIDTH == 1
+ *              interleaved [channels][pitch][2].
+ *   geometry   float [9][channel_pitch]: transmitter x y z, receiver x y z (m, from the grid's
+ *              origin), receiver velocity x y z over sound speed. Rows that no option uses are absent.
+ *   reference  per (tile, channel): nearest sample (int, counted from the line's first margin
+ *              sample), the fraction to the tile centre's range (samples) and phase (cycles in
+ *              [-0.5, 0.5]), each [tiles][channel_pitch].
+ *   pixels     float2 [rows][columns], padded to whole tiles.
+ */
+
+#define LOOKUP_GATHER 0
+#define LOOKUP_PERMUTE 1
+#define LOOKUP_SHUFFLE 2
+
+#if WIDTH == 16
+#define BLOCK_COLUMNS 4
+#define BLOCK_ROWS 4
+#define LANE_COLUMNS (vfloat)(-1.5f, -.5f, .5f, 1.5f, -1.5f, -.5f, .5f, 1.5f, -1.5f, -.5f, .5f, 1.5f, -1.5f, -.5f, .5f, 1.5f)
+#define LANE_ROWS (vfloat)(-1.5f, -1.5f, -1.5f, -1.5f, -.5f, -.5f, -.5f, -.5f, .5f, .5f, .5f, .5f, 1.5f, 1.5f, 1.5f, 1.5f)
+#elif WIDTH == 8
+#define BLOCK_COLUMNS 4
+#define BLOCK_ROWS 2
+#define LANE_COLUMNS (vfloat)(-1.5f, -.5f, .5f, 1.5f, -1.5f, -.5f, .5f, 1.5f)
+#define LANE_ROWS (vfloat)(-.5f, -.5f, -.5f, -.5f, .5f, .5f, .5f, .5f)
+#elif WIDTH == 4
+#define BLOCK_COLUMNS 2
+#define BLOCK_ROWS 2
+#define LANE_COLUMNS (vfloat)(-.5f, .5f, -.5f, .5f)
+#define LANE_ROWS (vfloat)(-.5f, -.5f, .5f, .5f)
+#else
+#define BLOCK_COLUMNS 1
+#define BLOCK_ROWS 1
+#define LANE_COLUMNS 0.0f
+#define LANE_ROWS 0.0f
+#endif
+#define STACK 4
+#define ITEM_ROWS (BLOCK_ROWS * STACK)
+#define BLOCKS_ACROSS (TILE / BLOCK_COLUMNS)
+#define ITEMS_PER_TILE (BLOCKS_ACROSS * (TILE / ITEM_ROWS))
+
+/* The TAPS samples around a position: indices lower, lower + 1, ... of one component. */
+#if LOOKUP == LOOKUP_PERMUTE
+typedef float m512 __attribute__((vector_size(64)));
+typedef int m512i __attribute__((vector_size(64)));
+#define PICK(low, high, index)                                                                     \
+    __builtin_astype(                                                                              \
+        __builtin_ia32_vpermi2varps512(__builtin_astype(low, m512), __builtin_astype(index, m512i), \
+                                       __builtin_astype(high, m512)),                              \
+        vfloat)
+#elif LOOKUP == LOOKUP_SHUFFLE
+#define PICK(low, high, index) shuffle2(low, high, as_uint16(index))
+#endif
+
+/* Interpolates one line at t - 0.5 samples from `centre` (the -0.5 makes rounding find the lower of the two
+ * middle taps). `centre` is the sample nearest to the block's middle, counted from the line's first margin
+ * sample; it is kept inside the line, so no number can make a read leave the buffer.
+ *
+ * The weight of the tap at distance a + 0.5 is E(nu^2) + nu O(nu^2) and its mirror image's
+ * E(nu^2) - nu O(nu^2), nu in [-0.5, 0.5] the position between the middle taps; `weights` holds, per
+ * pair of taps from the innermost, the coefficients of E then of O, highest power first. */
+static inline void interpolate(__global const float *line, int pitch, int centre, vfloat t,
+                               __global const float *weights, vfloat *re, vfloat *im)
+{
+    const vfloat shifted = t + ROUNDER;
+    const vfloat nu = t - (shifted - ROUNDER);
+    const vfloat nu2 = nu * nu;
+#if LOOKUP == LOOKUP_GATHER
+    vint index = ROUNDED_VINT(shifted) + (centre + 1 - TAPS / 2);
+    index = min(max(index, 0), pitch - TAPS);
+#if WIDTH == 1
+    __global const float2 *sample = (__global const float2 *)line + index;
+#define RE(k) sample[k].x
+#define IM(k) sample[k].y
+#else
+    vfloat re_taps[TAPS], im_taps[TAPS];
+#pragma unroll
+    for (int lane = 0; lane < WIDTH; lane++) {
+        __global const float *sample = line + ((const int *)&index)[lane];
+#pragma unroll
+        for (int k = 0; k < TAPS; k++) {
+            ((float *)&re_taps[k])[lane] = sample[k];
+            ((float *)&im_taps[k])[lane] = sample[k + pitch];
+        }
+    }
+#define RE(k) re_taps[k]
+#define IM(k) im_taps[k]
+#endif
+#else
+    __global const float *window = line + clamp(centre - 16, 0, pitch - 32);
+    const vfloat re_low = LOAD(window), re_high = LOAD(window + 16);
+    const vfloat im_low = LOAD(window + pitch), im_high = LOAD(window + pitch + 16);
+    /* Both lookups use an index's lowest five bits only: it cannot leave the window. */
+    const vint index = AS_VINT(shifted) + (16 + 1 - TAPS / 2);
+#define RE(k) PICK(re_low, re_high, index + (k))
+#define IM(k) PICK(im_low, im_high, index + (k))
+#endif
+    vfloat sum_re = 0.0f, sum_im = 0.0f;
+#pragma unroll
+    for (int pair = 0; pair < TAPS / 2; pair++) {
+        __global const float *coefficient = weights + pair * TAPS;
+        vfloat even = coefficient[0];
+        vfloat odd = coefficient[TAPS / 2];
+#pragma unroll
+        for (int power = 1; power < TAPS / 2; power++) {
+            even = even * nu2 + coefficient[power];
+            odd = odd * nu2 + coefficient[TAPS / 2 + power];
+        }
+        const vfloat upper = odd * nu + even;
+        const vfloat lower = even - odd * nu;
+        sum_re += upper * RE(TAPS / 2 + pair) + lower * RE(TAPS / 2 - 1 - pair);
+        sum_im += upper * IM(TAPS / 2 + pair) + lower * IM(TAPS / 2 - 1 - pair);
+    }
+    *re = sum_re;
+    *im = sum_im;
+#undef RE
+#undef IM
+}
+
+/* Adds a work-item's STACK blocks to the image at (row, column), the first block's first pixel. */
+static inline void add_to_image(const vfloat *re, const vfloat *im, __global float2 *pixels, int columns,
+                                int row, int column)
+{
+#pragma unroll
+    for (int block = 0; block < STACK; block++) {
+        __global float2 *corner = pixels + (size_t)(row + block * BLOCK_ROWS) * columns + column;
+#if WIDTH == 1
+        *corner += (float2)(re[block], im[block]);
+#else
+        for (int lane = 0; lane < WIDTH; lane++)
+            corner[(size_t)(lane / BLOCK_COLUMNS) * columns + lane % BLOCK_COLUMNS] +=
+                (float2)(((const float *)&re[block])[lane], ((const float *)&im[block])[lane]);
+#endif
+    }
+}
+
+/* Element k, a constant once loops are unrolled, of a float4 or int4. */
+#define AT(v, k) ((k) == 0 ? (v).s0 : (k) == 1 ? (v).s1 : (k) == 2 ? (v).s2 : (v).s3)
+
+/* Fixed-point passes for where a moving receiver is when the echo arrives: each gains a factor |b|,
+ * 0.003 for a sonar at 5 m/s. */
+#define PASSES 4
+
+/* Rows of `geometry`. */
+#define TX 0
+#define RX 3
+#define VELOCITY 6
+#define ROW(first, axis) geometry[((first) + (axis)) * channel_pitch + channel]
+#define ROWS(first, axis) LOAD(geometry + ((first) + (axis)) * channel_pitch + channel)
+
+/* Expands every channel's range about every tile's centre to third order in pixels (i along columns,
+ * j along rows), WIDTH channels per work-item:
+ *
+ *     t(i, j) = g0 i + g1 j + h0 i^2 + h1 i j + h2 j^2 + k0 i^3 + k1 i^2 j + k2 i j^2 + k3 j^3  [samples]
+ *
+ * With p the path from transmitter to receiver, e_t and e_r the unit vectors from either to the pixel
+ * and b the receiver's velocity over sound speed (0 unless MOVING),
+ *
+ *     dp   = (e_t + e_r).dx / (1 + e_r.b),
+ *     d2p  = (dx'P_t dx / R_t + dy'P_r dy / R_r) / (1 + e_r.b),   dy = dx - b dp,   P = 1 - e e',
+ *     d3|D| = -3 (e.dx) (dx'P dx) / R^2, where b is left out: its share is |b| of the smallest term.
+ *
+ * Global size (channel_pitch / WIDTH, tiles). centres: float [tiles][3], m from the grid's origin;
+ * step_column, step_row: m per pixel; samples_per_m: samples per metre of range (half a path).
+ * expansion: float [tiles][TERMS][channel_pitch]: g0, g1, h0, h1, h2, k0, k1, k2, k3. */
+#define TERMS 9
+
+typedef struct {
+    vfloat g0, g1, h00, h01, h11, k0, k1, k2, k3;
+} Derivatives;
+
+/* First, second and third derivatives of |D| along the steps a (index 0) and b (1); aa, ab, bb: their
+ * scalar products. The third ones come as Taylor coefficients (with 1/6 and 1/2). */
+static inline Derivatives distance_derivatives(vfloat x, vfloat y, vfloat z, float4 a, float4 b)
+{
+    const vfloat inverse = 1.0f / sqrt(x * x + y * y + z * z);
+    Derivatives d;
+    d.g0 = (x * a.x + y * a.y + z * a.z) * inverse;
+    d.g1 = (x * b.x + y * b.y + z * b.z) * inverse;
+    d.h00 = (dot(a, a) - d.g0 * d.g0) * inverse;
+    d.h01 = (dot(a, b) - d.g0 * d.g1) * inverse;
+    d.h11 = (dot(b, b) - d.g1 * d.g1) * inverse;
+    const vfloat third = -0.5f * inverse;
+    d.k0 = third * d.g0 * d.h00;
+    d.k1 = third * (2.0f * d.g0 * d.h01 + d.g1 * d.h00);
+    d.k2 = third * (2.0f * d.g1 * d.h01 + d.g0 * d.h11);
+    d.k3 = third * d.g1 * d.h11;
+    return d;
+}
+
+__kernel void expand_tiles(__global const float *geometry, int channel_pitch,
+                           __global const float *centres, float4 step_column, float4 step_row,
+                           float samples_per_m, __global float *expansion)
+{
+    const int channel = get_global_id(0) * WIDTH;
+    const int tile = get_global_id(1);
+    __global const float *centre = centres + 3 * tile;
+
+    const vfloat tx = centre[0] - ROWS(TX, 0), ty = centre[1] - ROWS(TX, 1), tz = centre[2] - ROWS(TX, 2);
+    const Derivatives t = distance_derivatives(tx, ty, tz, step_column, step_row);
+#if BISTATIC
+    vfloat rx = centre[0] - ROWS(RX, 0), ry = centre[1] - ROWS(RX, 1), rz = centre[2] - ROWS(RX, 2);
+#if MOVING
+    const vfloat bx = ROWS(VELOCITY, 0), by = ROWS(VELOCITY, 1), bz = ROWS(VELOCITY, 2);
+    const vfloat out = sqrt(tx * tx + ty * ty + tz * tz);
+    const vfloat ax = rx, ay = ry, az = rz;
+    for (int pass = 0; pass < PASSES; pass++) {
+        const vfloat path = out + sqrt(rx * rx + ry * ry + rz * rz);
+        rx = ax - bx * path;
+        ry = ay - by * path;
+        rz = az - bz * path;
+    }
+#endif
+    Derivatives r = distance_derivatives(rx, ry, rz, step_column, step_row);
+    vfloat g0 = t.g0 + r.g0, g1 = t.g1 + r.g1;
+#if MOVING
+    const vfloat inverse = 1.0f / sqrt(rx * rx + ry * ry + rz * rz);
+    const vfloat closing = 1.0f / (1.0f + (rx * bx + ry * by + rz * bz) * inverse);
+    g0 *= closing;
+    g1 *= closing;
+    /* dy of one pixel step along columns (c) and rows (s), and its part along e_r. */
+    const vfloat cx = step_column.x - bx * g0, cy = step_column.y - by * g0, cz = step_column.z - bz * g0;
+    const vfloat sx = step_row.x - bx * g1, sy = step_row.y - by * g1, sz = step_row.z - bz * g1;
+    const vfloat along_c = (rx * cx + ry * cy + rz * cz) * inverse;
+    const vfloat along_s = (rx * sx + ry * sy + rz * sz) * inverse;
+    r.h00 = (cx * cx + cy * cy + cz * cz - along_c * along_c) * inverse;
+    r.h01 = (cx * sx + cy * sy + cz * sz - along_c * along_s) * inverse;
+    r.h11 = (sx * sx + sy * sy + sz * sz - along_s * along_s) * inverse;
+    const vfloat scale = 0.5f * samples_per_m * closing;
+    g0 *= 0.5f * samples_per_m;
+    g1 *= 0.5f * samples_per_m;
+#else
+    const float scale = 0.5f * samples_per_m;
+    g0 *= scale;
+    g1 *= scale;
+#endif
+    const vfloat h00 = t.h00 + r.h00, h01 = t.h01 + r.h01, h11 = t.h11 + r.h11;
+    const vfloat k0 = t.k0 + r.k0, k1 = t.k1 + r.k1, k2 = t.k2 + r.k2, k3 = t.k3 + r.k3;
+#else
+    const float scale = samples_per_m;
+    const vfloat g0 = t.g0 * scale, g1 = t.g1 * scale;
+    const vfloat h00 = t.h00, h01 = t.h01, h11 = t.h11;
+    const vfloat k0 = t.k0, k1 = t.k1, k2 = t.k2, k3 = t.k3;
+#endif
+    __global float *row = expansion + (size_t)tile * TERMS * channel_pitch + channel;
+    STORE(g0, row);
+    STORE(g1, row + channel_pitch);
+    STORE(h00 * (0.5f * scale), row + 2 * channel_pitch);
+    STORE(h01 * scale, row + 3 * channel_pitch);
+    STORE(h11 * (0.5f * scale), row + 4 * channel_pitch);
+    STORE(k0 * scale, row + 5 * channel_pitch);
+    STORE(k1 * scale, row + 6 * channel_pitch);
+    STORE(k2 * scale, row + 7 * channel_pitch);
+    STORE(k3 * scale, row + 8 * channel_pitch);
+}
+
+/* Planar grids: pixels of a tile by the expansion of expand_tiles.
+ * Global size: tiles * ITEMS_PER_TILE, tiles counted from first_tile, row by row over the image. */
+__kernel void backproject_tiles(__global const float *samples, int pitch,
+                                __global const int *reference_sample,
+                                __global const float *reference_fraction,
+                                __global const float *reference_phase,
+                                __global const float *expansion, int channels, int channel_pitch,
+                                float cycles_per_sample, __global const float *weights,
+                                __global float2 *pixels, int columns, int first_tile)
+{
+    const int item = get_global_id(0);
+    const int tile = item / ITEMS_PER_TILE;
+    const int tiles_across = columns / TILE;
+    const int block_column = (item % ITEMS_PER_TILE) % BLOCKS_ACROSS * BLOCK_COLUMNS;
+    const int block_row = (item % ITEMS_PER_TILE) / BLOCKS_ACROSS * ITEM_ROWS;
+    const size_t first = (size_t)tile * channel_pitch;
+    reference_sample += first;
+    reference_fraction += first;
+    reference_phase += first;
+    expansion += TERMS * first;
+
+    /* Lanes from their block's centre, blocks' centres from the tile's, in pixels. */
+    const vfloat lane_i = LANE_COLUMNS, lane_j = LANE_ROWS;
+    const float i = block_column + 0.5f * (BLOCK_COLUMNS - TILE);
+    const float4 j = block_row + 0.5f * (BLOCK_ROWS - TILE) + BLOCK_ROWS * (float4)(0.0f, 1.0f, 2.0f, 3.0f);
+    const float middle_j = block_row + 0.5f * (ITEM_ROWS - TILE);
+
+    vfloat re[STACK], im[STACK];
+#pragma unroll
+    for (int block = 0; block < STACK; block++)
+        re[block] = im[block] = 0.0f;
+
+    for (int channel = 0; channel < channels; channel++) {
+        __global const float *term = expansion + channel;
+        const float g0 = term[0], g1 = term[channel_pitch];
+        const float h0 = term[2 * channel_pitch], h1 = term[3 * channel_pitch], h2 = term[4 * channel_pitch];
+        const float k0 = term[5 * channel_pitch], k1 = term[6 * channel_pitch], k2 = term[7 * channel_pitch],
+                    k3 = term[8 * channel_pitch];
+
+        /* The polynomial in j at this i, and the slopes, at the four blocks' centres. */
+        const float v0 = i * (g0 + i * (h0 + i * k0));
+        const float v1 = g1 + i * (h1 + i * k1);
+        const float v2 = h2 + i * k2;
+        const float4 move = v0 + j * (v1 + j * (v2 + j * k3));
+        const float4 slope_i = (g0 + i * (2.0f * h0 + i * (3.0f * k0))) + j * ((h1 + i * (2.0f * k1)) + j * k2);
+        const float4 slope_j = v1 + j * (2.0f * v2 + j * (3.0f * k3));
+        /* Curvature over the lanes of a block, taken at the middle of the four. */
+        const vfloat curvature = lane_i * (lane_i * (h0 + 3.0f * k0 * i + k1 * middle_j)
+                                           + lane_j * (h1 + 2.0f * (k1 * i + k2 * middle_j)))
+            + lane_j * lane_j * (h2 + k2 * i + 3.0f * k3 * middle_j);
+
+        const float4 position = move + reference_fraction[channel];
+        const float4 shifted = position + ROUNDER;
+        const float4 start = position - (shifted - ROUNDER) - 0.5f;
+        const int4 centre = reference_sample[channel] + (as_int4(shifted) - 0x4B400000);
+        const float4 cycles = move * cycles_per_sample + reference_phase[channel];
+        const float4 phase = cycles - ((cycles + ROUNDER) - ROUNDER);
+
+        __global const float *line = samples + (size_t)channel * 2 * pitch;
+#pragma unroll
+        for (int block = 0; block < STACK; block++) {
+            const vfloat d = lane_i * AT(slope_i, block) + (lane_j * AT(slope_j, block) + curvature);
+            vfloat line_re, line_im, sine, cosine;
+            interpolate(line, pitch, AT(centre, block), d + AT(start, block), weights, &line_re, &line_im);
+            sincos_cycles(d * cycles_per_sample + AT(phase, block), &sine, &cosine);
+            re[block] += line_re * cosine - line_im * sine;
+            im[block] += line_re * sine + line_im * cosine;
+        }
+    }
+    add_to_image(re, im, pixels, columns, ((first_tile + tile) / tiles_across) * TILE + block_row,
+                 ((first_tile + tile) % tiles_across) * TILE + block_column);
+}
+
+/* Distance |D + d| - |D| without cancellation. */
+static inline vfloat distance_change(float x, float y, float z, vfloat dx, vfloat dy, vfloat dz)
+{
+    const float square = x * x + y * y + z * z;
+    const vfloat change = dx * (2.0f * x + dx) + dy * (2.0f * y + dy) + dz * (2.0f * z + dz);
+    return change / (sqrt(change + square) + sqrt(square));
+}
+
+/* Any pixels: groups of WIDTH * STACK points near a common centre, whose range differences to the centre
+ * are computed without cancellation. Global size: groups.
+ * offsets: float [3][groups * WIDTH * STACK], m from the group's centre; centres, reference_*: per group
+ * as per tile; pixels: float2 [groups * WIDTH * STACK]. */
+__kernel void backproject_points(__global const float *samples, int pitch,
+                                 __global const int *reference_sample,
+                                 __global const float *reference_fraction,
+                                 __global const float *reference_phase,
+                                 __global const float *geometry, int channels, int channel_pitch,
+                                 float cycles_per_sample, __global const float *weights,
+                                 __global float2 *pixels, int first_group, __global const float *centres,
+                                 __global const float *offsets, int points, float samples_per_m)
+{
+    const int group = get_global_id(0);
+    const size_t first = (size_t)group * channel_pitch;
+    reference_sample += first;
+    reference_fraction += first;
+    reference_phase += first;
+    offsets += (size_t)group * STACK * WIDTH;
+    const float centre_x = centres[3 * group], centre_y = centres[3 * group + 1],
+                centre_z = centres[3 * group + 2];
+
+    vfloat re[STACK], im[STACK];
+#pragma unroll
+    for (int block = 0; block < STACK; block++)
+        re[block] = im[block] = 0.0f;
+
+    for (int channel = 0; channel < channels; channel++) {
+        const float tx = centre_x - ROW(TX, 0), ty = centre_y - ROW(TX, 1), tz = centre_z - ROW(TX, 2);
+#if BISTATIC
+        float rx = centre_x - ROW(RX, 0), ry = centre_y - ROW(RX, 1), rz = centre_z - ROW(RX, 2);
+#if MOVING
+        /* Where the receiver is when the centre's echo arrives. */
+        const float bx = ROW(VELOCITY, 0), by = ROW(VELOCITY, 1), bz = ROW(VELOCITY, 2);
+        const float ax = rx, ay = ry, az = rz;
+        const float out = sqrt(tx * tx + ty * ty + tz * tz);
+        for (int pass = 0; pass < PASSES; pass++) {
+            const float path = out + sqrt(rx * rx + ry * ry + rz * rz);
+            rx = ax - bx * path;
+            ry = ay - by * path;
+            rz = az - bz * path;
+        }
+#endif
+#endif
+        __global const float *line = samples + (size_t)channel * 2 * pitch;
+#pragma unroll
+        for (int block = 0; block < STACK; block++) {
+            const vfloat dx = LOAD(offsets + block * WIDTH);
+            const vfloat dy = LOAD(offsets + block * WIDTH + points);
+            const vfloat dz = LOAD(offsets + block * WIDTH + 2 * (size_t)points);
+            const vfloat out_change = distance_change(tx, ty, tz, dx, dy, dz);
+#if MOVING
+            vfloat path = out_change + distance_change(rx, ry, rz, dx, dy, dz);
+            for (int pass = 0; pass < PASSES; pass++)
+                path = out_change
+                    + distance_change(rx, ry, rz, dx - bx * path, dy - by * path, dz - bz * path);
+#elif BISTATIC
+            const vfloat path = out_change + distance_change(rx, ry, rz, dx, dy, dz);
+#else
+            const vfloat path = 2.0f * out_change;
+#endif
+            const vfloat move = path * (0.5f * samples_per_m);
+            const vfloat t = move + reference_fraction[channel];
+#if LOOKUP == LOOKUP_GATHER
+            const int whole = 0;
+#else
+            const int whole = ROUNDED_INT(t.s5 + ROUNDER); /* a lane in the block's middle */
+#endif
+            vfloat line_re, line_im, sine, cosine;
+            interpolate(line, pitch, reference_sample[channel] + whole, t - (whole + 0.5f), weights, &line_re,
+                        &line_im);
+            sincos_cycles(move * cycles_per_sample + reference_phase[channel], &sine, &cosine);
+            re[block] += line_re * cosine - line_im * sine;
+            im[block] += line_re * sine + line_im * cosine;
+        }
+    }
+    add_to_image(re, im, pixels, BLOCK_COLUMNS, (first_group + group) * ITEM_ROWS, 0);
+}

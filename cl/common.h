@@ -1,0 +1,59 @@
+/* Types and helpers shared by every kernel.
+ *
+ * WIDTH (build option) is the number of float lanes a work-item computes at once: 16, 8 or 4 on a
+ * CPU, whose compiler may not vectorise across work-items, and 1 on a GPU. A kernel is written once
+ * for all widths in terms of vfloat and vint.
+ *
+ * Products and sums are written a * b + c and left to the compiler to fuse: with some CPU drivers
+ * fma(), rint() and vloadn() are calls that are not inlined, which costs a factor of two.
+ */
+
+#define JOIN_(a, b) a##b
+#define JOIN(a, b) JOIN_(a, b)
+
+#if WIDTH == 1
+typedef float vfloat;
+typedef int vint;
+#define AS_VINT as_int
+#define LOAD(p) (*(p))
+#define STORE(value, p) (*(p) = (value))
+#else
+typedef JOIN(float, WIDTH) vfloat;
+typedef JOIN(int, WIDTH) vint;
+#define AS_VINT JOIN(as_int, WIDTH)
+#ifdef __clang__
+typedef float vfloat_anywhere __attribute__((ext_vector_type(WIDTH), aligned(4)));
+#define LOAD(p) (*(__global const vfloat_anywhere *)(p))
+#define STORE(value, p) (*(__global vfloat_anywhere *)(p) = (value))
+#else
+#define LOAD(p) JOIN(vload, WIDTH)(0, p)
+#define STORE(value, p) JOIN(vstore, WIDTH)(value, 0, p)
+#endif
+#endif
+
+/* Adding 1.5 * 2^23 leaves the nearest integer in the low bits of a float's mantissa: rounding and
+ * conversion to int in one addition, exact for |x| < 2^22. */
+#define ROUNDER 12582912.0f
+#define ROUNDED_INT(shifted) (as_int(shifted) - 0x4B400000)
+#define ROUNDED_VINT(shifted) (AS_VINT(shifted) - 0x4B400000)
+
+/* sin and cos of 2 pi t for t in cycles, |t| < 2^22. Error below 1.3e-6: least-squares polynomials
+ * with equalised error over one reduced cycle, in place of sin() and cos(), which are scalar code on some
+ * CPU drivers and take radians, whose reduction loses bits. */
+static inline void sincos_cycles(vfloat t, vfloat *sine, vfloat *cosine)
+{
+    const vfloat nearest = (t + ROUNDER) - ROUNDER;
+    const vfloat r = t - nearest;
+    const vfloat z = r * r;
+    vfloat s = z * -12.2712614f + 41.2053942f;
+    s = s * z - 76.5801004f;
+    s = s * z + 81.5961839f;
+    s = s * z - 41.3414214f;
+    s = s * z + 6.28318282f;
+    *sine = s * r;
+    vfloat c = z * -21.0767793f + 58.794037f;
+    c = c * z - 85.2723966f;
+    c = c * z + 64.9287266f;
+    c = c * z - 19.7389825f;
+    *cosine = c * z + 0.999999222f;
+}

@@ -1,0 +1,48 @@
+"""Synthetic aperture sonar images in the time domain, exact or fast, on any OpenCL device."""
+
+from clsas.backproject import backproject
+from clsas.compress import compress
+from clsas.device import DeviceError, list_devices
+from clsas.echoes import Echoes
+from clsas.grid import Grid
+from clsas.image import Image
+from clsas.io import FileFormatError, load, save, to_xarray
+from clsas.lines import RangeLines
+from clsas.quality import contrast, entropy, measure_point, relative_error_db
+from clsas.sampling import check_sampling
+from clsas.scene import PointTargets
+from clsas.simulate import simulate, simulate_lines
+from clsas.sonar import Pulse, Sonar
+from clsas.track import Pointing, Track, channels
+from clsas.validate import ClsasWarning
+
+__version__ = "0.1.0"
+
+__all__ = [
+    "ClsasWarning",
+    "DeviceError",
+    "Echoes",
+    "FileFormatError",
+    "Grid",
+    "Image",
+    "PointTargets",
+    "Pointing",
+    "Pulse",
+    "RangeLines",
+    "Sonar",
+    "Track",
+    "backproject",
+    "channels",
+    "check_sampling",
+    "compress",
+    "contrast",
+    "entropy",
+    "list_devices",
+    "load",
+    "measure_point",
+    "relative_error_db",
+    "save",
+    "simulate",
+    "simulate_lines",
+    "to_xarray",
+]

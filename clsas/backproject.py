@@ -1,0 +1,463 @@
+"""Exact backprojection: every channel summed into every pixel."""
+
+from __future__ import annotations
+
+import itertools
+import math
+import warnings
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import pyopencl as cl
+from numpy.typing import NDArray
+
+from clsas import interpolation, validate
+from clsas.device import Device, Slot, open_device
+from clsas.geometry import pairwise_range_m
+from clsas.grid import Grid
+from clsas.image import Image
+from clsas.interpolation import Interpolator, Resampling
+from clsas.layout import GEOMETRY_ERROR, STACK, Groups, Tiles, lay_out
+from clsas.lines import RangeLines
+
+BEST_ACCURACY_DB = -85.0
+"""The best accuracy that may be asked for: what float32 allows."""
+
+_LOOKUPS = {"gather": 0, "permute": 1, "shuffle": 2}
+_WINDOW = 32  # samples held in registers by the lookups that are not a gather
+_LARGEST_DISTANCE_M = 1e9
+_CHANNELS_AT_ONCE = 512  # bounds a float32 partial sum; lines that stay in a CPU's cache
+_REFERENCES_AT_ONCE = 1 << 20  # (part, channel) pairs: 50 MB on the device
+
+
+@dataclass(frozen=True, eq=False)
+class Preparation:
+    """Everything decided before the device starts."""
+
+    device: Device
+    lines: RangeLines
+    grid: Grid
+    layout: Tiles | Groups
+    interpolator: Interpolator
+    resampling: Resampling
+
+    @property
+    def samples_per_m(self) -> float:
+        """Upsampled samples per metre of range."""
+        return self.resampling.ratio / self.lines.range_step_m
+
+    @property
+    def cycles_per_m(self) -> float:
+        """Phase to restore per metre of range, cycles: of the lines' spectral centre."""
+        return _carrier_cycles_per_m(self.lines) + (
+            self.resampling.centre_cycles_per_sample / self.lines.range_step_m
+        )
+
+
+def backproject(
+    lines: RangeLines,
+    grid: Grid,
+    *,
+    device: Device | str | int | None = None,
+    accuracy_db: float = -60.0,
+    taps: int | None = None,
+    upsampling: float | None = None,
+    accumulate: Image | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> Image:
+    """Form the exact image of range lines on a grid.
+
+    Parameters
+    ----------
+    lines : RangeLines
+        Any number of channels, monostatic, bistatic or moving.
+    grid : Grid
+        Any number of pixels: a plane, a height map or arbitrary points.
+    device : Device, str or int, optional
+        See `clsas.device.choose`.
+    accuracy_db : float
+        Wanted relative rms error against the ideal sum, dB, from -85 to below 0. It decides how
+        the lines are interpolated, from their own spectrum.
+    taps : 2, 4, 6 or 8, optional
+        Samples per interpolation (2 is linear), instead of the fastest choice.
+    upsampling : float, optional
+        By how much lines are upsampled before interpolation, instead of the fastest choice. With
+        `taps` too, `accuracy_db` plays no part.
+    accumulate : Image, optional
+        Image on the same grid that this one is added to, so that data may arrive in pieces.
+    progress : callable, optional
+        Called as progress(done, total).
+
+    Returns
+    -------
+    Image
+        complex64, phase-preserving.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If an argument is not what is allowed, or `accumulate` is on another grid.
+    DeviceError
+        If there is no such device.
+
+    Warns
+    -----
+    ClsasWarning
+        If no pixel lies within any line's range, so that the lines add nothing.
+
+    Notes
+    -----
+    I(x) = sum_i s_i(rho_i(x)) exp(+j 2 k rho_i(x)), with rho half the path from transmitter to pixel
+    to receiver and k = 2 pi carrier/c. Beyond the ends of a line (by more than half an
+    interpolation filter) a pixel gets nothing from it.
+
+    Ranges and phases are referred in float64 to centres near the pixels; the device sees float32
+    differences only.
+    """
+    if accumulate is not None:
+        _check_same_grid(accumulate, grid)
+    preparation = prepare(
+        lines, grid, device=device, accuracy_db=accuracy_db, taps=taps, upsampling=upsampling
+    )
+    image = execute(preparation, progress=progress)
+    if accumulate is None:
+        return image
+    return Image(image.pixels + accumulate.pixels, grid)
+
+
+def prepare(
+    lines: RangeLines,
+    grid: Grid,
+    *,
+    device: Device | str | int | None = None,
+    accuracy_db: float = -60.0,
+    taps: int | None = None,
+    upsampling: float | None = None,
+) -> Preparation:
+    """Decide how `backproject` forms an image; parameters and errors are its."""
+    validate.instance("lines", lines, RangeLines)
+    validate.instance("grid", grid, Grid)
+    accuracy_db = validate.number(
+        "accuracy_db", accuracy_db, "dB", least=BEST_ACCURACY_DB, below=0.0
+    )
+    device = open_device(device)
+    spectrum = interpolation.measure_spectrum(lines)
+    cycles_per_m = _carrier_cycles_per_m(lines) + spectrum.centre / lines.range_step_m
+    antennas_m = np.unique(np.concatenate([lines.tx_m, lines.rx_m]), axis=0)
+    layout = lay_out(grid, antennas_m, abs(cycles_per_m), device.info.width)
+    _check_distances(antennas_m, layout)
+    interpolator = interpolation.choose(
+        spectrum,
+        10 * math.log10(10 ** (accuracy_db / 10) - GEOMETRY_ERROR**2),
+        taps=taps,
+        upsampling=upsampling,
+        most_upsampling=_room(max(interpolation.TAPS))
+        * lines.range_step_m
+        / max(layout.block_radius_m, 1e-30),
+    )
+    resampling = interpolation.resampling(lines.length, interpolator, spectrum)
+    return Preparation(device, lines, grid, layout, interpolator, resampling)
+
+
+def execute(
+    preparation: Preparation, *, progress: Callable[[int, int], None] | None = None
+) -> Image:
+    """Form the image that was prepared.
+
+    The image is formed in bands that fit the device, each from blocks of channels, each block in
+    jobs of so many (part, channel) pairs; a job is prepared on the host while the one before runs.
+    """
+    p = preparation
+    layout, device = p.layout, p.device
+    pixels = np.empty(layout.parts * layout.part_pixels, np.complex64)
+    try:
+        run = _Run(p, progress)
+        for band in _slices(slice(0, layout.parts), _band_parts(p)):
+            part = slice(band.start * layout.part_pixels, band.stop * layout.part_pixels)
+            on_device = device.zeros(pixels[part].nbytes)
+            for channels in _slices(slice(0, p.lines.channels), _CHANNELS_AT_ONCE):
+                run.add(channels, band, on_device)
+            cl.enqueue_copy(device.queue, pixels[part], on_device)
+    finally:
+        device.finish()  # an interrupted run leaves nothing in use
+    if not pixels.any() and p.lines.samples.any():
+        _warn_unseen(p)
+    return Image(layout.collect(pixels), p.grid)
+
+
+class _Run:
+    """A preparation at work: its kernels, its buffers, and how much it has done."""
+
+    def __init__(
+        self, preparation: Preparation, progress: Callable[[int, int], None] | None
+    ) -> None:
+        p = self.p = preparation
+        device, layout = p.device, p.layout
+        self.tiled = isinstance(layout, Tiles)
+        self.moving = p.lines.rx_velocity_m_s is not None
+        self.bistatic = self.moving or not np.array_equal(p.lines.tx_m, p.lines.rx_m)
+        self.origin_m = layout.centres_m(slice(0, 1))[0]
+
+        # Zeros around a line on the device: a part may reach beyond its end by a radius.
+        self.reach = math.ceil(layout.radius_m * p.samples_per_m * 1.1) + p.interpolator.taps
+        self.margin = 2 * self.reach + _WINDOW
+        self.pitch = _round_up(p.resampling.length + 2 * self.margin, 16)
+        if self.pitch % 256 == 0:  # lines at equal places in cache sets would evict each other
+            self.pitch += 16
+
+        fits = layout.block_radius_m * p.samples_per_m <= _room(p.interpolator.taps)
+        options = {
+            "WIDTH": device.info.width,
+            "TAPS": p.interpolator.taps,
+            "TILE": layout.side if self.tiled else 16,
+            "LOOKUP": _LOOKUPS[device.info.lookup if fits else "gather"],
+            "BISTATIC": int(self.bistatic),
+            "MOVING": int(self.moving),
+        }
+        name = "backproject_tiles" if self.tiled else "backproject_points"
+        self.kernel = device.kernel("backproject", name, **options)
+        self.expand = device.kernel("backproject", "expand_tiles", **options)
+
+        # While one set of buffers is in use on the device, the other is filled.
+        self.line_slots = itertools.cycle([Slot(device), Slot(device)])
+        self.part_slots = itertools.cycle([Slot(device), Slot(device)])
+        self.weights = device.upload(p.interpolator.coefficients.astype(np.float32))
+        self.progress = progress
+        self.done = 0
+
+    def add(self, channels: slice, band: slice, pixels: cl.Buffer) -> None:
+        """Add some channels to the pixels of a band of parts."""
+        lines = self.p.lines.select(channels)
+        line_slot = next(self.line_slots)
+        line_slot.wait()
+        line_slot.fill("samples", self._samples(lines))
+        line_slot.fill("geometry", self._geometry(lines))
+        for parts in _slices(band, max(_REFERENCES_AT_ONCE // lines.channels, 1)):
+            slot = next(self.part_slots)
+            slot.wait()
+            centres_m = self.p.layout.centres_m(parts)
+            slot.fill("centres", (centres_m - self.origin_m).astype(np.float32))
+            for name, values in self._references(centres_m, lines).items():
+                slot.fill(name, values)
+            ready = line_slot.filled + slot.filled
+            if self.tiled:
+                event = self._run_tiles(lines, line_slot, slot, parts, band, pixels, ready)
+            else:
+                event = self._run_groups(lines, line_slot, slot, parts, band, pixels, ready)
+            slot.busy = line_slot.busy = event
+            self.p.device.queue.flush()
+            self._report((parts.stop - parts.start) * lines.channels)
+
+    def _run_tiles(
+        self,
+        lines: RangeLines,
+        line_slot: Slot,
+        slot: Slot,
+        parts: slice,
+        band: slice,
+        pixels: cl.Buffer,
+        ready: list[cl.Event],
+    ) -> cl.Event:
+        p, device, layout = self.p, self.p.device, self.p.layout
+        count = parts.stop - parts.start
+        pitch = _channel_pitch(lines)
+        expansion = slot.buffer("expansion", count * 9 * pitch * 4)
+        steps = [
+            np.append(v, 0).astype(np.float32) for v in (p.grid.column_step_m, p.grid.row_step_m)
+        ]
+        device.run(
+            self.expand,
+            (pitch // device.info.width, count),
+            line_slot["geometry"],
+            pitch,
+            slot["centres"],
+            *steps,
+            p.samples_per_m,
+            expansion,
+            wait_for=ready,
+        )
+        return device.run(
+            self.kernel,
+            (count * layout.part_pixels // (device.info.width * STACK),),
+            *self._common(lines, line_slot, slot, expansion, pixels),
+            layout.across * layout.side,
+            parts.start - band.start,
+        )
+
+    def _run_groups(
+        self,
+        lines: RangeLines,
+        line_slot: Slot,
+        slot: Slot,
+        parts: slice,
+        band: slice,
+        pixels: cl.Buffer,
+        ready: list[cl.Event],
+    ) -> cl.Event:
+        p, layout = self.p, self.p.layout
+        offsets = layout.offset_m[parts].reshape(-1, 3).T
+        slot.fill("offsets", offsets)
+        return p.device.run(
+            self.kernel,
+            (parts.stop - parts.start,),
+            *self._common(lines, line_slot, slot, line_slot["geometry"], pixels),
+            parts.start - band.start,
+            slot["centres"],
+            slot["offsets"],
+            offsets.shape[1],
+            p.samples_per_m,
+            wait_for=[*ready, *slot.filled[-1:]],
+        )
+
+    def _common(
+        self,
+        lines: RangeLines,
+        line_slot: Slot,
+        slot: Slot,
+        geometry: cl.Buffer,
+        pixels: cl.Buffer,
+    ) -> tuple[object, ...]:
+        """Return the arguments that both kernels begin with."""
+        p = self.p
+        return (
+            line_slot["samples"],
+            self.pitch,
+            slot["sample"],
+            slot["fraction"],
+            slot["phase"],
+            geometry,
+            lines.channels,
+            _channel_pitch(lines),
+            p.cycles_per_m / p.samples_per_m,
+            self.weights,
+            pixels,
+        )
+
+    def _samples(self, lines: RangeLines) -> NDArray[np.float32]:
+        """Return upsampled lines within margins of zeros, as cl/backproject.cl wants them."""
+        upsampled = self.p.resampling.apply(lines.samples)
+        inside = slice(self.margin, self.margin + upsampled.shape[1])
+        if self.p.device.info.width == 1:
+            samples = np.zeros((lines.channels, self.pitch), np.complex64)
+            samples[:, inside] = upsampled
+            return samples.view(np.float32)
+        samples = np.zeros((lines.channels, 2, self.pitch), np.float32)
+        samples[:, 0, inside] = upsampled.real
+        samples[:, 1, inside] = upsampled.imag
+        return samples
+
+    def _geometry(self, lines: RangeLines) -> NDArray[np.float32]:
+        """Return positions about the origin and velocities over sound speed, [rows, channels]."""
+        rows = [lines.tx_m - self.origin_m]
+        if self.bistatic:
+            rows.append(lines.rx_m - self.origin_m)
+        if self.moving:
+            rows.append(lines.rx_velocity_m_s / lines.sound_speed_m_s)
+        geometry = np.concatenate(rows, axis=1).T.astype(np.float32)
+        return np.pad(geometry, ((0, 0), (0, _channel_pitch(lines) - lines.channels)), mode="edge")
+
+    def _references(self, centres_m: NDArray[np.float64], lines: RangeLines) -> dict[str, NDArray]:
+        """Return where each centre's echo lies in each line, and its phase, reduced in float64."""
+        resampling = self.p.resampling
+        range_m = pairwise_range_m(
+            centres_m, lines.tx_m, lines.rx_m, lines.rx_velocity_m_s, lines.sound_speed_m_s
+        )
+        place = (range_m - lines.first_range_m) / lines.range_step_m + resampling.lead
+        range_m *= _carrier_cycles_per_m(lines)
+        cycles = range_m + place * resampling.centre_cycles_per_sample
+        cycles -= np.rint(cycles)
+        place *= resampling.ratio
+        place += self.margin - resampling.first
+        nearest = np.rint(place)
+        place -= nearest
+        # A part that lies outside a line altogether is put where it reads zeros only.
+        nearest = np.clip(
+            nearest,
+            self.margin - self.reach,
+            self.margin + resampling.length + self.reach,
+        )
+        shape = (len(centres_m), _channel_pitch(lines))
+        references = {
+            "sample": np.empty(shape, np.int32),
+            "fraction": np.empty(shape, np.float32),
+            "phase": np.empty(shape, np.float32),
+        }
+        for array, values in zip(references.values(), (nearest, place, cycles), strict=True):
+            array[:, : lines.channels] = values
+            array[:, lines.channels :] = 0
+        return references
+
+    def _report(self, pairs: int) -> None:
+        self.done += pairs
+        if self.progress is not None:
+            self.progress(self.done, self.p.layout.parts * self.p.lines.channels)
+
+
+def _room(taps: int) -> float:
+    """Samples that a block's pixels may lie from its middle for the lookup window to hold them."""
+    return _WINDOW / 2 - 2 - taps / 2
+
+
+def _carrier_cycles_per_m(lines: RangeLines) -> float:
+    """Phase of the carrier per metre of range, cycles."""
+    return 2 * lines.carrier_hz / lines.sound_speed_m_s
+
+
+def _channel_pitch(lines: RangeLines) -> int:
+    """Channels with padding to whole vectors of any width."""
+    return _round_up(lines.channels, 16)
+
+
+def _round_up(number: int, multiple: int) -> int:
+    return -(-number // multiple) * multiple
+
+
+def _slices(whole: slice, most: int) -> Iterator[slice]:
+    """Cut a slice into pieces of at most `most`."""
+    for start in range(whole.start, whole.stop, most):
+        yield slice(start, min(start + most, whole.stop))
+
+
+def _band_parts(p: Preparation) -> int:
+    """Return how many parts' pixels may be on the device at once: whole rows of tiles."""
+    info = p.device.info
+    most = min(info.max_buffer_bytes, info.memory_bytes // 4) // (8 * p.layout.part_pixels)
+    return max(most // p.layout.across, 1) * p.layout.across
+
+
+def _check_same_grid(image: Image, grid: Grid) -> None:
+    validate.instance("accumulate", image, Image)
+    if image.grid is not grid and not np.array_equal(image.grid.positions_m(), grid.positions_m()):
+        raise ValueError("accumulate must be an image on the same grid")
+
+
+def _check_distances(antennas_m: NDArray[np.float64], layout: Tiles | Groups) -> None:
+    """Refuse distances so large that a square overflows float32 or float64 resolves no phase."""
+    points_m = np.concatenate([antennas_m, layout.centres_m(slice(None))])
+    extent_m = float(np.ptp(points_m, axis=0).max())
+    if extent_m > _LARGEST_DISTANCE_M:
+        raise ValueError(
+            f"lines and grid must lie within {_LARGEST_DISTANCE_M:g} m of each other, "
+            f"got {extent_m:g} m"
+        )
+
+
+def _warn_unseen(p: Preparation) -> None:
+    lines = p.lines
+    centres_m = p.layout.centres_m(slice(None))
+    some = lines.select(slice(None, None, max(lines.channels // 64, 1)))
+    range_m = pairwise_range_m(
+        centres_m[:: max(len(centres_m) // 1024, 1)],
+        some.tx_m,
+        some.rx_m,
+        some.rx_velocity_m_s,
+        some.sound_speed_m_s,
+    )
+    warnings.warn(
+        f"no pixel of the grid lies within any line's range, so the image is zero: the lines span "
+        f"{lines.first_range_m.min():.6g} to {lines.last_range_m.max():.6g} m, the grid lies at "
+        f"{range_m.min():.6g} to {range_m.max():.6g} m",
+        validate.ClsasWarning,
+        stacklevel=3,
+    )

@@ -1,0 +1,314 @@
+"""Choosing an OpenCL device, building kernels once, and profiling them."""
+
+from __future__ import annotations
+
+import functools
+import os
+import time
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from importlib.resources import files
+from pathlib import Path
+
+import numpy as np
+import pyopencl as cl
+
+ENVIRONMENT_VARIABLE = "CLSAS_DEVICE"
+
+_HOW_TO_GET_A_DEVICE = """\
+No OpenCL device was found. Any one of these gives one:
+  - a CPU driver from PyPI:  pip install "clsas[pocl]"
+  - the vendor's driver of your GPU or CPU, which installs an .icd file in /etc/OpenCL/vendors;
+    PyOpenCL's wheel looks there and in {folder}
+    (copy or write an .icd file there when the driver lives in your Python environment:
+    it is one line, the path of the driver's shared library)."""
+
+
+class DeviceError(RuntimeError):
+    """No OpenCL device fits, or it refused to build a kernel."""
+
+
+@dataclass(frozen=True)
+class DeviceInfo:
+    """One OpenCL device, and how clsas would drive it.
+
+    Attributes
+    ----------
+    index : int
+        Place in `list_devices()`.
+    platform, name, driver : str
+        As the driver reports them.
+    kind : str
+        "gpu", "cpu" or "accelerator".
+    compute_units : int
+        Cores of a CPU, multiprocessors of a GPU.
+    memory_bytes, max_buffer_bytes : int
+        Global memory and largest single buffer.
+    fp64 : bool
+        Whether the device has double precision (clsas never needs it).
+    width : int
+        Float lanes per work-item that clsas uses: 1 on GPUs.
+    lookup : str
+        How a kernel fetches interpolation samples there: "permute" (AVX-512 table in
+        registers), "shuffle" (OpenCL's shuffle2) or "gather".
+    """
+
+    index: int
+    platform: str
+    name: str
+    driver: str
+    kind: str
+    compute_units: int
+    memory_bytes: int
+    max_buffer_bytes: int
+    fp64: bool
+    width: int
+    lookup: str
+
+    @property
+    def label(self) -> str:
+        """Platform and name in one string; what a name is matched against."""
+        return f"{self.platform}: {self.name}"
+
+
+@dataclass(frozen=True, eq=False)
+class Device:
+    """An opened device: its context, its queues and the kernels built so far.
+
+    Kernels run in order on `queue`; uploads go through `uploads`, beside them.
+    """
+
+    info: DeviceInfo
+    context: cl.Context
+    queue: cl.CommandQueue
+    uploads: cl.CommandQueue
+    _kernels: dict[tuple, cl.Kernel] = field(default_factory=dict, repr=False)
+    _events: dict[str, list[cl.Event]] | None = field(default=None, repr=False)
+
+    def kernel(self, source: str, name: str, **options: int) -> cl.Kernel:
+        """Return kernel `name` of `cl/<source>.cl`, built once per set of options.
+
+        Parameters
+        ----------
+        source : str
+            File name in `cl/` without its ending; `common.h` is put before it.
+        name : str
+            Kernel in that file.
+        **options : int
+            Preprocessor definitions.
+
+        Raises
+        ------
+        DeviceError
+            If the driver's compiler refuses it; the message holds the compiler's log.
+        """
+        key = (source, name, *sorted(options.items()))
+        if key not in self._kernels:
+            definitions = [f"-D{option}={value}" for option, value in sorted(options.items())]
+            text = kernel_source("common.h") + kernel_source(f"{source}.cl")
+            try:
+                program = cl.Program(self.context, text).build(["-cl-mad-enable", *definitions])
+            except cl.RuntimeError as error:
+                raise DeviceError(
+                    f"{self.info.label} could not build {source}.cl with "
+                    f"{' '.join(definitions)}:\n{error}"
+                ) from error
+            for kernel in program.all_kernels():
+                self._kernels[(source, kernel.function_name, *key[2:])] = kernel
+        return self._kernels[key]
+
+    def run(
+        self,
+        kernel: cl.Kernel,
+        size: tuple[int, ...],
+        *arguments: object,
+        wait_for: Sequence[cl.Event] = (),
+    ) -> cl.Event:
+        """Enqueue a kernel over `size` work-items; plain ints and floats become 32-bit.
+
+        On a CPU the work-group is one work-item (PoCL compiles a kernel anew for every local size);
+        elsewhere the driver chooses.
+        """
+        local = (1,) * len(size) if self.info.kind == "cpu" else None
+        event = kernel(self.queue, size, local, *map(_argument, arguments), wait_for=wait_for)
+        if self._events is not None:
+            self._events[kernel.function_name].append(event)
+        return event
+
+    def finish(self) -> None:
+        """Wait until the device has done all it was given."""
+        self.uploads.finish()
+        self.queue.finish()
+
+    def buffer(self, bytes_: int) -> cl.Buffer:
+        """Return an uninitialised read-write buffer."""
+        return cl.Buffer(self.context, cl.mem_flags.READ_WRITE, max(int(bytes_), 4))
+
+    def upload(self, array: np.ndarray) -> cl.Buffer:
+        """Return a buffer that holds a copy of `array`."""
+        flags = cl.mem_flags.READ_WRITE | cl.mem_flags.COPY_HOST_PTR
+        return cl.Buffer(self.context, flags, hostbuf=np.ascontiguousarray(array))
+
+    def zeros(self, bytes_: int) -> cl.Buffer:
+        """Return a buffer of zeros."""
+        buffer = self.buffer(bytes_)
+        cl.enqueue_fill_buffer(self.queue, buffer, np.uint32(0), 0, buffer.size)
+        return buffer
+
+
+class Slot:
+    """Named buffers of one job, filled anew once the job that used them last is done.
+
+    With two slots in turn the host fills one while the device works on the other.
+    """
+
+    def __init__(self, device: Device) -> None:
+        self.device = device
+        self.busy: cl.Event | None = None
+        self.filled: list[cl.Event] = []
+        self._buffers: dict[str, cl.Buffer] = {}
+
+    def __getitem__(self, name: str) -> cl.Buffer:
+        """Return a buffer that was filled or made before."""
+        return self._buffers[name]
+
+    def wait(self) -> None:
+        """Wait until the buffers are free; to be called before they are filled."""
+        if self.busy is not None:
+            self.busy.wait()
+        self.filled.clear()
+
+    def buffer(self, name: str, bytes_: int) -> cl.Buffer:
+        """Return a buffer of at least so many bytes."""
+        if name not in self._buffers or self._buffers[name].size < bytes_:
+            self._buffers[name] = self.device.buffer(bytes_)
+        return self._buffers[name]
+
+    def fill(self, name: str, array: np.ndarray) -> None:
+        """Start copying an array into a buffer; `filled` gains the event to wait for."""
+        array = np.ascontiguousarray(array)
+        buffer = self.buffer(name, array.nbytes)
+        event = cl.enqueue_copy(self.device.uploads, buffer, array, is_blocking=False)
+        self.filled.append(event)
+        self.device.uploads.flush()
+
+
+def _argument(value: object) -> object:
+    if isinstance(value, (int, np.integer)):
+        return np.int32(value)
+    if isinstance(value, (float, np.floating)):
+        return np.float32(value)
+    return value
+
+
+def kernel_source(name: str) -> str:
+    """Return the text of a file of `cl/`."""
+    installed = files("clsas") / "cl" / name
+    if installed.is_file():
+        return installed.read_text()
+    return (Path(__file__).parents[1] / "cl" / name).read_text()  # a source checkout
+
+
+def _describe(index: int, device: cl.Device) -> DeviceInfo:
+    is_cpu = bool(device.type & cl.device_type.CPU)
+    is_gpu = bool(device.type & cl.device_type.GPU)
+    platform = device.platform.name
+    width = 1
+    if is_cpu:
+        native = device.native_vector_width_float
+        width = 16 if native >= 16 else 8 if native >= 8 else 4
+    lookup = "gather"
+    if width == 16:
+        lookup = "shuffle" if platform.startswith("Intel") else "permute"
+    return DeviceInfo(
+        index=index,
+        platform=platform,
+        name=device.name.strip(),
+        driver=device.driver_version,
+        kind="gpu" if is_gpu else "cpu" if is_cpu else "accelerator",
+        compute_units=device.max_compute_units,
+        memory_bytes=device.global_mem_size,
+        max_buffer_bytes=device.max_mem_alloc_size,
+        fp64="cl_khr_fp64" in device.extensions.split(),
+        width=width,
+        lookup=lookup,
+    )
+
+
+def _raw_devices() -> list[cl.Device]:
+    try:
+        platforms = cl.get_platforms()
+    except cl.LogicError:  # the loader found no driver at all
+        return []
+    devices = []
+    for platform in platforms:
+        try:
+            devices += platform.get_devices()
+        except cl.RuntimeError:  # a platform without a device
+            continue
+    return devices
+
+
+def list_devices() -> list[DeviceInfo]:
+    """Return every OpenCL device of every platform; empty when there is none."""
+    return [_describe(index, device) for index, device in enumerate(_raw_devices())]
+
+
+def choose(wish: str | int | None = None) -> tuple[DeviceInfo, str]:
+    """Return the device that `wish` names, and why it was chosen.
+
+    Parameters
+    ----------
+    wish : str or int, optional
+        An index of `list_devices()`, or a part of "platform: name" in any case. None takes the
+        environment variable CLSAS_DEVICE, and without it the first GPU, then the first CPU.
+
+    Raises
+    ------
+    DeviceError
+        If there is no device, saying how to get one, or none that fits, naming those there are.
+    """
+    devices = list_devices()
+    if not devices:
+        folder = Path(cl.__file__).parent / ".libs"
+        raise DeviceError(_HOW_TO_GET_A_DEVICE.format(folder=folder))
+    source = "asked for"
+    if wish is None and os.environ.get(ENVIRONMENT_VARIABLE):
+        wish = os.environ[ENVIRONMENT_VARIABLE]
+        source = f"asked for by {ENVIRONMENT_VARIABLE}"
+    if wish is None:
+        order = ("gpu", "cpu", "accelerator")
+        chosen = min(devices, key=lambda info: (order.index(info.kind), info.index))
+        reason = f"the first {chosen.kind.upper()}" + (
+            "" if chosen.kind == "gpu" else "; there is no GPU"
+        )
+        return chosen, reason
+    if isinstance(wish, str) and wish.strip().lstrip("-").isdigit():
+        wish = int(wish)
+    if isinstance(wish, int) and not isinstance(wish, bool):
+        fitting = [info for info in devices if info.index == wish]
+    elif isinstance(wish, str):
+        fitting = [info for info in devices if wish.lower() in info.label.lower()]
+    else:
+        raise TypeError(f"device must be a name, an index or None, got {wish!r}")
+    if not fitting:
+        have = "; ".join(f"{info.index} = {info.label}" for info in devices)
+        raise DeviceError(f"device {wish!r}, {source}, is not here; there are: {have}")
+    return fitting[0], f"{source} as {wish!r}"
+
+
+@functools.cache
+def _open(index: int) -> Device:
+    device = _raw_devices()[index]
+    context = cl.Context([device])
+    queue = cl.CommandQueue(context, properties=cl.command_queue_properties.PROFILING_ENABLE)
+    info = _describe(index, device)
+    return Device(info, context, queue, cl.CommandQueue(context))
+
+
+def open_device(wish: Device | str | int | None = None) -> Device:
+    """Return an opened device: `wish` itself, or what `choose` finds; opened once per process."""
+    if isinstance(wish, Device):
+        return wish
+    return _open(choose(wish)[0].index)

@@ -1,0 +1,114 @@
+"""Path lengths between transmitter, point and receiver: the one place where ranges are computed."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.distance import cdist
+
+
+def legs_m(
+    points_m: ArrayLike,
+    tx_m: ArrayLike,
+    rx_m: ArrayLike,
+    rx_velocity_m_s: ArrayLike | None = None,
+    sound_speed_m_s: float | None = None,
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the outward (tx to point) and the inward (point to rx) path length.
+
+    Parameters
+    ----------
+    points_m, tx_m, rx_m : array_like, [..., 3]
+        Positions in metres; leading axes broadcast. The receiver's is that at transmission.
+    rx_velocity_m_s : array_like, [..., 3], optional
+        Velocity of the receiver while the sound travels. None: it stands still ("stop and hop").
+    sound_speed_m_s : float, optional
+        Needed with a velocity, and only then.
+
+    Returns
+    -------
+    out_m, back_m : float64 arrays, [...]
+
+    Raises
+    ------
+    ValueError
+        If a velocity comes without a sound speed or is not below it, or a last axis is not 3.
+
+    Notes
+    -----
+    When the sound reaches the point, the receiver has moved to rx + b R, where R is the outward
+    leg and b = v/c. With d = x - rx - b R, the inward leg l solves |d - b l| = l, that is
+    (1 - b.b) l^2 + 2 (d.b) l - d.d = 0. Its positive root below is free of cancellation for any
+    speed small against that of sound, and is exactly |x - rx| at rest.
+    """
+    points, tx, rx = (
+        _vectors(name, value)
+        for name, value in (("points_m", points_m), ("tx_m", tx_m), ("rx_m", rx_m))
+    )
+    out = _norm(points - tx)
+    if rx_velocity_m_s is None:
+        return out, np.broadcast_to(_norm(points - rx), out.shape)
+    if sound_speed_m_s is None:
+        raise ValueError("sound_speed_m_s must be given with rx_velocity_m_s")
+    beta = _vectors("rx_velocity_m_s", rx_velocity_m_s) / sound_speed_m_s
+    beta2 = _dot(beta, beta)
+    if not np.all(beta2 < 1):
+        raise ValueError(
+            f"rx_velocity_m_s must be slower than sound ({sound_speed_m_s:g} m/s), "
+            f"got {sound_speed_m_s * np.sqrt(np.max(beta2)):g} m/s"
+        )
+    offset = points - rx - beta * out[..., None]
+    along = _dot(offset, beta)
+    back = (np.sqrt(along**2 + (1 - beta2) * _dot(offset, offset)) - along) / (1 - beta2)
+    return out, back
+
+
+def bistatic_range_m(
+    points_m: ArrayLike,
+    tx_m: ArrayLike,
+    rx_m: ArrayLike,
+    rx_velocity_m_s: ArrayLike | None = None,
+    sound_speed_m_s: float | None = None,
+) -> NDArray[np.float64]:
+    """Return half the two-way path, rho = (|x - tx| + |x - rx|)/2, in metres.
+
+    The two-way delay is 2 rho/c. Parameters, errors and the motion during flight are those of
+    `legs_m`; the result is float64 with the broadcast leading shape.
+    """
+    out, back = legs_m(points_m, tx_m, rx_m, rx_velocity_m_s, sound_speed_m_s)
+    return 0.5 * (out + back)
+
+
+def pairwise_range_m(
+    points_m: NDArray[np.float64],
+    tx_m: NDArray[np.float64],
+    rx_m: NDArray[np.float64],
+    rx_velocity_m_s: NDArray[np.float64] | None = None,
+    sound_speed_m_s: float | None = None,
+) -> NDArray[np.float64]:
+    """Return `bistatic_range_m` of every point and channel, float64 [points, channels].
+
+    Takes points [points, 3] and channels [channels, 3]; at rest it needs no memory for vectors.
+    """
+    if rx_velocity_m_s is not None:
+        return bistatic_range_m(points_m[:, None], tx_m, rx_m, rx_velocity_m_s, sound_speed_m_s)
+    range_m = cdist(points_m, tx_m)
+    if not np.array_equal(tx_m, rx_m):
+        range_m += cdist(points_m, rx_m)
+        range_m *= 0.5
+    return range_m
+
+
+def _vectors(name: str, value: ArrayLike) -> NDArray[np.float64]:
+    vectors = np.asarray(value, dtype=np.float64)
+    if vectors.ndim == 0 or vectors.shape[-1] != 3:
+        raise ValueError(f"{name} must have shape (..., 3), got {vectors.shape}")
+    return vectors
+
+
+def _dot(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.einsum("...i,...i", a, b)
+
+
+def _norm(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.sqrt(_dot(vectors, vectors))

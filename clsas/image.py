@@ -1,0 +1,41 @@
+"""A complex image and where its pixels lie."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsas import validate
+from clsas.grid import Grid
+
+
+@dataclass(frozen=True, eq=False)
+class Image:
+    """Complex pixels on a grid.
+
+    Parameters
+    ----------
+    pixels : array_like of complex, shape `grid.shape`
+        Kept as complex64. The phase is that of the scene: the carrier's phase at each pixel's
+        range has been restored.
+    grid : Grid
+        Where the pixels lie.
+
+    Raises
+    ------
+    TypeError
+        If the pixels are not complex or `grid` is not a Grid.
+    ValueError
+        If the pixels do not have the grid's shape, or a pixel is NaN or infinite.
+    """
+
+    pixels: NDArray[np.complex64]
+    grid: Grid
+
+    def __post_init__(self) -> None:
+        """Check every field and convert it."""
+        validate.instance("grid", self.grid, Grid)
+        pixels = validate.array("pixels", self.pixels, np.complex64, self.grid.shape)
+        object.__setattr__(self, "pixels", pixels)

@@ -1,0 +1,247 @@
+"""Range interpolation: least-squares filters, and how finely lines must be sampled for them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.fft
+from numpy.typing import NDArray
+
+from clsas import validate
+from clsas.lines import RangeLines
+
+TAPS = (2, 4, 6, 8)
+UPSAMPLINGS = (1.0, 1.25, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0, 12.0, 16.0)
+
+# Device time per pixel and channel by taps, relative to 4 taps: measured with PoCL and Intel's
+# runtime on an AVX-512 CPU (scripts/bench taps).
+_COST = {2: 0.75, 4: 1.0, 6: 1.3, 8: 1.55}
+_FREQUENCIES = 128
+_POSITIONS = 33
+
+
+@dataclass(frozen=True, eq=False)
+class Spectrum:
+    """Mean power spectrum of a set of lines, seen from its own centre.
+
+    Attributes
+    ----------
+    centre : float
+        Centre of the occupied band, cycles per sample, in [-0.5, 0.5).
+    frequency : float64 [n]
+        Distance from the centre, cycles per sample, 0 to 0.5.
+    power : float64 [n]
+        Share of the energy at that distance, both sides together; sums to 1.
+    """
+
+    centre: float
+    frequency: NDArray[np.float64]
+    power: NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Interpolator:
+    """A filter that evaluates lines between their samples after they are upsampled.
+
+    Attributes
+    ----------
+    taps : int
+        Samples per evaluation: 2, 4, 6 or 8.
+    upsampling : float
+        By how much the lines are upsampled first, by FFT.
+    coefficients : float64 [taps/2, 2, taps/2]
+        Per pair of taps from the innermost, the polynomials E and O, highest power first: the weight
+        of the tap at +-(pair + 1/2) from the middle is E(nu^2) +- nu O(nu^2), with nu in
+        [-1/2, 1/2] the position from the middle.
+    error_db : float
+        Predicted relative rms error of an evaluation of these lines, dB.
+    """
+
+    taps: int
+    upsampling: float
+    coefficients: NDArray[np.float64]
+    error_db: float
+
+    def weights(self, nu: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the taps' weights at positions `nu` from the middle, shape [..., taps]."""
+        even, odd = (
+            np.stack([np.polyval(c, nu**2) for c in self.coefficients[:, part]], axis=-1)
+            for part in (0, 1)
+        )
+        odd = odd * np.asarray(nu)[..., None]
+        return np.concatenate([(even - odd)[..., ::-1], even + odd], axis=-1)
+
+
+def measure_spectrum(lines: RangeLines, most_channels: int = 256) -> Spectrum:
+    """Return the mean power spectrum of (a regular selection of) the lines' channels."""
+    samples = lines.samples[:: -(-lines.channels // most_channels)]
+    length = scipy.fft.next_fast_len(2 * lines.length)
+    power = np.zeros(length)
+    for block in np.array_split(samples, -(-len(samples) // 64)):
+        # float32 FFTs leave a floor near -140 dB, below any filter designed here.
+        power += np.sum(np.abs(scipy.fft.fft(block, length)) ** 2, axis=0, dtype=np.float64)
+    frequency = scipy.fft.fftfreq(length)
+    if not power.any():
+        power[:] = 1.0
+    centre = float(np.angle(np.sum(power * np.exp(2j * np.pi * frequency))) / (2 * np.pi))
+    distance = np.abs((frequency - centre + 0.5) % 1.0 - 0.5)
+    edges = np.linspace(0, 0.5, _FREQUENCIES + 1)
+    share, _ = np.histogram(distance, edges, weights=power / power.sum())
+    return Spectrum(centre, (edges[1:] + edges[:-1]) / 2, share)
+
+
+def design(taps: int, upsampling: float, spectrum: Spectrum) -> Interpolator:
+    """Return the interpolator of least rms error for lines of a given spectrum.
+
+    Parameters
+    ----------
+    taps : int
+        2 (linear interpolation), 4, 6 or 8.
+    upsampling : float
+        By how much the lines will be upsampled first, >= 1.
+    spectrum : Spectrum
+        Of the lines before that.
+
+    Notes
+    -----
+    With frequency f in cycles per (upsampled) sample and taps at +-a, a = 1/2, 3/2, ..., a
+    symmetric filter errs by
+
+        2 sum_a E_a(nu^2) cos(2 pi f a) - cos(2 pi f nu)  +  j [2 nu sum_a O_a(nu^2) sin(2 pi f a) - sin(2 pi f nu)],
+
+    two separate least-squares problems in the polynomials' coefficients, weighted by the power at f.
+    Linear interpolation is the one filter that is given: E = 1/2, O = 1.
+    """
+    f = spectrum.frequency[:, None, None, None] / upsampling
+    nu = np.linspace(-0.5, 0.5, _POSITIONS)[None, :, None, None]
+    a = (np.arange(taps // 2) + 0.5)[None, None, :, None]
+    power = nu ** (2 * np.arange(taps // 2)[None, None, None, ::-1])
+    basis = (2 * np.cos(2 * np.pi * f * a) * power, 2 * np.sin(2 * np.pi * f * a) * nu * power)
+    aim = (np.cos(2 * np.pi * f * nu), np.sin(2 * np.pi * f * nu))
+    # A floor keeps the empty part of the band from making the problem singular.
+    share = np.sqrt(spectrum.power + 1e-13)[:, None]
+    coefficients = np.empty((taps // 2, 2, taps // 2))
+    error = 0.0
+    for part in (0, 1):
+        matrix = basis[part].reshape(*aim[part].shape[:2], -1)
+        wanted = aim[part][..., 0, 0]
+        if taps == 2:
+            solution = np.array([(0.5, 1.0)[part]])
+        else:
+            weighted = (matrix * share[..., None]).reshape(-1, matrix.shape[-1])
+            solution = np.linalg.lstsq(weighted, (wanted * share).ravel(), rcond=None)[0]
+        coefficients[:, part] = solution.reshape(taps // 2, taps // 2)
+        residual = matrix @ solution - wanted
+        error += float(np.sum(spectrum.power * np.mean(residual**2, axis=1)))
+    return Interpolator(taps, upsampling, coefficients, 10 * np.log10(max(error, 1e-30)))
+
+
+def choose(
+    spectrum: Spectrum,
+    accuracy_db: float,
+    *,
+    taps: int | None = None,
+    upsampling: float | None = None,
+    most_upsampling: float = np.inf,
+) -> Interpolator:
+    """Return the cheapest interpolator whose predicted error is at most `accuracy_db`.
+
+    Parameters
+    ----------
+    spectrum : Spectrum
+        Of the lines.
+    accuracy_db : float
+        Wanted relative rms error, dB, negative.
+    taps, upsampling : int, float, optional
+        Fix one or both; with both, `accuracy_db` plays no part.
+    most_upsampling : float
+        Prefer not to upsample beyond this (where the device's fast lookup ends).
+
+    Raises
+    ------
+    ValueError
+        If `taps` is not one of 2, 4, 6, 8, `upsampling` is below 1, or the fixed one cannot reach
+        `accuracy_db`.
+    """
+    if taps is not None and taps not in TAPS:
+        raise ValueError(f"taps must be one of {TAPS}, got {taps!r}")
+    if upsampling is not None:
+        upsampling = validate.number("upsampling", upsampling, least=1.0, most=64.0)
+    if taps is not None and upsampling is not None:
+        return design(taps, upsampling, spectrum)
+    rates: Sequence[float] = UPSAMPLINGS if upsampling is None else (upsampling,)
+    candidates = []
+    for each_taps in TAPS if taps is None else (taps,):
+        for rate in rates:
+            found = design(each_taps, rate, spectrum)
+            if found.error_db <= accuracy_db:
+                candidates.append(found)
+                break
+    if not candidates:
+        fixed = f"taps={taps}" if taps is not None else f"upsampling={upsampling}"
+        raise ValueError(
+            f"accuracy_db={accuracy_db:g} cannot be reached with {fixed}; "
+            f"the best there is {found.error_db:.1f} dB"
+        )
+    return min(
+        candidates, key=lambda c: (c.upsampling > most_upsampling, _COST[c.taps], c.upsampling)
+    )
+
+
+@dataclass(frozen=True)
+class Resampling:
+    """Where samples go when a line is shifted to its spectral centre and upsampled by FFT.
+
+    A line is zero beyond its ends. Upsampled sample m lies at index (m + first) / ratio - lead of
+    the line it came from, and has been turned by -centre_cycles_per_sample (index + lead) cycles.
+    """
+
+    lead: int
+    fft_length: int
+    upsampled_length: int
+    shift_bins: int
+    first: int
+    length: int
+
+    @property
+    def ratio(self) -> float:
+        """Upsampled samples per sample."""
+        return self.upsampled_length / self.fft_length
+
+    @property
+    def centre_cycles_per_sample(self) -> float:
+        """Frequency made zero, cycles per (given) sample."""
+        return self.shift_bins / self.fft_length
+
+    def apply(self, samples: NDArray[np.complexfloating]) -> NDArray[np.complexfloating]:
+        """Return lines [channels, n] upsampled, [channels, length], in their own precision."""
+        padded = np.zeros((len(samples), self.fft_length), samples.dtype)
+        padded[:, self.lead : self.lead + samples.shape[1]] = samples
+        spectrum = scipy.fft.fft(padded, axis=1, workers=-1, overwrite_x=True)
+        half = self.fft_length // 2
+        wide = np.zeros((len(samples), self.upsampled_length), samples.dtype)
+        # Bins -half .. half - 1 about the centre.
+        bins = (np.arange(-half, self.fft_length - half) + self.shift_bins) % self.fft_length
+        wide[:, np.arange(-half, self.fft_length - half)] = spectrum[:, bins]
+        wide *= self.ratio
+        result = scipy.fft.ifft(wide, axis=1, workers=-1, overwrite_x=True)
+        return result[:, self.first : self.first + self.length]
+
+
+# Zeros around a line during its FFT, in samples: what a band-limited line rings beyond one end
+# must have died away before it comes in again at the other.
+_GUARD = 64
+
+
+def resampling(length: int, interpolator: Interpolator, spectrum: Spectrum) -> Resampling:
+    """Return how lines of `length` samples are upsampled for an interpolator."""
+    fft_length = scipy.fft.next_fast_len(length + 2 * _GUARD)
+    upsampled_length = scipy.fft.next_fast_len(round(np.ceil(fft_length * interpolator.upsampling)))
+    ratio = upsampled_length / fft_length
+    beyond = interpolator.taps // 2  # so that the ends are interpolated like the middle
+    first = int(np.ceil(_GUARD * ratio)) - beyond
+    last = int(np.floor((_GUARD + length - 1) * ratio)) + beyond
+    shift = round(spectrum.centre * fft_length)
+    return Resampling(_GUARD, fft_length, upsampled_length, shift, first, last - first + 1)

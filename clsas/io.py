@@ -1,0 +1,265 @@
+"""Files: one HDF5 schema for grids, range lines, echoes and images; and xarray.
+
+The schema is in docs/format.md. It follows the dataclasses: an array is a dataset, a number or
+string is an attribute, a nested object is a group, None is left out.
+"""
+
+from __future__ import annotations
+
+import os
+import uuid
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import fields, is_dataclass
+from pathlib import Path
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
+
+import h5py
+import numpy as np
+
+from clsas import validate
+from clsas.echoes import Echoes
+from clsas.grid import Grid
+from clsas.image import Image
+from clsas.lines import RangeLines
+from clsas.sonar import Pulse
+
+if TYPE_CHECKING:
+    import xarray
+
+FORMAT = "clsas"
+VERSION = 1
+_KINDS = {
+    "grid": Grid,
+    "range_lines": RangeLines,
+    "image": Image,
+    "echoes": Echoes,
+    "pulse": Pulse,
+}
+_SAVED = (Grid, RangeLines, Image, Echoes)
+
+Saved = Grid | RangeLines | Image | Echoes
+
+
+class FileFormatError(ValueError):
+    """A file that is not a whole clsas file of a version this library reads."""
+
+
+def save(path: str | os.PathLike, obj: Saved) -> None:
+    """Write an object to an HDF5 file, replacing a file of that name at once or not at all.
+
+    Parameters
+    ----------
+    path : path-like
+        The file. Its folder must exist.
+    obj : Grid, RangeLines, Image or Echoes
+        What to write; `load` returns it bit for bit.
+
+    Raises
+    ------
+    TypeError
+        If `obj` is of another type.
+    OSError
+        If the folder does not exist or the file cannot be written.
+    """
+    validate.instance("obj", obj, *_SAVED)
+    # The metadata of HDF5 1.10 carry checksums; those of earlier versions do not all.
+    with replacing(path) as temporary, h5py.File(temporary, "x", libver=("v110", "v110")) as file:
+        _set(file, "format", FORMAT)
+        file.attrs["version"] = VERSION
+        _write(file, obj)
+
+
+def load(path: str | os.PathLike) -> Saved:
+    """Read what `save` wrote.
+
+    Parameters
+    ----------
+    path : path-like
+        The file.
+
+    Returns
+    -------
+    Grid, RangeLines, Image or Echoes
+        Equal to what was saved, bit for bit.
+
+    Raises
+    ------
+    FileFormatError
+        If the file is not HDF5, not of clsas, of a newer version, incomplete or damaged.
+    OSError
+        If it does not exist (FileNotFoundError) or cannot be read.
+    """
+    path = Path(path)
+    with path.open("rb"):
+        pass  # Whatever keeps it from being opened is said by Python, better than by HDF5.
+    if not h5py.is_hdf5(path):
+        raise FileFormatError(f"{path} is not an HDF5 file")
+    try:
+        with h5py.File(path, "r") as file:
+            _check_header(file)
+            obj = _read(file)
+            if not isinstance(obj, _SAVED):
+                raise FileFormatError(f"holds only a {type(obj).__name__}")
+            return obj
+    except FileFormatError as error:
+        raise FileFormatError(f"{path} {error}") from None
+    # HDF5 reports damage by any of these, depending on what it met first.
+    except (OSError, RuntimeError, LookupError, ValueError, TypeError) as error:
+        raise FileFormatError(f"{path} is damaged: {error}") from error
+
+
+@contextmanager
+def replacing(path: str | os.PathLike) -> Iterator[Path]:
+    """Give a temporary path beside `path`; rename it to `path` on success, else remove it.
+
+    Raises
+    ------
+    OSError
+        If the folder of `path` does not exist, or `path` is a folder.
+    """
+    path = Path(path)
+    if not path.parent.is_dir():
+        raise FileNotFoundError(f"cannot write {path}: there is no folder {path.parent}")
+    if path.is_dir():
+        raise IsADirectoryError(f"cannot write {path}: it is a folder")
+    temporary = path.with_name(f".{uuid.uuid4().hex}.part")
+    try:
+        yield temporary
+        os.replace(temporary, path)
+    finally:  # also on Ctrl-C
+        temporary.unlink(missing_ok=True)
+
+
+def to_xarray(obj: Saved) -> xarray.DataArray | xarray.Dataset:
+    """Return an object as an xarray one, with coordinates in metres.
+
+    An image is a DataArray; a grid is a Dataset of coordinates only; range lines and echoes are
+    Datasets over (channel, sample). A coordinate has its unit in `attrs["units"]`; numbers that
+    belong to no axis are attributes, with the unit in their name.
+
+    Parameters
+    ----------
+    obj : Grid, RangeLines, Image or Echoes
+        What to convert. The arrays are shared, not copied.
+
+    Raises
+    ------
+    ImportError
+        If xarray is not installed.
+    TypeError
+        If `obj` is of another type.
+    """
+    try:
+        import xarray
+    except ImportError:
+        raise ImportError("to_xarray needs xarray: pip install xarray") from None
+    validate.instance("obj", obj, *_SAVED)
+    match obj:
+        case Grid():
+            return xarray.Dataset(coords=_grid_coordinates(obj))
+        case Image(pixels=pixels, grid=grid):
+            return xarray.DataArray(pixels, _grid_coordinates(grid), _grid_dims(grid), "pixels")
+    return _channels_to_xarray(xarray, obj)
+
+
+def _write(group: h5py.Group, obj: Any) -> None:
+    _set(group, "kind", next(name for name, kind in _KINDS.items() if type(obj) is kind))
+    for field in fields(obj):
+        value = getattr(obj, field.name)
+        if value is None:
+            continue
+        if isinstance(value, np.ndarray):
+            # Checksummed, so that damage does not become data.
+            group.create_dataset(field.name, data=value, fletcher32=True)
+        elif type(value) in _KINDS.values():
+            _write(group.create_group(field.name), value)
+        else:
+            _set(group, field.name, value)
+
+
+def _read(group: h5py.Group) -> Any:
+    name = _attribute(group, "kind")
+    if name not in _KINDS:
+        raise FileFormatError(f"holds an object of unknown kind {name!r} at {group.name}")
+    kind = _KINDS[name]
+    values = {}
+    for field in fields(kind):
+        if field.name in group.attrs:
+            values[field.name] = _attribute(group, field.name)
+        elif field.name in group:
+            item = group[field.name]
+            values[field.name] = _read(item) if isinstance(item, h5py.Group) else item[()]
+        elif "None" in str(field.type):
+            values[field.name] = None
+        else:
+            raise FileFormatError(f"lacks {field.name} of the {name} at {group.name}")
+    return kind(**values)
+
+
+def _set(group: h5py.Group, name: str, value: Any) -> None:
+    # Of fixed length, a string is inside the checksummed metadata; of variable length it is not.
+    group.attrs[name] = np.bytes_(value.encode()) if isinstance(value, str) else value
+
+
+def _attribute(group: h5py.Group, name: str) -> Any:
+    """Return an attribute as Python's own number, string or list, or None where there is none."""
+    value = group.attrs.get(name)
+    value = value.tolist() if isinstance(value, np.generic | np.ndarray) else value
+    return value.decode() if isinstance(value, bytes) else value
+
+
+def _check_header(file: h5py.File) -> None:
+    if _attribute(file, "format") != FORMAT:
+        raise FileFormatError("is an HDF5 file, but not one of clsas (attribute format)")
+    version = int(file.attrs["version"])
+    if version > VERSION:
+        raise FileFormatError(
+            f"is of format version {version}, newer than this clsas, which reads up to {VERSION}"
+        )
+
+
+def _grid_dims(grid: Grid) -> tuple[str, ...]:
+    if grid.points_m is not None:
+        return tuple(f"point_{axis}" for axis in range(len(grid.shape)))
+    return ("y", "x") if grid.has_axes else ("row", "column")
+
+
+def _grid_coordinates(grid: Grid) -> dict[str, tuple]:
+    metres = {"units": "m"}
+    dims = _grid_dims(grid)
+    if not grid.has_axes:
+        positions = np.moveaxis(grid.positions_m(), -1, 0)
+        return {name: (dims, values, metres) for name, values in zip("xyz", positions, strict=True)}
+    x, y = grid.axes_m
+    if grid.height_m is None:
+        z = ((), grid.origin_m[2], metres)
+    else:
+        z = (dims, grid.origin_m[2] + grid.height_m, metres)
+    return {"x": ("x", x, metres), "y": ("y", y, metres), "z": z}
+
+
+_UNITS = {"_m_s": "m s-1", "_m": "m", "_s": "s", "_hz": "Hz"}
+
+
+def _channels_to_xarray(xarray: ModuleType, obj: RangeLines | Echoes) -> xarray.Dataset:
+    steps = np.arange(obj.samples.shape[1])
+    if isinstance(obj, RangeLines):
+        offset = {"range_offset_m": ("sample", steps * obj.range_step_m, {"units": "m"})}
+    else:
+        offset = {"time_offset_s": ("sample", steps / obj.sample_rate_hz, {"units": "s"})}
+    variables, attributes = {}, {}
+    for field in fields(obj):
+        name, value = field.name, getattr(obj, field.name)
+        if isinstance(value, np.ndarray):
+            dims = ("channel", "sample" if name == "samples" else "axis")[: value.ndim]
+            unit = next((unit for end, unit in _UNITS.items() if name.endswith(end)), None)
+            variables[name] = (dims, value, {} if unit is None else {"units": unit})
+        elif is_dataclass(value):
+            attributes |= {
+                f"{name}_{part.name}": getattr(value, part.name) for part in fields(value)
+            }
+        elif value is not None:
+            attributes[name] = value
+    return xarray.Dataset(variables, {**offset, "axis": ["x", "y", "z"]}, attributes)

@@ -1,0 +1,230 @@
+"""Pixels as work for a device: tiles of a plane, or groups of nearby points.
+
+Either way the pixels form parts, each with a centre. Ranges and phases are referred, in float64, to
+the centres; within a part the device computes differences in float32.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import KDTree
+
+from clsas.grid import Grid
+
+STACK = 4
+"""Blocks per work-item, one below the other (cl/backproject.cl)."""
+
+BLOCKS = {16: (4, 4), 8: (2, 4), 4: (2, 2), 1: (1, 1)}
+"""Rows and columns of a block, by float lanes."""
+
+GEOMETRY_ERROR = 3.2e-5
+"""Relative rms error that the geometry's rounding and expansion may add: -90 dB."""
+
+_SIDES = (64, 32, 16)
+_FLOAT32_ERROR = 2.2e-7  # rms error, radians, per cycle over a part's radius: measured
+
+
+@dataclass(frozen=True, eq=False)
+class Tiles:
+    """A plane cut into tiles of side x side pixels, padded to whole ones.
+
+    Attributes
+    ----------
+    grid : Grid
+        The plane.
+    side : int
+        Pixels along a tile's side.
+    width : int
+        Float lanes per work-item.
+    """
+
+    grid: Grid
+    side: int
+    width: int
+
+    @property
+    def down(self) -> int:
+        """Rows of tiles."""
+        return -(-self.grid.shape[0] // self.side)
+
+    @property
+    def across(self) -> int:
+        """Columns of tiles: how many parts must be computed together."""
+        return -(-self.grid.shape[1] // self.side)
+
+    @property
+    def parts(self) -> int:
+        """Number of tiles."""
+        return self.down * self.across
+
+    @property
+    def part_pixels(self) -> int:
+        """Pixels of a tile."""
+        return self.side**2
+
+    @property
+    def radius_m(self) -> float:
+        """Largest distance of a pixel from its tile's centre."""
+        return (self.side - 1) / 2 * _longest_diagonal(self.grid)
+
+    @property
+    def block_radius_m(self) -> float:
+        """Largest distance of a pixel from the centre of its work-item's block."""
+        return (max(BLOCKS[self.width]) - 1) / 2 * _longest_diagonal(self.grid)
+
+    def centres_m(self, parts: slice) -> NDArray[np.float64]:
+        """Return the centres of some tiles, counted row by row, float64 [parts, 3]."""
+        down, across = np.divmod(np.arange(self.parts)[parts, None], self.across)
+        middle = (self.side - 1) / 2
+        return (
+            self.grid.origin_m
+            + (down * self.side + middle) * self.grid.row_step_m
+            + (across * self.side + middle) * self.grid.column_step_m
+        )
+
+    def collect(self, pixels: NDArray[np.complex64]) -> NDArray[np.complex64]:
+        """Return the image of pixels [parts * part_pixels], rows of the padded plane."""
+        padded = pixels.reshape(self.down * self.side, self.across * self.side)
+        rows, columns = self.grid.shape
+        return np.ascontiguousarray(padded[:rows, :columns])
+
+
+@dataclass(frozen=True, eq=False)
+class Groups:
+    """Points in groups of STACK blocks.
+
+    Attributes
+    ----------
+    grid : Grid
+        The points.
+    index : int64 [parts, part_pixels]
+        Which pixel each slot computes, flat; a pixel may stand in several slots to fill a group.
+    centre_m : float64 [parts, 3]
+        Mean of a group's extremes.
+    offset_m : float32 [parts, part_pixels, 3]
+        Positions from the centre.
+    width : int
+        Float lanes per work-item.
+    """
+
+    grid: Grid
+    index: NDArray[np.int64]
+    centre_m: NDArray[np.float64]
+    offset_m: NDArray[np.float32]
+    width: int
+    across: int = 1
+
+    @property
+    def parts(self) -> int:
+        """Number of groups."""
+        return len(self.index)
+
+    @property
+    def part_pixels(self) -> int:
+        """Slots of a group."""
+        return self.index.shape[1]
+
+    @property
+    def radius_m(self) -> float:
+        """Largest distance of a pixel from its group's centre."""
+        return float(np.linalg.norm(self.offset_m, axis=-1).max())
+
+    @property
+    def block_radius_m(self) -> float:
+        """Largest distance of a pixel from the one in the middle of its work-item's block."""
+        blocks = self.offset_m.reshape(-1, self.width, 3)
+        middle = 5 if self.width == 16 else 0  # the lane that cl/backproject.cl takes
+        return float(np.linalg.norm(blocks - blocks[:, middle, None], axis=-1).max())
+
+    def centres_m(self, parts: slice) -> NDArray[np.float64]:
+        """Return the centres of some groups, float64 [parts, 3]."""
+        return self.centre_m[parts]
+
+    def collect(self, pixels: NDArray[np.complex64]) -> NDArray[np.complex64]:
+        """Return the image of pixels [parts * part_pixels]."""
+        image = np.empty(self.grid.size, np.complex64)
+        image[self.index.ravel()] = pixels
+        return image.reshape(self.grid.shape)
+
+
+def lay_out(
+    grid: Grid, antennas_m: NDArray[np.float64], cycles_per_m: float, width: int
+) -> Tiles | Groups:
+    """Return how to divide a grid so that the geometry's share of the error stays below -90 dB.
+
+    Parameters
+    ----------
+    grid : Grid
+        The pixels.
+    antennas_m : float64 [n, 3]
+        Every transmitter and receiver position.
+    cycles_per_m : float
+        Phase per metre of range, cycles: two over the wavelength.
+    width : int
+        Float lanes per work-item.
+
+    Notes
+    -----
+    A tile is expanded to third order, so that its largest error is that of the fourth:
+    r^4/(8 R^3) at most, r its half diagonal and R the distance of the nearest antenna. The rms over
+    a tile's pixels and directions is 0.15 of it. Where even the smallest tile is too large, near the
+    antennas, and off a plane, pixels go into groups, which expand nothing.
+    """
+    if grid.is_planar:
+        tree = KDTree(antennas_m)
+        for side in _SIDES:
+            tiles = Tiles(grid, side, width)
+            nearest = tree.query(tiles.centres_m(slice(None)))[0].min()
+            remainder_m = 0.15 * tiles.radius_m**4 / (8 * max(nearest, 1e-30) ** 3)
+            rounding = _FLOAT32_ERROR * cycles_per_m * tiles.radius_m
+            if np.hypot(2 * np.pi * cycles_per_m * remainder_m, rounding) <= GEOMETRY_ERROR:
+                return tiles
+    with np.errstate(divide="ignore"):
+        largest_radius_m = GEOMETRY_ERROR / _FLOAT32_ERROR / np.float64(cycles_per_m)
+    return _group(grid, largest_radius_m, width)
+
+
+def _group(grid: Grid, largest_radius_m: float, width: int) -> Groups:
+    """Return groups whose pixels lie within a radius of their centre."""
+    positions = grid.positions_m().reshape(-1, 3)
+    size = STACK * width
+    rest = _neighbours(grid, positions, width)
+    # Runs of neighbours; those that are too wide are halved until they fit or hold one point.
+    index = []
+    length = size
+    while len(rest):
+        runs = np.append(rest, np.repeat(rest[-1:], -len(rest) % length)).reshape(-1, length)
+        extent = np.ptp(positions[runs], axis=1)
+        fits = (np.linalg.norm(extent, axis=1) <= 2 * largest_radius_m) | (length == 1)
+        index.append(np.pad(runs[fits], ((0, 0), (0, size - length)), mode="edge"))
+        rest = runs[~fits].ravel()
+        length //= 2
+    index = np.concatenate(index)
+    centre = (positions[index].min(axis=1) + positions[index].max(axis=1)) / 2
+    offset = (positions[index] - centre[:, None]).astype(np.float32)
+    return Groups(grid, index, centre, offset, width)
+
+
+def _neighbours(grid: Grid, positions: NDArray[np.float64], width: int) -> NDArray[np.int64]:
+    """Return every pixel's flat index, near ones after each other; edge pixels may come twice."""
+    if grid.points_m is not None:
+        return KDTree(positions, leafsize=STACK * width).indices
+    rows, columns = BLOCKS[width]
+    rows *= STACK
+    index = np.arange(grid.size).reshape(grid.shape)
+    index = np.pad(index, [(0, -grid.shape[0] % rows), (0, -grid.shape[1] % columns)], mode="edge")
+    down, across = index.shape[0] // rows, index.shape[1] // columns
+    return index.reshape(down, rows, across, columns).swapaxes(1, 2).ravel()
+
+
+def _longest_diagonal(grid: Grid) -> float:
+    """Return the longer diagonal of a pixel, metres."""
+    return float(
+        max(
+            np.linalg.norm(grid.row_step_m + grid.column_step_m),
+            np.linalg.norm(grid.row_step_m - grid.column_step_m),
+        )
+    )

@@ -1,0 +1,130 @@
+"""Range lines: compressed echoes with their geometry, the one input of every imager."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from clsas import validate
+
+
+@dataclass(frozen=True, eq=False)
+class RangeLines:
+    """Pulse-compressed complex echoes of every channel, and where each was taken.
+
+    A channel is one (ping, receiver) pair, in ping-major order. Range is half the two-way path,
+    rho(x) = (|x - tx| + |x - rx|) / 2, so that monostatic range is range. A point of amplitude A
+    at rho appears in a line as
+
+        A p(r - rho) exp(-j 2 k rho),   k = 2 pi carrier_hz / sound_speed_m_s,
+
+    with sample n of channel i at r = first_range_m[i] + n range_step_m.
+
+    Parameters
+    ----------
+    samples : array_like of complex, shape [channels, length]
+        Kept as complex64.
+    first_range_m : float or array_like, shape [channels]
+        Range of each channel's first sample, metres; one number stands for every channel.
+    range_step_m : float
+        Range between samples, metres: sound_speed_m_s / (2 sample rate).
+    tx_m, rx_m : array_like of float, shape [channels, 3] or [3]
+        Transmitter and receiver positions (x, y, z) at transmission, metres, kept as float64;
+        one position stands for every channel. Monostatic is `rx_m=tx_m`.
+    carrier_hz : float
+        Frequency that was mixed out, hertz; 0 when the lines still carry their carrier.
+    sound_speed_m_s : float
+        Speed of the waves, metres per second.
+    rx_velocity_m_s : array_like of float, shape [channels, 3] or [3], optional
+        Velocity of the receivers during the echoes' flight, metres per second. None is
+        stop-and-hop.
+
+    Raises
+    ------
+    TypeError
+        If an argument is of a wrong kind; real samples, which hold no phase, among them.
+    ValueError
+        If shapes disagree, an array is empty, a value is NaN or infinite, a step or speed is not
+        positive, the carrier is negative, or a receiver is not slower than the waves.
+    """
+
+    samples: NDArray[np.complex64]
+    first_range_m: NDArray[np.float64]
+    range_step_m: float
+    tx_m: NDArray[np.float64]
+    rx_m: NDArray[np.float64]
+    carrier_hz: float
+    sound_speed_m_s: float
+    rx_velocity_m_s: NDArray[np.float64] | None = None
+
+    def __post_init__(self) -> None:
+        """Check every field and convert it."""
+
+        def put(name: str, value: object) -> None:
+            object.__setattr__(self, name, value)
+
+        put("samples", validate.array("samples", self.samples, np.complex64, (None, None)))
+        per_channel = {"first_range_m": (self.channels,)}
+        per_channel |= dict.fromkeys(("tx_m", "rx_m"), (self.channels, 3))
+        if self.rx_velocity_m_s is not None:
+            per_channel["rx_velocity_m_s"] = (self.channels, 3)
+        for name, shape in per_channel.items():
+            value = getattr(self, name)
+            put(name, validate.array(name, value, np.float64, shape, broadcast=True))
+        put("range_step_m", validate.positive("range_step_m", self.range_step_m, "m"))
+        put("carrier_hz", validate.number("carrier_hz", self.carrier_hz, "Hz", least=0.0))
+        put("sound_speed_m_s", validate.positive("sound_speed_m_s", self.sound_speed_m_s, "m/s"))
+        if self.rx_velocity_m_s is not None:
+            fastest = float(np.linalg.norm(self.rx_velocity_m_s, axis=1).max())
+            validate.number(
+                "the speed of rx_velocity_m_s", fastest, "m/s", below=self.sound_speed_m_s
+            )
+
+    @property
+    def channels(self) -> int:
+        """Number of channels."""
+        return self.samples.shape[0]
+
+    @property
+    def length(self) -> int:
+        """Samples per channel."""
+        return self.samples.shape[1]
+
+    @property
+    def wavenumber_rad_m(self) -> float:
+        """Wavenumber k of the carrier, radians per metre (one way)."""
+        return 2 * np.pi * self.carrier_hz / self.sound_speed_m_s
+
+    @property
+    def last_range_m(self) -> NDArray[np.float64]:
+        """Range of each channel's last sample, metres, shape [channels]."""
+        return self.first_range_m + (self.length - 1) * self.range_step_m
+
+    def select(self, channels: slice | ArrayLike) -> RangeLines:
+        """Return the lines of some channels.
+
+        Parameters
+        ----------
+        channels : slice or array_like
+            Which channels: a slice (samples are then shared, not copied), indices, or a mask of
+            bools.
+
+        Raises
+        ------
+        IndexError
+            If an index is outside the channels.
+        ValueError
+            If nothing is selected.
+        """
+        index = channels if isinstance(channels, slice) else np.atleast_1d(channels)
+        velocity = self.rx_velocity_m_s
+        return replace(
+            self,
+            samples=self.samples[index],
+            first_range_m=self.first_range_m[index],
+            tx_m=self.tx_m[index],
+            rx_m=self.rx_m[index],
+            rx_velocity_m_s=None if velocity is None else velocity[index],
+        )

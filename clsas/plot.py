@@ -1,0 +1,297 @@
+"""Pictures: images, point responses, geometry and range lines.
+
+Every function returns a `matplotlib.figure.Figure` that belongs to no window and no global state;
+`save_png` writes it, and notebooks show it.
+"""
+
+from __future__ import annotations
+
+import os
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsas import validate
+from clsas.echoes import Echoes
+from clsas.grid import Grid
+from clsas.image import Image
+from clsas.io import replacing
+from clsas.lines import RangeLines
+from clsas.quality import Cut, PointResponse
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+_MOST_PIXELS = 1500  # along an axis: more than a picture shows
+
+
+def image_db(
+    image: Image,
+    *,
+    dynamic_range_db: float = 60.0,
+    reference: float | None = None,
+    title: str = "",
+) -> Figure:
+    """Draw the amplitude of an image in dB over metres.
+
+    Parameters
+    ----------
+    image : Image
+        On a plane or height map. Where its columns run along x and its rows along y the axes are
+        x and y, else the distances along columns and rows.
+    dynamic_range_db : float
+        What is so far below the reference, or more, is black.
+    reference : float, optional
+        Amplitude of 0 dB (white); the image's greatest unless given.
+    title : str
+        Put above.
+
+    Raises
+    ------
+    ImportError
+        If matplotlib is not installed.
+    TypeError, ValueError
+        If an argument is of a wrong kind or not positive, or the image is one of arbitrary points.
+    """
+    validate.instance("image", image, Image)
+    across, upward, names = _plane_axes(image.grid)
+    figure, axes = _draw_levels(
+        np.abs(image.pixels),
+        (*_edges(across, upward), *_edges(upward, across)),
+        dynamic_range_db,
+        reference,
+    )
+    axes.set(xlabel=names[0], ylabel=names[1], title=title)
+    axes.set_aspect("equal" if min(image.grid.shape) > 1 else "auto")
+    return figure
+
+
+def cuts(response: PointResponse, *, floor_db: float = -60.0, resolutions: float = 12.0) -> Figure:
+    """Draw the cuts through a point along x and y, with the measured figures.
+
+    Parameters
+    ----------
+    response : PointResponse
+        From `clsas.quality.measure_point`.
+    floor_db : float
+        Lower end of the level axis, dB.
+    resolutions : float
+        How many resolutions of the point the distance axis shows on each side.
+
+    Raises
+    ------
+    ImportError
+        If matplotlib is not installed.
+    TypeError, ValueError
+        If an argument is of a wrong kind, `floor_db` not negative or `resolutions` not positive.
+    """
+    validate.instance("response", response, PointResponse)
+    validate.number("floor_db", floor_db, "dB", below=0.0)
+    validate.positive("resolutions", resolutions)
+    figure = _figure(7.0, 7.0)
+    axes_of_both = figure.subplots(2)
+    panels = (("x (along track)", response.azimuth), ("y (across track)", response.range))
+    for axes, (name, cut) in zip(axes_of_both, panels, strict=True):
+        scale, unit = _scale(cut.resolution_m * resolutions)
+        axes.plot(scale * cut.offset_m, cut.level_db, linewidth=1.0, label=_figures_of(cut))
+        reach = scale * resolutions * cut.resolution_m
+        axes.set(
+            xlim=(max(-reach, scale * cut.offset_m[0]), min(reach, scale * cut.offset_m[-1])),
+            ylim=(floor_db, 3),
+            xlabel=f"{name} from the peak ({unit})",
+            ylabel="level (dB)",
+        )
+        axes.grid(alpha=0.3)
+        axes.legend(loc="upper right", fontsize="small", handlelength=0)
+    axes_of_both[0].set_title(f"point at x = {response.x_m:.4f} m, y = {response.y_m:.4f} m")
+    return figure
+
+
+def geometry(lines: RangeLines | Echoes, grid: Grid | None = None) -> Figure:
+    """Draw a plan view of where transmitters and receivers were, and of the grid's outline.
+
+    Parameters
+    ----------
+    lines : RangeLines or Echoes
+        Whose `tx_m` and `rx_m` are drawn.
+    grid : Grid, optional
+        What is imaged: its outline, or every point.
+
+    Raises
+    ------
+    ImportError
+        If matplotlib is not installed.
+    TypeError
+        If `lines` or `grid` is of another type.
+    """
+    validate.instance("lines", lines, RangeLines, Echoes)
+    figure = _figure(7.0, 6.0)
+    axes = figure.subplots()
+    for name, position_m, marker in (
+        ("receiver", lines.rx_m, "."),
+        ("transmitter", lines.tx_m, "x"),
+    ):
+        places = np.unique(position_m[:, :2], axis=0)
+        axes.plot(*places.T, marker, markersize=5, label=f"{name} ({len(places)} places)")
+    if grid is not None:
+        validate.instance("grid", grid, Grid)
+        outline, style = _outline(grid)
+        axes.plot(
+            *outline.T,
+            style,
+            linewidth=1.5,
+            markersize=2,
+            label="grid " + " × ".join(map(str, grid.shape)),
+        )
+    axes.set(xlabel="x (m)", ylabel="y (m)", aspect="equal")
+    axes.set_adjustable("datalim")
+    axes.grid(alpha=0.3)
+    axes.legend(loc="best", fontsize="small")
+    _plain_ticks(axes)
+    return figure
+
+
+def range_lines(lines: RangeLines, *, dynamic_range_db: float = 60.0, title: str = "") -> Figure:
+    """Draw the amplitude of range lines in dB: channels across, range upward.
+
+    Parameters
+    ----------
+    lines : RangeLines
+        What to draw. Lines that start elsewhere than others are shown where they lie.
+    dynamic_range_db : float
+        What is so far below the greatest sample, or more, is black.
+    title : str
+        Put above.
+
+    Raises
+    ------
+    ImportError
+        If matplotlib is not installed.
+    TypeError, ValueError
+        If an argument is of a wrong kind, or the dynamic range is not positive.
+    """
+    validate.instance("lines", lines, RangeLines)
+    amplitude, first_m, last_m = _aligned(lines)
+    extent = (-0.5, lines.channels - 0.5, first_m, last_m)
+    figure, axes = _draw_levels(amplitude, extent, dynamic_range_db, None)
+    axes.set(xlabel="channel", ylabel="range (m)", title=title, aspect="auto")
+    return figure
+
+
+def save_png(figure: Figure, path: str | os.PathLike, *, dpi: float = 150.0) -> None:
+    """Write a figure as PNG, replacing a file of that name at once or not at all.
+
+    Raises
+    ------
+    ValueError
+        If `dpi` (pixels per inch) is not positive.
+    OSError
+        If the folder does not exist or the file cannot be written.
+    """
+    validate.positive("dpi", dpi, "pixels per inch")
+    with replacing(path) as temporary:
+        figure.savefig(temporary, format="png", dpi=dpi)
+
+
+def _figure(width_in: float, height_in: float) -> Figure:
+    try:
+        from matplotlib.figure import Figure
+    except ImportError:
+        raise ImportError("pictures need matplotlib: pip install clsas[plot]") from None
+    return Figure(figsize=(width_in, height_in), layout="constrained")
+
+
+def _draw_levels(
+    amplitude: NDArray,
+    extent: tuple[float, float, float, float],
+    dynamic_range_db: float,
+    reference: float | None,
+) -> tuple[Figure, Axes]:
+    """Draw amplitudes [upward, across] in dB over `extent` (left, right, bottom, top)."""
+    validate.positive("dynamic_range_db", dynamic_range_db, "dB")
+    label = "amplitude over the greatest (dB)"
+    if reference is not None:
+        label = f"amplitude over {validate.positive('reference', reference):g} (dB)"
+    figure = _figure(7.0, 6.0)
+    axes = figure.subplots()
+    # The greatest of the pixels that share a dot: a mean would hide a point among many.
+    for axis in (0, 1):
+        count = amplitude.shape[axis]
+        first = np.linspace(0, count, min(count, _MOST_PIXELS), endpoint=False).astype(int)
+        amplitude = np.maximum.reduceat(amplitude, first, axis)
+    reference = reference or float(amplitude.max()) or 1.0
+    floor = 10 ** (-dynamic_range_db / 20)
+    drawn = axes.imshow(
+        20 * np.log10(np.maximum(amplitude / reference, floor)),
+        cmap="inferno",
+        vmin=-dynamic_range_db,
+        vmax=0,
+        origin="lower",
+        extent=extent,
+    )
+    axes.set(xlim=sorted(extent[:2]), ylim=sorted(extent[2:]))
+    _plain_ticks(axes)
+    figure.colorbar(drawn, ax=axes, label=label, shrink=0.8)
+    return figure, axes
+
+
+def _plain_ticks(axes: Axes) -> None:
+    """Write coordinates in full, however far the origin is, and few enough to fit."""
+    axes.ticklabel_format(style="plain", useOffset=False)
+    axes.locator_params(nbins=6)
+
+
+def _plane_axes(grid: Grid) -> tuple[NDArray, NDArray, tuple[str, str]]:
+    """Return what to put across and upward, metres, and their names."""
+    if grid.has_axes:
+        return *grid.axes_m, ("x (m)", "y (m)")
+    if grid.points_m is not None:
+        raise ValueError("image must be on a plane or height map to be drawn, got points")
+    rows, columns = grid.shape
+    return (
+        np.arange(columns) * np.linalg.norm(grid.column_step_m),
+        np.arange(rows) * np.linalg.norm(grid.row_step_m),
+        ("along columns (m)", "along rows (m)"),
+    )
+
+
+def _edges(axis: NDArray, other: NDArray) -> tuple[float, float]:
+    """Return the outer edges of the pixels of an axis; a single one is as wide as the other's."""
+    step = next((a[1] - a[0] for a in (axis, other) if len(a) > 1), 1.0)
+    return axis[0] - step / 2, axis[-1] + step / 2
+
+
+def _outline(grid: Grid) -> tuple[NDArray, str]:
+    """Return x and y of what to draw for a grid, and how."""
+    if grid.points_m is not None:
+        return grid.points_m[..., :2].reshape(-1, 2), "."
+    down, right = (count - 1 for count in grid.shape)
+    corners = np.array([[0, 0], [0, right], [down, right], [down, 0], [0, 0]])
+    return (grid.origin_m + corners @ [grid.row_step_m, grid.column_step_m])[:, :2], "-"
+
+
+def _aligned(lines: RangeLines) -> tuple[NDArray, float, float]:
+    """Return amplitudes [range, channel] on one range axis, and that axis's outer edges."""
+    first_m, step_m = lines.first_range_m.min(), lines.range_step_m
+    start = np.rint((lines.first_range_m - first_m) / step_m).astype(int)
+    amplitude = np.zeros((start.max() + lines.length, lines.channels), np.float32)
+    for channel, (at, samples) in enumerate(zip(start, lines.samples, strict=True)):
+        amplitude[at : at + lines.length, channel] = np.abs(samples)
+    return amplitude, first_m - step_m / 2, first_m + (len(amplitude) - 0.5) * step_m
+
+
+def _scale(length_m: float) -> tuple[float, str]:
+    return (1e3, "mm") if length_m < 0.5 else (1.0, "m")
+
+
+def _figures_of(cut: Cut) -> str:
+    """Return what was measured on a cut, one figure a line."""
+    scale, unit = _scale(cut.resolution_m)
+    return (
+        f"resolution {scale * cut.resolution_m:.4g} {unit} (−3 dB)\n"
+        "PSLR nearest {:.1f}, {:.1f} dB\n".format(*cut.pslr_nearest_db)
+        + "PSLR highest {:.1f}, {:.1f} dB\n".format(*cut.pslr_db)
+        + "ISLR {:.1f} dB ({} + {} lobes)".format(cut.islr_db, *cut.lobes)
+    )

@@ -1,0 +1,345 @@
+"""Image quality: point responses, image-to-image error, entropy and contrast."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy import signal
+
+from clsas import validate
+from clsas.image import Image
+
+_LOBES = 10  # side lobes on each side that the ISLR counts
+_SEARCH = 10  # pixels around the given place where the peak is looked for, unless told
+_REACH = 1024  # pixels around the peak that are looked at, at most
+_UPSAMPLING = 32  # points of a cut per pixel
+
+
+@dataclass(frozen=True, eq=False)
+class Cut:
+    """A point response along one axis, and what was measured on it.
+
+    Side lobes are numbered from the main lobe outwards and end at minima of the amplitude; the
+    main lobe is what lies between the first minimum on each side. Pairs are (towards smaller,
+    towards larger coordinate).
+
+    Attributes
+    ----------
+    offset_m : ndarray of float64, shape [points]
+        Distance from the peak, metres.
+    level_db : ndarray of float64, shape [points]
+        Amplitude over the peak's, dB.
+    resolution_m : float
+        Width of the main lobe at half the peak's power (-3.01 dB), metres.
+    pslr_nearest_db : (float, float)
+        Peak of the first side lobe over the main lobe's, dB.
+    pslr_db : (float, float)
+        Peak of the highest side lobe over the main lobe's, dB, as far as the cut reaches.
+    islr_db : float
+        Energy of the `lobes` nearest side lobes on both sides over that of the main lobe, dB.
+    lobes : (int, int)
+        How many whole side lobes the ISLR counts: 10, or less where the cut ends.
+    """
+
+    offset_m: NDArray[np.float64]
+    level_db: NDArray[np.float64]
+    resolution_m: float
+    pslr_nearest_db: tuple[float, float]
+    pslr_db: tuple[float, float]
+    islr_db: float
+    lobes: tuple[int, int]
+
+
+@dataclass(frozen=True, eq=False)
+class PointResponse:
+    """A point in an image.
+
+    Attributes
+    ----------
+    x_m, y_m : float
+        Where its peak is, metres.
+    amplitude : float
+        Amplitude of the peak. (There is no phase here: that of the range carrier, which the
+        pixels hold as an alias, is not known between them.)
+    azimuth, range : Cut
+        The cuts through the peak along x and along y.
+    """
+
+    x_m: float
+    y_m: float
+    amplitude: float
+    azimuth: Cut
+    range: Cut
+
+
+def measure_point(
+    image: Image,
+    near: tuple[float, float],
+    *,
+    search_m: float | None = None,
+    extent_m: float | None = None,
+) -> PointResponse:
+    """Measure the point response nearby: position, resolution and side lobes.
+
+    Parameters
+    ----------
+    image : Image
+        An image whose columns run along x and rows along y, with pixels no larger than its
+        bandwidth asks for (1 / bandwidth: the carrier need not be sampled).
+    near : (float, float)
+        About where the point is: x, y, metres.
+    search_m : float, optional
+        How far from there, along x and along y, the greatest pixel is taken for the point;
+        10 pixels unless given.
+    extent_m : float, optional
+        How far from the peak side lobes are looked for, metres, to keep other targets out; as
+        far as the image (and 1024 pixels) unless given.
+
+    Returns
+    -------
+    PointResponse
+
+    Raises
+    ------
+    ValueError
+        If the image has no such axes, `near` is outside it, it is zero there or has no peak, its
+        peak is at the border, or the main lobe and a side lobe on each side do not fit in.
+    TypeError
+        If an argument is of a wrong kind.
+
+    Notes
+    -----
+    An image carries the phase exp(j 2 k rho(x)) of its points, which wraps from pixel to pixel
+    where these are larger than a quarter of a wavelength: its spectrum lies anywhere, across the
+    edge of the FFT's too. The phase step between the pixels of the main lobe gives the centre
+    of that spectrum modulo the sampling; with it removed, sinc interpolation is exact.
+    """
+    validate.instance("image", image, Image)
+    x_m, y_m = image.grid.axes_m
+    steps = []
+    for name, axis in (("x", x_m), ("y", y_m)):
+        if len(axis) < 3:
+            raise ValueError(f"image must have 3 or more pixels along {name}, got {len(axis)}")
+        steps.append((axis[-1] - axis[0]) / (len(axis) - 1))
+    dx, dy = steps
+    row, column = _find_peak(image.pixels, (x_m, y_m), (dx, dy), near, search_m)
+
+    top, left = max(row - _REACH, 0), max(column - _REACH, 0)
+    pixels = image.pixels[top : row + _REACH + 1, left : column + _REACH + 1].astype(np.complex128)
+    row, column = row - top, column - left
+    pixels = _without_carrier(pixels, row, column)
+    row, column, amplitude = _refine_peak(pixels, row, column)
+
+    along_x = _sinc([row], pixels.shape[0])[0] @ pixels
+    along_y = pixels @ _sinc([column], pixels.shape[1])[0]
+    if extent_m is not None:
+        validate.positive("extent_m", extent_m, "m")
+    return PointResponse(
+        x_m=float(x_m[0] + (left + column) * dx),
+        y_m=float(y_m[0] + (top + row) * dy),
+        amplitude=amplitude,
+        azimuth=_measure_cut("x", along_x, column, dx, amplitude, extent_m),
+        range=_measure_cut("y", along_y, row, dy, amplitude, extent_m),
+    )
+
+
+def relative_error_db(image: Image | ArrayLike, reference: Image | ArrayLike) -> float:
+    """Return the relative rms error of an image, 20 log10(||I - R|| / ||R||), dB.
+
+    Parameters
+    ----------
+    image, reference : Image or array_like
+        Complex images of one shape.
+
+    Returns
+    -------
+    float
+        -inf when they are equal.
+
+    Raises
+    ------
+    ValueError
+        If the shapes differ, a value is not finite, or the reference is zero.
+    """
+    given, wanted = _values("image", image), _values("reference", reference)
+    if given.shape != wanted.shape:
+        raise ValueError(
+            f"image and reference must have one shape, got {given.shape} and {wanted.shape}"
+        )
+    norm = np.linalg.norm(wanted)
+    if norm == 0:
+        raise ValueError("reference must not be zero everywhere")
+    error = np.linalg.norm(given - wanted) / norm
+    return 20 * math.log10(error) if error > 0 else -math.inf
+
+
+def entropy(image: Image | ArrayLike) -> float:
+    """Return the entropy of the intensity, nats: least when an image is best focused.
+
+    -sum p ln p with p = |I|^2 / sum |I|^2: 0 for one bright pixel, ln(size) for a flat image.
+
+    Raises
+    ------
+    ValueError
+        If the image is zero everywhere, or a value is not finite.
+    """
+    share = _intensity(image)
+    share = share[share > 0] / share.sum()
+    return float(-(share * np.log(share)).sum())
+
+
+def contrast(image: Image | ArrayLike) -> float:
+    """Return the contrast of the intensity |I|^2, its standard deviation over its mean.
+
+    0 for a flat image, 1 for fully developed speckle, and the more the sharper.
+
+    Raises
+    ------
+    ValueError
+        If the image is zero everywhere, or a value is not finite.
+    """
+    intensity = _intensity(image)
+    return float(intensity.std() / intensity.mean())
+
+
+def _values(name: str, image: Image | ArrayLike) -> NDArray[np.complex128]:
+    values = np.asarray(image.pixels if isinstance(image, Image) else image)
+    if values.dtype.kind in "iuf":
+        values = values.astype(np.complex128)
+    return validate.array(name, values, np.complex128, (None,) * values.ndim)
+
+
+def _intensity(image: Image | ArrayLike) -> NDArray[np.float64]:
+    amplitude = np.abs(_values("image", image))
+    if not amplitude.any():
+        raise ValueError("image must not be zero everywhere")
+    return (amplitude / amplitude.max()) ** 2
+
+
+def _find_peak(
+    pixels: NDArray,
+    axes_m: tuple[NDArray, NDArray],
+    steps_m: tuple[float, float],
+    near: tuple[float, float],
+    search_m: float | None,
+) -> tuple[int, int]:
+    """Return row and column of the greatest pixel near a place."""
+    place = validate.array("near", near, np.float64, (2,))
+    if search_m is not None:
+        validate.positive("search_m", search_m, "m")
+    windows = []
+    for name, axis, step, at in zip("xy", axes_m, steps_m, place, strict=True):
+        index = (at - axis[0]) / step
+        if not -0.5 <= index <= len(axis) - 0.5:
+            ends = sorted((axis[0], axis[-1]))
+            raise ValueError(
+                f"near must be inside the image: {name} from {ends[0]:g} to {ends[1]:g} m, "
+                f"got {at:g} m"
+            )
+        search = _SEARCH if search_m is None else search_m / abs(step)
+        nearest = int(np.clip(round(index), 0, len(axis) - 1))
+        first = max(math.ceil(index - search), 0)
+        windows.append(slice(min(first, nearest), max(math.floor(index + search), nearest) + 1))
+    columns, rows = windows
+    amplitude = np.abs(pixels[rows, columns])
+    row, column = np.unravel_index(amplitude.argmax(), amplitude.shape)
+    if amplitude[row, column] == 0:
+        raise ValueError(f"image is zero around near = ({place[0]:g}, {place[1]:g}) m")
+    row, column = int(row) + rows.start, int(column) + columns.start
+    for name, index, axis in (("x", column, axes_m[0]), ("y", row, axes_m[1])):
+        if not 0 < index < len(axis) - 1:
+            raise ValueError(
+                f"the peak near ({place[0]:g}, {place[1]:g}) m lies at the image's border "
+                f"({name} = {axis[index]:g} m): a larger image is needed"
+            )
+    if np.abs(pixels[row - 1 : row + 2, column - 1 : column + 2]).max() > np.abs(
+        pixels[row, column]
+    ):
+        raise ValueError(
+            f"there is no peak around near = ({place[0]:g}, {place[1]:g}) m, only the flank of one "
+            "outside the search: give a nearer place or a larger search_m"
+        )
+    return row, column
+
+
+def _without_carrier(pixels: NDArray, row: int, column: int) -> NDArray:
+    """Shift the spectrum of the point at a pixel to zero frequency, on both axes."""
+    main_lobe = pixels[row - 1 : row + 2, column - 1 : column + 2]
+    down = np.angle(np.vdot(main_lobe[:-1], main_lobe[1:]))
+    across = np.angle(np.vdot(main_lobe[:, :-1], main_lobe[:, 1:]))
+    rows, columns = (np.arange(n) for n in pixels.shape)
+    return pixels * np.exp(-1j * (down * rows[:, None] + across * columns))
+
+
+def _sinc(positions: ArrayLike, count: int) -> NDArray:
+    """Return the weights [positions, count] that evaluate `count` samples between them."""
+    return np.sinc(np.asarray(positions)[:, None] - np.arange(count))
+
+
+def _refine_peak(pixels: NDArray, row: float, column: float) -> tuple[float, float, float]:
+    """Return row, column and amplitude of the peak of the band-limited image near a pixel."""
+    zoom = np.arange(-16, 17)
+    for step in (1 / 16, 1 / 256, 1 / 4096):
+        rows, columns = row + step * zoom, column + step * zoom
+        near = _sinc(rows, pixels.shape[0]) @ pixels @ _sinc(columns, pixels.shape[1]).T
+        amplitude = np.abs(near)
+        i, j = np.unravel_index(amplitude.argmax(), amplitude.shape)
+        row, column = rows[i], columns[j]
+    return float(row), float(column), float(amplitude[i, j])
+
+
+def _measure_cut(
+    name: str,
+    samples: NDArray,
+    peak: float,
+    step_m: float,
+    amplitude: float,
+    extent_m: float | None,
+) -> Cut:
+    """Measure a line of pixels through the peak, which lies at index `peak` in it."""
+    fine = signal.resample(samples, _UPSAMPLING * len(samples))
+    offset = (np.arange(len(fine)) / _UPSAMPLING - peak) * step_m
+    # Behind the last sample the periodic interpolation only leads back to the first one.
+    inside = np.arange(len(fine)) <= _UPSAMPLING * (len(samples) - 1)
+    if extent_m is not None:
+        inside &= np.abs(offset) <= extent_m
+    power = np.abs(fine[inside] / amplitude) ** 2
+    offset = offset[inside]
+    if step_m < 0:
+        offset, power = offset[::-1], power[::-1]
+
+    top = int(np.abs(offset).argmin())
+    sides = [power[top::-1], power[top:]]  # both outwards
+    half, main, energy, nearest, highest, counts = 0.0, -power[top], 0.0, [], [], []
+    for side, word in zip(sides, ("smaller", "larger"), strict=True):
+        ends = signal.argrelmin(side)[0]
+        if len(ends) < 2 or side[: ends[0] + 1].min() > 0.5:
+            raise ValueError(
+                f"no whole side lobe at {word} {name} within the image (or extent_m): the point "
+                "is too near the border, or what is around it is not a point response"
+            )
+        below = int(np.argmax(side < 0.5))
+        half += below - (0.5 - side[below]) / (side[below - 1] - side[below])
+        lobes = ends[: _LOBES + 1]
+        main += side[: ends[0]].sum()
+        energy += side[lobes[0] : lobes[-1]].sum()
+        nearest.append(float(_decibels(side[ends[0] : ends[1]].max())))
+        highest.append(float(_decibels(side[ends[0] :].max())))
+        counts.append(len(lobes) - 1)
+    return Cut(
+        offset_m=offset,
+        level_db=_decibels(power),
+        resolution_m=float(half * abs(step_m)) / _UPSAMPLING,
+        pslr_nearest_db=tuple(nearest),
+        pslr_db=tuple(highest),
+        islr_db=float(_decibels(energy / main)),
+        lobes=tuple(counts),
+    )
+
+
+def _decibels(power: ArrayLike) -> NDArray:
+    """Return 10 log10(power), not below -300 dB."""
+    return 10 * np.log10(np.maximum(power, 1e-30))

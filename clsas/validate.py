@@ -1,0 +1,158 @@
+"""Checks of user input, made once where it enters the library.
+
+Every check raises one exception that names the argument, what was given and what is allowed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike, DTypeLike, NDArray
+
+
+class ClsasWarning(UserWarning):
+    """A result that is valid but probably not what was meant, with what was done instead."""
+
+
+def number(
+    name: str,
+    value: float,
+    unit: str = "",
+    *,
+    above: float | None = None,
+    below: float | None = None,
+    least: float | None = None,
+    most: float | None = None,
+) -> float:
+    """Return `value` as a finite float inside the given limits.
+
+    Raises
+    ------
+    TypeError
+        If `value` is not a real number.
+    ValueError
+        If it is not finite, or not above `above` and below `below`, or outside [`least`, `most`].
+    """
+    if isinstance(value, bool) or (not np.isscalar(value) and np.ndim(value) != 0):
+        raise TypeError(f"{name} must be one number{_in(unit)}, got {value!r}")
+    try:
+        result = float(value)
+    except (TypeError, ValueError):
+        raise TypeError(f"{name} must be one real number{_in(unit)}, got {value!r}") from None
+    limits = []
+    if above is not None:
+        limits.append(f"> {above:g}")
+    if below is not None:
+        limits.append(f"< {below:g}")
+    if least is not None:
+        limits.append(f">= {least:g}")
+    if most is not None:
+        limits.append(f"<= {most:g}")
+    inside = (
+        np.isfinite(result)
+        and (above is None or result > above)
+        and (below is None or result < below)
+        and (least is None or result >= least)
+        and (most is None or result <= most)
+    )
+    if not inside:
+        allowed = " and ".join(["finite", *limits])
+        raise ValueError(f"{name} must be {allowed}{_in(unit)}, got {result:g}")
+    return result
+
+
+def positive(name: str, value: float, unit: str = "") -> float:
+    """Return `value` as a finite float greater than zero; see `number`."""
+    return number(name, value, unit, above=0.0)
+
+
+def count(name: str, value: int, *, least: int = 1) -> int:
+    """Return `value` as an int of at least `least`; raises TypeError or ValueError."""
+    if isinstance(value, bool) or not isinstance(value, (int, np.integer)):
+        raise TypeError(f"{name} must be a whole number, got {value!r}")
+    if value < least:
+        raise ValueError(f"{name} must be at least {least}, got {value}")
+    return int(value)
+
+
+def one_of(name: str, value: str, allowed: Sequence[str]) -> str:
+    """Return `value` if it is one of `allowed`; raises ValueError naming them all."""
+    if value not in allowed:
+        raise ValueError(f"{name} must be one of {', '.join(map(repr, allowed))}, got {value!r}")
+    return value
+
+
+def instance(name: str, value: object, *kinds: type) -> None:
+    """Raise TypeError unless `value` is of one of the classes `kinds`."""
+    if not isinstance(value, kinds):
+        names = " or ".join(kind.__name__ for kind in kinds)
+        raise TypeError(f"{name} must be of type {names}, got {type(value).__name__}")
+
+
+def array(
+    name: str,
+    value: ArrayLike,
+    dtype: DTypeLike,
+    shape: tuple[int | None, ...],
+    *,
+    broadcast: bool = False,
+) -> NDArray:
+    """Return `value` as a finite, C-contiguous, read-only array of `dtype` and `shape`.
+
+    Parameters
+    ----------
+    name : str
+        The argument's name, for the message.
+    value : array_like
+        What was given. Converted when its kind allows it (integers and other float widths to
+        float, complex128 to complex64); a caller's own array is never modified.
+    dtype : dtype
+        Wanted type. A real array is refused where complex is due, and the reverse.
+    shape : tuple of int or None
+        Wanted shape; None stands for any length of at least 1.
+    broadcast : bool
+        A value of shape `shape[1:]` stands for every entry along the first axis.
+
+    Raises
+    ------
+    TypeError
+        If the values are not numbers of a kind that fits `dtype`.
+    ValueError
+        If the shape differs, an axis is empty, or a value is NaN or infinite.
+    """
+    dtype = np.dtype(dtype)
+    try:
+        given = np.asarray(value)
+    except ValueError as error:
+        raise ValueError(f"{name} must be a regular array: {error}") from None
+    if dtype.kind == "c" and given.dtype.kind != "c":
+        raise TypeError(
+            f"{name} must be complex, got {given.dtype}: real samples hold no phase; "
+            "form the analytic signal first (clsas.compress does)"
+        )
+    if dtype.kind != "c" and given.dtype.kind not in "iuf":
+        raise TypeError(f"{name} must be real numbers, got {given.dtype}")
+    if broadcast and given.shape == shape[1:]:
+        given = np.broadcast_to(given, shape)
+    fits = given.ndim == len(shape) and all(
+        have == want or (want is None and have > 0)
+        for have, want in zip(given.shape, shape, strict=False)
+    )
+    if not fits:
+        wanted = ", ".join("any" if axis is None else str(axis) for axis in shape)
+        raise ValueError(f"{name} must have shape ({wanted}) and no empty axis, got {given.shape}")
+    with np.errstate(over="ignore"):
+        result = np.ascontiguousarray(given, dtype=dtype)
+    if not np.isfinite(result).all():
+        bad = int(np.size(result) - np.isfinite(result).sum())
+        raise ValueError(
+            f"{name} must be finite, got {bad} NaN or infinite of {result.size} values"
+        )
+    result = result.view()
+    result.flags.writeable = False
+    return result
+
+
+def _in(unit: str) -> str:
+    return f" {unit}" if unit else ""

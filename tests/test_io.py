@@ -1,0 +1,303 @@
+import dataclasses
+import hashlib
+import os
+import subprocess
+import sys
+
+import h5py
+import numpy as np
+import pytest
+
+from clsas import io
+from clsas.echoes import Echoes
+from clsas.grid import Grid
+from clsas.image import Image
+from clsas.io import FileFormatError, load, save, to_xarray
+from clsas.lines import RangeLines
+from clsas.sonar import Pulse
+
+RNG = np.random.default_rng(3)
+
+
+def noise(*shape):
+    return RNG.normal(size=shape)
+
+
+def complex_noise(*shape):
+    return (noise(*shape) + 1j * noise(*shape)).astype(np.complex64)
+
+
+PLANE = Grid.plane(x=(1e6, 1e6 + 0.7, 5), y=(40, 41 / 3, 3), z=-1 / 3)
+TX, RX = 1e7 + noise(4, 3), 1e7 + noise(4, 3)
+# -0, the smallest and the largest number are among the bits to be kept.
+SAMPLES = complex_noise(4, 6)
+SAMPLES[0, :3] = [complex(-0.0, 0.0), np.finfo(np.float32).smallest_subnormal, 3.4e38]
+OBJECTS = {
+    "plane": PLANE,
+    "oriented": Grid.oriented(noise(3), noise(3), noise(3), (2, 3)),
+    "height map": PLANE.with_height(noise(3, 5)),
+    "points": Grid.points(noise(2, 3, 4, 3)),
+    "image": Image(complex_noise(3, 5), PLANE),
+    "image of points": Image(complex_noise(7), Grid.points(noise(7, 3))),
+    "lines": RangeLines(SAMPLES, noise(4), 1 / 3, TX, RX, 1e6 / 3, 1500.1),
+    "moving lines": RangeLines(SAMPLES, 40, 0.1, TX, RX, 0, 1500, noise(4, 3)),
+    "echoes": Echoes(SAMPLES, 0.1, 1e5 / 3, 1e6, TX, RX, 1500, Pulse(1e6, 1e5 / 3, 1e-3, "down")),
+    "phase code": Echoes(
+        SAMPLES, noise(4), 1e5, 1e6, TX, RX, 1500, Pulse.phase_code(1e6, 1e-3), noise(4, 3)
+    ),
+    "passband without a pulse": Echoes(noise(4, 6).astype(np.float32), 0, 1e6, 2e5, TX, RX, 1500),
+}
+EVERY_OBJECT = pytest.mark.parametrize("obj", OBJECTS.values(), ids=OBJECTS.keys())
+
+
+def digest(obj):
+    """One number for every bit, type and name in an object."""
+    if dataclasses.is_dataclass(obj):
+        text = repr([(f.name, digest(getattr(obj, f.name))) for f in dataclasses.fields(obj)])
+        text = type(obj).__name__ + text
+    elif isinstance(obj, np.ndarray):
+        text = f"{obj.dtype.str} {obj.shape} {hashlib.sha256(obj.tobytes()).hexdigest()}"
+    else:
+        text = f"{type(obj).__name__} {obj!r}"
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+@EVERY_OBJECT
+def test_round_trip_keeps_every_bit(obj, tmp_path):
+    save(tmp_path / "file.h5", obj)
+    assert digest(load(tmp_path / "file.h5")) == digest(obj)
+    assert os.listdir(tmp_path) == ["file.h5"]
+
+
+def test_another_process_reads_every_bit(tmp_path):
+    paths = [str(tmp_path / f"{name}.h5") for name in OBJECTS]
+    for path, obj in zip(paths, OBJECTS.values(), strict=True):
+        save(path, obj)
+    code = "import sys, test_io as t\nfor p in sys.argv[1:]: print(t.digest(t.load(p)))"
+    folders = [os.path.dirname(__file__), *sys.path]
+    done = subprocess.run(
+        [sys.executable, "-c", code, *paths],
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, folders))},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert done.stdout.split() == [digest(obj) for obj in OBJECTS.values()]
+
+
+def test_schema_is_the_documented_one(tmp_path):
+    save(tmp_path / "image.h5", OBJECTS["image"])
+    with h5py.File(tmp_path / "image.h5") as file:
+        assert dict(file.attrs) == {"format": b"clsas", "version": 1, "kind": b"image"}
+        assert set(file) == {"pixels", "grid"}
+        assert set(file["grid"]) == {"origin_m", "row_step_m", "column_step_m"}
+        assert file["grid"].attrs["kind"] == b"grid"
+        assert list(file["grid"].attrs["shape"]) == [3, 5]
+        np.testing.assert_array_equal(file["pixels"], OBJECTS["image"].pixels)
+
+
+def test_a_file_by_another_program_loads(tmp_path):
+    with h5py.File(tmp_path / "lines.h5", "w") as file:
+        file.attrs.update(format="clsas", version=1, kind="range_lines", range_step_m=0.1)
+        file.attrs.update(carrier_hz=100_000, sound_speed_m_s=1500)
+        file["samples"] = np.ones((2, 3), np.complex128)
+        file["first_range_m"] = [1, 2]
+        file["tx_m"] = file["rx_m"] = np.zeros((2, 3), ">f4")
+    lines = load(tmp_path / "lines.h5")
+    assert lines.samples.dtype == np.complex64
+    assert lines.tx_m.dtype == np.float64
+    assert lines.rx_velocity_m_s is None
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt, RuntimeError])
+@pytest.mark.parametrize("exists", [False, True])
+def test_an_interrupted_save_leaves_nothing(error, exists, tmp_path, monkeypatch):
+    path = tmp_path / "file.h5"
+    if exists:
+        path.write_bytes(b"what was there")
+    write, begun = io._write, []
+
+    def interrupted(group, obj):
+        write(group, obj)
+        begun.extend(os.listdir(tmp_path))
+        raise error
+
+    monkeypatch.setattr(io, "_write", interrupted)
+    with pytest.raises(error):
+        save(path, OBJECTS["lines"])
+    assert len(set(begun) - {"file.h5"}) == 1  # it was being written, under another name
+    assert os.listdir(tmp_path) == (["file.h5"] if exists else [])
+    assert not exists or path.read_bytes() == b"what was there"
+
+
+def test_save_replaces(tmp_path):
+    for name in ("lines", "plane"):
+        save(tmp_path / "file.h5", OBJECTS[name])
+    assert digest(load(tmp_path / "file.h5")) == digest(PLANE)
+
+
+def test_save_names_bad_input(tmp_path):
+    with pytest.raises(TypeError, match=r"obj must be of type Grid or RangeLines or .*, got dict"):
+        save(tmp_path / "file.h5", {})
+    with pytest.raises(FileNotFoundError, match="there is no folder"):
+        save(tmp_path / "none" / "file.h5", PLANE)
+    with pytest.raises(IsADirectoryError, match="it is a folder"):
+        save(tmp_path, PLANE)
+    assert os.listdir(tmp_path) == []
+
+
+def test_load_leaves_missing_files_to_python(tmp_path):
+    with pytest.raises(FileNotFoundError):
+        load(tmp_path / "none.h5")
+    with pytest.raises(IsADirectoryError):
+        load(tmp_path)
+
+
+@pytest.mark.parametrize("content", [b"", b"not HDF5 at all", b"\x89PNG\r\n\x1a\n" + bytes(1000)])
+def test_load_refuses_what_is_not_hdf5(content, tmp_path):
+    path = tmp_path / "file.h5"
+    path.write_bytes(content)
+    with pytest.raises(FileFormatError, match=r"file\.h5 is not an HDF5 file"):
+        load(path)
+
+
+def change(file, name):
+    """Damage an open file of range lines in a way."""
+    match name:
+        case "foreign":
+            del file.attrs["format"]
+        case "of another format":
+            file.attrs["format"] = "NetCDF"
+        case "newer":
+            file.attrs["version"] = 2
+        case "without version":
+            del file.attrs["version"]
+        case "of unknown kind":
+            file.attrs["kind"] = "hologram"
+        case "without kind":
+            del file.attrs["kind"]
+        case "without samples":
+            del file["samples"]
+        case "without step":
+            del file.attrs["range_step_m"]
+        case "of one channel too many":
+            del file["tx_m"]
+            file["tx_m"] = np.zeros((5, 3))
+        case "with NaN":
+            file["first_range_m"][1] = np.nan
+        case "with text":
+            file.attrs["carrier_hz"] = "much"
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("foreign", "is an HDF5 file, but not one of clsas"),
+        ("of another format", "is an HDF5 file, but not one of clsas"),
+        ("newer", "is of format version 2, newer than this clsas, which reads up to 1"),
+        ("without version", "is damaged: .*version"),
+        ("of unknown kind", "holds an object of unknown kind 'hologram'"),
+        ("without kind", "holds an object of unknown kind None"),
+        ("without samples", "lacks samples of the range_lines"),
+        ("without step", "lacks range_step_m of the range_lines"),
+        ("of one channel too many", r"is damaged: tx_m must have shape \(4, 3\)"),
+        ("with NaN", "is damaged: first_range_m must be finite, got 1 NaN"),
+        ("with text", "is damaged: carrier_hz must be one real number Hz"),
+    ],
+)
+def test_load_names_what_is_wrong(name, words, tmp_path):
+    path = tmp_path / "file.h5"
+    save(path, OBJECTS["lines"])
+    with h5py.File(path, "r+") as file:
+        change(file, name)
+    with pytest.raises(FileFormatError, match=rf"file\.h5 {words}"):
+        load(path)
+
+
+def test_a_pulse_alone_is_no_file(tmp_path):
+    path = tmp_path / "file.h5"
+    save(path, OBJECTS["echoes"])
+    with h5py.File(path, "r+") as file:
+        for name, value in file["pulse"].attrs.items():
+            file.attrs[name] = value
+    with pytest.raises(FileFormatError, match="holds only a Pulse"):
+        load(path)
+
+
+def test_truncated_files_are_refused(tmp_path):
+    save(tmp_path / "whole.h5", OBJECTS["lines"])
+    whole = (tmp_path / "whole.h5").read_bytes()
+    path = tmp_path / "file.h5"
+    for size in range(0, len(whole), 97):
+        path.write_bytes(whole[:size])
+        with pytest.raises(FileFormatError, match=r"file\.h5 is (damaged|not an HDF5 file)"):
+            load(path)
+
+
+def test_damaged_bytes_never_become_data(tmp_path):
+    save(tmp_path / "whole.h5", OBJECTS["lines"])
+    whole = (tmp_path / "whole.h5").read_bytes()
+    path = tmp_path / "file.h5"
+    found = 0
+    for position in RNG.integers(0, len(whole), 400):
+        damaged = bytearray(whole)
+        damaged[position] ^= 1 << RNG.integers(8)
+        path.write_bytes(damaged)
+        try:
+            assert digest(load(path)) == digest(OBJECTS["lines"])  # bytes that nothing uses
+        except FileFormatError:
+            found += 1
+    assert found > 200
+
+
+def test_xarray_of_an_image():
+    image = OBJECTS["image"]
+    array = to_xarray(image)
+    assert array.dims == ("y", "x")
+    assert np.shares_memory(array.values, image.pixels)
+    for name, axis in zip(("x", "y"), PLANE.axes_m, strict=True):
+        np.testing.assert_array_equal(array[name], axis)
+        assert array[name].attrs["units"] == "m"
+    assert float(array.z) == -1 / 3
+    assert array.sel(x=1e6 + 0.7, y=40, method="nearest").item() == image.pixels[0, 4]
+
+
+@pytest.mark.parametrize("name", ["oriented", "height map", "points", "image of points"])
+def test_xarray_positions_are_the_grids(name):
+    obj = OBJECTS[name]
+    grid = obj.grid if isinstance(obj, Image) else obj
+    converted = to_xarray(obj)
+    dims = converted.z.dims
+    assert converted.z.shape == grid.shape
+    assert converted.z.attrs["units"] == "m"
+    x, y, z = (converted[axis].broadcast_like(converted.z).transpose(*dims) for axis in "xyz")
+    np.testing.assert_allclose(np.stack([x, y, z], -1), grid.positions_m(), rtol=1e-15)
+
+
+def test_xarray_of_lines():
+    lines = OBJECTS["moving lines"]
+    data = to_xarray(lines)
+    assert data.samples.dims == ("channel", "sample")
+    assert data.tx_m.dims == ("channel", "axis")
+    assert data.rx_velocity_m_s.attrs["units"] == "m s-1"
+    assert data.attrs["carrier_hz"] == 0
+    assert data.first_range_m.attrs["units"] == data.range_offset_m.attrs["units"] == "m"
+    last = (data.first_range_m + data.range_offset_m)[:, -1]
+    np.testing.assert_allclose(last, lines.last_range_m)
+    np.testing.assert_array_equal(data.rx_m.sel(axis="z"), lines.rx_m[:, 2])
+
+
+def test_xarray_of_echoes():
+    data = to_xarray(OBJECTS["phase code"])
+    assert data.attrs["pulse_carrier_hz"] == 1e6
+    assert len(data.attrs["pulse_code"]) == 13
+    assert data.time_offset_s[1] == 1e-5
+    assert data.start_time_s.attrs["units"] == "s"
+
+
+def test_xarray_names_bad_input(monkeypatch):
+    with pytest.raises(TypeError, match="obj must be of type Grid or"):
+        to_xarray(np.ones(3))
+    monkeypatch.setitem(sys.modules, "xarray", None)
+    with pytest.raises(ImportError, match="pip install xarray"):
+        to_xarray(PLANE)
