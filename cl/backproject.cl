@@ -11,10 +11,9 @@
  *              pixels, and a work-item computes four such blocks, one below the other.
  *   TILE       pixels along a tile's side, 16 or a multiple.
  *   TAPS       2, 4, 6 or 8 samples per interpolation.
- *   LOOKUP     how samples are fetched: LOOKUP_GATHER, or from a window of 32 samples per component
- *              held in registers, LOOKUP_PERMUTE (AVX-512 compilers with the builtin) or
- *              LOOKUP_SHUFFLE (OpenCL's shuffle2). The window serves when all lanes' samples lie
- *              within 32; the host checks that.
+ *   PERMUTE    fetch samples from a window of 32 per component held in two AVX-512 registers, five
+ *              times as fast as a gather. The host asks for it where all lanes' samples lie
+ *              within 32, and the compiler decides whether it can (WIDTH 16 only).
  *   BISTATIC   receiver positions differ from the transmitter's.
  *   MOVING     receivers move at `velocity` (in units of the sound speed) during the echo's flight.
  *
@@ -30,9 +29,9 @@
  *   pixels     float2 [rows][columns], padded to whole tiles.
  */
 
-#define LOOKUP_GATHER 0
-#define LOOKUP_PERMUTE 1
-#define LOOKUP_SHUFFLE 2
+#if PERMUTE && defined(__AVX512F__)
+#define WINDOW
+#endif
 
 #if WIDTH == 16
 #define BLOCK_COLUMNS 4
@@ -58,10 +57,9 @@
 #define STACK 4
 #define ITEM_ROWS (BLOCK_ROWS * STACK)
 #define BLOCKS_ACROSS (TILE / BLOCK_COLUMNS)
-#define ITEMS_PER_TILE (BLOCKS_ACROSS * (TILE / ITEM_ROWS))
 
 /* The TAPS samples around a position: indices lower, lower + 1, ... of one component. */
-#if LOOKUP == LOOKUP_PERMUTE
+#ifdef WINDOW
 typedef float m512 __attribute__((vector_size(64)));
 typedef int m512i __attribute__((vector_size(64)));
 #define PICK(low, high, index)                                                                     \
@@ -69,8 +67,6 @@ typedef int m512i __attribute__((vector_size(64)));
         __builtin_ia32_vpermi2varps512(__builtin_astype(low, m512), __builtin_astype(index, m512i), \
                                        __builtin_astype(high, m512)),                              \
         vfloat)
-#elif LOOKUP == LOOKUP_SHUFFLE
-#define PICK(low, high, index) shuffle2(low, high, as_uint16(index))
 #endif
 
 /* Interpolates one line at t - 0.5 samples from `centre` (the -0.5 makes rounding find the lower of the two
@@ -80,13 +76,13 @@ typedef int m512i __attribute__((vector_size(64)));
  * The weight of the tap at distance a + 0.5 is E(nu^2) + nu O(nu^2) and its mirror image's
  * E(nu^2) - nu O(nu^2), nu in [-0.5, 0.5] the position between the middle taps; `weights` holds, per
  * pair of taps from the innermost, the coefficients of E then of O, highest power first. */
-static inline void interpolate(__global const float *line, int pitch, int centre, vfloat t,
+INLINE void interpolate(__global const float *line, int pitch, int centre, vfloat t,
                                __global const float *weights, vfloat *re, vfloat *im)
 {
     const vfloat shifted = t + ROUNDER;
     const vfloat nu = t - (shifted - ROUNDER);
     const vfloat nu2 = nu * nu;
-#if LOOKUP == LOOKUP_GATHER
+#ifndef WINDOW
     vint index = ROUNDED_VINT(shifted) + (centre + 1 - TAPS / 2);
     index = min(max(index, 0), pitch - TAPS);
 #if WIDTH == 1
@@ -111,7 +107,7 @@ static inline void interpolate(__global const float *line, int pitch, int centre
     __global const float *window = line + clamp(centre - 16, 0, pitch - 32);
     const vfloat re_low = LOAD(window), re_high = LOAD(window + 16);
     const vfloat im_low = LOAD(window + pitch), im_high = LOAD(window + pitch + 16);
-    /* Both lookups use an index's lowest five bits only: it cannot leave the window. */
+    /* The permutation uses an index's lowest five bits only: it cannot leave the window. */
     const vint index = AS_VINT(shifted) + (16 + 1 - TAPS / 2);
 #define RE(k) PICK(re_low, re_high, index + (k))
 #define IM(k) PICK(im_low, im_high, index + (k))
@@ -139,7 +135,7 @@ static inline void interpolate(__global const float *line, int pitch, int centre
 }
 
 /* Adds a work-item's STACK blocks to the image at (row, column), the first block's first pixel. */
-static inline void add_to_image(const vfloat *re, const vfloat *im, __global float2 *pixels, int columns,
+INLINE void add_to_image(const vfloat *re, const vfloat *im, __global float2 *pixels, int columns,
                                 int row, int column)
 {
 #pragma unroll
@@ -192,7 +188,7 @@ typedef struct {
 
 /* First, second and third derivatives of |D| along the steps a (index 0) and b (1); aa, ab, bb: their
  * scalar products. The third ones come as Taylor coefficients (with 1/6 and 1/2). */
-static inline Derivatives distance_derivatives(vfloat x, vfloat y, vfloat z, float4 a, float4 b)
+INLINE Derivatives distance_derivatives(vfloat x, vfloat y, vfloat z, float4 a, float4 b)
 {
     const vfloat inverse = 1.0f / sqrt(x * x + y * y + z * z);
     Derivatives d;
@@ -276,7 +272,7 @@ __kernel void expand_tiles(__global const float *geometry, int channel_pitch,
 }
 
 /* Planar grids: pixels of a tile by the expansion of expand_tiles.
- * Global size: tiles * ITEMS_PER_TILE, tiles counted from first_tile, row by row over the image. */
+ * Global size (TILE^2 / (4 WIDTH), tiles), tiles counted from first_tile, row by row over the image. */
 __kernel void backproject_tiles(__global const float *samples, int pitch,
                                 __global const int *reference_sample,
                                 __global const float *reference_fraction,
@@ -286,10 +282,10 @@ __kernel void backproject_tiles(__global const float *samples, int pitch,
                                 __global float2 *pixels, int columns, int first_tile)
 {
     const int item = get_global_id(0);
-    const int tile = item / ITEMS_PER_TILE;
+    const int tile = get_global_id(1);
     const int tiles_across = columns / TILE;
-    const int block_column = (item % ITEMS_PER_TILE) % BLOCKS_ACROSS * BLOCK_COLUMNS;
-    const int block_row = (item % ITEMS_PER_TILE) / BLOCKS_ACROSS * ITEM_ROWS;
+    const int block_column = item % BLOCKS_ACROSS * BLOCK_COLUMNS;
+    const int block_row = item / BLOCKS_ACROSS * ITEM_ROWS;
     const size_t first = (size_t)tile * channel_pitch;
     reference_sample += first;
     reference_fraction += first;
@@ -349,7 +345,7 @@ __kernel void backproject_tiles(__global const float *samples, int pitch,
 }
 
 /* Distance |D + d| - |D| without cancellation. */
-static inline vfloat distance_change(float x, float y, float z, vfloat dx, vfloat dy, vfloat dz)
+INLINE vfloat distance_change(float x, float y, float z, vfloat dx, vfloat dy, vfloat dz)
 {
     const float square = x * x + y * y + z * z;
     const vfloat change = dx * (2.0f * x + dx) + dy * (2.0f * y + dy) + dz * (2.0f * z + dz);
@@ -419,7 +415,7 @@ __kernel void backproject_points(__global const float *samples, int pitch,
 #endif
             const vfloat move = path * (0.5f * samples_per_m);
             const vfloat t = move + reference_fraction[channel];
-#if LOOKUP == LOOKUP_GATHER
+#ifndef WINDOW
             const int whole = 0;
 #else
             const int whole = ROUNDED_INT(t.s5 + ROUNDER); /* a lane in the block's middle */

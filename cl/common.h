@@ -8,6 +8,12 @@
  * fma(), rint() and vloadn() are calls that are not inlined, which costs a factor of two.
  */
 
+#ifdef __clang__
+#define INLINE static inline __attribute__((always_inline))
+#else
+#define INLINE static inline
+#endif
+
 #define JOIN_(a, b) a##b
 #define JOIN(a, b) JOIN_(a, b)
 
@@ -40,7 +46,7 @@ typedef float vfloat_anywhere __attribute__((ext_vector_type(WIDTH), aligned(4))
 /* sin and cos of 2 pi t for t in cycles, |t| < 2^22. Error below 1.3e-6: least-squares polynomials
  * with equalised error over one reduced cycle, in place of sin() and cos(), which are scalar code on some
  * CPU drivers and take radians, whose reduction loses bits. */
-static inline void sincos_cycles(vfloat t, vfloat *sine, vfloat *cosine)
+INLINE void sincos_cycles(vfloat t, vfloat *sine, vfloat *cosine)
 {
     const vfloat nearest = (t + ROUNDER) - ROUNDER;
     const vfloat r = t - nearest;

@@ -24,8 +24,7 @@ from clsas.lines import RangeLines
 BEST_ACCURACY_DB = -85.0
 """The best accuracy that may be asked for: what float32 allows."""
 
-_LOOKUPS = {"gather": 0, "permute": 1, "shuffle": 2}
-_WINDOW = 32  # samples held in registers by the lookups that are not a gather
+_WINDOW = 32  # samples that the permuting lookup holds in registers
 _LARGEST_DISTANCE_M = 1e9
 _CHANNELS_AT_ONCE = 512  # bounds a float32 partial sum; lines that stay in a CPU's cache
 _REFERENCES_AT_ONCE = 1 << 20  # (part, channel) pairs: 50 MB on the device
@@ -211,7 +210,7 @@ class _Run:
             "WIDTH": device.info.width,
             "TAPS": p.interpolator.taps,
             "TILE": layout.side if self.tiled else 16,
-            "LOOKUP": _LOOKUPS[device.info.lookup if fits else "gather"],
+            "PERMUTE": int(device.info.permute and fits),
             "BISTATIC": int(self.bistatic),
             "MOVING": int(self.moving),
         }
@@ -279,7 +278,7 @@ class _Run:
         )
         return device.run(
             self.kernel,
-            (count * layout.part_pixels // (device.info.width * STACK),),
+            (layout.part_pixels // (device.info.width * STACK), count),
             *self._common(lines, line_slot, slot, expansion, pixels),
             layout.across * layout.side,
             parts.start - band.start,

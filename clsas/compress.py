@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from fractions import Fraction
 
@@ -14,6 +15,7 @@ from scipy.signal import get_window
 from clsas import validate
 from clsas.echoes import Echoes
 from clsas.lines import RangeLines
+from clsas.sonar import Pulse
 from clsas.spectral import EDGE_PRODUCT, fourier_integral, smooth_edge
 
 Window = str | float | tuple
@@ -88,12 +90,12 @@ def compress(
 
     ratio = _fraction(oversampling * band / rate)
     fade = EDGE_PRODUCT * rate / (_BAND_EDGE * band)
-    units = fft.next_fast_len(int(np.ceil(2 * (echoes.length + fade) / ratio.denominator)))
+    units = fft.next_fast_len(math.ceil(2 * (echoes.length + fade) / ratio.denominator))
     padded, resampled = units * ratio.denominator, units * ratio.numerator
     length = int(whole * ratio + 1e-9) + 1
 
-    bins = int(np.ceil((0.5 + _BAND_EDGE) * band * padded / rate))
-    bins = np.arange(-bins, bins + 1)
+    outermost = math.ceil((0.5 + _BAND_EDGE) * band * padded / rate)
+    bins = np.arange(-outermost, outermost + 1)
     # Twice the points where the filter's edges would not fit otherwise; every other one is kept.
     every = 1 if resampled >= len(bins) else 2
     response = _filter_response(pulse, band, weights, bins, padded / rate, echoes.length / rate)
@@ -179,8 +181,15 @@ def _fraction(ratio: float) -> Fraction:
     return 1 / Fraction(1 / ratio).limit_denominator(1000)
 
 
-def _filter_response(pulse, band, weights, bins, period_s, reach_s):
-    """Return the filter's transfer function at frequencies bins/period."""
+def _filter_response(
+    pulse: Pulse | None,
+    band: float,
+    weights: Callable[[NDArray], NDArray],
+    bins: NDArray[np.int_],
+    period_s: float,
+    reach_s: float,
+) -> NDArray[np.complex128]:
+    """Return the transfer function at bins/period of the filter that is whole up to +-reach."""
 
     def spectrum(frequency: NDArray) -> NDArray:
         return np.full(len(frequency), 1 / band) if pulse is None else pulse.spectrum(frequency)
@@ -194,7 +203,7 @@ def _filter_response(pulse, band, weights, bins, period_s, reach_s):
     edges = [-band / 2, band / 2]
     # P turns as fast as its delay, a window some cycles over the band.
     rate = 8 / band + (0.0 if pulse is None else pulse.duration_s)
-    points = fft.next_fast_len(int(np.ceil(1.25 * band * period_s)))
+    points = fft.next_fast_len(math.ceil(1.25 * band * period_s))
     lag = fft.fftfreq(points) * period_s
     impulse = fourier_integral(matched, edges, lag, sign=1, rate=rate)
     impulse /= fourier_integral(energy, edges, 0.0, sign=1, rate=rate).real

@@ -48,10 +48,10 @@ class DeviceInfo:
     fp64 : bool
         Whether the device has double precision (clsas never needs it).
     width : int
-        Float lanes per work-item that clsas uses: 1 on GPUs.
-    lookup : str
-        How a kernel fetches interpolation samples there: "permute" (AVX-512 table in
-        registers), "shuffle" (OpenCL's shuffle2) or "gather".
+        Float lanes per work-item that clsas uses: 1 on GPUs, and where the driver's compiler
+        vectorises across work-items itself.
+    permute : bool
+        Whether kernels may look samples up in AVX-512 registers.
     """
 
     index: int
@@ -64,7 +64,7 @@ class DeviceInfo:
     max_buffer_bytes: int
     fp64: bool
     width: int
-    lookup: str
+    permute: bool
 
     @property
     def label(self) -> str:
@@ -127,10 +127,10 @@ class Device:
     ) -> cl.Event:
         """Enqueue a kernel over `size` work-items; plain ints and floats become 32-bit.
 
-        On a CPU the work-group is one work-item (PoCL compiles a kernel anew for every local size);
-        elsewhere the driver chooses.
+        Work-items that hold vectors are work-groups of their own (PoCL compiles a kernel anew for
+        every local size); otherwise the driver chooses.
         """
-        local = (1,) * len(size) if self.info.kind == "cpu" else None
+        local = (1,) * len(size) if self.info.width > 1 else None
         event = kernel(self.queue, size, local, *map(_argument, arguments), wait_for=wait_for)
         if self._events is not None:
             self._events[kernel.function_name].append(event)
@@ -215,12 +215,10 @@ def _describe(index: int, device: cl.Device) -> DeviceInfo:
     is_gpu = bool(device.type & cl.device_type.GPU)
     platform = device.platform.name
     width = 1
-    if is_cpu:
+    # Intel's runtime vectorises across work-items, faster than through explicit vectors.
+    if is_cpu and not platform.startswith("Intel"):
         native = device.native_vector_width_float
         width = 16 if native >= 16 else 8 if native >= 8 else 4
-    lookup = "gather"
-    if width == 16:
-        lookup = "shuffle" if platform.startswith("Intel") else "permute"
     return DeviceInfo(
         index=index,
         platform=platform,
@@ -232,7 +230,7 @@ def _describe(index: int, device: cl.Device) -> DeviceInfo:
         max_buffer_bytes=device.max_mem_alloc_size,
         fp64="cl_khr_fp64" in device.extensions.split(),
         width=width,
-        lookup=lookup,
+        permute=width == 16,
     )
 
 

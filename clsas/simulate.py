@@ -105,7 +105,8 @@ def simulate(
     ------
     TypeError, ValueError
         If an argument is outside its limits, `pointing` has nothing to act on, a point lies on
-        an element while spreading is asked for, or no echo is received to set the noise by.
+        an element while spreading or patterns are asked for, or no echo is received to set the
+        noise by.
 
     Warns
     -----
@@ -128,8 +129,9 @@ def simulate(
         start = nearest - ringing
         longest = np.max(farthest + ringing - start)
     else:
-        near = validate.number("range_m[0]", range_m[0], "m", least=0.0)
-        far = validate.number("range_m[1]", range_m[1], "m", above=near)
+        near, far = validate.array("range_m", range_m, np.float64, (2,))
+        if not 0 <= near < far:
+            raise ValueError(f"range_m must be 0 <= near < far in m, got ({near:g}, {far:g})")
         start = np.full(paths.channels, 2 * near / sound)
         longest = 2 * (far - near) / sound
     length = math.ceil((longest + pulse.duration_s) * rate) + 1
@@ -226,7 +228,7 @@ def simulate_lines(
     every = 1 if oversampling * PASSBAND >= 1 else 2
     rate = every * oversampling * band
     step = every / rate
-    if first_range_m is None:
+    if first_range_m is None or length is None:
         nearest, farthest = paths.delay_limits_s(workers)
         nearest, farthest = nearest - _RINGING * step, farthest + _RINGING * step
         length = math.ceil(np.max(farthest - nearest) / step) + 1
@@ -341,7 +343,8 @@ class _Paths:
         return len(self.geometry.tx_m)
 
     def elements(self, channel: int) -> Channels:
-        return Channels(*(None if part is None else part[channel] for part in self.geometry))
+        tx, rx, velocity = self.geometry
+        return Channels(tx[channel], rx[channel], None if velocity is None else velocity[channel])
 
     def legs(self, channel: int) -> Iterator[tuple[NDArray, ...]]:
         """Yield positions, amplitudes, outward and inward legs, some points at a time."""
@@ -358,8 +361,8 @@ class _Paths:
             lengths = [out + back for _, _, out, back in self.legs(channel)]
             return min(map(np.min, lengths)), max(map(np.max, lengths))
 
-        found = np.array(list(_in_threads(limits, self.channels, workers)))
-        return found.T / self.sound_speed_m_s
+        found = np.array(list(_in_threads(limits, self.channels, workers)), np.float64)
+        return np.divide(found.T, self.sound_speed_m_s)
 
     def directions(
         self, channel: int, points: NDArray, out: NDArray, back: NDArray
@@ -406,12 +409,12 @@ def _record(
             points, amplitudes, out, back = block
             cycles = carrier_hz * delay
             strengths = amplitudes * np.exp(-2j * np.pi * (cycles - np.rint(cycles)))
+            if (paths.spreading or paths.beams) and not (out.all() and back.all()):
+                raise ValueError(
+                    f"scene must have no point on an element with spreading or element patterns, "
+                    f"got one on an element of channel {channel}"
+                )
             if paths.spreading:
-                if not (out.all() and back.all()):
-                    raise ValueError(
-                        f"scene must have no point on an element with spreading, got one on an "
-                        f"element of channel {channel}"
-                    )
                 strengths /= out * back
             angles = 2 * np.pi * rate_hz / modes * (delay - start_s[channel])
             if paths.beams is None:
@@ -456,16 +459,13 @@ def _in_threads(function: Callable, count: int, workers: int | None) -> Iterator
 
 def _channels(tx_m: ArrayLike, rx_m: ArrayLike, rx_velocity_m_s: ArrayLike | None) -> Channels:
     """Return checked positions, a single one stretched to every channel."""
-    given = {"tx_m": tx_m, "rx_m": rx_m, "rx_velocity_m_s": rx_velocity_m_s}
-    count = max(len(np.atleast_2d(part)) for part in given.values() if part is not None)
-    return Channels(
-        *(
-            None
-            if part is None
-            else validate.array(name, part, np.float64, (count, 3), broadcast=True)
-            for name, part in given.items()
-        )
+    given = (tx_m, rx_m) if rx_velocity_m_s is None else (tx_m, rx_m, rx_velocity_m_s)
+    count = max(len(np.atleast_2d(part)) for part in given)
+    tx, rx, *velocity = (
+        validate.array(name, part, np.float64, (count, 3), broadcast=True)
+        for name, part in zip(Channels._fields, given, strict=False)
     )
+    return Channels(tx, rx, velocity[0] if velocity else None)
 
 
 def _add_noise(samples: NDArray[np.complex64], snr_db: float, seed: int) -> None:

@@ -122,7 +122,7 @@ class Track:
         velocity = validate.array("velocity_m_s", velocity_m_s, np.float64, (3,))
         pings = validate.count("pings", pings)
         interval = validate.positive("ping_interval_s", ping_interval_s, "s")
-        time = interval * np.arange(pings)
+        time = interval * np.arange(pings, dtype=np.float64)
         heading = np.arctan2(velocity[1], velocity[0])
         directions = Rotation.from_euler("Z", heading).as_matrix().T
         positions = start + velocity * time[:, None]

@@ -1,10 +1,10 @@
+import importlib
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from scipy.special import erfc, fresnel
 
-from clsas import simulate as simulator
 from clsas.echoes import Echoes
 from clsas.geometry import bistatic_range_m
 from clsas.scene import PointTargets
@@ -16,9 +16,7 @@ from clsas.validate import ClsasWarning
 C = 1500.0
 CARRIER = 1e6
 # Fully tapered and four times oversampled: nothing to -115 dB beyond 0.4 sample rates.
-SMOOTH = Sonar(
-    Pulse(CARRIER, 100e3, 1e-3, taper=1.0), line_array(3, 16.5e-3), sample_rate_hz=400e3
-)
+SMOOTH = Sonar(Pulse(CARRIER, 100e3, 1e-3, taper=1.0), line_array(3, 16.5e-3), sample_rate_hz=400e3)
 TRACK = Track.straight([0, 0, 0], [1.5, 0, 0], 4, 0.35, sway_m=[0.0, 0.01, -0.02, 0.005])
 SCENE = PointTargets([[0.2, 40, -3], [1.0, 41.0, 0], [-2.0, 38.5, 1]], [1, 0.5j, -0.25 + 0.3j])
 
@@ -91,7 +89,7 @@ def test_phase_code_echo_in_a_wide_receiver():
     tau = 20 / C
     edges = tau + 130e-6 / 13 * np.arange(14)
     away = np.abs(sample_times(echoes)[0][:, None] - edges).min(axis=1) > 90 / 20e6
-    assert away.sum() > 300
+    assert away.sum() > 200
     # Away from the chips' edges the filter changes nothing.
     assert db(error[away]) < -100
 
@@ -110,7 +108,7 @@ def test_result_does_not_depend_on_blocks_or_threads(monkeypatch):
     scene = PointTargets(rng.uniform([-2, 38, -1], [2, 42, 1], (50, 3)))
     sonar = replace(SMOOTH, tx_length_m=0.1, rx_length_m=0.05)
     whole = simulate(sonar, TRACK, scene)
-    monkeypatch.setattr(simulator, "_BLOCK", 7)
+    monkeypatch.setattr(importlib.import_module("clsas.simulate"), "_BLOCK", 7)
     parts = simulate(sonar, TRACK, scene, workers=1)
     assert db(whole.samples - parts.samples, whole.samples) < -110
 
@@ -127,7 +125,7 @@ def test_spreading_is_one_over_both_legs():
 
 def direct_with_patterns(echoes, sonar, scene, axes, sizes):
     """Direct sum of the frequency-domain model, patterns evaluated at every frequency."""
-    modes = 4096
+    modes = 8192
     f = np.fft.fftfreq(modes, 1 / echoes.sample_rate_hz)
     filtered = np.abs(f) / echoes.sample_rate_hz
     spectrum = sonar.pulse.spectrum(f) * erfc((filtered - 0.45) / 0.05 * 5.3 / np.sqrt(2)) / 2
@@ -157,7 +155,7 @@ def direct_with_patterns(echoes, sonar, scene, axes, sizes):
     [
         ((15e-3, 10e-3, None, None), None),
         ((15e-3, None, 5e-3, 4e-3), Pointing.squint(0.3, depression_rad=0.1)),
-        ((60e-3, 60e-3, None, None), Pointing.scan([-0.2, 0.1])),
+        ((60e-3, 60e-3, None, None), Pointing.scan([-0.2, 0.0])),
         ((None, 30e-3, None, 3e-3), Pointing.spot([0.5, 40, -2])),
     ],
 )
@@ -325,6 +323,7 @@ def lines_closed_form(lines, scene, bandwidth=BAND):
 @pytest.mark.parametrize("oversampling", [1.0, 1.1, 1.25, np.sqrt(2), 2.0, 3.7, 8.0])
 def test_lines_are_sinc_responses(oversampling):
     tx, rx, velocity = channels(SMOOTH, TRACK, motion_in_flight=True)
+    length = int(800 * oversampling)
     lines = simulate_lines(
         tx,
         rx,
@@ -332,18 +331,14 @@ def test_lines_are_sinc_responses(oversampling):
         carrier_hz=CARRIER,
         bandwidth_hz=BAND,
         oversampling=oversampling,
-        first_range_m=36.0 + 0.1 * np.arange(12),
-        length=1200,
+        first_range_m=37.0 + 0.1 * np.arange(12),
+        length=length,
         rx_velocity_m_s=velocity,
     )
-    assert lines.length == 1200
+    assert lines.length == length
     assert lines.range_step_m == pytest.approx(C / (2 * oversampling * BAND), rel=1e-6)
-    np.testing.assert_allclose(lines.first_range_m, 36.0 + 0.1 * np.arange(12))
-    inside = bistatic_range_m(SCENE.positions_m[:, None], tx, rx) <= lines.last_range_m
-    kept = PointTargets(SCENE.positions_m[inside.all(1)], SCENE.amplitudes[inside.all(1)])
-    assert kept.points >= 1
-    assert np.all(inside.all(1) == inside.any(1))
-    assert db(lines.samples - lines_closed_form(lines, kept)) < -120
+    np.testing.assert_allclose(lines.first_range_m, 37.0 + 0.1 * np.arange(12))
+    assert db(lines.samples - lines_closed_form(lines, SCENE)) < -120
 
 
 def test_lines_without_limits_hold_every_point():
@@ -376,7 +371,7 @@ def test_lines_are_a_linear_operator_with_its_adjoint():
     rng = np.random.default_rng(7)
     points = rng.uniform([-2, 38, -1], [2, 42, 1], (40, 3))
     tx, rx, _ = channels(SMOOTH, TRACK)
-    limits = {"first_range_m": 37.0, "length": 900}
+    limits = {"first_range_m": 37.0, "length": 2000}
 
     def forward(x):
         return simulate_lines(
@@ -415,9 +410,9 @@ def test_points_outside_a_line_give_it_nothing():
 @pytest.mark.parametrize(
     ("arguments", "error", "message"),
     [
-        ({"range_m": (40, 30)}, ValueError, r"range_m\[1\] must be finite and > 40 m, got 30"),
-        ({"range_m": (-1, 30)}, ValueError, r"range_m\[0\] must be finite and >= 0 m, got -1"),
-        ({"range_m": 40}, TypeError, r"range_m must be \(near, far\) in metres, got 40"),
+        ({"range_m": (40, 30)}, ValueError, r"range_m must be 0 <= near < far in m, got \(40, 30"),
+        ({"range_m": (-1, 30)}, ValueError, r"range_m must be 0 <= .* got \(-1, 30\)"),
+        ({"range_m": 40}, ValueError, r"range_m must have shape \(2\)"),
         ({"snr_db": np.nan}, ValueError, "snr_db must be finite dB, got nan"),
         ({"workers": 0}, ValueError, "workers must be at least 1, got 0"),
         ({"pointing": Pointing.squint(0.1)}, ValueError, "pointing has nothing to act on"),
@@ -431,8 +426,10 @@ def test_bad_arguments(arguments, error, message):
 def test_point_on_an_element_with_spreading():
     scene = PointTargets([[0, 40, 0], TRACK.positions_m[0]])
     assert np.isfinite(simulate(SMOOTH, TRACK, scene).samples).all()
-    with pytest.raises(ValueError, match="scene must have no point on an element .* channel 0"):
+    with pytest.raises(ValueError, match=r"scene must have no point on an element .* channel 0"):
         simulate(SMOOTH, TRACK, scene, spreading=True)
+    with pytest.raises(ValueError, match=r"scene must have no point on an element .* channel 0"):
+        simulate(replace(SMOOTH, rx_length_m=0.1), TRACK, scene)
 
 
 def test_platform_faster_than_sound():

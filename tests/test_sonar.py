@@ -49,6 +49,8 @@ def test_tapered_spectrum_is_the_integral_of_its_envelope(code, taper):
                 0,
                 pulse.duration_s,
                 limit=2000,
+                epsabs=1e-14,
+                epsrel=1e-10,
                 points=np.linspace(0, pulse.duration_s, 14)[1:-1],
             )[0]
             for part in (np.real, np.imag)
@@ -119,7 +121,11 @@ def test_sample_rate_defaults_to_twice_the_bandwidth():
         ({"duration_s": "1 ms"}, TypeError, "duration_s must be one real number s, got '1 ms'"),
         ({"taper": 1.5}, ValueError, "taper must be .* <= 1, got 1.5"),
         ({"code": "sideways"}, ValueError, "code must be one of 'up', 'down', got 'sideways'"),
-        ({"code": (1, 0, -1)}, ValueError, r"code must be .* chips of \+1 and -1, got \(1, 0, -1\)"),
+        (
+            {"code": (1, 0, -1)},
+            ValueError,
+            r"code must be .* chips of \+1 and -1, got \(1, 0, -1\)",
+        ),
         ({"code": ()}, ValueError, r"code must be .* got \(\)"),
         ({"code": (1, -1)}, ValueError, "bandwidth_hz of a phase code must be .* 2000 Hz, got"),
     ],
@@ -138,7 +144,11 @@ def test_bad_pulse(arguments, error, message):
         ({"rx_m": np.zeros((0, 3))}, ValueError, "rx_m must have shape .* no empty axis"),
         ({"rx_m": [[0, np.nan, 0]]}, ValueError, "rx_m must be finite, got 1 NaN"),
         ({"tx_m": [1.0, 2.0]}, ValueError, r"tx_m must have shape \(3\)"),
-        ({"sample_rate_hz": 110e3}, ValueError, "sample_rate_hz must be .* >= 125000 Hz, got 110000"),
+        (
+            {"sample_rate_hz": 110e3},
+            ValueError,
+            "sample_rate_hz must be .* >= 125000 Hz, got 110000",
+        ),
         ({"sound_speed_m_s": 0}, ValueError, "sound_speed_m_s must be finite and > 0 m/s, got 0"),
         ({"rx_length_m": -0.1}, ValueError, "rx_length_m must be finite and > 0 m, got -0.1"),
         ({"tx_height_m": 0}, ValueError, "tx_height_m must be finite and > 0 m, got 0"),

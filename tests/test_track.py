@@ -201,5 +201,5 @@ def test_bad_pointing():
         Pointing.spot([1, 2])
     with pytest.raises(ValueError, match="depression_rad must be finite"):
         Pointing.broadside(depression_rad=np.nan)
-    with pytest.raises(ValueError, match="spot_m must not lie straight ahead or astern.*ping 0"):
+    with pytest.raises(ValueError, match=r"spot_m must not lie straight ahead or astern.*ping 0"):
         Pointing.spot([9, 0, 0]).axes(one_ping())

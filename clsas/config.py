@@ -1,0 +1,491 @@
+"""Scene files: sonar, track, targets, grid and processing from one TOML file.
+
+docs/scene-files.md lists every key. A file is checked whole before anything is computed, and every
+message names the file, the table and the key.
+"""
+
+from __future__ import annotations
+
+import csv
+import difflib
+import os
+import tomllib
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from importlib.resources import files
+from pathlib import Path
+from typing import Annotated, Any, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from clsas import validate
+from clsas.grid import Grid
+from clsas.scene import PointTargets
+from clsas.sonar import Pulse, Sonar, line_array
+from clsas.track import Motion, Pointing, Track
+
+PRESETS = ("thesis_wide_beam", "edgetech", "sensotek")
+
+
+@dataclass(frozen=True, eq=False)
+class SceneFile:
+    """What a scene file describes; a part that it leaves out is None.
+
+    Attributes
+    ----------
+    name : str
+        Where it came from, for messages.
+    sonar, track, targets, grid
+        The tables of these names.
+    simulate, compress, image : dict
+        Keyword arguments for `clsas.simulate`, `clsas.compress` and `clsas.backproject`.
+    """
+
+    name: str
+    sonar: Sonar | None = None
+    track: Track | None = None
+    targets: PointTargets | None = None
+    grid: Grid | None = None
+    simulate: dict[str, Any] = field(default_factory=dict)
+    compress: dict[str, Any] = field(default_factory=dict)
+    image: dict[str, Any] = field(default_factory=dict)
+
+    def need(self, *tables: str) -> tuple[Any, ...]:
+        """Return the parts of these names; raises ValueError naming one that is missing."""
+        for table in tables:
+            if getattr(self, table) is None:
+                brackets = "[[{}]]" if table == "targets" else "[{}]"
+                raise ValueError(f"{self.name}: missing table {brackets.format(table)}")
+        return tuple(getattr(self, table) for table in tables)
+
+
+def read_scene(path: str | os.PathLike) -> SceneFile:
+    """Read a scene file.
+
+    Parameters
+    ----------
+    path : path-like
+        The TOML file. Files that it names are looked for beside it.
+
+    Raises
+    ------
+    ValueError
+        If it is not TOML, or a key is unknown, missing, of a wrong type or outside its limits:
+        one line per mistake, each with the key's path, what was given and what is allowed.
+    OSError
+        If it, or a file that it names, cannot be read.
+    """
+    path = Path(path)
+    return parse_scene(path.read_bytes(), name=str(path), folder=path.parent)
+
+
+def parse_scene(text: bytes, *, name: str, folder: Path) -> SceneFile:
+    """Return what the TOML `text` describes; `read_scene` for text that is in no file."""
+    try:
+        tables = tomllib.loads(text.decode())
+    except ValueError as error:  # TOML's and UTF-8's
+        raise ValueError(f"{name}: is not TOML: {error}") from None
+    try:
+        return _Scene.model_validate(tables).build(name, folder)
+    except ValidationError as error:
+        raise ValueError("\n".join(f"{name}: {line}" for line in _explain(error, tables))) from None
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{name}: {error}") from None
+
+
+def built_in_scene(name: str) -> bytes:
+    """Return the text of a scene file that comes with clsas, such as "thesis_wide_beam"."""
+    folder = files("clsas") / "scenes"
+    names = sorted(Path(item.name).stem for item in folder.iterdir())
+    return (folder / f"{validate.one_of('name', name, names)}.toml").read_bytes()
+
+
+Vector = Annotated[list[float], Field(min_length=3, max_length=3)]
+
+
+class _Table(BaseModel):
+    model_config = ConfigDict(extra="forbid", strict=True)
+
+    def given(self) -> dict[str, Any]:
+        """Return the keys that the file sets."""
+        return {name: getattr(self, name) for name in self.model_fields_set}
+
+
+class _Pulse(_Table):
+    carrier_hz: float
+    duration_s: float
+    bandwidth_hz: float | None = None
+    code: str | list[int] = "up"
+    taper: float = 0.0
+
+    def build(self) -> Pulse:
+        if self.bandwidth_hz is not None:
+            code = self.code if isinstance(self.code, str) else tuple(self.code)
+            return Pulse(self.carrier_hz, self.bandwidth_hz, self.duration_s, code, self.taper)
+        if isinstance(self.code, str):
+            raise ValueError("missing key 'bandwidth_hz' (only a phase code sets its own)")
+        return Pulse.phase_code(
+            self.carrier_hz, self.duration_s, tuple(self.code), taper=self.taper
+        )
+
+
+class _Sonar(_Table):
+    preset: str | None = None
+    pulse: _Pulse | None = None
+    receivers: int | None = None
+    spacing_m: float | None = None
+    rx_m: list[Vector] | None = None
+    tx_m: Vector = [0.0, 0.0, 0.0]
+    sample_rate_hz: float | None = None
+    sound_speed_m_s: float = 1500.0
+    tx_length_m: float | None = None
+    rx_length_m: float | None = None
+    tx_height_m: float | None = None
+    rx_height_m: float | None = None
+
+    def build(self) -> Sonar:
+        with _in("[sonar]"):
+            if self.preset is not None:
+                others = sorted(self.model_fields_set - {"preset"})
+                if others:
+                    raise ValueError(f"preset must stand alone, got also {', '.join(others)}")
+                validate.one_of("preset", self.preset, PRESETS)
+                return getattr(Sonar, self.preset)()
+            if self.pulse is None:
+                raise ValueError("missing table [sonar.pulse], or key 'preset'")
+            array = (self.receivers, self.spacing_m)
+            if (self.rx_m is None) == (array == (None, None)) or (None in array and any(array)):
+                raise ValueError("receivers must be given by rx_m, or by receivers and spacing_m")
+            rx = line_array(*array) if self.rx_m is None else self.rx_m
+        with _in("[sonar.pulse]"):
+            pulse = self.pulse.build()
+        skipped = {"preset", "pulse", "receivers", "spacing_m", "rx_m"}
+        with _in("[sonar]"):
+            return Sonar(pulse, rx, **self.model_dump(exclude=skipped))
+
+
+class _Motion(_Table):
+    """A sinusoid in time, or random motion of the same power."""
+
+    period_s: float
+    phase_deg: float = 0.0
+    random_seed: int | None = None
+
+    def _motion(self, name: str, unit: str, scale: float = 1.0) -> Motion:
+        amplitude = scale * validate.number(name, getattr(self, name), unit)
+        period = validate.positive("period_s", self.period_s, "s")
+        phases, frequencies = np.radians([self.phase_deg]), np.array([1 / period])
+        if self.random_seed is not None:
+            if "phase_deg" in self.model_fields_set:
+                raise ValueError("phase_deg must be left out with random_seed")
+            # Sinusoids of random frequency and phase, none faster than the period given.
+            random = np.random.default_rng(validate.count("random_seed", self.random_seed, least=0))
+            frequencies = random.uniform(0.1, 1.0, 32) / period
+            phases = random.uniform(0, 2 * np.pi, 32)
+        amplitude /= np.sqrt(len(phases))
+
+        def motion(time: NDArray[np.float64]) -> NDArray[np.float64]:
+            turns = np.multiply.outer(time, frequencies)
+            return amplitude * np.sin(2 * np.pi * turns + phases).sum(axis=-1)
+
+        return motion
+
+
+class _Displacement(_Motion):
+    amplitude_m: float
+
+    def build(self) -> Motion:
+        return self._motion("amplitude_m", "m")
+
+
+class _Rotation(_Motion):
+    amplitude_deg: float
+
+    def build(self) -> Motion:
+        return self._motion("amplitude_deg", "degrees", np.pi / 180)
+
+
+class _Track(_Table):
+    file: str | None = None
+    start_m: Vector | None = None
+    velocity_m_s: Vector | None = None
+    pings: int | None = None
+    ping_interval_s: float | None = None
+    surge: _Displacement | None = None
+    sway: _Displacement | None = None
+    heave: _Displacement | None = None
+    yaw: _Rotation | None = None
+    pitch: _Rotation | None = None
+    roll: _Rotation | None = None
+
+    def build(self, folder: Path) -> Track:
+        if self.file is not None:
+            others = sorted(self.model_fields_set - {"file"})
+            if others:
+                raise ValueError(f"[track] file must stand alone, got also {', '.join(others)}")
+            with _in("[track] file"):
+                return read_track(folder / self.file)
+        course = ("start_m", "velocity_m_s", "pings", "ping_interval_s")
+        for name in course:
+            if getattr(self, name) is None:
+                raise ValueError(f"[track] missing key {name!r} (or 'file')")
+        motions = {}
+        for argument in ("surge_m", "sway_m", "heave_m", "yaw_rad", "pitch_rad", "roll_rad"):
+            table = argument.split("_")[0]
+            if (motion := getattr(self, table)) is not None:
+                with _in(f"[track.{table}]"):
+                    motions[argument] = motion.build()
+        with _in("[track]"):
+            return Track.straight(*(getattr(self, name) for name in course), **motions)
+
+
+class _Target(_Table):
+    position_m: Vector
+    amplitude: float = 1.0
+
+
+class _Axis(_Table):
+    start_m: float
+    stop_m: float
+    count: int
+
+    def build(self) -> tuple[float, float, int]:
+        return self.start_m, self.stop_m, self.count
+
+
+class _Grid(_Table):
+    x: _Axis
+    y: _Axis
+    z_m: float = 0.0
+
+    def build(self) -> Grid:
+        with _in("[grid]"):
+            return Grid.plane(self.x.build(), self.y.build(), self.z_m)
+
+
+class _Pointing(_Table):
+    squint_deg: float | list[float] = 0.0
+    depression_deg: float = 0.0
+    spot_m: Vector | None = None
+
+    def build(self) -> Pointing:
+        with _in("[simulate.pointing]"):
+            if self.spot_m is None:
+                angles = np.radians(self.squint_deg)
+                return Pointing.scan(angles, depression_rad=np.radians(self.depression_deg))
+            if len(self.model_fields_set) > 1:
+                raise ValueError("spot_m must stand alone: it sets the angles")
+            return Pointing.spot(self.spot_m)
+
+
+class _Simulate(_Table):
+    spreading: bool = False
+    motion_in_flight: bool = False
+    range_m: Annotated[list[float], Field(min_length=2, max_length=2)] | None = None
+    snr_db: float | None = None
+    seed: int = 0
+    pointing: _Pointing | None = None
+
+
+class _Compress(_Table):
+    window: str | list[str | float] = "none"
+    oversampling: float = 2.0
+
+
+class _Image(_Table):
+    accuracy_db: float = -60.0
+    taps: int | None = None
+    upsampling: float | None = None
+
+
+class _Scene(_Table):
+    sonar: _Sonar | None = None
+    track: _Track | None = None
+    targets: list[_Target] | None = None
+    grid: _Grid | None = None
+    simulate: _Simulate = _Simulate()
+    compress: _Compress = _Compress()
+    image: _Image = _Image()
+
+    def build(self, name: str, folder: Path) -> SceneFile:
+        targets = None
+        if self.targets is not None:
+            with _in("[[targets]]"):
+                targets = PointTargets(
+                    np.reshape([target.position_m for target in self.targets], (-1, 3)),
+                    [target.amplitude for target in self.targets],
+                )
+        simulate = self.simulate.given()
+        if self.simulate.pointing is not None:
+            simulate["pointing"] = self.simulate.pointing.build()
+        compress = self.compress.given()
+        if isinstance(self.compress.window, list):
+            compress["window"] = tuple(self.compress.window)
+        return SceneFile(
+            name=name,
+            sonar=self.sonar and self.sonar.build(),
+            track=self.track and self.track.build(folder),
+            targets=targets,
+            grid=self.grid and self.grid.build(),
+            simulate=simulate,
+            compress=compress,
+            image=self.image.given(),
+        )
+
+
+_POSITION = ("time_s", "x_m", "y_m", "z_m")
+_VELOCITY = ("vx_m_s", "vy_m_s", "vz_m_s")
+_ATTITUDE = ("yaw_deg", "pitch_deg", "roll_deg")
+
+
+def read_track(path: str | os.PathLike) -> Track:
+    """Read a track from a CSV file with one line per ping under a line of column names.
+
+    Columns, in any order: time_s, x_m, y_m, z_m; if known yaw_deg, pitch_deg, roll_deg (zero unless
+    given) and, together, vx_m_s, vy_m_s, vz_m_s (the slope of the positions unless given).
+
+    Raises
+    ------
+    ValueError
+        If a column is unknown or missing, a value is not a finite number, or time does not ascend.
+    OSError
+        If the file cannot be read.
+    """
+    with open(path, newline="", encoding="utf-8-sig") as file:
+        reader = csv.reader(file, skipinitialspace=True)
+        names = [name.strip() for name in next(reader, [])]
+        rows = [(reader.line_num, row) for row in reader if row]
+    known = (*_POSITION, *_ATTITUDE, *_VELOCITY)
+    for name in names:
+        if name not in known:
+            raise ValueError(f"{path}: unknown column {name!r}{_near(name, known)}")
+    velocity = _VELOCITY if set(names) & set(_VELOCITY) else ()
+    for name in (*_POSITION, *velocity):
+        if names.count(name) != 1:
+            raise ValueError(f"{path}: column {name!r} must be there once")
+    values = np.empty((len(rows), len(names)))
+    for index, (line, row) in enumerate(rows):
+        try:
+            values[index] = [float(value) for value in row]
+        except ValueError:
+            raise ValueError(
+                f"{path}: line {line} must be {len(names)} numbers, got {','.join(row)!r}"
+            ) from None
+    column = dict(zip(names, values.T, strict=True))
+    with _in(f"{path}:"):
+        time, *position = (column[name] for name in _POSITION)
+        positions = np.stack(position, axis=-1)
+        track = Track(
+            positions,
+            time,
+            yaw_rad=np.radians(column.get("yaw_deg", 0.0)),
+            pitch_rad=np.radians(column.get("pitch_deg", 0.0)),
+            roll_rad=np.radians(column.get("roll_deg", 0.0)),
+        )
+        if velocity:
+            return replace(track, velocity_m_s=np.stack([column[v] for v in velocity], axis=-1))
+        if track.pings > 1:
+            return replace(track, velocity_m_s=np.gradient(positions, time, axis=0))
+        return track
+
+
+@contextmanager
+def _in(place: str) -> Iterator[None]:
+    """Put the place in the file before the library's own messages."""
+    try:
+        yield
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{place} {error}") from None
+
+
+# What a value must be, by pydantic's name for the mistake; its own words for any other.
+_MUST_BE = {
+    "bool_type": "true or false",
+    "float_type": "a number",
+    "int_type": "a whole number",
+    "list_type": "a list in [...]",
+    "model_type": "a table of keys",
+    "string_type": "a text in quotes",
+}
+
+
+def _explain(error: ValidationError, tables: dict[str, Any]) -> list[str]:
+    """Return one line per key that pydantic refuses."""
+    lines: dict[tuple, str] = {}
+    musts: dict[tuple, dict[str, None]] = {}  # as ordered sets
+    mistyped: set[tuple] = set()
+    for problem in error.errors(include_url=False):
+        kind, path = problem["type"], _path_in(tables, problem["loc"])
+        if kind == "missing":
+            path = problem["loc"]
+            lines[path] = f"missing key {path[-1]!r} in {_table(path[:-1])}"
+        elif kind == "extra_forbidden":
+            *place, name = path
+            allowed = list(_model_at(place).model_fields)
+            mistyped |= {(*place, guess) for guess in _close(name, allowed)}
+            unknown = f"key {name!r} in {_table(place)}" if place else f"table [{name}]"
+            lines[path] = f"unknown {unknown}{_near(name, allowed)}"
+        else:  # each member of a union of types reports its own
+            musts.setdefault(path, {})[_must_be(problem, path)] = None
+            expected = " or ".join(musts[path])
+            lines[path] = f"{_key(path)} must be {expected}, got {problem['input']!r}"
+    return [line for path, line in lines.items() if path not in mistyped]
+
+
+def _must_be(problem: Any, path: tuple) -> str:
+    if path == ("targets",):
+        return "one or more tables [[targets]]"
+    if "actual_length" in problem.get("ctx", {}):
+        return f"a list of {problem['ctx'].get('min_length', problem['ctx'].get('max_length'))}"
+    return _MUST_BE.get(problem["type"], problem["msg"])
+
+
+def _path_in(tables: Any, location: Sequence[str | int]) -> tuple[str | int, ...]:
+    """Return the part of pydantic's location that is in the file: no members of unions."""
+    for depth, part in enumerate(location):
+        try:
+            tables = tables[part]
+        except (KeyError, IndexError, TypeError):
+            return tuple(location[:depth])
+    return tuple(location)
+
+
+def _table(path: Sequence[str | int]) -> str:
+    """Return a table's name as the file writes it, counted from 1 where there are several."""
+    name = ".".join(str(part) for part in path if isinstance(part, str))
+    return f"[[{name}]] number {path[-1] + 1}" if isinstance(path[-1], int) else f"[{name}]"
+
+
+def _key(path: Sequence[str | int]) -> str:
+    last = max(index for index, part in enumerate(path) if isinstance(part, str))
+    name = f"{path[last]}" + "".join(f"[{index}]" for index in path[last + 1 :])
+    return f"{_table(path[:last])} {name}" if last else name
+
+
+def _model_at(place: Sequence[str | int]) -> type[BaseModel]:
+    model: type[BaseModel] = _Scene
+    for part in place:
+        if isinstance(part, str):
+            model = next(_models(model.model_fields[part].annotation))
+    return model
+
+
+def _models(annotation: Any) -> Iterator[type[BaseModel]]:
+    """Yield the tables in a type such as list[_Target] | None."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        yield annotation
+    for argument in get_args(annotation):
+        yield from _models(argument)
+
+
+def _close(name: str, allowed: Sequence[str]) -> list[str]:
+    return difflib.get_close_matches(name, allowed, n=1)
+
+
+def _near(name: str, allowed: Sequence[str]) -> str:
+    if close := _close(name, allowed):
+        return f": did you mean {close[0]!r}?"
+    return f"; allowed are {', '.join(allowed)}"

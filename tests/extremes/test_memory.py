@@ -1,0 +1,81 @@
+"""Data larger than a device: everything goes in blocks."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from cases import APERTURE, CARRIER, STEP, along_x, made, noise, patch, points, thesis_lines
+
+from clsas.backproject import backproject
+from clsas.device import Device
+from clsas.grid import Grid
+from clsas.lines import RangeLines
+from clsas.quality import relative_error_db
+from clsas.reference import ideal
+
+
+@pytest.fixture
+def small(device):
+    """The device with memory for a few thousand pixels only."""
+
+    def limited(memory_bytes):
+        info = dataclasses.replace(
+            device.info, memory_bytes=memory_bytes, max_buffer_bytes=memory_bytes // 4
+        )
+        return dataclasses.replace(device, info=info)
+
+    return limited
+
+
+@pytest.fixture
+def largest(monkeypatch):
+    """Sizes of the buffers made, largest first."""
+    sizes = []
+    make = Device.buffer
+
+    def buffer(device, bytes_):
+        sizes.append(int(bytes_))
+        return make(device, bytes_)
+
+    monkeypatch.setattr(Device, "buffer", buffer)
+    return sizes
+
+
+@pytest.mark.parametrize("kind", ["plane", "points"])
+def test_an_image_in_bands_is_the_same_bit_for_bit(device, small, kind):
+    grid = patch(1.3, 42, 100, 90)
+    lines = thesis_lines(grid, APERTURE[::16])
+    if kind == "points":
+        grid = Grid.points(grid.positions_m())
+    fixed = {"taps": 6, "upsampling": 3}
+    whole = backproject(lines, grid, device=device, **fixed)
+    calls = []
+    banded = backproject(
+        lines, grid, device=small(65536), progress=lambda *call: calls.append(call), **fixed
+    )
+    assert len(calls) >= 5  # it did go in bands
+    np.testing.assert_array_equal(banded.pixels, whole.pixels)
+
+
+def test_pixels_stay_within_the_device(device, small, largest):
+    lines, grid = made(points)
+    backproject(lines, grid, device=small(1 << 22), taps=4, upsampling=3)
+    assert max(largest) <= 1 << 20
+
+
+def test_one_channel_over_many_points_stays_within_the_device(device, small, largest):
+    grid = Grid.points(patch(-1, 42, 400, 400).positions_m())
+    track = along_x(1, 1.0)
+    lines = RangeLines(noise(1, 1000), 40.0, STEP, track, track, CARRIER, 1500.0)
+    backproject(lines, grid, device=small(1 << 20), taps=4, upsampling=3)
+    assert max(largest) <= 1 << 18
+
+
+def test_long_lines_stay_within_the_device(device, small, largest):
+    """Lines of 10 000 samples: 512 of them do not fit at once."""
+    grid = patch(1.3, 42, 5, 5)
+    track = along_x(520, 0.01)
+    lines = RangeLines(noise(520, 10_000), 20.0, STEP, track, track, CARRIER, 1500.0)
+    image = backproject(lines, grid, device=small(1 << 24), taps=6, upsampling=3)
+    assert max(largest) <= 1 << 22
+    assert relative_error_db(image, ideal(lines, grid.positions_m())) <= -80
