@@ -107,8 +107,8 @@ def backproject(
 
     Notes
     -----
-    I(x) = sum_i s_i(rho_i(x)) exp(+j 2 k rho_i(x)), with rho half the path from transmitter to pixel
-    to receiver and k = 2 pi carrier/c. Beyond the ends of a line (by more than half an
+    I(x) = sum_i s_i(rho_i(x)) exp(+j 2 k rho_i(x)), with rho half the path from transmitter to
+    pixel to receiver and k = 2 pi carrier/c. Beyond the ends of a line (by more than half an
     interpolation filter) a pixel gets nothing from it.
 
     Ranges and phases are referred in float64 to centres near the pixels; the device sees float32
@@ -394,7 +394,7 @@ class _Run:
 
 
 def _room(taps: int) -> float:
-    """Samples that a block's pixels may lie from its middle for the lookup window to hold them."""
+    """Return how many samples a block may reach from its middle within the lookup window."""
     return _WINDOW / 2 - 2 - taps / 2
 
 

@@ -87,9 +87,14 @@ class _Output(click.Path):
         path = super().convert(value, param, ctx)
         if not path.parent.is_dir():
             self.fail(f"there is no folder {str(path.parent)!r}", param, ctx)
-        if param.name == "png" and importlib.util.find_spec("matplotlib") is None:
-            self.fail("pictures need matplotlib: pip install 'clsas[plot]'", param, ctx)
+        if param.name == "png":
+            _need_matplotlib()
         return path
+
+
+def _need_matplotlib() -> None:
+    if importlib.util.find_spec("matplotlib") is None:
+        raise click.ClickException("pictures need matplotlib: pip install 'clsas[plot]'")
 
 
 _INPUT = click.Path(exists=True, dir_okay=False, path_type=Path)
@@ -346,6 +351,7 @@ def demo(out: Path, device: str | None, as_json: bool) -> None:
     \b
     Example:  clsas demo --out my-demo
     """
+    _need_matplotlib()
     say = (lambda line: None) if as_json else click.echo
     results = demonstration.run(out, device=device, say=say, progress=_progress)
     if as_json:

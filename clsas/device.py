@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import os
-import time
+import statistics
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from importlib.resources import files
 from pathlib import Path
@@ -72,7 +73,18 @@ class DeviceInfo:
         return f"{self.platform}: {self.name}"
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True)
+class KernelTimes:
+    """How often a kernel ran on the device, and for how long, in seconds."""
+
+    count: int
+    minimum_s: float
+    median_s: float
+    maximum_s: float
+    total_s: float
+
+
+@dataclass(eq=False)
 class Device:
     """An opened device: its context, its queues and the kernels built so far.
 
@@ -84,7 +96,7 @@ class Device:
     queue: cl.CommandQueue
     uploads: cl.CommandQueue
     _kernels: dict[tuple, cl.Kernel] = field(default_factory=dict, repr=False)
-    _events: dict[str, list[cl.Event]] | None = field(default=None, repr=False)
+    _events: list[tuple[str, cl.Event]] | None = field(default=None, repr=False)
 
     def kernel(self, source: str, name: str, **options: int) -> cl.Kernel:
         """Return kernel `name` of `cl/<source>.cl`, built once per set of options.
@@ -133,8 +145,26 @@ class Device:
         local = (1,) * len(size) if self.info.width > 1 else None
         event = kernel(self.queue, size, local, *map(_argument, arguments), wait_for=wait_for)
         if self._events is not None:
-            self._events[kernel.function_name].append(event)
+            self._events.append((kernel.function_name, event))
         return event
+
+    @contextlib.contextmanager
+    def profile(self) -> Iterator[dict[str, KernelTimes]]:
+        """Time every kernel run within the block; the yielded dict is filled at its end."""
+        times: dict[str, KernelTimes] = {}
+        self._events = []
+        try:
+            yield times
+            self.finish()
+            seconds = defaultdict(list)
+            for name, event in self._events:
+                seconds[name].append(1e-9 * (event.profile.end - event.profile.start))
+            for name, runs in seconds.items():
+                times[name] = KernelTimes(
+                    len(runs), min(runs), statistics.median(runs), max(runs), sum(runs)
+                )
+        finally:
+            self._events = None
 
     def finish(self) -> None:
         """Wait until the device has done all it was given."""

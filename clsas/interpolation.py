@@ -52,8 +52,8 @@ class Interpolator:
     upsampling : float
         By how much the lines are upsampled first, by FFT.
     coefficients : float64 [taps/2, 2, taps/2]
-        Per pair of taps from the innermost, the polynomials E and O, highest power first: the weight
-        of the tap at +-(pair + 1/2) from the middle is E(nu^2) +- nu O(nu^2), with nu in
+        Per pair of taps from the innermost, the polynomials E and O, highest power first: the
+        weight of the tap at +-(pair + 1/2) from the middle is E(nu^2) +- nu O(nu^2), with nu in
         [-1/2, 1/2] the position from the middle.
     error_db : float
         Predicted relative rms error of an evaluation of these lines, dB.
@@ -109,9 +109,11 @@ def design(taps: int, upsampling: float, spectrum: Spectrum) -> Interpolator:
     With frequency f in cycles per (upsampled) sample and taps at +-a, a = 1/2, 3/2, ..., a
     symmetric filter errs by
 
-        2 sum_a E_a(nu^2) cos(2 pi f a) - cos(2 pi f nu)  +  j [2 nu sum_a O_a(nu^2) sin(2 pi f a) - sin(2 pi f nu)],
+        2 sum_a E_a(nu^2) cos(2 pi f a) - cos(2 pi f nu)
+        + j [2 nu sum_a O_a(nu^2) sin(2 pi f a) - sin(2 pi f nu)],
 
-    two separate least-squares problems in the polynomials' coefficients, weighted by the power at f.
+    two separate least-squares problems in the polynomials' coefficients, weighted by the power
+    at f.
     Linear interpolation is the one filter that is given: E = 1/2, O = 1.
     """
     f = spectrum.frequency[:, None, None, None] / upsampling

@@ -169,9 +169,9 @@ def lay_out(
     Notes
     -----
     A tile is expanded to third order, so that its largest error is that of the fourth:
-    r^4/(8 R^3) at most, r its half diagonal and R the distance of the nearest antenna. The rms over
-    a tile's pixels and directions is 0.15 of it. Where even the smallest tile is too large, near the
-    antennas, and off a plane, pixels go into groups, which expand nothing.
+    r^4/(8 R^3) at most, r its half diagonal and R the distance of the nearest antenna. The rms
+    over a tile's pixels and directions is 0.15 of it. Where even the smallest tile is too large,
+    near the antennas, and off a plane, pixels go into groups, which expand nothing.
     """
     if grid.is_planar:
         tree = KDTree(antennas_m)

@@ -321,7 +321,7 @@ def _nodes(terms: int) -> NDArray[np.float64]:
 
 
 @lru_cache(maxsize=32)
-def _interpolation(terms: int, modes: int) -> NDArray[np.float64]:
+def _interpolation(terms: int, modes: int) -> NDArray:
     """Return the matrix [terms, modes] from values at `_nodes` to FFT frequencies -1..1."""
     to_coefficients = chebvander(_nodes(terms), terms - 1) * (2 / terms)
     to_coefficients[:, 0] /= 2
@@ -354,15 +354,15 @@ class _Paths:
             amplitudes = self.scene.amplitudes[first : first + _BLOCK]
             yield points, amplitudes, *legs_m(points, *elements, self.sound_speed_m_s)
 
-    def delay_limits_s(self, workers: int | None) -> NDArray[np.float64]:
+    def delay_limits_s(self, workers: int | None) -> NDArray:
         """Return the shortest and the longest delay of every channel, [2, channels]."""
 
         def limits(channel: int) -> tuple[float, float]:
             lengths = [out + back for _, _, out, back in self.legs(channel)]
             return min(map(np.min, lengths)), max(map(np.max, lengths))
 
-        found = np.array(list(_in_threads(limits, self.channels, workers)), np.float64)
-        return np.divide(found.T, self.sound_speed_m_s)
+        found = np.array(list(_in_threads(limits, self.channels, workers)))
+        return found.T / self.sound_speed_m_s
 
     def directions(
         self, channel: int, points: NDArray, out: NDArray, back: NDArray

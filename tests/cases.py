@@ -57,6 +57,11 @@ def along_x(channels, spacing_m, y=0.0, z=0.0):
     return np.stack([x, np.full(channels, y), np.full(channels, z)], axis=1)
 
 
+def beside(positions_m, *offset_m):
+    """Positions moved by (x, y, z)."""
+    return positions_m + np.array(offset_m)
+
+
 # Chapter 5 of the thesis: 1 MHz, 100 kHz, 640 channels over 5.28 m; lines at 1.25 times the
 # bandwidth.
 CARRIER, STEP, PITCH = 1e6, 0.006, 4.9e-3
@@ -76,7 +81,7 @@ def thesis():
 
 def bistatic():
     """One transmitter for each ping of 8 receivers, apart in all directions."""
-    tx = np.repeat(APERTURE[::8], 8, axis=0) + [0.3, 0.1, -0.2]
+    tx = beside(np.repeat(APERTURE[::8], 8, axis=0), 0.3, 0.1, -0.2)
     grid = patch(1.3, 42)
     return thesis_lines(grid, tx, APERTURE), grid
 
@@ -85,7 +90,7 @@ def moving():
     """Receivers that move forwards, sideways and up, at up to 10 m/s."""
     velocity = np.random.default_rng(2).uniform(-5.5, 5.5, APERTURE.shape)
     grid = patch(1.3, 42)
-    return thesis_lines(grid, APERTURE, APERTURE + [0.05, 0, 0.02], velocity=velocity), grid
+    return thesis_lines(grid, APERTURE, beside(APERTURE, 0.05, 0, 0.02), velocity=velocity), grid
 
 
 def height_map():
@@ -96,7 +101,9 @@ def height_map():
 
 def moving_over_height_map():
     grid = patch(1.3, 42, z=-9.0).with_height(np.linspace(-1, 1, 33 * 40).reshape(33, 40) ** 3)
-    return thesis_lines(grid, APERTURE, APERTURE + [0.1, 0, 0], velocity=[[8.0, -3, 1]] * 640), grid
+    return thesis_lines(
+        grid, APERTURE, beside(APERTURE, 0.1, 0, 0), velocity=[[8.0, -3, 1]] * 640
+    ), grid
 
 
 def oriented():

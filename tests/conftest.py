@@ -7,7 +7,7 @@ import pytest
 
 from clsas.device import list_devices, open_device
 
-# Float lanes that other devices have, without the lookup in registers: one lane is what runs on GPUs.
+# What other devices have: float lanes (one is what runs on GPUs), and whether kernels may permute.
 FORCED = ((1, False), (4, False), (8, False), (16, False))
 
 
@@ -15,11 +15,14 @@ def _variants():
     """(index, lanes, permute) of one device per platform, and of one CPU driven in every way."""
     first = {info.platform: info for info in reversed(list_devices())}
     own = [(info.index, info.width, info.permute) for info in first.values()]
-    # PoCL's compiler is the fastest of the CPUs'.
+    # Of the CPUs' compilers PoCL's is the fastest.
     cpus = sorted(name for name, info in first.items() if info.kind == "cpu")[-1:]
     forced = [(first[name].index, *way) for name in cpus for way in FORCED]
     names = {info.index: info.platform.replace("(", " ").split()[0] for info in first.values()}
-    variants = {f"{names[v[0]]}-{v[1]}{'-permute' * v[2]}": v for v in own + forced}
+    variants = {
+        f"{names[index]}-{width}{'-permute' * permute}": (index, width, permute)
+        for index, width, permute in own + forced
+    }
     # Without any device the tests fail, with the message that says how to get one.
     return variants or {"none": (None, None, None)}
 
@@ -39,5 +42,5 @@ _VARIANTS = _variants()
 
 @pytest.fixture(params=_VARIANTS.values(), ids=_VARIANTS.keys(), scope="session")
 def device(request):
-    """Every platform's first device, and a CPU's also with other vector widths and lookups."""
+    """Every platform's first device, and a CPU also with other vector widths."""
     return variant(*request.param)

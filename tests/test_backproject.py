@@ -8,6 +8,7 @@ from cases import (
     ORDINARY,
     STEP,
     along_x,
+    beside,
     bistatic,
     height_map,
     lines_over,
@@ -139,7 +140,7 @@ def test_a_point_keeps_its_amplitude_and_phase(device, amplitude):
     track = APERTURE[::10] + rng.normal(0, 0.05, APERTURE[::10].shape)
     target = [0.31, 41.7, -3.2]
     lines = simulate_lines(
-        track, track + [0.1, 0, 0], PointTargets([target], [amplitude]),
+        track, beside(track, 0.1, 0, 0), PointTargets([target], [amplitude]),
         carrier_hz=CARRIER, bandwidth_hz=1e5, rx_velocity_m_s=[2.0, 0, 0],
     )  # fmt: skip
     image = backproject(lines, Grid.points([target]), device=device, accuracy_db=-60)
@@ -173,7 +174,7 @@ def test_backprojection_is_the_adjoint_of_simulation(device):
     oversampling, band = 1.6, 1e5
     step = 1500 / (2 * oversampling * band)
     tx = APERTURE[::20] + rng.normal(0, 0.1, (32, 3))
-    geometry = {"tx_m": tx, "rx_m": tx + [0.2, 0, 0.1], "rx_velocity_m_s": [2.0, 1, 0]}
+    geometry = {"tx_m": tx, "rx_m": beside(tx, 0.2, 0, 0.1), "rx_velocity_m_s": [2.0, 1, 0]}
     x = rng.normal(size=(60, 2)) @ [1, 1j]
     where = rng.uniform([-1, 41, -3], [1, 42, -2], (60, 3))
     first, length = 39.0, 1200

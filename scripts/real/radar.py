@@ -1,7 +1,7 @@
 """Image airborne X-band radar recordings (GOTCHA): a car park on the plane z = 0.
 
-Every file holds one degree of a circle of 7 km radius, flown 7 km above the scene. The images of all
-files are added up coherently.
+Every file holds one degree of a circle of 7 km radius, flown 7 km above the scene. The images of
+all files are added up coherently.
 """
 
 from __future__ import annotations
@@ -55,10 +55,15 @@ class PhaseHistory:
 def read_phase_history(path: Path) -> PhaseHistory:
     """Read a file of the GOTCHA volumetric data set.
 
-    The range r0 that a pulse is referenced to is the antenna's distance from the scene's centre, the
-    origin. Positions and r0 are float32, so r0 is rounded to 1 mm, 0.4 rad of phase. It is computed
-    from the positions instead: their own rounding then moves every point's range alike, and drops
-    out of R - r0.
+    The range r0 that a pulse is referenced to is the antenna's distance from the origin, the
+    scene's centre. The file holds it as float32, in steps of 1 mm, which are 0.4 rad of phase. It
+    is computed from the positions instead: these are rounded too, but that moves the ranges of all
+    points alike, and drops out of R - r0.
+
+    Raises
+    ------
+    ValueError
+        If r0 is something else, by more than rounding explains.
     """
     data = loadmat(path, simplify_cells=True)["data"]
     frequency_hz = data["freq"].astype(np.float64)
@@ -82,9 +87,9 @@ def range_lines(history: PhaseHistory) -> clsas.RangeLines:
 
         p(r - R) exp(-j 4 pi f_0 (R - r0)/c),    p(d) = sum over m of exp(j 4 pi m df d/c),
 
-    and range lines hold p(r - R) exp(-j 4 pi f_0 R/c): they lack the phase of r0, which is put on in
-    float64. The lines are one period, c/(2 df), of range, centred on r0; twice as many samples as
-    frequencies leave the imager's range interpolation some room.
+    and range lines hold p(r - R) exp(-j 4 pi f_0 R/c): they lack the phase of r0, which is put on
+    in float64. The lines are one period, c/(2 df), of range, centred on r0; twice as many samples
+    as frequencies leave the imager's range interpolation some room.
     """
     frequency_hz, reference_range_m = history.frequency_hz, history.reference_range_m
     count = 2 * len(frequency_hz)

@@ -9,6 +9,7 @@ from cases import (
     PITCH,
     STEP,
     along_x,
+    beside,
     lines_over,
     made,
     noise,
@@ -87,7 +88,7 @@ def inside_the_aperture():
 def in_the_array_plane():
     """Pixels in the very plane of the antennas, some 10 um from one."""
     grid = patch(APERTURE[300, 0] + 1e-5, -0.08)
-    return thesis_lines(grid, APERTURE[::4], APERTURE[::4] + [0, 0.02, 0]), grid
+    return thesis_lines(grid, APERTURE[::4], beside(APERTURE[::4], 0, 0.02, 0)), grid
 
 
 def large_pixels():
@@ -102,7 +103,7 @@ def fast_receivers():
     track = along_x(64, 4e-3)
     grid = patch(0.1, 4, pitch=2e-3)
     lines = lines_over(
-        grid, track, track + [0.05, 0, 0.1], carrier_hz=4e4, step_m=8e-3, speed=343.0,
+        grid, track, beside(track, 0.05, 0, 0.1), carrier_hz=4e4, step_m=8e-3, speed=343.0,
         velocity=velocity,
     )  # fmt: skip
     return lines, grid
@@ -121,7 +122,7 @@ def long_scene():
 def long_strip():
     """A strip of 1 km, seen by a few channels from 40 m at its far end."""
     grid = Grid.oriented([0, 40, 0], [0, PITCH, 0], [PITCH, 0, 0], (2, 204_800))
-    track = along_x(4, 0.5) + [1000.0, 0, 0]
+    track = beside(along_x(4, 0.5), 1000.0, 0, 0)
     return RangeLines(noise(4, 2000), 36.0, STEP, track, track, CARRIER, 1500.0), grid
 
 
@@ -150,7 +151,7 @@ def test_a_pixel_at_an_antenna_is_a_pixel_like_others(device, shape, way):
     """Where the distance to a transmitter is zero, so that no direction is defined."""
     track = along_x(9, 0.01)
     grid = Grid.points(np.broadcast_to(track[4], (*shape, 3)))
-    rx = track if way == "monostatic" else track + [0, 0.02, 0]
+    rx = track if way == "monostatic" else beside(track, 0, 0.02, 0)
     velocity = [3.0, 0, 0] if way == "moving" else None
     lines = RangeLines(noise(9, 400), -200 * STEP, STEP, track, rx, CARRIER, 1500.0, velocity)
     preparation = prepare(lines, grid, device=device, taps=6, upsampling=3)

@@ -34,8 +34,8 @@ def tip(image):
 def direct_sum(echoes, points_m):
     """The image at some points, straight from the recorded samples, in float64.
 
-    I = sum over channels and samples of 2/fs x_n h(tau - t_n) exp(j 2 pi fc (tau - t_n)), where h is
-    the inverse Fourier transform of a Hann window of mean 1 over the band B:
+    I = sum over channels and samples of 2/fs x_n h(tau - t_n) exp(j 2 pi fc (tau - t_n)), where h
+    is the inverse Fourier transform of a Hann window of mean 1 over the band B:
     h(t) = B sinc(Bt) / (1 - (Bt)^2).
     """
     band = 2 * echoes.carrier_hz
@@ -55,10 +55,9 @@ def direct_sum(echoes, points_m):
 
 def pixels_about(image, x_m, depth_m):
     """Rows and columns of 5 by 5 pixels, every fourth, about a place."""
-    columns, rows = (
-        np.argmin(np.abs(axis - at)) for axis, at in zip(image.grid.axes_m, (x_m, depth_m))
-    )
-    return slice(rows - 8, rows + 9, 4), slice(columns - 8, columns + 9, 4)
+    all_x_m, all_depth_m = image.grid.axes_m
+    row, column = np.argmin(np.abs(all_depth_m - depth_m)), np.argmin(np.abs(all_x_m - x_m))
+    return slice(row - 8, row + 9, 4), slice(column - 8, column + 9, 4)
 
 
 def test_recording_is_the_whole_matrix_with_pairs_of_two_counted_twice(recording, echoes):
