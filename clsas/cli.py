@@ -362,7 +362,7 @@ def demo(out: Path, device: str | None, as_json: bool) -> None:
 @click.argument("case", required=False)
 @_device
 @click.option("--accuracy-db", type=float, default=-50.0, show_default=True, help="Error wanted.")
-@click.option("--repeats", type=click.IntRange(1), default=5, show_default=True)
+@click.option("--repeats", type=click.IntRange(1), default=5, show_default=True, help="Timed runs.")
 @_as_json
 def bench(
     case: str | None, device: str | None, accuracy_db: float, repeats: int, as_json: bool

@@ -482,7 +482,8 @@ def _models(annotation: Any) -> Iterator[type[BaseModel]]:
 
 
 def _close(name: str, allowed: Sequence[str]) -> list[str]:
-    return difflib.get_close_matches(name, allowed, n=1)
+    without_unit = [other for other in allowed if other.startswith(f"{name}_")]
+    return (without_unit or difflib.get_close_matches(name, allowed))[:1]
 
 
 def _near(name: str, allowed: Sequence[str]) -> str:

@@ -6,6 +6,7 @@ import contextlib
 import functools
 import os
 import statistics
+import warnings
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
@@ -120,7 +121,10 @@ class Device:
             definitions = [f"-D{option}={value}" for option, value in sorted(options.items())]
             text = kernel_source("common.h") + kernel_source(f"{source}.cl")
             try:
-                program = cl.Program(self.context, text).build(["-cl-mad-enable", *definitions])
+                with warnings.catch_warnings():
+                    # Some drivers' compilers greet; a failure brings its log anyway.
+                    warnings.simplefilter("ignore", cl.CompilerWarning)
+                    program = cl.Program(self.context, text).build(["-cl-mad-enable", *definitions])
             except cl.RuntimeError as error:
                 raise DeviceError(
                     f"{self.info.label} could not build {source}.cl with "

@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from cases import APERTURE, CARRIER, STEP, along_x, made, noise, patch, points, thesis_lines
+from cases import APERTURE, CARRIER, STEP, along_x, noise, patch, thesis_lines
 
 from clsas.backproject import backproject
 from clsas.device import Device
@@ -48,19 +48,13 @@ def test_an_image_in_bands_is_the_same_bit_for_bit(device, small, kind):
     if kind == "points":
         grid = Grid.points(grid.positions_m())
     fixed = {"taps": 6, "upsampling": 3}
-    whole = backproject(lines, grid, device=device, **fixed)
-    calls = []
+    once, often = [], []
+    whole = backproject(lines, grid, device=device, progress=lambda *n: once.append(n), **fixed)
     banded = backproject(
-        lines, grid, device=small(65536), progress=lambda *call: calls.append(call), **fixed
+        lines, grid, device=small(65536), progress=lambda *n: often.append(n), **fixed
     )
-    assert len(calls) >= 5  # it did go in bands
+    assert len(often) >= 3 * len(once)
     np.testing.assert_array_equal(banded.pixels, whole.pixels)
-
-
-def test_pixels_stay_within_the_device(device, small, largest):
-    lines, grid = made(points)
-    backproject(lines, grid, device=small(1 << 22), taps=4, upsampling=3)
-    assert max(largest) <= 1 << 20
 
 
 def test_one_channel_over_many_points_stays_within_the_device(device, small, largest):

@@ -91,7 +91,7 @@ def test_notch_tip_is_as_narrow_as_the_aperture_allows(echoes, tip):
 def test_back_wall_is_flat_and_where_it_is(image):
     depth_m = ultrasound.back_wall_depth_m(image)
     assert len(depth_m) > 50
-    # The pulse is not compressed, so that depths include up to half of its 1 us, 3 mm.
+    # The pulse is not compressed, so that depths include its own delay: 0.3 mm for 0.1 us.
     assert np.all((depth_m > 39.5e-3) & (depth_m < 41.5e-3))
     assert np.ptp(depth_m) <= 0.2e-3
 

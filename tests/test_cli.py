@@ -1,0 +1,366 @@
+import json
+import os
+import pty
+import re
+import shlex
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import click
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+import clsas
+from clsas import bench, cli, demo
+from clsas.config import built_in_scene, read_scene
+
+pytest.importorskip("matplotlib")
+
+ROOT = Path(__file__).parents[1]
+README = (ROOT / "README.md").read_text()
+(EXAMPLE,) = re.findall(
+    r"```toml\n(.*?)```", (ROOT / "docs" / "scene-files.md").read_text(), re.DOTALL
+)
+
+
+def run(*args, code=0):
+    """Run a command; return standard output and standard error."""
+    result = CliRunner().invoke(cli.main, [str(arg) for arg in args], prog_name="clsas")
+    assert result.exit_code == code, (result.output, result.exception)
+    return result.stdout, result.stderr
+
+
+def run_json(*args):
+    stdout, stderr = run(*args, "--json")
+    assert stderr == ""  # neither warnings nor, off a terminal, progress
+    return json.loads(stdout)
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """A folder with the documented scene and what the commands make of it, and their results."""
+    folder = tmp_path_factory.mktemp("made")
+    (folder / "scene.toml").write_text(EXAMPLE)
+    scene, echoes, lines, image = (
+        folder / name for name in ("scene.toml", "echoes.h5", "lines.h5", "image.h5")
+    )
+    results = [
+        run_json("simulate", scene, "-o", echoes, "--png", folder / "geometry.png"),
+        run_json("compress", echoes, "--scene", scene, "-o", lines, "--png", folder / "lines.png"),
+        run_json("image", lines, "--scene", scene, "-o", image, "--png", folder / "image.png"),
+        run_json("quality", image, "--near", "0,20", "--png", folder / "cuts.png"),
+    ]
+    return folder, results
+
+
+def test_commands_do_what_the_library_does(made):
+    folder, _ = made
+    scene = read_scene(folder / "scene.toml")
+    echoes = clsas.simulate(scene.sonar, scene.track, scene.targets, **scene.simulate)
+    np.testing.assert_array_equal(clsas.load(folder / "echoes.h5").samples, echoes.samples)
+    lines = clsas.compress(echoes, window="hamming")
+    np.testing.assert_array_equal(clsas.load(folder / "lines.h5").samples, lines.samples)
+    image = clsas.backproject(lines, scene.grid, accuracy_db=-60)
+    assert clsas.relative_error_db(clsas.load(folder / "image.h5"), image) < -100
+    for name in ("geometry", "lines", "image", "cuts"):
+        assert (folder / f"{name}.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_results_in_json(made):
+    folder, (simulated, compressed, imaged, measured) = made
+    assert simulated["file"] == str(folder / "echoes.h5")
+    assert simulated["channels"] == compressed["channels"] == imaged["channels"] == 320
+    assert compressed["range_step_m"] == pytest.approx(1500 / (4 * 60e3))
+    assert imaged["shape"] == [201, 201]
+    assert imaged["interpolation_error_db"] < -60
+    assert all(result["seconds"] > 0 for result in (simulated, compressed, imaged))
+    point = measured["point"]
+    # The documented scene has noise, sway and yaw, and sound that takes its time.
+    assert (point["x_m"], point["y_m"]) == pytest.approx((0, 20), abs=1e-3)
+    assert "offset_m" not in point["range"]
+    scene = read_scene(folder / "scene.toml")
+    azimuth_m, _ = demo.expected_resolution_m(scene.sonar, scene.track, np.array([0, 20.0, 0]))
+    assert point["azimuth"]["resolution_m"] == pytest.approx(azimuth_m, rel=0.02)
+    # Hamming's 1.3 c/2B, and a little more along the ground.
+    assert point["range"]["resolution_m"] == pytest.approx(1.3 * 0.0125, rel=0.1)
+
+
+def test_results_as_text(made, tmp_path):
+    folder, _ = made
+    stdout, _ = run("simulate", folder / "scene.toml", "-o", tmp_path / "echoes.h5")
+    assert stdout.startswith(f"{tmp_path / 'echoes.h5'}: 320 channels of ")
+    stdout, _ = run("compress", folder / "echoes.h5", "-o", tmp_path / "lines.h5")
+    assert "320 lines of " in stdout
+    assert "6.25 mm apart" in stdout
+    grid = ("--x", "-0.1:0.1:11", "--y", "19.9:20.1:21")
+    stdout, _ = run("image", folder / "lines.h5", *grid, "-o", tmp_path / "image.h5")
+    assert "21 x 11 pixels from 320 lines" in stdout
+    stdout, _ = run("quality", folder / "image.h5", "--near", "0,20")
+    assert re.search(r"^point at x = -?0\.000\d\d m, y = (19\.999|20\.000)", stdout, re.MULTILINE)
+    assert stdout.count("PSLR nearest") == 2
+
+
+def test_options_go_before_the_scene_file(made, tmp_path):
+    folder, _ = made
+    scene = ("--scene", folder / "scene.toml")
+    lines = tmp_path / "lines.h5"
+    result = run_json("compress", folder / "echoes.h5", *scene, "--oversampling", 4, "-o", lines)
+    assert result["range_step_m"] == pytest.approx(1500 / (8 * 60e3))
+    grid = ("--x", "-1:1:5", "--y", "20:21:6", "--z", "0.5")
+    image = tmp_path / "image.h5"
+    result = run_json("image", lines, *scene, *grid, "--taps", 8, "--upsampling", 2, "-o", image)
+    assert (result["shape"], result["taps"]) == ([6, 5], 8)
+    assert result["upsampling"] == pytest.approx(2, rel=0.02)
+    positions = clsas.load(image).grid.positions_m()
+    np.testing.assert_allclose(positions[[0, -1], [0, -1]], [[-1, 20, 0.5], [1, 21, 0.5]])
+
+
+def test_an_image_against_itself_has_no_finite_error(made):
+    image = made[0] / "image.h5"
+    assert run_json("quality", image, "--reference", image)["relative_error_db"] is None
+    assert "-inf dB" in run("quality", image, "--reference", image)[0]
+
+
+def test_devices(monkeypatch):
+    infos = clsas.list_devices()
+    result = run_json("devices")
+    assert [device["name"] for device in result["devices"]] == [info.name for info in infos]
+    text, _ = run("devices")
+    assert all(info.label in text and info.driver in text for info in infos)
+    assert f"Used: {result['used']} ({result['reason']})" in text
+    last = infos[-1].index
+    monkeypatch.setenv("CLSAS_DEVICE", str(last))
+    assert run_json("devices")["used"] == last
+    assert "CLSAS_DEVICE" in run("devices")[0]
+    monkeypatch.setenv("CLSAS_DEVICE", "abacus")
+    assert "Error: device 'abacus', asked for by CLSAS_DEVICE" in run("devices", code=1)[1]
+
+
+def test_without_a_device_the_message_says_how_to_get_one(made, tmp_path, monkeypatch):
+    monkeypatch.setattr("clsas.device.list_devices", list)
+    _, stderr = run("devices", code=1)
+    assert stderr.startswith("Error: No OpenCL device was found.")
+    assert "pip install" in stderr
+    scene, lines = (made[0] / name for name in ("scene.toml", "lines.h5"))
+    run("image", lines, "--scene", scene, "-o", tmp_path / "image.h5", code=1)
+    assert not any(tmp_path.iterdir())
+
+
+def test_a_broken_sampling_limit_is_a_warning(made, tmp_path):
+    sparse = tmp_path / "sparse.toml"
+    sparse.write_text(EXAMPLE.replace("spacing_m = 0.02", "spacing_m = 0.04"))
+    _, stderr = run("simulate", sparse, "-o", tmp_path / "echoes.h5")
+    assert re.fullmatch(
+        r"Warning: phase centres are up to 0\.02\d* m apart .* grating lobes .*\n", stderr
+    )
+    lines = made[0] / "lines.h5"
+    _, stderr = run("image", lines, "--scene", sparse, "-o", tmp_path / "image.h5")
+    assert stderr.startswith("Warning: phase centres are up to 0.02")
+
+
+def test_a_grid_that_no_line_reaches_is_a_warning(made, tmp_path):
+    grid = ("--x", "0:1:4", "--y", "500:501:4")
+    _, stderr = run("image", made[0] / "lines.h5", *grid, "-o", tmp_path / "image.h5")
+    assert stderr.startswith("Warning: ")
+    assert stderr.count("\n") == 1
+    assert not clsas.load(tmp_path / "image.h5").pixels.any()
+
+
+GRID = ["--x", "0:1:4", "--y", "19:20:4"]
+
+
+@pytest.mark.parametrize(
+    ("args", "code", "message"),
+    [
+        (["image", "echoes.h5", *GRID, "-o", "new.h5"], 1, "must hold RangeLines (clsas compress"),
+        (["compress", "image.h5", "-o", "new.h5"], 1, "image.h5 must hold Echoes, got Image"),
+        (["quality", "scene.toml"], 1, "scene.toml is not an HDF5 file"),
+        (["simulate", "lines.h5", "-o", "new.h5"], 1, "lines.h5: is not TOML"),
+        (["simulate", "typo.toml", "-o", "new.h5"], 1, "in [grid]: did you mean 'z_m'?"),
+        (["simulate", "grid.toml", "-o", "new.h5"], 1, "grid.toml: missing table [sonar]"),
+        (["compress", "echoes.h5", "-o", "new.h5", "--window", "bay"], 1, "bay"),
+        (["compress", "echoes.h5", "-o", "new.h5", "--oversampling", "0.5"], 1, "oversampling"),
+        (["image", "lines.h5", *GRID, "-o", "new.h5", "--taps", "3"], 1, "taps must be one of"),
+        (["image", "lines.h5", *GRID, "-o", "new.h5", "--accuracy-db", "3"], 1, "accuracy_db must"),
+        (["image", "lines.h5", *GRID, "-o", "new.h5", "--device", "abacus"], 1, "'abacus'"),
+        (["image", "lines.h5", "--x", "0:1:0", *GRID[2:], "-o", "new.h5"], 1, "x count must be"),
+        (["quality", "image.h5", "--near", "9,9"], 1, "near must be inside the image"),
+        (["quality", "image.h5", "--near", "0,20", "--search-m", "-1"], 1, "search_m must be"),
+        (["simulate", "none.toml", "-o", "new.h5"], 2, "'none.toml' does not exist"),
+        (["simulate", "scene.toml"], 2, "Missing option '-o'"),
+        (["simulate", "scene.toml", "-o", "no/new.h5"], 2, "there is no folder 'no'"),
+        (["image", "lines.h5", "-o", "new.h5"], 2, "a grid is needed: --scene, or --x and --y"),
+        (["image", "lines.h5", *GRID[:2], "-o", "new.h5"], 2, "--x and --y go together"),
+        (["image", "lines.h5", "--x", "0:1", *GRID[2:], "-o", "new.h5"], 2, "START:STOP:N"),
+        (["quality", "image.h5", "--near", "0"], 2, "must be X,Y in metres"),
+        (["quality", "image.h5", "--png", "new.png"], 2, "go with --near"),
+        (["bench", "bp-nothing"], 2, "'bp-nothing' is not one of bp-thesis, "),
+        (["imagine"], 2, "No such command 'imagine'"),
+    ],
+)
+def test_errors_are_one_message_and_leave_nothing(made, monkeypatch, args, code, message):
+    folder, _ = made
+    monkeypatch.chdir(folder)
+    grid = EXAMPLE[EXAMPLE.index("[grid]") : EXAMPLE.index("[image]")]
+    Path("grid.toml").write_text(grid)
+    Path("typo.toml").write_text(f"{grid}z = 3")
+    before = set(folder.iterdir())
+    stdout, stderr = run(*args, code=code)
+    assert stdout == ""
+    assert message in stderr
+    assert len(re.findall("^Error: ", stderr, re.MULTILINE)) == 1
+    assert stderr.count("\n") == 1 or code == 2
+    assert set(folder.iterdir()) == before
+
+
+def test_traceback_on_request(made):
+    args = ["--traceback", "quality", str(made[0] / "image.h5"), "--near", "9,9"]
+    result = CliRunner().invoke(cli.main, args)
+    assert isinstance(result.exception, ValueError)
+
+
+def test_pictures_without_matplotlib_are_refused_before_any_work(made, tmp_path, monkeypatch):
+    monkeypatch.setattr(cli.importlib.util, "find_spec", lambda name: None)
+    scene = made[0] / "scene.toml"
+    png = ("--png", tmp_path / "x.png")
+    _, stderr = run("simulate", scene, "-o", tmp_path / "echoes.h5", *png, code=1)
+    assert "pip install 'clsas[plot]'" in stderr
+    run("demo", "--out", tmp_path / "out", code=1)
+    assert not any(tmp_path.iterdir())
+
+
+def test_help_shows_an_example_that_parses(monkeypatch):
+    for name, command in cli.main.commands.items():
+        text, _ = run(name, "--help")
+        (example,) = re.findall(r"Example:  (?:\w+=\w+ )?clsas (.*)", text)
+        given, *args = shlex.split(example)
+        assert given == name
+        files = [p.type for p in command.params if getattr(p.type, "exists", False)]
+        for file in files:
+            monkeypatch.setattr(file, "exists", False)  # an example's are nowhere
+        command.make_context(name, args)
+        assert all(p.help for p in command.params if isinstance(p, click.Option)), name
+    assert run("--version")[0] == f"clsas, version {clsas.__version__}\n"
+
+
+def test_bench(monkeypatch):
+    small = bench.Case(48, 8.25e-3, 1e6, 100e3, (-0.2, 0.2), (40.0, 40.4), 64)
+    monkeypatch.setattr(bench, "CASES", {"one": small, "two": small})
+    result = run_json("bench", "one", "--repeats", 2)
+    assert result["case"] == "one"
+    assert result.keys() >= {"device", "driver", "gbp_per_s", "rounding_error_db"}
+    seconds = result["seconds"]
+    assert 0 < seconds["min"] <= seconds["median"] <= seconds["max"]
+    assert result["true_error_db"] < -50
+    stdout, _ = run("bench", "--repeats", 1, "--json")
+    assert [json.loads(line)["case"] for line in stdout.splitlines()] == ["one", "two"]
+    text, _ = run("bench", "one", "--repeats", 1)
+    assert re.search(r"^ +gbp_per_s  \d", text, re.MULTILINE)
+    assert "'one' or 'two'" not in text
+
+
+def test_demo_in_json(tmp_path, monkeypatch):
+    small = built_in_scene("thesis_wide_beam").replace(b"count = 1024", b"count = 64")
+    monkeypatch.setattr(demo, "built_in_scene", lambda name: small)
+    result = run_json("demo", "--out", tmp_path / "new" / "folder")
+    assert result["seconds"].keys() == {"simulate", "compress", "image", "close-up"}
+    assert all(Path(file).stat().st_size > 0 for file in result["files"])
+    point, expected = result["point"], result["expected"]
+    assert (point["x_m"], point["y_m"]) == pytest.approx((0, 42.5), abs=1e-5)
+    for axis in ("azimuth", "range"):
+        assert point[axis]["resolution_m"] == pytest.approx(
+            expected[f"{axis}_resolution_m"], rel=5e-3
+        )
+    # A range side lobe of an unweighted band, and an azimuth one that the beams weigh.
+    assert point["range"]["pslr_db"] == pytest.approx([-13.26, -13.26], abs=0.5)
+    assert max(point["azimuth"]["pslr_db"]) < -20
+
+
+def test_expected_resolution_of_a_plain_aperture():
+    """Without beams and far off, lambda R/(2 L) and c/(2 B), 0.886 of them at -3 dB."""
+    pulse = clsas.Pulse(carrier_hz=1e5, bandwidth_hz=5e3, duration_s=0.1)
+    sonar = clsas.Sonar(pulse, [[0.0, 0.0, 0.0]])
+    track = clsas.Track.straight([-5, 0, 0], [1, 0, 0], 1001, 0.01)
+    azimuth_m, range_m = demo.expected_resolution_m(sonar, track, np.array([0, 1000.0, 0]))
+    assert azimuth_m == pytest.approx(0.8859 * 0.015 * 1000 / (2 * 10.01), rel=1e-3)
+    assert range_m == pytest.approx(0.8859 * 1500 / (2 * 5e3), rel=0.02)
+
+
+def test_ctrl_c_ends_with_130_and_leaves_no_file(tmp_path):
+    """Interrupted once the warning of a sparse array says that work begins."""
+    points = "".join(f"[[targets]]\nposition_m = [0, {20 + n / 1e3}, 0]\n" for n in range(2000))
+    text = EXAMPLE.replace("pings = 20", "pings = 20000").replace(
+        "spacing_m = 0.02", "spacing_m = 1"
+    )
+    (tmp_path / "scene.toml").write_text(points + text.replace("snr_db = 20", ""))
+    command = [sys.executable, "-m", "clsas", "simulate", "scene.toml", "-o", "echoes.h5"]
+    with subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stderr.readline().startswith("Warning: phase centres")
+        time.sleep(0.5)
+        process.send_signal(signal.SIGINT)
+        _, stderr = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert stderr.splitlines()[-1] == "Interrupted"
+    assert "Traceback" not in stderr
+    assert [path.name for path in tmp_path.iterdir()] == ["scene.toml"]
+
+
+def test_progress_is_shown_on_a_terminal(made, tmp_path):
+    ours, theirs = pty.openpty()
+    command = [sys.executable, "-m", "clsas", "compress", str(made[0] / "echoes.h5"), "-o", "l.h5"]
+    subprocess.run(
+        command, cwd=tmp_path, stderr=theirs, stdout=subprocess.DEVNULL, check=True,
+        env={**os.environ, "TERM": "xterm"},
+    )  # fmt: skip
+    os.close(theirs)
+    shown = b""
+    try:
+        while chunk := os.read(ours, 4096):
+            shown += chunk
+    except OSError:  # how a pseudo-terminal ends
+        pass
+    os.close(ours)
+    assert b"compressing" in shown
+    assert (tmp_path / "l.h5").exists()
+
+
+def test_readme_tour(tmp_path, monkeypatch):
+    """Every command of the README's tour does what it says, in its order."""
+    monkeypatch.chdir(tmp_path)
+    tour = README[README.index("## Five minutes") :]
+    commands, program = (
+        re.search(rf"```{kind}\n(.*?)```", tour, re.DOTALL)[1] for kind in ("sh", "python")
+    )
+    shown = {}
+    for line in filter(None, commands.splitlines()):
+        name, *args = shlex.split(line)
+        if name == "cd":
+            monkeypatch.chdir(*args)
+        else:
+            assert name == "clsas"
+            shown[args[0]], _ = run(*args)
+    assert re.search(
+        r"azimuth 6\.58 mm wide at -3 dB \(theory 6\.58 mm; L/2 = 7\.50 mm\)", shown["demo"]
+    )
+    assert re.search(r"range +6\.86 mm wide at -3 dB \(theory 6\.86 mm", shown["demo"])
+    assert "point at x = " in shown["quality"]
+    assert {path.name for path in Path().glob("*.png")} > {"geometry.png", "lines.png"}
+
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True, cwd=tmp_path
+    )
+    azimuth, range_ = map(float, re.findall(r"([\d.]+) mm", done.stdout))
+    assert azimuth == pytest.approx(6.6, abs=0.3)
+    assert range_ == pytest.approx(1.3 * 7.5, rel=0.1)
+
+
+def test_documentation_pages_are_listed_and_links_lead_somewhere():
+    for page in (ROOT / "README.md", *(ROOT / "docs").glob("*.md")):
+        for link in re.findall(r"\]\(([^)#:]+)\)", page.read_text()):
+            assert (page.parent / link).exists(), (page, link)
+    for page in (ROOT / "docs").glob("*.md"):
+        assert f"(docs/{page.name})" in README
