@@ -31,6 +31,17 @@ from clsas.config import SceneFile, read_scene
 from clsas.device import choose
 from clsas.quality import Cut, PointResponse
 
+# What users cause, and what machines lack.
+_ERRORS = (
+    ValueError,
+    TypeError,
+    clsas.DeviceError,
+    pyopencl.Error,
+    OSError,
+    ImportError,
+    MemoryError,
+)
+
 
 class _Commands(click.Group):
     """Turns what the library raises and warns of into messages and exit codes."""
@@ -47,9 +58,7 @@ class _Commands(click.Group):
             except KeyboardInterrupt:
                 click.echo("Interrupted", err=True)
                 ctx.exit(130)
-            except (
-                ValueError, TypeError, clsas.DeviceError, OSError, ImportError, MemoryError
-            ) as error:  # fmt: skip
+            except _ERRORS as error:
                 if ctx.params.get("traceback"):
                     raise
                 raise click.ClickException(_message(error)) from error
@@ -84,7 +93,7 @@ class _Output(click.Path):
         super().__init__(dir_okay=False, writable=True, path_type=Path)
 
     def convert(self, value: Any, param: Any, ctx: Any) -> Path:
-        path = super().convert(value, param, ctx)
+        path: Any = super().convert(value, param, ctx)
         if not path.parent.is_dir():
             self.fail(f"there is no folder {str(path.parent)!r}", param, ctx)
         if param.name == "png":
@@ -205,7 +214,7 @@ def compress(
     Example:  clsas compress echoes.h5 -o lines.h5 --window hamming
     """
     options = _options(
-        scene and read_scene(scene).compress, window=window, oversampling=oversampling
+        read_scene(scene).compress if scene else {}, window=window, oversampling=oversampling
     )
     echoes = _load(echoes_file, clsas.Echoes)
     with _progress("compressing") as progress:
@@ -244,8 +253,8 @@ def image(
     lines_file: Path,
     output: Path,
     scene: Path | None,
-    x: tuple | None,
-    y: tuple | None,
+    x: tuple[float, float, int] | None,
+    y: tuple[float, float, int] | None,
     z: float | None,
     device: str | None,
     accuracy_db: float | None,
@@ -267,7 +276,7 @@ def image(
     if scene is None and x is None:
         raise click.UsageError("a grid is needed: --scene, or --x and --y")
     described = read_scene(scene) if scene is not None else SceneFile(name="")
-    grid = described.need("grid")[0] if x is None else clsas.Grid.plane(x, y, z or 0.0)
+    grid = clsas.Grid.plane(x, y, z or 0.0) if x and y else described.need("grid")[0]
     options = _options(described.image, accuracy_db=accuracy_db, taps=taps, upsampling=upsampling)
     _warn_of_sampling(described, grid)
     lines = _load(lines_file, clsas.RangeLines)
@@ -427,9 +436,9 @@ def _load(path: Path, kind: type) -> Any:
     )
 
 
-def _options(described: dict[str, Any] | None, **given: Any) -> dict[str, Any]:
+def _options(described: dict[str, Any], **given: Any) -> dict[str, Any]:
     """Return a scene file's options, overruled by those given."""
-    return (described or {}) | {name: value for name, value in given.items() if value is not None}
+    return described | {name: value for name, value in given.items() if value is not None}
 
 
 def _warn_of_sampling(scene: SceneFile, grid: clsas.Grid | None = None) -> None:

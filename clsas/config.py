@@ -156,10 +156,13 @@ class _Sonar(_Table):
                 return getattr(Sonar, self.preset)()
             if self.pulse is None:
                 raise ValueError("missing table [sonar.pulse], or key 'preset'")
-            array = (self.receivers, self.spacing_m)
-            if (self.rx_m is None) == (array == (None, None)) or (None in array and any(array)):
-                raise ValueError("receivers must be given by rx_m, or by receivers and spacing_m")
-            rx = line_array(*array) if self.rx_m is None else self.rx_m
+            match self.rx_m, self.receivers, self.spacing_m:
+                case list(), None, None:
+                    rx = np.array(self.rx_m)
+                case None, int(count), float(spacing):
+                    rx = line_array(count, spacing)
+                case _:
+                    raise ValueError("receivers must be given by receivers and spacing_m, or rx_m")
         with _in("[sonar.pulse]"):
             pulse = self.pulse.build()
         skipped = {"preset", "pulse", "receivers", "spacing_m", "rx_m"}
@@ -316,7 +319,7 @@ class _Scene(_Table):
             with _in("[[targets]]"):
                 targets = PointTargets(
                     np.reshape([target.position_m for target in self.targets], (-1, 3)),
-                    [target.amplitude for target in self.targets],
+                    np.array([target.amplitude for target in self.targets], complex),
                 )
         simulate = self.simulate.given()
         if self.simulate.pointing is not None:
@@ -326,10 +329,10 @@ class _Scene(_Table):
             compress["window"] = tuple(self.compress.window)
         return SceneFile(
             name=name,
-            sonar=self.sonar and self.sonar.build(),
-            track=self.track and self.track.build(folder),
+            sonar=self.sonar.build() if self.sonar else None,
+            track=self.track.build(folder) if self.track else None,
             targets=targets,
-            grid=self.grid and self.grid.build(),
+            grid=self.grid.build() if self.grid else None,
             simulate=simulate,
             compress=compress,
             image=self.image.given(),
@@ -423,7 +426,7 @@ def _explain(error: ValidationError, tables: dict[str, Any]) -> list[str]:
             path = problem["loc"]
             lines[path] = f"missing key {path[-1]!r} in {_table(path[:-1])}"
         elif kind == "extra_forbidden":
-            *place, name = path
+            *place, name = *path[:-1], str(path[-1])
             allowed = list(_model_at(place).model_fields)
             mistyped |= {(*place, guess) for guess in _close(name, allowed)}
             unknown = f"key {name!r} in {_table(place)}" if place else f"table [{name}]"

@@ -30,12 +30,16 @@ _CLOSE_UP_M = 0.25  # to each side of the measured point
 _CLOSE_UP_PIXELS = 501
 
 
+def _silent(step: str) -> AbstractContextManager[Progress]:
+    return nullcontext()
+
+
 def run(
     out: Path,
     *,
     device: str | int | None = None,
     say: Callable[[str], None] = print,
-    progress: Callable[[str], AbstractContextManager[Progress]] = nullcontext,
+    progress: Callable[[str], AbstractContextManager[Progress]] = _silent,
 ) -> dict[str, Any]:
     """Simulate, compress, image, measure and draw the case.
 

@@ -11,20 +11,27 @@ from clsas.device import list_devices, open_device
 FORCED = ((1, False), (4, False), (8, False), (16, False))
 
 
+def _named(ways, infos):
+    return {
+        f"{infos[index].platform.replace('(', ' ').split()[0]}-{width}{'-permute' * permute}": (
+            index,
+            width,
+            permute,
+        )
+        for index, width, permute in ways
+    }
+
+
 def _variants():
     """(index, lanes, permute) of one device per platform, and of one CPU driven in every way."""
-    first = {info.platform: info for info in reversed(list_devices())}
-    own = [(info.index, info.width, info.permute) for info in first.values()]
+    infos = list_devices()
+    first = {info.platform: info for info in reversed(infos)}.values()
+    own = _named([(info.index, info.width, info.permute) for info in first], infos)
     # Of the CPUs' compilers PoCL's is the fastest.
-    cpus = sorted(name for name, info in first.items() if info.kind == "cpu")[-1:]
-    forced = [(first[name].index, *way) for name in cpus for way in FORCED]
-    names = {info.index: info.platform.replace("(", " ").split()[0] for info in first.values()}
-    variants = {
-        f"{names[index]}-{width}{'-permute' * permute}": (index, width, permute)
-        for index, width, permute in own + forced
-    }
+    cpus = sorted((info for info in first if info.kind == "cpu"), key=lambda i: i.platform)[-1:]
+    forced = _named([(info.index, *way) for info in cpus for way in FORCED], infos)
     # Without any device the tests fail, with the message that says how to get one.
-    return variants or {"none": (None, None, None)}
+    return own or {"none": (None, None, None)}, forced
 
 
 @cache
@@ -37,10 +44,17 @@ def variant(index, width, permute):
     return dataclasses.replace(device, info=info, _kernels={})
 
 
-_VARIANTS = _variants()
+OWN, OTHERS = _variants()
+_ALL = OWN | OTHERS
 
 
-@pytest.fixture(params=_VARIANTS.values(), ids=_VARIANTS.keys(), scope="session")
+@pytest.fixture(params=OWN.values(), ids=OWN.keys(), scope="session")
+def platform(request):
+    """Every platform's first device, as it is used."""
+    return variant(*request.param)
+
+
+@pytest.fixture(params=_ALL.values(), ids=_ALL.keys(), scope="session")
 def device(request):
     """Every platform's first device, and a CPU also with other vector widths."""
     return variant(*request.param)

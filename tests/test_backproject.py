@@ -70,8 +70,8 @@ SCATTER_DB = 0.6
 
 @pytest.mark.parametrize("accuracy_db", [-30, -50, -60, -80])
 @pytest.mark.parametrize("case", [thesis, own_starts], ids=lambda case: case.__name__)
-def test_the_true_error_is_what_was_asked_for(case, device, accuracy_db):
-    image = backproject(*made(case), device=device, accuracy_db=accuracy_db)
+def test_the_true_error_is_what_was_asked_for(case, platform, accuracy_db):
+    image = backproject(*made(case), device=platform, accuracy_db=accuracy_db)
     assert true_error_db(case, image) <= accuracy_db + SCATTER_DB
 
 
@@ -98,9 +98,7 @@ def test_any_number_of_channels(device, channels):
     assert relative_error_db(execute(preparation), wanted) <= -80
 
 
-@pytest.mark.parametrize(
-    "shape", [(1, 1), (1, 40), (40, 1), (3, 5), (16, 16), (17, 33), (64, 64), (65, 2)]
-)
+@pytest.mark.parametrize("shape", [(1, 1), (1, 40), (3, 5), (17, 33), (65, 2)])
 @pytest.mark.parametrize("kind", ["plane", "heights", "points"])
 def test_any_shape_of_grid(device, shape, kind):
     grid = patch(1.3, 42, shape[1], shape[0])
@@ -139,7 +137,7 @@ def test_any_geometry(data):
 
 
 @pytest.mark.parametrize("amplitude", [1, -2j, 3 * np.exp(1.1j)])
-def test_a_point_keeps_its_amplitude_and_phase(device, amplitude):
+def test_a_point_keeps_its_amplitude_and_phase(platform, amplitude):
     rng = np.random.default_rng(2)
     track = APERTURE[::10] + rng.normal(0, 0.05, APERTURE[::10].shape)
     target = [0.31, 41.7, -3.2]
@@ -147,11 +145,11 @@ def test_a_point_keeps_its_amplitude_and_phase(device, amplitude):
         track, beside(track, 0.1, 0, 0), PointTargets([target], [amplitude]),
         carrier_hz=CARRIER, bandwidth_hz=1e5, rx_velocity_m_s=[2.0, 0, 0],
     )  # fmt: skip
-    image = backproject(lines, Grid.points([target]), device=device, accuracy_db=-60)
+    image = backproject(lines, Grid.points([target]), device=platform, accuracy_db=-60)
     assert abs(image.pixels[0] / (len(track) * amplitude) - 1) <= 1e-3
 
 
-def test_a_gaussian_pulse_gives_the_closed_form(device):
+def test_a_gaussian_pulse_gives_the_closed_form(platform):
     """Lines p(r) exp(-2jk rho) with a pulse known everywhere need no reference code."""
     track, target = along_x(40, 0.02), np.array([[0.1, 8.0, -1.0]])
     grid = patch(0.08, 7.95, 21, 17, z=-1.0)
@@ -163,7 +161,7 @@ def test_a_gaussian_pulse_gives_the_closed_form(device):
     lines = RangeLines(samples, 7.0, STEP, track, track, CARRIER, 1500.0)
     range_m = np.linalg.norm(grid.positions_m()[..., None, :] - track, axis=-1)
     wanted = np.exp(-(((range_m - rho) / pulse_m) ** 2) + 2j * k * (range_m - rho)).sum(axis=-1)
-    image = backproject(lines, grid, device=device, accuracy_db=-80)
+    image = backproject(lines, grid, device=platform, accuracy_db=-80)
     assert relative_error_db(image, wanted) <= -80
 
 
@@ -246,7 +244,7 @@ def rotation(seed):
 
 @pytest.mark.parametrize("case", [bistatic, moving, oriented], ids=lambda case: case.__name__)
 @pytest.mark.parametrize("motion", ["shift", "rotation"])
-def test_where_the_scene_lies_does_not_matter(case, device, motion):
+def test_where_the_scene_lies_does_not_matter(case, platform, motion):
     lines, grid = made(case)
     turn = rotation(1) if motion == "rotation" else np.eye(3)
     shift = np.array([1024.5, -512.25, 64.125]) if motion == "shift" else np.zeros(3)
@@ -260,23 +258,23 @@ def test_where_the_scene_lies_does_not_matter(case, device, motion):
     grid_there = Grid.oriented(
         turn @ grid.origin_m + shift, turn @ grid.row_step_m, turn @ grid.column_step_m, grid.shape
     )
-    image = backproject(there, grid_there, device=device, **FINE)
-    assert relative_error_db(image, backproject(lines, grid, device=device, **FINE)) <= -80
+    image = backproject(there, grid_there, device=platform, **FINE)
+    assert relative_error_db(image, backproject(lines, grid, device=platform, **FINE)) <= -80
 
 
-def test_transmitter_and_receiver_may_be_exchanged(device):
+def test_transmitter_and_receiver_may_be_exchanged(platform):
     lines, grid = made(bistatic)
     exchanged = dataclasses.replace(lines, tx_m=lines.rx_m, rx_m=lines.tx_m)
-    one, other = (backproject(each, grid, device=device, **FINE) for each in (lines, exchanged))
+    one, other = (backproject(each, grid, device=platform, **FINE) for each in (lines, exchanged))
     assert relative_error_db(other, one) <= -100
 
 
 @pytest.mark.parametrize("case", [bistatic, height_map], ids=lambda case: case.__name__)
-def test_a_receiver_that_stands_still_may_be_called_moving(case, device):
+def test_a_receiver_that_stands_still_may_be_called_moving(case, platform):
     lines, grid = made(case)
     still = dataclasses.replace(lines, rx_velocity_m_s=[0.0, 0, 0])
-    image = backproject(still, grid, device=device, **FINE)
-    assert relative_error_db(image, backproject(lines, grid, device=device, **FINE)) <= -100
+    image = backproject(still, grid, device=platform, **FINE)
+    assert relative_error_db(image, backproject(lines, grid, device=platform, **FINE)) <= -100
 
 
 def similar_lines(grid):
@@ -287,56 +285,56 @@ def similar_lines(grid):
 
 
 @pytest.mark.parametrize("case", ["plane", "heights"])
-def test_parts_add_up_to_the_whole(device, case):
+def test_parts_add_up_to_the_whole(platform, case):
     grid = patch(1.3, 42)
     if case == "heights":
         grid = grid.with_height(np.full(grid.shape, 0.25))
     lines = similar_lines(grid)
     image = None
     for part in (slice(0, 7), slice(7, 300), slice(300, 640)):
-        image = backproject(lines.select(part), grid, device=device, accumulate=image, **FINE)
-    whole = backproject(lines, grid, device=device, **FINE)
+        image = backproject(lines.select(part), grid, device=platform, accumulate=image, **FINE)
+    whole = backproject(lines, grid, device=platform, **FINE)
     assert relative_error_db(image, whole) <= -120
 
 
-def test_accumulation_leaves_its_argument_alone(device):
+def test_accumulation_leaves_its_argument_alone(platform):
     grid = patch(1.3, 42, 5, 3)
     lines = thesis_lines(grid, APERTURE[::64])
     before = Image(np.full((3, 5), 1 + 2j), patch(1.3, 42, 5, 3))  # an equal grid, not the same
-    image = backproject(lines, grid, device=device, accumulate=before)
-    alone = backproject(lines, grid, device=device)
+    image = backproject(lines, grid, device=platform, accumulate=before)
+    alone = backproject(lines, grid, device=platform)
     np.testing.assert_array_equal(before.pixels, np.full((3, 5), 1 + 2j))
     np.testing.assert_array_equal(image.pixels, before.pixels + alone.pixels)
 
 
-def test_the_order_of_channels_does_not_matter(device):
+def test_the_order_of_channels_does_not_matter(platform):
     lines, grid = made(own_starts)
     lines = lines.select(slice(0, 200))
     order = np.random.default_rng(6).permutation(200)
-    image = backproject(lines.select(order), grid, device=device, **FINE)
-    assert relative_error_db(image, backproject(lines, grid, device=device, **FINE)) <= -110
+    image = backproject(lines.select(order), grid, device=platform, **FINE)
+    assert relative_error_db(image, backproject(lines, grid, device=platform, **FINE)) <= -110
 
 
-def test_it_is_linear(device):
-    one, grid = made(thesis)
+def test_it_is_linear(platform):
+    one, grid = made(own_starts)
     other = dataclasses.replace(one, samples=noise(one.channels, one.length, seed=9))
     a, b = 0.3 - 2j, 1.5j
     both = dataclasses.replace(one, samples=a * one.samples + b * other.samples)
     image, of_one, of_other = (
-        backproject(lines, grid, device=device, **FINE).pixels for lines in (both, one, other)
+        backproject(lines, grid, device=platform, **FINE).pixels for lines in (both, one, other)
     )
     assert relative_error_db(image, a * of_one + b * of_other) <= -90
 
 
-def test_it_gives_the_same_twice(device):
-    first, second = (backproject(*made(bistatic), device=device).pixels for _ in range(2))
+def test_it_gives_the_same_twice(platform):
+    first, second = (backproject(*made(bistatic), device=platform).pixels for _ in range(2))
     np.testing.assert_array_equal(first, second)
 
 
-def test_part_of_a_grid_is_part_of_the_image(device):
+def test_part_of_a_grid_is_part_of_the_image(platform):
     lines, grid = made(bistatic)
-    whole = backproject(lines, grid, device=device, **FINE).pixels[5:30, 3:20]
-    part = backproject(lines, grid.window(slice(5, 30), slice(3, 20)), device=device, **FINE)
+    whole = backproject(lines, grid, device=platform, **FINE).pixels[5:30, 3:20]
+    part = backproject(lines, grid.window(slice(5, 30), slice(3, 20)), device=platform, **FINE)
     assert relative_error_db(part, whole) <= -80
 
 
@@ -344,9 +342,9 @@ def test_part_of_a_grid_is_part_of_the_image(device):
 
 
 @pytest.mark.parametrize("case", [bistatic, points], ids=lambda case: case.__name__)
-def test_progress_rises_to_its_end(device, case):
+def test_progress_rises_to_its_end(platform, case):
     calls = []
-    backproject(*made(case), device=device, progress=lambda *call: calls.append(call))
+    backproject(*made(case), device=platform, progress=lambda *call: calls.append(call))
     done, total = np.array(calls).T
     assert len(calls) >= 2
     assert np.all(np.diff(done) > 0)
@@ -354,13 +352,13 @@ def test_progress_rises_to_its_end(device, case):
     assert done[-1] == total[0]
 
 
-def test_an_interrupted_run_leaves_the_device_usable(device):
+def test_an_interrupted_run_leaves_the_device_usable(platform):
     def interrupt(done, total):
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        backproject(*made(bistatic), device=device, progress=interrupt)
-    assert rounding_error_db(bistatic, device) <= -80
+        backproject(*made(bistatic), device=platform, progress=interrupt)
+    assert rounding_error_db(bistatic, platform) <= -80
 
 
 # Bad input
@@ -423,12 +421,12 @@ def test_a_wrong_grid_is_named_also_beside_an_image(good):
 
 @pytest.mark.parametrize("kind", ["plane", "points"])
 @pytest.mark.parametrize("y", [4.0, 400.0, -4000.0])
-def test_a_grid_that_no_line_reaches_warns_and_is_zero(good, device, y, kind):
+def test_a_grid_that_no_line_reaches_warns_and_is_zero(good, platform, y, kind):
     grid = patch(1.3, y, 9, 7)
     if kind == "points":
         grid = Grid.points(grid.positions_m())
     with pytest.warns(ClsasWarning, match=r"span 41\.\d+ to 4\d\.\d+ m, the grid lies at .*\d m"):
-        image = backproject(good["lines"], grid, device=device)
+        image = backproject(good["lines"], grid, device=platform)
     assert not image.pixels.any()
 
 
@@ -439,25 +437,25 @@ def test_the_warning_points_at_the_caller(good):
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (4, 4)])
-def test_a_small_grid_just_short_of_a_line_warns_too(device, shape):
+def test_a_small_grid_just_short_of_a_line_warns_too(platform, shape):
     """What a tile holds beyond the grid's own pixels does not count."""
     grid = Grid.oriented([0, 42, 0], [0, 0.01, 0], [0.01, 0, 0], shape)
     lines = RangeLines(noise(1, 500), 42.08, STEP, [0, 0, 0], [0, 0, 0], CARRIER, 1500.0)
     with pytest.warns(ClsasWarning, match="no pixel"):
-        image = backproject(lines, grid, device=device)
+        image = backproject(lines, grid, device=platform)
     assert not image.pixels.any()
 
 
-def test_lines_of_zeros_give_zeros_without_a_warning(good, device):
+def test_lines_of_zeros_give_zeros_without_a_warning(good, platform):
     lines = dataclasses.replace(good["lines"], samples=np.zeros_like(good["lines"].samples))
-    assert not backproject(lines, good["grid"], device=device).pixels.any()
+    assert not backproject(lines, good["grid"], device=platform).pixels.any()
 
 
-def test_one_sample_is_a_line(device):
+def test_one_sample_is_a_line(platform):
     """The shortest line: a pulse as wide as a sample."""
     grid = Grid.points([[0, 42, 0], [0, 42 + 4 * STEP, 0]])
     lines = RangeLines([[2 - 1j]], 42.0, STEP, [0, 0, 0], [0, 0, 0], CARRIER, 1500.0)
-    pixels = backproject(lines, grid, device=device, taps=8, upsampling=8).pixels
+    pixels = backproject(lines, grid, device=platform, taps=8, upsampling=8).pixels
     phase = np.exp(2j * lines.wavenumber_rad_m * 42.0)
     assert pixels[0] == pytest.approx((2 - 1j) * phase, abs=2e-3)
     assert pixels[1] == 0

@@ -244,7 +244,10 @@ def test_bad_track_files(tmp_path, text, message):
             "preset must stand alone, got also spacing",
         ),
         ("[sonar]\nreceivers = 3", "missing table [sonar.pulse], or key 'preset'"),
-        (f"[sonar]\nreceivers = 3\n{SONAR[SONAR.index('[sonar.p') :]}", "receivers and spacing_m"),
+        (
+            f"[sonar]\nreceivers = 3\n{SONAR[SONAR.index('[sonar.p') :]}",
+            "by receivers and spacing_m, or rx_m",
+        ),
         (SONAR.replace("[0.1, 0, 0]", "[0.1, 0]"), "[sonar] rx_m[1] must be a list of 3, got"),
         ("[track]\npings = 3", "[track] missing key 'start_m' (or 'file')"),
         (TRACK.replace("400", "2.5"), "[track] pings must be a whole number, got 2.5"),

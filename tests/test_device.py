@@ -1,0 +1,222 @@
+import dataclasses
+import re
+from pathlib import Path
+
+import numpy as np
+import pyopencl as cl
+import pytest
+
+from clsas import device as module
+from clsas.device import (
+    ENVIRONMENT_VARIABLE,
+    DeviceError,
+    choose,
+    kernel_source,
+    list_devices,
+    open_device,
+)
+
+FOLDERS = (Path(module.__file__).parent / "cl", Path(module.__file__).parents[1] / "cl")
+SOURCES = sorted(path.name for folder in FOLDERS for path in folder.glob("*.*"))
+OPTIONS = {"WIDTH": 1, "TAPS": 4, "TILE": 16, "PERMUTE": 0, "BISTATIC": 0, "MOVING": 0}
+
+
+@pytest.fixture(autouse=True)
+def no_wish(monkeypatch):
+    monkeypatch.delenv(ENVIRONMENT_VARIABLE, raising=False)
+
+
+@pytest.fixture
+def nothing(monkeypatch):
+    """A machine without any device."""
+    monkeypatch.setattr(module, "_raw_devices", list)
+
+
+def test_every_device_is_described():
+    devices = list_devices()
+    assert [info.index for info in devices] == list(range(len(devices)))
+    for info in devices:
+        assert info.label == f"{info.platform}: {info.name}"
+        assert info.kind in ("gpu", "cpu", "accelerator")
+        assert info.width in ((1, 4, 8, 16) if info.kind == "cpu" else (1,))
+        assert not info.permute or info.width == 16
+        assert info.driver
+        assert info.compute_units >= 1
+        assert 0 < info.max_buffer_bytes <= info.memory_bytes
+
+
+def test_it_agrees_with_opencl():
+    raw = [device for platform in cl.get_platforms() for device in platform.get_devices()]
+    for info, device in zip(list_devices(), raw, strict=True):
+        assert info.name == device.name.strip()
+        assert info.platform == device.platform.name
+        assert info.memory_bytes > 0.1 * device.global_mem_size  # PoCL's follows what is free
+
+
+def test_chosen_by_index():
+    for info in list_devices():
+        for wish in (info.index, str(info.index)):
+            chosen, why = choose(wish)
+            assert chosen.index == info.index
+            assert why == f"asked for as {info.index}"
+
+
+def test_chosen_by_a_part_of_its_name():
+    devices = list_devices()
+    for info in devices:
+        first = next(each for each in devices if each.platform == info.platform)
+        for wish in (info.platform, info.platform.upper(), info.platform[1:].lower()):
+            assert choose(wish)[0].index == first.index
+
+
+def test_chosen_by_the_environment(monkeypatch):
+    info = list_devices()[-1]
+    monkeypatch.setenv(ENVIRONMENT_VARIABLE, str(info.index))
+    chosen, why = choose()
+    assert chosen.index == info.index
+    assert ENVIRONMENT_VARIABLE in why
+
+
+def test_a_wish_goes_before_the_environment(monkeypatch):
+    monkeypatch.setenv(ENVIRONMENT_VARIABLE, "nothing like it")
+    assert choose(0)[0].index == 0
+    with pytest.raises(DeviceError, match=f"'nothing like it'.*{ENVIRONMENT_VARIABLE}"):
+        choose()
+
+
+def test_gpus_go_before_cpus(monkeypatch):
+    info = list_devices()[0]
+    kinds = ("accelerator", "cpu", "gpu", "gpu")
+    several = [dataclasses.replace(info, index=i, kind=kind) for i, kind in enumerate(kinds)]
+    monkeypatch.setattr(module, "list_devices", lambda: several)
+    chosen, why = choose()
+    assert (chosen.index, why) == (2, "the first GPU")
+    monkeypatch.setattr(module, "list_devices", lambda: several[:2])
+    chosen, why = choose()
+    assert (chosen.index, why) == (1, "the first CPU; there is no GPU")
+
+
+@pytest.mark.parametrize("wish", ["no such device", 99, "99", -1, "-1"])
+def test_an_unknown_device_names_those_there_are(wish):
+    with pytest.raises(DeviceError) as error:
+        choose(wish)
+    assert repr(wish).strip("'") in str(error.value)
+    for info in list_devices():
+        assert f"{info.index} = {info.label}" in str(error.value)
+
+
+@pytest.mark.parametrize("wish", [1.0, True, ["0"], b"0"])
+def test_a_wish_of_a_wrong_type_is_refused(wish):
+    with pytest.raises(TypeError, match=re.escape(f"a name, an index or None, got {wish!r}")):
+        choose(wish)
+
+
+def test_an_index_may_come_from_numpy():
+    assert choose(np.int64(0))[0].index == 0
+
+
+@pytest.mark.parametrize("wish", [None, 0, "portable"])
+def test_no_device_at_all_says_how_to_get_one(nothing, wish):
+    assert list_devices() == []
+    with pytest.raises(DeviceError) as error:
+        open_device(wish)
+    for part in ("No OpenCL device", 'pip install "clsas[pocl]"', "/etc/OpenCL/vendors", ".libs"):
+        assert part in str(error.value)
+
+
+def test_a_loader_without_a_driver_is_no_device(monkeypatch):
+    def fail():
+        raise cl.LogicError("clGetPlatformIDs failed: PLATFORM_NOT_FOUND_KHR")
+
+    monkeypatch.setattr(cl, "get_platforms", fail)
+    assert list_devices() == []
+
+
+def test_a_platform_without_a_device_is_passed_over(monkeypatch):
+    class Empty:
+        def get_devices(self):
+            raise cl.RuntimeError("clGetDeviceIDs failed: DEVICE_NOT_FOUND")
+
+    platforms = cl.get_platforms()
+    names = [info.label for info in list_devices()]
+    monkeypatch.setattr(cl, "get_platforms", lambda: [Empty(), *platforms])
+    assert [info.label for info in list_devices()] == names
+
+
+def test_opened_once():
+    device = open_device(0)
+    assert open_device("0") is device
+    assert open_device(device) is device
+    assert open_device(device.info.platform).info.platform == device.info.platform
+
+
+def test_kernels_are_built_once(platform):
+    kernel = platform.kernel("backproject", "backproject_tiles", **OPTIONS)
+    assert platform.kernel("backproject", "backproject_tiles", **OPTIONS) is kernel
+    reordered = dict(reversed(OPTIONS.items()))
+    assert platform.kernel("backproject", "backproject_tiles", **reordered) is kernel
+    other = platform.kernel("backproject", "backproject_tiles", **(OPTIONS | {"TAPS": 2}))
+    assert other is not kernel
+
+
+def test_a_program_is_built_once_for_all_its_kernels(platform, monkeypatch):
+    options = OPTIONS | {"TAPS": 6}
+    platform.kernel("backproject", "backproject_tiles", **options)
+    monkeypatch.setattr(cl, "Program", None)  # nothing more may be built
+    assert platform.kernel("backproject", "expand_tiles", **options)
+    assert platform.kernel("backproject", "backproject_points", **options)
+
+
+def test_a_failed_build_shows_the_compilers_log(platform, monkeypatch):
+    broken = "__kernel void broken(__global float *x) { x[0] = no_such_variable; }"
+    monkeypatch.setattr(module, "kernel_source", lambda name: broken * name.endswith(".cl"))
+    with pytest.raises(DeviceError) as error:
+        platform.kernel("some_file", "broken", WIDTH=1)
+    message = str(error.value)
+    assert "no_such_variable" in message
+    assert "some_file.cl" in message
+    assert "-DWIDTH=1" in message
+    assert platform.info.label in message
+
+
+def test_the_vector_widths_give_their_values(device):
+    """Uploads, a build and a run: the smallest job, through the header all kernels share."""
+    width = device.info.width
+    source = (
+        kernel_source("common.h")
+        + """
+        __kernel void turn(__global const float *t, __global float *sine, __global float *cosine)
+        {
+            const int i = get_global_id(0) * WIDTH;
+            vfloat s, c;
+            sincos_cycles(LOAD(t + i), &s, &c);
+            STORE(s, sine + i);
+            STORE(c, cosine + i);
+        }"""
+    )
+    program = cl.Program(device.context, source).build([f"-DWIDTH={width}"])
+    rng = np.random.default_rng(1)
+    t = np.concatenate([rng.uniform(-0.5, 0.5, 3000), rng.uniform(-3e3, 3e3, 1000), np.zeros(96)])
+    t = t.astype(np.float32)
+    t[-9:] = np.arange(-4, 5) / 4
+    sine, cosine = np.empty_like(t), np.empty_like(t)
+    buffers = [device.upload(t), device.buffer(t.nbytes), device.buffer(t.nbytes)]
+    device.run(cl.Kernel(program, "turn"), (len(t) // width,), *buffers)
+    cl.enqueue_copy(device.queue, sine, buffers[1])
+    cl.enqueue_copy(device.queue, cosine, buffers[2])
+    angle = 2 * np.pi * t.astype(np.float64)
+    assert np.abs(sine - np.sin(angle)).max() <= 2e-6
+    assert np.abs(cosine - np.cos(angle)).max() <= 2e-6
+
+
+def test_the_sources_are_found():
+    assert {"common.h", "backproject.cl"} <= set(SOURCES)
+
+
+@pytest.mark.parametrize("name", SOURCES)
+def test_no_kernel_needs_double_precision(name):
+    code = re.sub(r"/\*.*?\*/|//[^\n]*", "", kernel_source(name), flags=re.DOTALL)
+    assert "__kernel" in code or "vfloat" in code
+    assert not re.search(r"\b(double\d*|cl_khr_fp64|as_double\d*|convert_double\d*)\b", code)
+    # A literal without its f is a double.
+    assert not re.findall(r"(?<![\w.])(?:\d+\.\d*|\.\d+|\d+[eE])(?:[eE]?[+-]?\d+)?(?![\w.])", code)
