@@ -21,8 +21,11 @@
  *   samples    float, each line with `pitch` samples including its zero margins: WIDTH > 1 a plane
  *              of real parts, then one of imaginary parts, [channels][2][pitch]; WIDTH == 1
  *              interleaved [channels][pitch][2].
- *   geometry   float [9][channel_pitch]: transmitter x y z, receiver x y z (m, from the grid's
- *              origin), receiver velocity x y z over sound speed. Rows that no option uses are absent.
+ *   geometry   float [15][channel_pitch]: transmitter x y z and what float32 leaves of them, the
+ *              receiver's likewise (m, from the grid's origin), receiver velocity x y z over sound
+ *              speed. Rows that no option uses are absent.
+ *   centres    float [parts][6]: of tiles or groups, x y z and what float32 leaves of them (m, from
+ *              the grid's origin). With the pairs a short distance between far points is exact.
  *   reference  per (tile, channel): nearest sample (int, counted from the line's first margin
  *              sample), the fraction to the tile centre's range (samples) and phase (cycles in
  *              [-0.5, 0.5]), each [tiles][channel_pitch].
@@ -160,10 +163,15 @@ INLINE void add_to_image(const vfloat *re, const vfloat *im, __global float2 *pi
 
 /* Rows of `geometry`. */
 #define TX 0
-#define RX 3
-#define VELOCITY 6
+#define RX 6
+#define VELOCITY 12
 #define ROW(first, axis) geometry[((first) + (axis)) * channel_pitch + channel]
 #define ROWS(first, axis) LOAD(geometry + ((first) + (axis)) * channel_pitch + channel)
+/* Component of the vector from an antenna to a centre, for one channel and for WIDTH of them. */
+#define FROM(first, axis)                                                                          \
+    ((centre[axis] - ROW(first, axis)) + (centre[(axis) + 3] - ROW(first, (axis) + 3)))
+#define FROMS(first, axis)                                                                         \
+    ((centre[axis] - ROWS(first, axis)) + (centre[(axis) + 3] - ROWS(first, (axis) + 3)))
 
 /* Expands every channel's range about every tile's centre to third order in pixels (i along columns,
  * j along rows), WIDTH channels per work-item:
@@ -177,8 +185,7 @@ INLINE void add_to_image(const vfloat *re, const vfloat *im, __global float2 *pi
  *     d2p  = (dx'P_t dx / R_t + dy'P_r dy / R_r) / (1 + e_r.b),   dy = dx - b dp,   P = 1 - e e',
  *     d3|D| = -3 (e.dx) (dx'P dx) / R^2, where b is left out: its share is |b| of the smallest term.
  *
- * Global size (channel_pitch / WIDTH, tiles). centres: float [tiles][3], m from the grid's origin;
- * step_column, step_row: m per pixel; samples_per_m: samples per metre of range (half a path).
+ * Global size (channel_pitch / WIDTH, tiles). step_column, step_row: m per pixel; samples_per_m: samples per metre of range (half a path).
  * expansion: float [tiles][TERMS][channel_pitch]: g0, g1, h0, h1, h2, k0, k1, k2, k3. */
 #define TERMS 9
 
@@ -211,12 +218,12 @@ __kernel void expand_tiles(__global const float *geometry, int channel_pitch,
 {
     const int channel = get_global_id(0) * WIDTH;
     const int tile = get_global_id(1);
-    __global const float *centre = centres + 3 * tile;
+    __global const float *centre = centres + 6 * tile;
 
-    const vfloat tx = centre[0] - ROWS(TX, 0), ty = centre[1] - ROWS(TX, 1), tz = centre[2] - ROWS(TX, 2);
+    const vfloat tx = FROMS(TX, 0), ty = FROMS(TX, 1), tz = FROMS(TX, 2);
     const Derivatives t = distance_derivatives(tx, ty, tz, step_column, step_row);
 #if BISTATIC
-    vfloat rx = centre[0] - ROWS(RX, 0), ry = centre[1] - ROWS(RX, 1), rz = centre[2] - ROWS(RX, 2);
+    vfloat rx = FROMS(RX, 0), ry = FROMS(RX, 1), rz = FROMS(RX, 2);
 #if MOVING
     const vfloat bx = ROWS(VELOCITY, 0), by = ROWS(VELOCITY, 1), bz = ROWS(VELOCITY, 2);
     const vfloat out = sqrt(tx * tx + ty * ty + tz * tz);
@@ -344,12 +351,12 @@ __kernel void backproject_tiles(__global const float *samples, int pitch,
                  ((first_tile + tile) % tiles_across) * TILE + block_column);
 }
 
-/* Distance |D + d| - |D| without cancellation. */
+/* Distance |D + d| - |D| without cancellation; 0 where D and d are 0. */
 INLINE vfloat distance_change(float x, float y, float z, vfloat dx, vfloat dy, vfloat dz)
 {
     const float square = x * x + y * y + z * z;
     const vfloat change = dx * (2.0f * x + dx) + dy * (2.0f * y + dy) + dz * (2.0f * z + dz);
-    return change / (sqrt(change + square) + sqrt(square));
+    return change / (sqrt(max(change + square, 0.0f)) + sqrt(square) + FLT_MIN);
 }
 
 /* Any pixels: groups of WIDTH * STACK points near a common centre, whose range differences to the centre
@@ -371,8 +378,7 @@ __kernel void backproject_points(__global const float *samples, int pitch,
     reference_fraction += first;
     reference_phase += first;
     offsets += (size_t)group * STACK * WIDTH;
-    const float centre_x = centres[3 * group], centre_y = centres[3 * group + 1],
-                centre_z = centres[3 * group + 2];
+    __global const float *centre = centres + 6 * group;
 
     vfloat re[STACK], im[STACK];
 #pragma unroll
@@ -380,9 +386,9 @@ __kernel void backproject_points(__global const float *samples, int pitch,
         re[block] = im[block] = 0.0f;
 
     for (int channel = 0; channel < channels; channel++) {
-        const float tx = centre_x - ROW(TX, 0), ty = centre_y - ROW(TX, 1), tz = centre_z - ROW(TX, 2);
+        const float tx = FROM(TX, 0), ty = FROM(TX, 1), tz = FROM(TX, 2);
 #if BISTATIC
-        float rx = centre_x - ROW(RX, 0), ry = centre_y - ROW(RX, 1), rz = centre_z - ROW(RX, 2);
+        float rx = FROM(RX, 0), ry = FROM(RX, 1), rz = FROM(RX, 2);
 #if MOVING
         /* Where the receiver is when the centre's echo arrives. */
         const float bx = ROW(VELOCITY, 0), by = ROW(VELOCITY, 1), bz = ROW(VELOCITY, 2);

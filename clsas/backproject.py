@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import math
-import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
@@ -27,7 +26,7 @@ BEST_ACCURACY_DB = -85.0
 _WINDOW = 32  # samples that the permuting lookup holds in registers
 _LARGEST_DISTANCE_M = 1e9
 _CHANNELS_AT_ONCE = 512  # bounds a float32 partial sum; lines that stay in a CPU's cache
-_REFERENCES_AT_ONCE = 1 << 20  # (part, channel) pairs: 50 MB on the device
+_PART_BYTES = 64 << 20  # device memory for one set of parts: a job of some tenths of a second
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,17 +107,18 @@ def backproject(
     Notes
     -----
     I(x) = sum_i s_i(rho_i(x)) exp(+j 2 k rho_i(x)), with rho half the path from transmitter to
-    pixel to receiver and k = 2 pi carrier/c. Beyond the ends of a line (by more than half an
-    interpolation filter) a pixel gets nothing from it.
+    pixel to receiver and k = 2 pi carrier/c. The lines are taken as band-limited about their
+    spectral centre and as zero beyond their ends: a pixel outside a line's range (by more than
+    the taps of one interpolation) gets nothing from it.
 
     Ranges and phases are referred in float64 to centres near the pixels; the device sees float32
     differences only.
     """
-    if accumulate is not None:
-        _check_same_grid(accumulate, grid)
     preparation = prepare(
         lines, grid, device=device, accuracy_db=accuracy_db, taps=taps, upsampling=upsampling
     )
+    if accumulate is not None:
+        _check_same_grid(accumulate, grid)
     image = execute(preparation, progress=progress)
     if accumulate is None:
         return image
@@ -142,15 +142,20 @@ def prepare(
     )
     device = open_device(device)
     spectrum = interpolation.measure_spectrum(lines)
-    cycles_per_m = _carrier_cycles_per_m(lines) + spectrum.centre / lines.range_step_m
+    # What rounding a range costs: phase, and place within the lines' band, 0.3 Nyquist rms.
+    cycles_per_m = math.hypot(
+        _carrier_cycles_per_m(lines) + spectrum.centre / lines.range_step_m,
+        0.3 / lines.range_step_m,
+    )
     antennas_m = np.unique(np.concatenate([lines.tx_m, lines.rx_m]), axis=0)
-    layout = lay_out(grid, antennas_m, abs(cycles_per_m), device.info.width)
+    layout = lay_out(grid, antennas_m, cycles_per_m, device.info.width)
     _check_distances(antennas_m, layout)
     interpolator = interpolation.choose(
         spectrum,
-        10 * math.log10(10 ** (accuracy_db / 10) - GEOMETRY_ERROR**2),
+        accuracy_db,
         taps=taps,
         upsampling=upsampling,
+        other_error=GEOMETRY_ERROR,
         most_upsampling=_room(max(interpolation.TAPS))
         * lines.range_step_m
         / max(layout.block_radius_m, 1e-30),
@@ -167,6 +172,8 @@ def execute(
     The image is formed in bands that fit the device, each from blocks of channels, each block in
     jobs of so many (part, channel) pairs; a job is prepared on the host while the one before runs.
     """
+    if not (progress is None or callable(progress)):
+        raise TypeError(f"progress must be a function or None, got {progress!r}")
     p = preparation
     layout, device = p.layout, p.device
     pixels = np.empty(layout.parts * layout.part_pixels, np.complex64)
@@ -175,14 +182,15 @@ def execute(
         for band in _slices(slice(0, layout.parts), _band_parts(p)):
             part = slice(band.start * layout.part_pixels, band.stop * layout.part_pixels)
             on_device = device.zeros(pixels[part].nbytes)
-            for channels in _slices(slice(0, p.lines.channels), _CHANNELS_AT_ONCE):
+            for channels in _slices(slice(0, p.lines.channels), run.channels_at_once):
                 run.add(channels, band, on_device)
             cl.enqueue_copy(device.queue, pixels[part], on_device)
     finally:
         device.finish()  # an interrupted run leaves nothing in use
-    if not pixels.any() and p.lines.samples.any():
+    image = Image(layout.collect(pixels), p.grid)
+    if not image.pixels.any() and p.lines.samples.any():
         _warn_unseen(p)
-    return Image(layout.collect(pixels), p.grid)
+    return image
 
 
 class _Run:
@@ -218,6 +226,20 @@ class _Run:
         self.kernel = device.kernel("backproject", name, **options)
         self.expand = device.kernel("backproject", "expand_tiles", **options)
 
+        # Device memory: an eighth for either set of lines, a sixteenth for either of references.
+        line_bytes = 8 * self.pitch
+        part_bytes = 52 * _CHANNELS_AT_ONCE if self.tiled else 16 * _CHANNELS_AT_ONCE
+        part_bytes += 12 * layout.part_pixels
+        most = device.info.max_buffer_bytes
+        room = min(most, device.info.memory_bytes // 8)
+        if line_bytes > most:
+            raise ValueError(
+                f"lines of {p.lines.length} samples need {line_bytes / 2**20:.0f} MiB each when "
+                f"upsampled, more than a buffer of {device.info.label}, {most / 2**20:.0f} MiB"
+            )
+        self.channels_at_once = min(_CHANNELS_AT_ONCE, max(room // line_bytes, 1))
+        self.parts_at_once = max(min(_PART_BYTES, room // 2) // part_bytes, 1)
+
         # While one set of buffers is in use on the device, the other is filled.
         self.line_slots = itertools.cycle([Slot(device), Slot(device)])
         self.part_slots = itertools.cycle([Slot(device), Slot(device)])
@@ -232,11 +254,11 @@ class _Run:
         line_slot.wait()
         line_slot.fill("samples", self._samples(lines))
         line_slot.fill("geometry", self._geometry(lines))
-        for parts in _slices(band, max(_REFERENCES_AT_ONCE // lines.channels, 1)):
+        for parts in _slices(band, self.parts_at_once):
             slot = next(self.part_slots)
             slot.wait()
             centres_m = self.p.layout.centres_m(parts)
-            slot.fill("centres", (centres_m - self.origin_m).astype(np.float32))
+            slot.fill("centres", _float_pairs(centres_m - self.origin_m))
             for name, values in self._references(centres_m, lines).items():
                 slot.fill(name, values)
             ready = line_slot.filled + slot.filled
@@ -348,12 +370,12 @@ class _Run:
 
     def _geometry(self, lines: RangeLines) -> NDArray[np.float32]:
         """Return positions about the origin and velocities over sound speed, [rows, channels]."""
-        rows = [lines.tx_m - self.origin_m]
+        rows = [_float_pairs(lines.tx_m - self.origin_m)]
         if self.bistatic:
-            rows.append(lines.rx_m - self.origin_m)
+            rows.append(_float_pairs(lines.rx_m - self.origin_m))
         if self.moving:
-            rows.append(lines.rx_velocity_m_s / lines.sound_speed_m_s)
-        geometry = np.concatenate(rows, axis=1).T.astype(np.float32)
+            rows.append((lines.rx_velocity_m_s / lines.sound_speed_m_s).astype(np.float32))
+        geometry = np.concatenate(rows, axis=1).T
         return np.pad(geometry, ((0, 0), (0, _channel_pitch(lines) - lines.channels)), mode="edge")
 
     def _references(self, centres_m: NDArray[np.float64], lines: RangeLines) -> dict[str, NDArray]:
@@ -391,6 +413,12 @@ class _Run:
         self.done += pairs
         if self.progress is not None:
             self.progress(self.done, self.p.layout.parts * self.p.lines.channels)
+
+
+def _float_pairs(positions_m: NDArray[np.float64]) -> NDArray[np.float32]:
+    """Return float32 [n, 6]: positions [n, 3] as nearest float32 numbers, and what these leave."""
+    nearest = positions_m.astype(np.float32)
+    return np.concatenate([nearest, (positions_m - nearest).astype(np.float32)], axis=1)
 
 
 def _room(taps: int) -> float:
@@ -453,10 +481,8 @@ def _warn_unseen(p: Preparation) -> None:
         some.rx_velocity_m_s,
         some.sound_speed_m_s,
     )
-    warnings.warn(
+    validate.warn(
         f"no pixel of the grid lies within any line's range, so the image is zero: the lines span "
         f"{lines.first_range_m.min():.6g} to {lines.last_range_m.max():.6g} m, the grid lies at "
-        f"{range_m.min():.6g} to {range_m.max():.6g} m",
-        validate.ClsasWarning,
-        stacklevel=3,
+        f"{range_m.min():.6g} to {range_m.max():.6g} m"
     )

@@ -294,7 +294,8 @@ def choose(wish: str | int | None = None) -> tuple[DeviceInfo, str]:
     ----------
     wish : str or int, optional
         An index of `list_devices()`, or a part of "platform: name" in any case. None takes the
-        environment variable CLSAS_DEVICE, and without it the first GPU, then the first CPU.
+        environment variable CLSAS_DEVICE, and without it the first GPU, then the first CPU, one
+        with the fast lookup in registers before others.
 
     Raises
     ------
@@ -311,17 +312,20 @@ def choose(wish: str | int | None = None) -> tuple[DeviceInfo, str]:
         source = f"asked for by {ENVIRONMENT_VARIABLE}"
     if wish is None:
         order = ("gpu", "cpu", "accelerator")
-        chosen = min(devices, key=lambda info: (order.index(info.kind), info.index))
-        reason = f"the first {chosen.kind.upper()}" + (
-            "" if chosen.kind == "gpu" else "; there is no GPU"
+        chosen = min(
+            devices, key=lambda info: (order.index(info.kind), not info.permute, info.index)
         )
-        return chosen, reason
+        if chosen.kind == "gpu":
+            return chosen, "the first GPU"
+        fast = ", with the fast lookup in registers" if chosen.permute else ""
+        return chosen, f"the first {chosen.kind.upper()}{fast}; there is no GPU"
     if isinstance(wish, str) and wish.strip().lstrip("-").isdigit():
         wish = int(wish)
-    if isinstance(wish, int) and not isinstance(wish, bool):
+    if isinstance(wish, (int, np.integer)) and not isinstance(wish, bool):
         fitting = [info for info in devices if info.index == wish]
     elif isinstance(wish, str):
-        fitting = [info for info in devices if wish.lower() in info.label.lower()]
+        part = wish.strip().lower()
+        fitting = [info for info in devices if part and part in info.label.lower()]
     else:
         raise TypeError(f"device must be a name, an index or None, got {wish!r}")
     if not fitting:

@@ -79,9 +79,12 @@ def measure_spectrum(lines: RangeLines, most_channels: int = 256) -> Spectrum:
     samples = lines.samples[:: -(-lines.channels // most_channels)]
     length = scipy.fft.next_fast_len(2 * lines.length)
     power = np.zeros(length)
+    largest = np.abs(samples).max() or 1.0  # whose square might leave the range of float32
     for block in np.array_split(samples, -(-len(samples) // 64)):
         # float32 FFTs leave a floor near -140 dB, below any filter designed here.
-        power += np.sum(np.abs(scipy.fft.fft(block, length)) ** 2, axis=0, dtype=np.float64)
+        power += np.sum(
+            np.abs(scipy.fft.fft(block / largest, length)) ** 2, axis=0, dtype=np.float64
+        )
     frequency = scipy.fft.fftfreq(length)
     if not power.any():
         power[:] = 1.0
@@ -146,9 +149,12 @@ def choose(
     *,
     taps: int | None = None,
     upsampling: float | None = None,
+    other_error: float = 0.0,
     most_upsampling: float = np.inf,
 ) -> Interpolator:
-    """Return the cheapest interpolator whose predicted error is at most `accuracy_db`.
+    """Return the cheapest interpolator that keeps the error below `accuracy_db`.
+
+    Half a decibel is left for the scatter of measured errors about the predicted one.
 
     Parameters
     ----------
@@ -158,6 +164,8 @@ def choose(
         Wanted relative rms error, dB, negative.
     taps, upsampling : int, float, optional
         Fix one or both; with both, `accuracy_db` plays no part.
+    other_error : float
+        Relative rms error that comes from elsewhere and adds in power.
     most_upsampling : float
         Prefer not to upsample beyond this (where the device's fast lookup ends).
 
@@ -167,18 +175,20 @@ def choose(
         If `taps` is not one of 2, 4, 6, 8, `upsampling` is below 1, or the fixed one cannot reach
         `accuracy_db`.
     """
-    if taps is not None and taps not in TAPS:
+    if taps is not None and not (isinstance(taps, (int, np.integer)) and taps in TAPS):
         raise ValueError(f"taps must be one of {TAPS}, got {taps!r}")
     if upsampling is not None:
         upsampling = validate.number("upsampling", upsampling, least=1.0, most=64.0)
     if taps is not None and upsampling is not None:
         return design(taps, upsampling, spectrum)
+    power_left = 10 ** (accuracy_db / 10) - other_error**2
+    target_db = 10 * np.log10(max(power_left, 1e-30)) - 0.5
     rates: Sequence[float] = UPSAMPLINGS if upsampling is None else (upsampling,)
     candidates = []
     for each_taps in TAPS if taps is None else (taps,):
         for rate in rates:
             found = design(each_taps, rate, spectrum)
-            if found.error_db <= accuracy_db:
+            if found.error_db <= target_db:
                 candidates.append(found)
                 break
     if not candidates:

@@ -450,7 +450,7 @@ def _in_threads(function: Callable, count: int, workers: int | None) -> Iterator
     """Yield function(0), ..., function(count - 1), computed by threads; stop early if closed."""
     if workers is not None:
         workers = validate.count("workers", workers)
-    pool = ThreadPoolExecutor(workers or len(os.sched_getaffinity(0)))
+    pool = ThreadPoolExecutor(workers or os.cpu_count())
     try:
         yield from pool.map(function, range(count))
     finally:

@@ -5,6 +5,8 @@ Every check raises one exception that names the argument, what was given and wha
 
 from __future__ import annotations
 
+import sys
+import warnings
 from collections.abc import Sequence
 
 import numpy as np
@@ -13,6 +15,16 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 class ClsasWarning(UserWarning):
     """A result that is valid but probably not what was meant, with what was done instead."""
+
+
+def warn(message: str) -> None:
+    """Warn with a ClsasWarning that points at the first caller outside clsas."""
+    level = 2
+    frame = sys._getframe(1)
+    while frame.f_back is not None and frame.f_globals["__name__"].split(".")[0] == "clsas":
+        frame = frame.f_back
+        level += 1
+    warnings.warn(message, ClsasWarning, stacklevel=level)
 
 
 def number(
