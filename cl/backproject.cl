@@ -303,7 +303,6 @@ __kernel void backproject_tiles(__global const float *samples, int pitch,
     const vfloat lane_i = LANE_COLUMNS, lane_j = LANE_ROWS;
     const float i = block_column + 0.5f * (BLOCK_COLUMNS - TILE);
     const float4 j = block_row + 0.5f * (BLOCK_ROWS - TILE) + BLOCK_ROWS * (float4)(0.0f, 1.0f, 2.0f, 3.0f);
-    const float middle_j = block_row + 0.5f * (ITEM_ROWS - TILE);
 
     vfloat re[STACK], im[STACK];
 #pragma unroll
@@ -324,10 +323,10 @@ __kernel void backproject_tiles(__global const float *samples, int pitch,
         const float4 move = v0 + j * (v1 + j * (v2 + j * k3));
         const float4 slope_i = (g0 + i * (2.0f * h0 + i * (3.0f * k0))) + j * ((h1 + i * (2.0f * k1)) + j * k2);
         const float4 slope_j = v1 + j * (2.0f * v2 + j * (3.0f * k3));
-        /* Curvature over the lanes of a block, taken at the middle of the four. */
-        const vfloat curvature = lane_i * (lane_i * (h0 + 3.0f * k0 * i + k1 * middle_j)
-                                           + lane_j * (h1 + 2.0f * (k1 * i + k2 * middle_j)))
-            + lane_j * lane_j * (h2 + k2 * i + 3.0f * k3 * middle_j);
+        /* Curvature over the lanes of a block in row 0 and its change per row. */
+        const vfloat curvature = lane_i * (lane_i * (h0 + 3.0f * k0 * i) + lane_j * (h1 + 2.0f * k1 * i))
+            + lane_j * lane_j * (h2 + k2 * i);
+        const vfloat bend = lane_i * (lane_i * k1 + lane_j * (2.0f * k2)) + lane_j * lane_j * (3.0f * k3);
 
         const float4 position = move + reference_fraction[channel];
         const float4 shifted = position + ROUNDER;
@@ -339,7 +338,8 @@ __kernel void backproject_tiles(__global const float *samples, int pitch,
         __global const float *line = samples + (size_t)channel * 2 * pitch;
 #pragma unroll
         for (int block = 0; block < STACK; block++) {
-            const vfloat d = lane_i * AT(slope_i, block) + (lane_j * AT(slope_j, block) + curvature);
+            const vfloat d = lane_i * AT(slope_i, block)
+                + (lane_j * AT(slope_j, block) + (bend * AT(j, block) + curvature));
             vfloat line_re, line_im, sine, cosine;
             interpolate(line, pitch, AT(centre, block), d + AT(start, block), weights, &line_re, &line_im);
             sincos_cycles(d * cycles_per_sample + AT(phase, block), &sine, &cosine);
