@@ -13,7 +13,7 @@ import sys
 import time
 import warnings
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any
@@ -248,6 +248,7 @@ def compress(
 @click.option("--upsampling", type=float, help="Fix how much lines are upsampled.")
 @_png("the image in dB")
 @click.option("--dynamic-range-db", type=float, default=60.0, show_default=True, help="Of the PNG.")
+@click.option("--profile", is_flag=True, help="Also report the time of every kernel.")
 @_as_json
 def image(
     lines_file: Path,
@@ -262,6 +263,7 @@ def image(
     upsampling: float | None,
     png: Path | None,
     dynamic_range_db: float,
+    profile: bool,
     as_json: bool,
 ) -> None:
     """Form the exact image of range lines.
@@ -283,7 +285,8 @@ def image(
     with _progress("imaging") as progress:
         start = time.perf_counter()
         preparation = prepare(lines, grid, device=device, **options)
-        formed = execute(preparation, progress=progress)
+        with preparation.device.profile() if profile else nullcontext({}) as kernels:
+            formed = execute(preparation, progress=progress)
         seconds = time.perf_counter() - start
     clsas.save(output, formed)
     if png is not None:
@@ -291,14 +294,19 @@ def image(
 
         plot.save_png(plot.image_db(formed, dynamic_range_db=dynamic_range_db), png)
     used, interpolator = preparation.device.info, preparation.interpolator
+    table = "".join(
+        f"\n  {name}: {times.count} runs of {1e3 * times.minimum_s:.3g} to "
+        f"{1e3 * times.maximum_s:.3g} ms, median {1e3 * times.median_s:.3g} ms"
+        for name, times in kernels.items()
+    )
     _report(
         as_json,
         f"{output}: {' x '.join(map(str, grid.shape))} pixels from {lines.channels} lines in "
         f"{seconds:.2f} s on {used.label} ({interpolator.taps} taps on lines upsampled "
-        f"{preparation.resampling.ratio:.3g} times, {interpolator.error_db:.0f} dB)",
+        f"{preparation.resampling.ratio:.3g} times, {interpolator.error_db:.0f} dB){table}",
         file=output, png=png, shape=grid.shape, channels=lines.channels, device=used.label,
         driver=used.driver, taps=interpolator.taps, upsampling=preparation.resampling.ratio,
-        interpolation_error_db=interpolator.error_db, seconds=seconds,
+        interpolation_error_db=interpolator.error_db, seconds=seconds, kernels=kernels,
     )  # fmt: skip
 
 

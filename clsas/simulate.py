@@ -19,7 +19,6 @@ from __future__ import annotations
 
 import math
 import os
-import warnings
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -431,11 +430,7 @@ def _record(
         if progress is not None:
             progress(channel + 1, paths.channels)
     if not samples.any():
-        warnings.warn(
-            "no echo falls within the receive window: every sample is zero",
-            validate.ClsasWarning,
-            stacklevel=3,
-        )
+        validate.warn("no echo falls within the receive window: every sample is zero")
     return samples
 
 

@@ -119,6 +119,17 @@ def test_options_go_before_the_scene_file(made, tmp_path):
     np.testing.assert_allclose(positions[[0, -1], [0, -1]], [[-1, 20, 0.5], [1, 21, 0.5]])
 
 
+def test_an_image_tells_its_kernels_times(made, tmp_path):
+    folder, _ = made
+    image = "image", folder / "lines.h5", "--scene", folder / "scene.toml", "-o", tmp_path / "i.h5"
+    kernels = run_json(*image, "--profile")["kernels"]
+    for times in kernels.values():
+        assert 0 < times["minimum_s"] <= times["median_s"] <= times["maximum_s"] <= times["total_s"]
+    assert "backproject_tiles" in kernels
+    assert re.search(r"backproject_tiles: \d+ runs? of .* ms, median", run(*image, "--profile")[0])
+    assert run_json(*image)["kernels"] == {}
+
+
 def test_an_image_against_itself_has_no_finite_error(made):
     image = made[0] / "image.h5"
     assert run_json("quality", image, "--reference", image)["relative_error_db"] is None

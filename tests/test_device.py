@@ -85,7 +85,7 @@ def test_a_wish_goes_before_the_environment(monkeypatch):
 
 
 def test_gpus_go_before_cpus(monkeypatch):
-    info = list_devices()[0]
+    info = dataclasses.replace(list_devices()[0], permute=False)
     kinds = ("accelerator", "cpu", "gpu", "gpu")
     several = [dataclasses.replace(info, index=i, kind=kind) for i, kind in enumerate(kinds)]
     monkeypatch.setattr(module, "list_devices", lambda: several)
@@ -94,6 +94,9 @@ def test_gpus_go_before_cpus(monkeypatch):
     monkeypatch.setattr(module, "list_devices", lambda: several[:2])
     chosen, why = choose()
     assert (chosen.index, why) == (1, "the first CPU; there is no GPU")
+    fast = dataclasses.replace(info, index=2, kind="cpu", permute=True)
+    monkeypatch.setattr(module, "list_devices", lambda: [*several[:2], fast])
+    assert choose()[0] == fast
 
 
 @pytest.mark.parametrize("wish", ["no such device", 99, "99", -1, "-1"])
@@ -207,6 +210,20 @@ def test_the_vector_widths_give_their_values(device):
     angle = 2 * np.pi * t.astype(np.float64)
     assert np.abs(sine - np.sin(angle)).max() <= 2e-6
     assert np.abs(cosine - np.cos(angle)).max() <= 2e-6
+
+
+def test_a_profile_counts_and_times_what_runs_within(platform):
+    kernel = platform.kernel("peak", "peak", WIDTH=platform.info.width)
+    result = platform.buffer(4 * 64)
+    platform.run(kernel, (64,), 1, 0.5, result)
+    with platform.profile() as times:
+        for steps in (1, 10000, 10000):
+            platform.run(kernel, (64,), steps, 0.5, result)
+    peak = times.pop("peak")
+    assert peak.count == 3
+    assert 0 < peak.minimum_s < peak.median_s <= peak.maximum_s
+    assert peak.total_s == pytest.approx(peak.minimum_s + peak.median_s + peak.maximum_s)
+    assert not times
 
 
 def test_the_sources_are_found():
