@@ -156,6 +156,7 @@ def prepare(
         taps=taps,
         upsampling=upsampling,
         other_error=GEOMETRY_ERROR,
+        pixels_per_sample=grid.size / lines.length,
         most_upsampling=_room(max(interpolation.TAPS))
         * lines.range_step_m
         / max(layout.block_radius_m, 1e-30),

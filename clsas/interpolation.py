@@ -18,6 +18,8 @@ UPSAMPLINGS = (1.0, 1.25, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0, 12.0, 16
 # Device time per pixel and channel by taps, relative to 4 taps: measured with PoCL and Intel's
 # runtime on an AVX-512 CPU (scripts/bench taps).
 _COST = {2: 0.75, 4: 1.0, 6: 1.3, 8: 1.55}
+# The same for one upsampled sample: an FFT on the host.
+_UPSAMPLING_COST = 40.0
 _FREQUENCIES = 128
 _POSITIONS = 33
 
@@ -150,6 +152,7 @@ def choose(
     taps: int | None = None,
     upsampling: float | None = None,
     other_error: float = 0.0,
+    pixels_per_sample: float = np.inf,
     most_upsampling: float = np.inf,
 ) -> Interpolator:
     """Return the cheapest interpolator that keeps the error below `accuracy_db`.
@@ -166,6 +169,8 @@ def choose(
         Fix one or both; with both, `accuracy_db` plays no part.
     other_error : float
         Relative rms error that comes from elsewhere and adds in power.
+    pixels_per_sample : float
+        Pixels over samples of a line: how soon upsampling pays.
     most_upsampling : float
         Prefer not to upsample beyond this (where the device's fast lookup ends).
 
@@ -197,9 +202,13 @@ def choose(
             f"accuracy_db={accuracy_db:g} cannot be reached with {fixed}; "
             f"the best there is {found.error_db:.1f} dB"
         )
-    return min(
-        candidates, key=lambda c: (c.upsampling > most_upsampling, _COST[c.taps], c.upsampling)
-    )
+
+    def cost(candidate: Interpolator) -> tuple[bool, float]:
+        slow = candidate.upsampling > most_upsampling
+        upsampling_cost = _UPSAMPLING_COST * candidate.upsampling / pixels_per_sample
+        return slow, _COST[candidate.taps] + upsampling_cost
+
+    return min(candidates, key=cost)
 
 
 @dataclass(frozen=True)
