@@ -241,12 +241,12 @@ class Resampling:
         padded = np.zeros((len(samples), self.fft_length), samples.dtype)
         padded[:, self.lead : self.lead + samples.shape[1]] = samples
         spectrum = scipy.fft.fft(padded, axis=1, workers=-1, overwrite_x=True)
-        half = self.fft_length // 2
+        spectrum = np.roll(spectrum, -self.shift_bins, axis=1)
+        upper = self.fft_length // 2  # bins of negative frequency, at the end
+        lower = self.fft_length - upper
         wide = np.zeros((len(samples), self.upsampled_length), samples.dtype)
-        # Bins -half .. half - 1 about the centre.
-        bins = (np.arange(-half, self.fft_length - half) + self.shift_bins) % self.fft_length
-        wide[:, np.arange(-half, self.fft_length - half)] = spectrum[:, bins]
-        wide *= self.ratio
+        wide[:, :lower] = self.ratio * spectrum[:, :lower]
+        wide[:, self.upsampled_length - upper :] = self.ratio * spectrum[:, lower:]
         result = scipy.fft.ifft(wide, axis=1, workers=-1, overwrite_x=True)
         return result[:, self.first : self.first + self.length]
 
