@@ -22,7 +22,7 @@ import os
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, reduce
 
 import finufft
 import numpy as np
@@ -47,8 +47,10 @@ _RINGING = math.ceil(EDGE_PRODUCT / ((1 - PASSBAND) / 2))
 # Relative errors of the sum over points and of the patterns' expansion.
 _SUM_ERROR = 1e-9
 _PATTERN_ERROR = 1e-6
-# Points worked on at once, small enough for caches.
-_BLOCK = 1 << 15
+# Points worked on at once, and of these with all terms of their patterns: few enough for caches,
+# so many that their sum costs more than its FFT.
+_BLOCK = 1 << 17
+_BEAM_BLOCK = 1 << 14
 
 
 def simulate(
@@ -277,13 +279,16 @@ class _Beams:
         channel: int,
         tx_way: NDArray[np.float64],
         rx_way: NDArray[np.float64],
-    ) -> NDArray[np.float64]:
-        """Return the two-way pattern [terms, points] at `_nodes(terms)` of the sampled band.
+    ) -> Iterator[tuple[NDArray[np.intp], NDArray[np.float32]]]:
+        """Yield indices of points and their two-way pattern [terms, points] at `_nodes(terms)`.
 
-        Interpolated from there it is right to `_PATTERN_ERROR` at every frequency: with b the sum
-        of sizes times their largest sines over the sound speed, the product of sincs has
-        derivatives of order Q below (pi b)^Q / (Q + 1), so that over a band of +-h hertz Q nodes
-        leave at most 2 (pi b h/2)^Q / (Q + 1)!.
+        The nodes are those of the sampled band. Points behind an element's face are left out; the
+        others come in order of how much their pattern varies, so that most need few terms.
+
+        Interpolated, a pattern is right to `_PATTERN_ERROR` at every frequency, half of which is
+        left for rounding to single precision: with b the sum of sizes times their sines over the
+        sound speed, the product of sincs has derivatives of order Q below (pi b)^Q / (Q + 1), so
+        that over a band of +-h hertz Q nodes leave at most 2 (pi b h/2)^Q / (Q + 1)!.
         """
         sonar = self.sonar
         along, axis, up = self.axes[channel // sonar.receivers]
@@ -294,21 +299,26 @@ class _Beams:
             (sonar.rx_height_m, rx_way, up),
         )
         sizes = [(size, way @ vector) for size, way, vector in factors if size is not None]
-        extent = sum(size * np.max(np.abs(sine)) for size, sine in sizes)
-        nodes = _nodes(_terms(sonar, extent)) * sonar.sample_rate_hz / 2
-        frequency = sonar.pulse.carrier_hz + nodes[:, None]
-        faced = (tx_way @ axis > 0) & (rx_way @ axis > 0)
-        gain = np.tile(faced.astype(np.float64), (len(nodes), 1))
-        for size, sine in sizes:
-            gain *= element_pattern(size, sine, frequency, sonar.sound_speed_m_s)
-        return gain
+        faced = np.flatnonzero((tx_way @ axis > 0) & (rx_way @ axis > 0))
+        extent = sum(size * np.abs(sine[faced]) for size, sine in sizes)
+        order = np.argsort(extent)
+        for first in range(0, len(order), _BEAM_BLOCK):
+            chosen = order[first : first + _BEAM_BLOCK]
+            some = faced[chosen]
+            nodes = _nodes(_terms(sonar, extent[chosen[-1]])) * sonar.sample_rate_hz / 2
+            frequency = sonar.pulse.carrier_hz + nodes[:, None]
+            patterns = (
+                element_pattern(size, sine[some], frequency, sonar.sound_speed_m_s, np.float32)
+                for size, sine in sizes
+            )
+            yield some, reduce(np.multiply, patterns)
 
 
 def _terms(sonar: Sonar, extent_m: float) -> int:
-    """Return the least Q with 2 (pi b h/2)^Q / (Q + 1)! <= `_PATTERN_ERROR`; see `gains`."""
+    """Return the least Q with 2 (pi b h/2)^Q / (Q + 1)! <= `_PATTERN_ERROR`/2; see `gains`."""
     reach = np.pi * extent_m / sonar.sound_speed_m_s * sonar.sample_rate_hz / 4
     terms, remainder = 1, reach
-    while remainder > _PATTERN_ERROR:
+    while remainder > _PATTERN_ERROR / 2:
         terms += 1
         remainder *= reach / (terms + 1)
     return terms
@@ -419,9 +429,11 @@ def _record(
             if paths.beams is None:
                 total += _sum(angles, strengths, modes)
                 continue
-            gains = paths.beams.gains(channel, *paths.directions(channel, points, out, back))
-            sums = _sum(angles, strengths * gains, modes).reshape(len(gains), modes)
-            total += np.einsum("qk,qk->k", _interpolation(len(gains), modes), sums)
+            ways = paths.directions(channel, points, out, back)
+            for some, gains in paths.beams.gains(channel, *ways):
+                sums = _sum(angles[some], strengths[some] * gains, modes)
+                sums = sums.reshape(len(gains), modes)
+                total += np.sum(_interpolation(len(gains), modes) * sums, axis=0)
         return fft.ifft(total * transfer)[:length].astype(np.complex64)
 
     samples = np.empty((paths.channels, length), np.complex64)

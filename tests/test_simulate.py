@@ -108,7 +108,9 @@ def test_result_does_not_depend_on_blocks_or_threads(monkeypatch):
     scene = PointTargets(rng.uniform([-2, 38, -1], [2, 42, 1], (50, 3)))
     sonar = replace(SMOOTH, tx_length_m=0.1, rx_length_m=0.05)
     whole = simulate(sonar, TRACK, scene)
-    monkeypatch.setattr(importlib.import_module("clsas.simulate"), "_BLOCK", 7)
+    module = importlib.import_module("clsas.simulate")
+    monkeypatch.setattr(module, "_BLOCK", 7)
+    monkeypatch.setattr(module, "_BEAM_BLOCK", 3)
     parts = simulate(sonar, TRACK, scene, workers=1)
     assert db(whole.samples - parts.samples, whole.samples) < -110
 
