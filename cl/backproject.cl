@@ -15,6 +15,7 @@
  *              times as fast as a gather. The host asks for it where all lanes' samples lie
  *              within 32, and the compiler decides whether it can (WIDTH 16 only).
  *   BISTATIC   receiver positions differ from the transmitter's.
+ *   OWN_LINES  every tile has lines and geometry of its own: one set after the other.
  *   MOVING     receivers move at `velocity` (in units of the sound speed) during the echo's flight.
  *
  * Buffers
@@ -219,6 +220,9 @@ __kernel void expand_tiles(__global const float *geometry, int channel_pitch,
     const int channel = get_global_id(0) * WIDTH;
     const int tile = get_global_id(1);
     __global const float *centre = centres + 6 * tile;
+#if OWN_LINES
+    geometry += (size_t)tile * 6 * channel_pitch;
+#endif
 
     const vfloat tx = FROMS(TX, 0), ty = FROMS(TX, 1), tz = FROMS(TX, 2);
     const Derivatives t = distance_derivatives(tx, ty, tz, step_column, step_row);
@@ -298,6 +302,9 @@ __kernel void backproject_tiles(__global const float *samples, int pitch,
     reference_fraction += first;
     reference_phase += first;
     expansion += TERMS * first;
+#if OWN_LINES
+    samples += (size_t)tile * channels * 2 * pitch;
+#endif
 
     /* Lanes from their block's centre, blocks' centres from the tile's, in pixels. */
     const vfloat lane_i = LANE_COLUMNS, lane_j = LANE_ROWS;

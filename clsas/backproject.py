@@ -222,6 +222,7 @@ class _Run:
             "PERMUTE": int(device.info.permute and fits),
             "BISTATIC": int(self.bistatic),
             "MOVING": int(self.moving),
+            "OWN_LINES": 0,
         }
         name = "backproject_tiles" if self.tiled else "backproject_points"
         self.kernel = device.kernel("backproject", name, **options)
@@ -259,7 +260,7 @@ class _Run:
             slot = next(self.part_slots)
             slot.wait()
             centres_m = self.p.layout.centres_m(parts)
-            slot.fill("centres", _float_pairs(centres_m - self.origin_m))
+            slot.fill("centres", float_pairs(centres_m - self.origin_m))
             for name, values in self._references(centres_m, lines).items():
                 slot.fill(name, values)
             ready = line_slot.filled + slot.filled
@@ -371,9 +372,9 @@ class _Run:
 
     def _geometry(self, lines: RangeLines) -> NDArray[np.float32]:
         """Return positions about the origin and velocities over sound speed, [rows, channels]."""
-        rows = [_float_pairs(lines.tx_m - self.origin_m)]
+        rows = [float_pairs(lines.tx_m - self.origin_m)]
         if self.bistatic:
-            rows.append(_float_pairs(lines.rx_m - self.origin_m))
+            rows.append(float_pairs(lines.rx_m - self.origin_m))
         if self.moving:
             rows.append((lines.rx_velocity_m_s / lines.sound_speed_m_s).astype(np.float32))
         geometry = np.concatenate(rows, axis=1).T
@@ -416,7 +417,7 @@ class _Run:
             self.progress(self.done, self.p.layout.parts * self.p.lines.channels)
 
 
-def _float_pairs(positions_m: NDArray[np.float64]) -> NDArray[np.float32]:
+def float_pairs(positions_m: NDArray[np.float64]) -> NDArray[np.float32]:
     """Return float32 [n, 6]: positions [n, 3] as nearest float32 numbers, and what these leave."""
     nearest = positions_m.astype(np.float32)
     return np.concatenate([nearest, (positions_m - nearest).astype(np.float32)], axis=1)
