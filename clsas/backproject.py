@@ -25,6 +25,10 @@ BEST_ACCURACY_DB = -85.0
 
 _WINDOW = 32  # samples that the permuting lookup holds in registers
 _LARGEST_DISTANCE_M = 1e9
+_SMALLEST_STEP_M = 1e-9
+_MOST_CYCLES = 1e10  # float64 leaves 1e-6 of a cycle
+_LARGEST_SUM = 1e37
+_FASTEST = 0.05  # of a receiver, in sound speeds: cl/backproject.cl iterates on it
 _CHANNELS_AT_ONCE = 512  # bounds a float32 partial sum; lines that stay in a CPU's cache
 _PART_BYTES = 64 << 20  # device memory for one set of parts: a job of some tenths of a second
 
@@ -95,7 +99,9 @@ def backproject(
     Raises
     ------
     TypeError, ValueError
-        If an argument is not what is allowed, or `accumulate` is on another grid.
+        If an argument is not what is allowed, `accumulate` is on another grid, receivers move
+        faster than 0.05 sound speeds, or numbers are so large or small that float32 sums or
+        float64 phases could not hold them.
     DeviceError
         If there is no such device.
 
@@ -140,6 +146,7 @@ def prepare(
     accuracy_db = validate.number(
         "accuracy_db", accuracy_db, "dB", least=BEST_ACCURACY_DB, below=0.0
     )
+    _check_numbers(lines)
     device = open_device(device)
     spectrum = interpolation.measure_spectrum(lines)
     # What rounding a range costs: phase, and place within the lines' band, 0.3 Nyquist rms.
@@ -148,7 +155,7 @@ def prepare(
         0.3 / lines.range_step_m,
     )
     antennas_m = np.unique(np.concatenate([lines.tx_m, lines.rx_m]), axis=0)
-    layout = lay_out(grid, antennas_m, cycles_per_m, device.info.width)
+    layout = lay_out(grid, antennas_m, cycles_per_m, device.info.width, speed_ratio=_fastest(lines))
     _check_distances(antennas_m, layout)
     interpolator = interpolation.choose(
         spectrum,
@@ -236,8 +243,8 @@ class _Run:
         room = min(most, device.info.memory_bytes // 8)
         if line_bytes > most:
             raise ValueError(
-                f"lines of {p.lines.length} samples need {line_bytes / 2**20:.0f} MiB each when "
-                f"upsampled, more than a buffer of {device.info.label}, {most / 2**20:.0f} MiB"
+                f"lines of {p.lines.length} samples need {line_bytes / 2**10:.0f} KiB each when "
+                f"upsampled, more than a buffer of {device.info.label}, {most / 2**10:.0f} KiB"
             )
         self.channels_at_once = min(_CHANNELS_AT_ONCE, max(room // line_bytes, 1))
         self.parts_at_once = max(min(_PART_BYTES, room // 2) // part_bytes, 1)
@@ -461,8 +468,39 @@ def _check_same_grid(image: Image, grid: Grid) -> None:
         raise ValueError("accumulate must be an image on the same grid")
 
 
+def _check_numbers(lines: RangeLines) -> None:
+    """Refuse lines whose numbers would leave what float32 sums or float64 phases can hold."""
+    validate.number(
+        "range_step_m", lines.range_step_m, "m", least=_SMALLEST_STEP_M, most=_LARGEST_DISTANCE_M
+    )
+    farthest_m = np.abs([lines.first_range_m, lines.last_range_m]).max()
+    with np.errstate(over="ignore"):
+        cycles = np.float64(2) * lines.carrier_hz / lines.sound_speed_m_s * farthest_m
+    if not cycles <= _MOST_CYCLES:
+        raise ValueError(
+            f"carrier_hz = {lines.carrier_hz:g} Hz makes {cycles:.3g} cycles over {farthest_m:g} m "
+            f"at {lines.sound_speed_m_s:g} m/s; float64 holds the phase of {_MOST_CYCLES:g}"
+        )
+    largest, most = float(np.abs(lines.samples).max()), _LARGEST_SUM / lines.channels
+    if largest > most:
+        raise ValueError(
+            f"samples must be at most {most:.3g} for the sum of {lines.channels} channels to stay "
+            f"within float32, got {largest:.3g}"
+        )
+    speed_m_s = _fastest(lines) * lines.sound_speed_m_s
+    most_m_s = _FASTEST * lines.sound_speed_m_s
+    validate.number("the speed of rx_velocity_m_s", speed_m_s, "m/s", most=most_m_s * (1 + 1e-9))
+
+
+def _fastest(lines: RangeLines) -> float:
+    """Return the speed of the fastest receiver over that of sound."""
+    if lines.rx_velocity_m_s is None:
+        return 0.0
+    return float(np.linalg.norm(lines.rx_velocity_m_s, axis=1).max()) / lines.sound_speed_m_s
+
+
 def _check_distances(antennas_m: NDArray[np.float64], layout: Tiles | Groups) -> None:
-    """Refuse distances so large that a square overflows float32 or float64 resolves no phase."""
+    """Refuse distances so large that a square overflows float32."""
     points_m = np.concatenate([antennas_m, layout.centres_m(slice(None))])
     extent_m = float(np.ptp(points_m, axis=0).max())
     if extent_m > _LARGEST_DISTANCE_M:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import functools
 import os
+import re
 import statistics
 import warnings
 from collections import defaultdict
@@ -24,7 +25,8 @@ No OpenCL device was found. Any one of these gives one:
   - the vendor's driver of your GPU or CPU, which installs an .icd file in /etc/OpenCL/vendors;
     PyOpenCL's wheel looks there and in {folder}
     (copy or write an .icd file there when the driver lives in your Python environment:
-    it is one line, the path of the driver's shared library)."""
+    it is one line, the path of the driver's shared library).
+The environment variable OCL_ICD_VENDORS, where it is set, replaces these places."""
 
 
 class DeviceError(RuntimeError):
@@ -319,7 +321,7 @@ def choose(wish: str | int | None = None) -> tuple[DeviceInfo, str]:
             return chosen, "the first GPU"
         fast = ", with the fast lookup in registers" if chosen.permute else ""
         return chosen, f"the first {chosen.kind.upper()}{fast}; there is no GPU"
-    if isinstance(wish, str) and wish.strip().lstrip("-").isdigit():
+    if isinstance(wish, str) and re.fullmatch(r"\s*[0-9]+\s*", wish, re.ASCII):
         wish = int(wish)
     if isinstance(wish, (int, np.integer)) and not isinstance(wish, bool):
         fitting = [info for info in devices if info.index == wish]

@@ -81,12 +81,9 @@ def measure_spectrum(lines: RangeLines, most_channels: int = 256) -> Spectrum:
     samples = lines.samples[:: -(-lines.channels // most_channels)]
     length = scipy.fft.next_fast_len(2 * lines.length)
     power = np.zeros(length)
-    largest = np.abs(samples).max() or 1.0  # whose square might leave the range of float32
     for block in np.array_split(samples, -(-len(samples) // 64)):
-        # float32 FFTs leave a floor near -140 dB, below any filter designed here.
-        power += np.sum(
-            np.abs(scipy.fft.fft(block / largest, length)) ** 2, axis=0, dtype=np.float64
-        )
+        amplitude = np.abs(scipy.fft.fft(block.astype(np.complex128), length))
+        power += np.sum(amplitude**2, axis=0)
     frequency = scipy.fft.fftfreq(length)
     if not power.any():
         power[:] = 1.0

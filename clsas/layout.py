@@ -151,7 +151,12 @@ class Groups:
 
 
 def lay_out(
-    grid: Grid, antennas_m: NDArray[np.float64], cycles_per_m: float, width: int
+    grid: Grid,
+    antennas_m: NDArray[np.float64],
+    cycles_per_m: float,
+    width: int,
+    *,
+    speed_ratio: float = 0.0,
 ) -> Tiles | Groups:
     """Return how to divide a grid so that the geometry's share of the error stays below -90 dB.
 
@@ -165,13 +170,16 @@ def lay_out(
         Phase per metre of range, cycles: two over the wavelength.
     width : int
         Float lanes per work-item.
+    speed_ratio : float
+        Speed of the fastest receiver over that of sound.
 
     Notes
     -----
     A tile is expanded to third order, so that its largest error is that of the fourth:
     r^4/(8 R^3) at most, r its half diagonal and R the distance of the nearest antenna. The rms
     over a tile's pixels and directions is 0.15 of it. Within a block the third order is left out
-    too: 0.19 r^3/R^2 at most, 0.04 of r^3/R^2 rms. Where even the smallest tile is too large, near
+    too: 0.19 r^3/R^2 at most, 0.04 of r^3/R^2 rms; and what receivers' motion does to the third
+    order of a tile, 0.2 of it times the speed ratio. Where even the smallest tile is too large, near
     the antennas, and off a plane, pixels go into groups, which expand nothing.
     """
     if grid.is_planar:
@@ -182,6 +190,7 @@ def lay_out(
             nearest = max(nearest, 1e-30)
             remainder_m = 0.15 * tiles.radius_m**4 / (8 * nearest**3)
             remainder_m += 0.04 * tiles.block_radius_m**3 / nearest**2
+            remainder_m += 0.2 * speed_ratio * tiles.radius_m**3 / nearest**2
             rounding = _FLOAT32_ERROR * cycles_per_m * tiles.radius_m
             if np.hypot(2 * np.pi * cycles_per_m * remainder_m, rounding) <= GEOMETRY_ERROR:
                 return tiles

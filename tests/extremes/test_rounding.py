@@ -1,5 +1,7 @@
 """Rounding at the extremes: far, near, high, fast, large, and far from the coordinates' origin."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 from cases import (
@@ -18,7 +20,7 @@ from cases import (
     thesis_lines,
 )
 
-from clsas.backproject import backproject, prepare
+from clsas.backproject import backproject, execute, prepare
 from clsas.grid import Grid
 from clsas.lines import RangeLines
 from clsas.quality import relative_error_db
@@ -164,7 +166,7 @@ def test_a_pixel_at_an_antenna_is_a_pixel_like_others(device, shape, way):
     assert relative_error_db(image, same_interpolator(preparation, grid.points_m)) <= -80
 
 
-@pytest.mark.parametrize("scale", [1e-30, 1e-10, 1e10, 1e20, 1e30])
+@pytest.mark.parametrize("scale", [1e-36, 1e-30, 1e-10, 1e10, 1e20, 1e30])
 @pytest.mark.parametrize("centre", [0.0, 0.3])
 def test_the_unit_of_the_samples_does_not_matter(scale, centre):
     """Amplitudes whose squares leave the range of float32."""
@@ -194,3 +196,47 @@ def test_a_distance_that_float32_cannot_square_is_refused():
     lines = thesis_lines(patch(1.3, 42, 5, 5), APERTURE[::80])
     with pytest.raises(ValueError, match=r"within 1e\+09 m .* got 1e\+20 m"):
         backproject(lines, Grid.points([[1e20, 0, 0]]))
+
+
+@pytest.mark.parametrize(
+    "grid", [patch(0.1, 4, pitch=2e-3), Grid.points(patch(0.1, 4).positions_m())]
+)
+@pytest.mark.parametrize("direction", [[1, 0, 0], [0, 1, 0], [-0.6, 0.8, 0]])
+def test_receivers_as_fast_as_allowed(platform, grid, direction):
+    track = along_x(48, 4e-3)
+    velocity = np.broadcast_to(0.05 * 1500.0 * np.array(direction), track.shape)
+    rx = beside(track, 0.05, 0, 0.1)
+    lines = thesis_lines(grid, track, rx, velocity=velocity)
+    preparation = prepare(lines, grid, device=platform, taps=6, upsampling=3)
+    wanted = same_interpolator(preparation, grid.positions_m())
+    assert relative_error_db(execute(preparation), wanted) <= -80
+    faster = dataclasses.replace(lines, rx_velocity_m_s=1.01 * velocity)
+    with pytest.raises(
+        ValueError, match=r"the speed of rx_velocity_m_s must be .*<= 75 m/s, got 75\.75"
+    ):
+        backproject(faster, grid, device=platform)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"range_step_m": 1e-300}, "range_step_m must be .*>= 1e-09 and <= 1e\\+09 m, got 1e-300"),
+        ({"range_step_m": 1e300}, "range_step_m must be .*got 1e"),
+        ({"carrier_hz": 1e15}, "carrier_hz = 1e\\+15 Hz makes .* cycles over"),
+        ({"carrier_hz": 1e300}, "carrier_hz = 1e\\+300 Hz makes .* cycles over"),
+        ({"sound_speed_m_s": 1e-308}, "carrier_hz = .* makes inf cycles over"),
+    ],
+)
+def test_numbers_that_no_phase_survives_are_refused(change, message):
+    grid = patch(1.3, 42, 5, 5)
+    lines = dataclasses.replace(thesis_lines(grid, APERTURE[::80]), **change)
+    with pytest.raises(ValueError, match=message):
+        backproject(lines, grid)
+
+
+def test_samples_whose_sum_overflows_are_refused():
+    grid = patch(1.3, 42, 5, 5)
+    lines = thesis_lines(grid, APERTURE[::80])
+    huge = dataclasses.replace(lines, samples=np.full_like(lines.samples, 2e36))
+    with pytest.raises(ValueError, match=r"samples must be at most 1.25e.36 .* 8 channels"):
+        backproject(huge, grid)
