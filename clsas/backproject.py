@@ -24,6 +24,7 @@ BEST_ACCURACY_DB = -85.0
 """The best accuracy that may be asked for: what float32 allows."""
 
 _WINDOW = 32  # samples that the permuting lookup holds in registers
+_EXPANSION_TERMS = 9  # coefficients per (tile, channel)
 _LARGEST_DISTANCE_M = 1e9
 _SMALLEST_STEP_M = 1e-9
 _MOST_CYCLES = 1e10  # float64 leaves 1e-6 of a cycle
@@ -117,8 +118,9 @@ def backproject(
     spectral centre and as zero beyond their ends: a pixel outside a line's range (by more than
     the taps of one interpolation) gets nothing from it.
 
-    Ranges and phases are referred in float64 to centres near the pixels; the device sees float32
-    differences only.
+    Lines know no beam: a pixel behind the antennas, at the range of one before them, is its mirror
+    image. Ranges and phases are referred in float64 to centres near the pixels; the device sees
+    float32 differences only.
     """
     preparation = prepare(
         lines, grid, device=device, accuracy_db=accuracy_db, taps=taps, upsampling=upsampling
@@ -270,87 +272,49 @@ class _Run:
             slot.fill("centres", float_pairs(centres_m - self.origin_m))
             for name, values in self._references(centres_m, lines).items():
                 slot.fill(name, values)
-            ready = line_slot.filled + slot.filled
-            if self.tiled:
-                event = self._run_tiles(lines, line_slot, slot, parts, band, pixels, ready)
-            else:
-                event = self._run_groups(lines, line_slot, slot, parts, band, pixels, ready)
+            event = self._launch(lines, line_slot, slot, parts, parts.start - band.start, pixels)
             slot.busy = line_slot.busy = event
             self.p.device.queue.flush()
             self._report((parts.stop - parts.start) * lines.channels)
 
-    def _run_tiles(
+    def _launch(
         self,
         lines: RangeLines,
         line_slot: Slot,
         slot: Slot,
         parts: slice,
-        band: slice,
+        first_part: int,
         pixels: cl.Buffer,
-        ready: list[cl.Event],
     ) -> cl.Event:
+        """Run the kernels of one job on buffers that are being filled."""
         p, device, layout = self.p, self.p.device, self.p.layout
         count = parts.stop - parts.start
         pitch = _channel_pitch(lines)
-        expansion = slot.buffer("expansion", count * 9 * pitch * 4)
-        steps = [
-            np.append(v, 0).astype(np.float32) for v in (p.grid.column_step_m, p.grid.row_step_m)
-        ]
-        device.run(
-            self.expand,
-            (pitch // device.info.width, count),
-            line_slot["geometry"],
-            pitch,
-            slot["centres"],
-            *steps,
-            p.samples_per_m,
-            expansion,
-            wait_for=ready,
-        )
+        if self.tiled:
+            geometry = slot.buffer("expansion", 4 * _EXPANSION_TERMS * count * pitch)
+            steps_m = (p.grid.column_step_m, p.grid.row_step_m)
+            device.run(
+                self.expand,
+                (pitch // device.info.width, count),
+                line_slot["geometry"],
+                pitch,
+                slot["centres"],
+                *(np.append(step, 0).astype(np.float32) for step in steps_m),
+                p.samples_per_m,
+                geometry,
+                wait_for=line_slot.filled + slot.filled,
+            )
+            size = (layout.part_pixels // (device.info.width * STACK), count)
+            rest = (layout.across * layout.side, first_part)
+        else:
+            geometry = line_slot["geometry"]
+            slot.fill("offsets", layout.offset_m[parts].reshape(-1, 3).T)
+            size = (count,)
+            points = count * layout.part_pixels
+            rest = (first_part, slot["centres"], slot["offsets"], points, p.samples_per_m)
         return device.run(
             self.kernel,
-            (layout.part_pixels // (device.info.width * STACK), count),
-            *self._common(lines, line_slot, slot, expansion, pixels),
-            layout.across * layout.side,
-            parts.start - band.start,
-        )
-
-    def _run_groups(
-        self,
-        lines: RangeLines,
-        line_slot: Slot,
-        slot: Slot,
-        parts: slice,
-        band: slice,
-        pixels: cl.Buffer,
-        ready: list[cl.Event],
-    ) -> cl.Event:
-        p, layout = self.p, self.p.layout
-        offsets = layout.offset_m[parts].reshape(-1, 3).T
-        slot.fill("offsets", offsets)
-        return p.device.run(
-            self.kernel,
-            (parts.stop - parts.start,),
-            *self._common(lines, line_slot, slot, line_slot["geometry"], pixels),
-            parts.start - band.start,
-            slot["centres"],
-            slot["offsets"],
-            offsets.shape[1],
-            p.samples_per_m,
-            wait_for=[*ready, *slot.filled[-1:]],
-        )
-
-    def _common(
-        self,
-        lines: RangeLines,
-        line_slot: Slot,
-        slot: Slot,
-        geometry: cl.Buffer,
-        pixels: cl.Buffer,
-    ) -> tuple[object, ...]:
-        """Return the arguments that both kernels begin with."""
-        p = self.p
-        return (
+            size,
             line_slot["samples"],
             self.pitch,
             slot["sample"],
@@ -358,10 +322,12 @@ class _Run:
             slot["phase"],
             geometry,
             lines.channels,
-            _channel_pitch(lines),
+            pitch,
             p.cycles_per_m / p.samples_per_m,
             self.weights,
             pixels,
+            *rest,
+            wait_for=line_slot.filled + slot.filled,
         )
 
     def _samples(self, lines: RangeLines) -> NDArray[np.float32]:

@@ -179,8 +179,8 @@ def lay_out(
     r^4/(8 R^3) at most, r its half diagonal and R the distance of the nearest antenna. The rms
     over a tile's pixels and directions is 0.15 of it. Within a block the third order is left out
     too: 0.19 r^3/R^2 at most, 0.04 of r^3/R^2 rms; and what receivers' motion does to the third
-    order of a tile, 0.2 of it times the speed ratio. Where even the smallest tile is too large, near
-    the antennas, and off a plane, pixels go into groups, which expand nothing.
+    order of a tile, 0.2 of it times the speed ratio. Where even the smallest tile is too large,
+    near the antennas, and off a plane, pixels go into groups, which expand nothing.
     """
     if grid.is_planar:
         tree = KDTree(antennas_m)
