@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from clsas import validate
 
 _ALL = slice(None)
+_PARALLEL = 1e-12  # sine of the angle between steps: float64 leaves 1e-16
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,7 +23,8 @@ class Grid:
 
         origin_m + row row_step_m + column column_step_m (+ height_m[row, column] along z).
 
-    All coordinates are float64, so that UTM-sized ones (1e7 m) keep nanometres.
+    All coordinates are float64, so that UTM-sized ones (1e7 m) keep nanometres. Arrays that need
+    no conversion are not copied: do not write into them afterwards.
 
     Attributes
     ----------
@@ -142,9 +144,8 @@ class Grid:
             If the points are not finite real numbers, or there is none, or the last axis is not
             of length 3.
         """
-        given = np.asarray(points_m)
-        wanted = (*(None,) * max(given.ndim - 1, 1), 3)
-        checked = validate.array("points_m", given, np.float64, wanted)
+        wanted = (*(None,) * max(np.ndim(points_m) - 1, 1), 3)
+        checked = validate.array("points_m", points_m, np.float64, wanted)
         return cls(None, None, None, checked.shape[:-1], points_m=checked)
 
     def with_height(self, height_m: ArrayLike) -> Self:
@@ -221,9 +222,13 @@ class Grid:
 
         Raises
         ------
+        TypeError
+            If `rows` or `columns` is not a slice.
         ValueError
             If nothing is selected.
         """
+        validate.instance("rows", rows, slice)
+        validate.instance("columns", columns, slice)
         if self.points_m is not None:
             return self.points(self.points_m[self._index(rows, columns)])
         row, column = (range(n)[s] for n, s in zip(self.shape, (rows, columns), strict=True))
@@ -272,7 +277,12 @@ def _check_steps(
     for (name, step), count in zip(steps.items(), shape, strict=True):
         if count > 1 and not step.any():
             raise ValueError(f"{name} must not be zero m, got {step} for {count} pixels")
-    if min(shape) > 1 and not np.cross(row_step_m, column_step_m).any():
+    if min(shape) == 1:
+        return
+    # Of steps of any length, by the sine of the angle between them.
+    directions = (step / np.abs(step).max() for step in steps.values())
+    sine = np.linalg.norm(np.cross(*(d / np.linalg.norm(d) for d in directions)))
+    if sine < _PARALLEL:
         raise ValueError(
             f"row_step_m and column_step_m must not be parallel, got {row_step_m} "
             f"and {column_step_m} m"

@@ -29,6 +29,10 @@ class Image:
         If the pixels are not complex or `grid` is not a Grid.
     ValueError
         If the pixels do not have the grid's shape, or a pixel is NaN or infinite.
+
+    Notes
+    -----
+    Pixels that need no conversion are not copied: do not write into them afterwards.
     """
 
     pixels: NDArray[np.complex64]

@@ -6,11 +6,13 @@ string is an attribute, a nested object is a group, None is left out.
 
 from __future__ import annotations
 
+import math
 import os
 import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import fields, is_dataclass
+from io import BytesIO
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
@@ -61,14 +63,25 @@ def save(path: str | os.PathLike, obj: Saved) -> None:
     TypeError
         If `obj` is of another type.
     OSError
-        If the folder does not exist or the file cannot be written.
+        If the folder does not exist or the file cannot be written, as on a full disk.
+
+    Notes
+    -----
+    The file is put together in memory, which thus holds the object once more: HDF5 does not
+    recover from a disk that turns out to be full.
     """
     validate.instance("obj", obj, *_SAVED)
-    # The metadata of HDF5 1.10 carry checksums; those of earlier versions do not all.
-    with replacing(path) as temporary, h5py.File(temporary, "x", libver=("v110", "v110")) as file:
-        _set(file, "format", FORMAT)
-        file.attrs["version"] = VERSION
-        _write(file, obj)
+    with replacing(path) as temporary:
+        memory = BytesIO()
+        # The metadata of HDF5 1.10 carry checksums; those of earlier versions do not all.
+        with h5py.File(memory, "w", libver=("v110", "v110")) as content:
+            _set(content, "format", FORMAT)
+            content.attrs["version"] = VERSION
+            _write(content, obj)
+        with temporary.open("xb") as file:
+            file.write(memory.getbuffer())
+            file.flush()
+            os.fsync(file.fileno())
 
 
 def load(path: str | os.PathLike) -> Saved:
@@ -190,12 +203,24 @@ def _read(group: h5py.Group) -> Any:
             values[field.name] = _attribute(group, field.name)
         elif field.name in group:
             item = group[field.name]
-            values[field.name] = _read(item) if isinstance(item, h5py.Group) else item[()]
+            values[field.name] = _read(item) if isinstance(item, h5py.Group) else _values(item)
         elif "None" in str(field.type):
             values[field.name] = None
         else:
             raise FileFormatError(f"lacks {field.name} of the {name} at {group.name}")
     return kind(**values)
+
+
+def _values(dataset: h5py.Dataset) -> np.ndarray:
+    # HDF5 reads what was never written as zeros, however many.
+    if dataset.chunks is None:
+        whole = dataset.id.get_storage_size() >= dataset.nbytes
+    else:
+        counts = map(math.ceil, np.divide(dataset.shape, dataset.chunks))
+        whole = dataset.id.get_num_chunks() == math.prod(counts)
+    if not whole:
+        raise FileFormatError(f"lacks a part of {dataset.name}, of shape {dataset.shape}")
+    return dataset[()]
 
 
 def _set(group: h5py.Group, name: str, value: Any) -> None:
@@ -218,6 +243,8 @@ def _check_header(file: h5py.File) -> None:
         raise FileFormatError(
             f"is of format version {version}, newer than this clsas, which reads up to {VERSION}"
         )
+    if version < 1:
+        raise FileFormatError(f"is of format version {version}, but the first one is 1")
 
 
 def _grid_dims(grid: Grid) -> tuple[str, ...]:

@@ -48,6 +48,12 @@ class RangeLines:
     ValueError
         If shapes disagree, an array is empty, a value is NaN or infinite, a step or speed is not
         positive, the carrier is negative, or a receiver is not slower than the waves.
+
+    Notes
+    -----
+    Arrays that need no conversion are not copied, since samples are large: the fields are
+    read-only views of them. Do not write into your own arrays afterwards; what is written is
+    not checked again.
     """
 
     samples: NDArray[np.complex64]
@@ -115,10 +121,20 @@ class RangeLines:
         ------
         IndexError
             If an index is outside the channels.
+        TypeError
+            If `channels` is neither a slice nor whole numbers nor bools.
         ValueError
             If nothing is selected.
         """
-        index = channels if isinstance(channels, slice) else np.atleast_1d(channels)
+        index = channels
+        if not isinstance(channels, slice):
+            index = np.atleast_1d(channels)
+            if index.size == 0:
+                raise ValueError("channels must select at least one line, got none")
+            if index.dtype.kind not in "iub":
+                raise TypeError(
+                    f"channels must be a slice, whole numbers or bools, got {channels!r}"
+                )
         velocity = self.rx_velocity_m_s
         return replace(
             self,

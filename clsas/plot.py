@@ -185,22 +185,29 @@ def save_png(figure: Figure, path: str | os.PathLike, *, dpi: float = 150.0) -> 
 
     Raises
     ------
-    ValueError
-        If `dpi` (pixels per inch) is not positive.
+    ImportError
+        If matplotlib is not installed.
+    TypeError, ValueError
+        If `figure` is not a Figure, or `dpi` (pixels per inch) is not a positive number.
     OSError
         If the folder does not exist or the file cannot be written.
     """
+    validate.instance("figure", figure, _figure_class())
     validate.positive("dpi", dpi, "pixels per inch")
     with replacing(path) as temporary:
         figure.savefig(temporary, format="png", dpi=dpi)
 
 
-def _figure(width_in: float, height_in: float) -> Figure:
+def _figure_class() -> type[Figure]:
     try:
         from matplotlib.figure import Figure
     except ImportError:
         raise ImportError("pictures need matplotlib: pip install clsas[plot]") from None
-    return Figure(figsize=(width_in, height_in), layout="constrained")
+    return Figure
+
+
+def _figure(width_in: float, height_in: float) -> Figure:
+    return _figure_class()(figsize=(width_in, height_in), layout="constrained")
 
 
 def _draw_levels(

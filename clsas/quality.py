@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import signal
 
 from clsas import validate
+from clsas.grid import Grid
 from clsas.image import Image
 
 _LOBES = 10  # side lobes on each side that the ISLR counts
@@ -106,9 +107,15 @@ def measure_point(
     ------
     ValueError
         If the image has no such axes, `near` is outside it, it is zero there or has no peak, its
-        peak is at the border, or the main lobe and a side lobe on each side do not fit in.
+        peak is at the border, `extent_m` is less than a pixel, or the main lobe and a side lobe
+        on each side do not fit in.
     TypeError
         If an argument is of a wrong kind.
+
+    Warns
+    -----
+    ClsasWarning
+        If a side lobe is higher than the peak, which then is itself one, or other targets are in.
 
     Notes
     -----
@@ -125,6 +132,8 @@ def measure_point(
             raise ValueError(f"image must have 3 or more pixels along {name}, got {len(axis)}")
         steps.append((axis[-1] - axis[0]) / (len(axis) - 1))
     dx, dy = steps
+    if extent_m is not None:
+        validate.number("extent_m", extent_m, "m", least=max(abs(dx), abs(dy)))
     row, column = _find_peak(image.pixels, (x_m, y_m), (dx, dy), near, search_m)
 
     top, left = max(row - _REACH, 0), max(column - _REACH, 0)
@@ -135,15 +144,21 @@ def measure_point(
 
     along_x = _sinc([row], pixels.shape[0])[0] @ pixels
     along_y = pixels @ _sinc([column], pixels.shape[1])[0]
-    if extent_m is not None:
-        validate.positive("extent_m", extent_m, "m")
-    return PointResponse(
+    response = PointResponse(
         x_m=float(x_m[0] + (left + column) * dx),
         y_m=float(y_m[0] + (top + row) * dy),
         amplitude=amplitude,
         azimuth=_measure_cut("x", along_x, column, dx, amplitude, extent_m),
         range=_measure_cut("y", along_y, row, dy, amplitude, extent_m),
     )
+    highest_db = max(*response.azimuth.pslr_db, *response.range.pslr_db)
+    if highest_db > 0:
+        validate.warn(
+            f"the peak near ({near[0]:.9g}, {near[1]:.9g}) m is {highest_db:.1f} dB lower than a "
+            "side lobe of it: give a nearer place or a larger search_m, or keep other targets out "
+            "by extent_m"
+        )
+    return response
 
 
 def relative_error_db(image: Image | ArrayLike, reference: Image | ArrayLike) -> float:
@@ -152,7 +167,7 @@ def relative_error_db(image: Image | ArrayLike, reference: Image | ArrayLike) ->
     Parameters
     ----------
     image, reference : Image or array_like
-        Complex images of one shape.
+        Complex images of one shape and, where both are Images, of the same pixel positions.
 
     Returns
     -------
@@ -162,18 +177,24 @@ def relative_error_db(image: Image | ArrayLike, reference: Image | ArrayLike) ->
     Raises
     ------
     ValueError
-        If the shapes differ, a value is not finite, or the reference is zero.
+        If the shapes or grids differ, a value is not finite, or the reference is zero.
     """
     given, wanted = _values("image", image), _values("reference", reference)
     if given.shape != wanted.shape:
         raise ValueError(
             f"image and reference must have one shape, got {given.shape} and {wanted.shape}"
         )
-    norm = np.linalg.norm(wanted)
-    if norm == 0:
+    if isinstance(image, Image) and isinstance(reference, Image):
+        _check_one_grid(image.grid, reference.grid)
+    if not wanted.any():
         raise ValueError("reference must not be zero everywhere")
-    error = np.linalg.norm(given - wanted) / norm
-    return 20 * math.log10(error) if error > 0 else -math.inf
+    # Scaled by the greatest part, so that no square overflows or vanishes.
+    given, wanted = given.view(np.float64), wanted.view(np.float64)
+    scale = max(np.abs(given).max(), np.abs(wanted).max())
+    error = given / scale - wanted / scale
+    if not error.any():
+        return -math.inf
+    return _norm_db(error) + 20 * math.log10(scale) - _norm_db(wanted)
 
 
 def entropy(image: Image | ArrayLike) -> float:
@@ -206,10 +227,29 @@ def contrast(image: Image | ArrayLike) -> float:
 
 
 def _values(name: str, image: Image | ArrayLike) -> NDArray[np.complex128]:
-    values = np.asarray(image.pixels if isinstance(image, Image) else image)
+    values = np.asanyarray(image.pixels if isinstance(image, Image) else image)
     if values.dtype.kind in "iuf":
         values = values.astype(np.complex128)
     return validate.array(name, values, np.complex128, (None,) * values.ndim)
+
+
+def _check_one_grid(image: Grid, reference: Grid) -> None:
+    """Refuse grids of one shape whose pixels lie elsewhere."""
+    part = [slice(None)] * 2
+    if image.is_planar and reference.is_planar:
+        part = [slice(None, None, max(count - 1, 1)) for count in image.shape]  # the corners
+    places = reference.positions_m(*part)
+    apart_m = np.abs(image.positions_m(*part) - places).max()
+    if apart_m > 1e-9 + 1e-14 * np.abs(places).max():
+        raise ValueError(
+            "image and reference must lie on one grid, got pixel positions that are up to "
+            f"{apart_m:g} m apart"
+        )
+
+
+def _norm_db(values: NDArray[np.float64]) -> float:
+    greatest = np.abs(values).max()
+    return 20 * (math.log10(greatest) + math.log10(np.linalg.norm(values / greatest)))
 
 
 def _intensity(image: Image | ArrayLike) -> NDArray[np.float64]:

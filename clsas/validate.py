@@ -5,9 +5,11 @@ Every check raises one exception that names the argument, what was given and wha
 
 from __future__ import annotations
 
+import math
 import sys
 import warnings
 from collections.abc import Sequence
+from numbers import Real
 
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
@@ -46,12 +48,13 @@ def number(
     ValueError
         If it is not finite, or not above `above` and below `below`, or outside [`least`, `most`].
     """
-    if isinstance(value, bool) or (not np.isscalar(value) and np.ndim(value) != 0):
-        raise TypeError(f"{name} must be one number{_in(unit)}, got {value!r}")
+    scalar = value[()] if getattr(value, "ndim", None) == 0 else value
+    if isinstance(scalar, bool) or not isinstance(scalar, Real) or np.ma.is_masked(value):
+        raise TypeError(f"{name} must be one real number{_in(unit)}, got {value!r}")
     try:
-        result = float(value)
-    except (TypeError, ValueError):
-        raise TypeError(f"{name} must be one real number{_in(unit)}, got {value!r}") from None
+        result = float(scalar)
+    except OverflowError:  # a whole number or fraction beyond float64
+        result = math.inf if scalar > 0 else -math.inf
     limits = []
     if above is not None:
         limits.append(f"> {above:g}")
@@ -131,20 +134,29 @@ def array(
     TypeError
         If the values are not numbers of a kind that fits `dtype`.
     ValueError
-        If the shape differs, an axis is empty, or a value is NaN or infinite.
+        If the shape differs, an axis is empty, or a value is NaN, infinite or masked.
+
+    Notes
+    -----
+    What needs no conversion is not copied: the result is a read-only view of it.
     """
     dtype = np.dtype(dtype)
     try:
         given = np.asarray(value)
     except ValueError as error:
         raise ValueError(f"{name} must be a regular array: {error}") from None
-    if dtype.kind == "c" and given.dtype.kind != "c":
-        raise TypeError(
-            f"{name} must be complex, got {given.dtype}: real samples hold no phase; "
-            "form the analytic signal first (clsas.compress does)"
-        )
-    if dtype.kind != "c" and given.dtype.kind not in "iuf":
-        raise TypeError(f"{name} must be real numbers, got {given.dtype}")
+    if given.dtype.kind not in ("c" if dtype.kind == "c" else "iuf"):
+        wanted = "complex" if dtype.kind == "c" else "real"
+        got = given.dtype if given.ndim else type(value).__name__
+        reason = ""
+        if name == "samples" and given.dtype.kind in "iuf":
+            reason = (
+                ": real samples hold no phase; form the analytic signal first (clsas.compress does)"
+            )
+        raise TypeError(f"{name} must be {wanted} numbers, got {got}{reason}")
+    if np.ma.is_masked(value):
+        masked = np.ma.count_masked(value)
+        raise ValueError(f"{name} must hold no masked value, got {masked} of {given.size}")
     if broadcast and given.shape == shape[1:]:
         given = np.broadcast_to(given, shape)
     fits = given.ndim == len(shape) and all(

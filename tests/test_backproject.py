@@ -259,7 +259,7 @@ def test_where_the_scene_lies_does_not_matter(case, platform, motion):
         turn @ grid.origin_m + shift, turn @ grid.row_step_m, turn @ grid.column_step_m, grid.shape
     )
     image = backproject(there, grid_there, device=platform, **FINE)
-    assert relative_error_db(image, backproject(lines, grid, device=platform, **FINE)) <= -80
+    assert relative_error_db(image.pixels, backproject(lines, grid, device=platform, **FINE)) <= -80
 
 
 def test_transmitter_and_receiver_may_be_exchanged(platform):

@@ -105,6 +105,24 @@ def test_window_lies_where_its_pixels_were(grid, rows, columns):
 
 
 @EVERY_GRID
+def test_window_takes_slices_only(grid):
+    with pytest.raises(TypeError, match="rows must be of type slice, got int"):
+        grid.window(3)
+    with pytest.raises(TypeError, match="columns must be of type slice, got list"):
+        grid.window(slice(0, 1), [0])
+
+
+@pytest.mark.parametrize("scale", [1e-200, 1.0, 1e200])
+def test_steps_are_parallel_by_their_angle(scale):
+    shape = (2, 2)
+    row, column = scale * np.array([1.0, 0, 0]), scale * np.array([1.0, 1e-9, 0])
+    assert Grid.oriented(ZERO, row, column, shape).shape == shape
+    for other in (scale * np.array([1.0, 1e-20, 0]), -1e-30 * row, 0.1 * row):
+        with pytest.raises(ValueError, match="must not be parallel"):
+            Grid.oriented(ZERO, row, other, shape)
+
+
+@EVERY_GRID
 def test_window_must_hold_a_pixel(grid):
     with pytest.raises(ValueError, match=r"must hold a pixel|no empty axis"):
         grid.window(slice(3, 3), slice(None))
@@ -177,6 +195,7 @@ ZERO, ONE, TWO = [0.0, 0, 0], [1.0, 0, 0], [2.0, 0, 0]
         (lambda: Grid.points(np.zeros((0, 3))), ValueError, "no empty axis"),
         (lambda: Grid.points(np.zeros((5, 2))), ValueError, r"shape \(any, 3\)"),
         (lambda: Grid.points(np.full((5, 3), np.nan)), ValueError, "points_m must be finite"),
+        (lambda: Grid.points(np.ma.masked_equal([ZERO], 0)), ValueError, "points_m must hold no m"),
         (lambda: Grid.points(np.zeros((5, 3), complex)), TypeError, "points_m must be real"),
         (lambda: Grid(ZERO, None, None, (1,), points_m=[ZERO]), ValueError, "must stand alone"),
     ],

@@ -62,6 +62,18 @@ def digest(obj):
     return hashlib.sha256(text.encode()).hexdigest()
 
 
+def run_beside(code, *arguments):
+    """What Python code that may import this module prints in another process."""
+    folders = [os.path.dirname(__file__), *sys.path]
+    return subprocess.run(
+        [sys.executable, "-c", code, *arguments],
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, folders))},
+        stdout=subprocess.PIPE,
+        text=True,
+        check=True,
+    ).stdout
+
+
 @EVERY_OBJECT
 def test_round_trip_keeps_every_bit(obj, tmp_path):
     save(tmp_path / "file.h5", obj)
@@ -74,15 +86,7 @@ def test_another_process_reads_every_bit(tmp_path):
     for path, obj in zip(paths, OBJECTS.values(), strict=True):
         save(path, obj)
     code = "import sys, test_io as t\nfor p in sys.argv[1:]: print(t.digest(t.load(p)))"
-    folders = [os.path.dirname(__file__), *sys.path]
-    done = subprocess.run(
-        [sys.executable, "-c", code, *paths],
-        env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, folders))},
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    assert done.stdout.split() == [digest(obj) for obj in OBJECTS.values()]
+    assert run_beside(code, *paths).split() == [digest(obj) for obj in OBJECTS.values()]
 
 
 def test_schema_is_the_documented_one(tmp_path):
@@ -115,19 +119,37 @@ def test_an_interrupted_save_leaves_nothing(error, exists, tmp_path, monkeypatch
     path = tmp_path / "file.h5"
     if exists:
         path.write_bytes(b"what was there")
-    write, begun = io._write, []
+    begun = []
 
-    def interrupted(group, obj):
-        write(group, obj)
+    def interrupted(_):
         begun.extend(os.listdir(tmp_path))
         raise error
 
-    monkeypatch.setattr(io, "_write", interrupted)
+    monkeypatch.setattr(io.os, "fsync", interrupted)
     with pytest.raises(error):
         save(path, OBJECTS["lines"])
     assert len(set(begun) - {"file.h5"}) == 1  # it was being written, under another name
     assert os.listdir(tmp_path) == (["file.h5"] if exists else [])
     assert not exists or path.read_bytes() == b"what was there"
+
+
+FULL_DISK = """
+import errno, resource, sys, test_io as t
+resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, 10_000))
+for path in sys.argv[1:]:
+    try:
+        t.save(path, t.RangeLines(t.complex_noise(4, 5000), 40, 0.1, t.TX, t.RX, 0, 1500))
+    except OSError as error:
+        print(errno.errorcode[error.errno])
+"""
+
+
+def test_a_full_disk_is_an_error_and_leaves_nothing(tmp_path):
+    (tmp_path / "old.h5").write_bytes(b"what was there")
+    done = run_beside(FULL_DISK, str(tmp_path / "new.h5"), str(tmp_path / "old.h5"))
+    assert done.split() == ["EFBIG", "EFBIG"]  # and the interpreter ended well
+    assert os.listdir(tmp_path) == ["old.h5"]
+    assert (tmp_path / "old.h5").read_bytes() == b"what was there"
 
 
 def test_save_replaces(tmp_path):
@@ -170,6 +192,8 @@ def change(file, name):
             file.attrs["format"] = "NetCDF"
         case "newer":
             file.attrs["version"] = 2
+        case "of version 0":
+            file.attrs["version"] = 0
         case "without version":
             del file.attrs["version"]
         case "of unknown kind":
@@ -195,6 +219,7 @@ def change(file, name):
         ("foreign", "is an HDF5 file, but not one of clsas"),
         ("of another format", "is an HDF5 file, but not one of clsas"),
         ("newer", "is of format version 2, newer than this clsas, which reads up to 1"),
+        ("of version 0", "is of format version 0, but the first one is 1"),
         ("without version", "is damaged: .*version"),
         ("of unknown kind", "holds an object of unknown kind 'hologram'"),
         ("without kind", "holds an object of unknown kind None"),
@@ -211,6 +236,20 @@ def test_load_names_what_is_wrong(name, words, tmp_path):
     with h5py.File(path, "r+") as file:
         change(file, name)
     with pytest.raises(FileFormatError, match=rf"file\.h5 {words}"):
+        load(path)
+
+
+@pytest.mark.parametrize("chunks", [None, (2, 4)])
+@pytest.mark.parametrize("shape", [(4, 6), (10**6, 10**6)])
+def test_samples_never_written_are_refused(shape, chunks, tmp_path):
+    path = tmp_path / "file.h5"
+    save(path, OBJECTS["lines"])
+    with h5py.File(path, "r+") as file:
+        del file["samples"]
+        samples = file.create_dataset("samples", shape, np.complex64, chunks=chunks)
+        if chunks is not None:
+            samples[:2, :6] = samples[2:4, :4] = 1  # all but one of the chunks of the small one
+    with pytest.raises(FileFormatError, match=r"file\.h5 lacks a part of /samples, of shape"):
         load(path)
 
 

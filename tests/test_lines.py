@@ -82,6 +82,10 @@ def test_select_keeps_the_axis_of_one_channel():
 def test_select_refuses_nothing_and_beyond():
     with pytest.raises(ValueError, match="samples must have shape"):
         make().select(slice(2, 2))
+    with pytest.raises(ValueError, match="channels must select at least one line, got none"):
+        make().select([])
+    with pytest.raises(TypeError, match=r"channels must be a slice, whole .* got \[1\.5\]"):
+        make().select([1.5])
     with pytest.raises(IndexError):
         make().select([4])
 
@@ -106,7 +110,7 @@ def with_bad(shape, value):
         ({"first_range_m": [1.0, 2.0]}, ValueError, "first_range_m must have shape"),
         ({"range_step_m": 0.0}, ValueError, "range_step_m must be finite and > 0 m, got 0"),
         ({"range_step_m": -0.1}, ValueError, "range_step_m"),
-        ({"range_step_m": [0.1, 0.1]}, TypeError, "range_step_m must be one number m"),
+        ({"range_step_m": [0.1, 0.1]}, TypeError, "range_step_m must be one real number m"),
         ({"tx_m": np.zeros((5, 3))}, ValueError, r"tx_m must have shape \(4, 3\)"),
         ({"rx_m": 0.0}, ValueError, r"rx_m must have shape \(4, 3\)"),
         ({"rx_m": with_bad((4, 3), np.inf)}, ValueError, "rx_m must be finite"),

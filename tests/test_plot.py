@@ -195,6 +195,14 @@ def test_bad_input_is_named():
         plot.cuts(measure_point(IMAGE, (X[80], Y[60])), floor_db=3)
 
 
+def test_only_figures_are_saved(tmp_path):
+    with pytest.raises(TypeError, match="figure must be of type Figure, got int"):
+        plot.save_png(5, tmp_path / "a.png")
+    with pytest.raises(TypeError, match="response must be of type PointResponse, got Image"):
+        plot.cuts(IMAGE)
+    assert os.listdir(tmp_path) == []
+
+
 def test_missing_matplotlib_says_how_to_get_it(monkeypatch):
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
     with pytest.raises(ImportError, match=r"pip install clsas\[plot\]"):

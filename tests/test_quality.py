@@ -5,6 +5,7 @@ from scipy import integrate, optimize
 from clsas.grid import Grid
 from clsas.image import Image
 from clsas.quality import contrast, entropy, measure_point, relative_error_db
+from clsas.validate import ClsasWarning
 
 # Closed forms of the point responses, in units of 1 / bandwidth.
 PEDESTALS = {"sinc": 1.0, "Hamming": 0.54}
@@ -176,8 +177,9 @@ def test_takes_the_greatest_pixel_within_the_search():
             {"pixels": point(at=(X[2], AT[1])), "near": (X[2], AT[1])},
             "no whole side lobe at smaller",
         ),
-        ({"extent_m": 0.01}, "no whole side lobe"),
-        ({"extent_m": 0}, "extent_m must be finite and > 0 m"),
+        ({"extent_m": 0.011}, "no whole side lobe"),
+        ({"extent_m": 1e-9}, r"extent_m must be finite and >= 0\.01 m, got 1e-09"),
+        ({"extent_m": 0}, r"extent_m must be finite and >= 0\.01 m, got 0"),
         ({"search_m": -1}, "search_m must be finite and > 0 m"),
     ],
 )
@@ -186,6 +188,13 @@ def test_bad_input_is_named(change, words):
     image = Image(arguments.pop("pixels", point()), GRID)
     with pytest.raises(ValueError, match=words):
         measure_point(image, **arguments)
+
+
+def test_a_side_lobe_taken_for_the_point_is_told():
+    side_lobe = AT[0] + 1.43 * 3 * DX, AT[1]
+    with pytest.warns(ClsasWarning, match=r"is 13\.\d dB lower than a side lobe of it"):
+        got = measure_point(Image(point(3.0), GRID), side_lobe, search_m=2 * DX)
+    assert got.azimuth.pslr_db[0] == pytest.approx(13.26, abs=0.1)
 
 
 def test_needs_an_image_with_axes():
@@ -215,11 +224,41 @@ def test_relative_error():
     assert relative_error_db(single, single) == -np.inf
 
 
+@pytest.mark.parametrize("scale", [1e-320, 1e-200, 1.0, 1e200, 1e307])
+def test_relative_error_does_not_depend_on_scale(scale):
+    image, reference = np.array([[2.0, 4.0j]]) * scale, np.array([[1.0, 1.0j]]) * scale
+    wanted = 10 * np.log10(5)
+    assert relative_error_db(image, reference) == pytest.approx(wanted, abs=1e-2)
+    assert relative_error_db([1e-200], [1e200]) == pytest.approx(0)
+    assert relative_error_db([1e200], [1e-200]) == pytest.approx(8000)
+
+
+def test_relative_error_is_of_one_place():
+    pixels = speckle(30, 40)
+    grid = Grid.plane((1e6, 1e6 + 1, 40), (0, 1, 30))
+    image = Image(pixels, grid)
+    for same in (
+        Grid.points(grid.positions_m()),
+        grid.with_height(np.zeros(grid.shape)),
+        Grid.plane((1e6 - 1, 1e6 + 1, 79), (0, 1, 30)).window(columns=slice(39, None)),
+    ):
+        assert relative_error_db(image, Image(pixels, same)) == -np.inf
+    for other, apart in (
+        (Grid.plane((1e6, 1e6 + 1.5, 40), (0, 1, 30)), "0.5"),
+        (Grid.plane((1e6, 1e6 + 1, 40), (1, 0, 30)), "1"),
+        (grid.with_height(np.full(grid.shape, 2.0)), "2"),
+    ):
+        with pytest.raises(ValueError, match=f"image and ref.* one grid, got .* to {apart} m apa"):
+            relative_error_db(image, Image(pixels, other))
+
+
 def test_relative_error_names_bad_input():
     with pytest.raises(ValueError, match=r"must have one shape, got \(2, 3\) and \(3, 2\)"):
         relative_error_db(speckle(2, 3), speckle(3, 2))
     with pytest.raises(ValueError, match="reference must not be zero"):
         relative_error_db(speckle(2, 3), np.zeros((2, 3)))
+    with pytest.raises(ValueError, match="image must hold no masked value, got 1 of 2"):
+        relative_error_db(np.ma.array([1.0, 2.0], mask=[True, False]), [1.0, 2.0])
     with pytest.raises(ValueError, match="image must be finite"):
         relative_error_db(np.full((2, 3), np.nan), speckle(2, 3))
 

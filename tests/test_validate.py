@@ -1,3 +1,5 @@
+from fractions import Fraction
+
 import numpy as np
 import pytest
 
@@ -15,7 +17,24 @@ def test_number_refuses_what_is_not_finite(value):
         validate.number("speed", value, "m/s")
 
 
-@pytest.mark.parametrize("value", [True, "fast", None, [1.0, 2.0], 1j])
+@pytest.mark.parametrize("value", [10**400, -(10**400), Fraction(10**400)])
+def test_number_refuses_what_float64_does_not_hold(value):
+    with pytest.raises(ValueError, match=r"step must be finite and > 0 m, got -?inf"):
+        validate.positive("step", value, "m")
+
+
+@pytest.mark.parametrize("value", [2, np.int8(2), np.array(2.0), Fraction(2), np.ma.array(2.0)])
+def test_number_takes_every_real_number(value):
+    assert validate.number("speed", value) == 2.0
+
+
+@pytest.mark.parametrize(
+    "value",
+    [
+        *(True, np.True_, np.array(True), "fast", "3", b"3", None, [1.0, 2.0], [3.0], np.ones(1)),
+        *(1j, np.complex64(1), np.ma.masked, np.datetime64("now")),
+    ],
+)
 def test_number_refuses_other_kinds(value):
     with pytest.raises(TypeError, match=r"speed must be one .*number m/s, got"):
         validate.number("speed", value, "m/s")
@@ -93,8 +112,31 @@ def test_array_narrows_complex():
 
 
 def test_array_refuses_real_where_complex_is_due():
-    with pytest.raises(TypeError, match="samples must be complex, got float64: real samples"):
+    with pytest.raises(TypeError, match="samples must be complex numbers, got float64: real s"):
         validate.array("samples", np.ones((2, 2)), np.complex64, (None, None))
+
+
+@pytest.mark.parametrize(
+    ("name", "given", "got"),
+    [
+        ("samples", None, "NoneType"),
+        ("samples", "loud", "str"),
+        ("samples", [[None]], "object"),
+        ("samples", [[True]], "bool"),
+        ("pixels", np.ones((2, 2)), "float64"),
+    ],
+)
+def test_array_speaks_of_phase_only_where_samples_are_real(name, given, got):
+    with pytest.raises(TypeError, match=rf"^{name} must be complex numbers, got {got}$"):
+        validate.array(name, given, np.complex64, (None, None))
+
+
+def test_array_refuses_masked_values():
+    given = np.ma.array([1.0, 2.0, 3.0], mask=[False, True, False])
+    with pytest.raises(ValueError, match="x must hold no masked value, got 1 of 3"):
+        validate.array("x", given, np.float64, (None,))
+    result = validate.array("x", np.ma.array([1.0, 2.0]), np.float64, (None,))
+    np.testing.assert_array_equal(result, [1.0, 2.0])
 
 
 @pytest.mark.parametrize("given", [[1j], ["a"], [None], [True], [np.datetime64("now")]])
