@@ -182,8 +182,7 @@ def execute(
     The image is formed in bands that fit the device, each from blocks of channels, each block in
     jobs of so many (part, channel) pairs; a job is prepared on the host while the one before runs.
     """
-    if not (progress is None or callable(progress)):
-        raise TypeError(f"progress must be a function or None, got {progress!r}")
+    validate.progress(progress)
     p = preparation
     layout, device = p.layout, p.device
     pixels = np.empty(layout.parts * layout.part_pixels, np.complex64)

@@ -10,6 +10,7 @@ import importlib.util
 import json
 import math
 import sys
+import tempfile
 import time
 import warnings
 from collections.abc import Callable, Iterator
@@ -26,10 +27,12 @@ from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, T
 
 import clsas
 from clsas import demo as demonstration
+from clsas import validate
 from clsas.backproject import execute, prepare
 from clsas.config import SceneFile, read_scene
 from clsas.device import choose
 from clsas.quality import Cut, PointResponse
+from clsas.validate import positive
 
 # What users cause, and what machines lack.
 _ERRORS = (
@@ -96,9 +99,30 @@ class _Output(click.Path):
         path: Any = super().convert(value, param, ctx)
         if not path.parent.is_dir():
             self.fail(f"there is no folder {str(path.parent)!r}", param, ctx)
+        try:
+            special = _exists(path) and not path.is_file()
+            with tempfile.TemporaryFile(dir=path.parent):
+                pass
+        except OSError as error:
+            self.fail(f"{str(path)!r} cannot be written: {error.strerror}", param, ctx)
+        if special:
+            self.fail(f"{str(path)!r} is not an ordinary file", param, ctx)
+        # Whichever of the two comes second on the command line finds the first one here.
+        other = ctx.params.get("output" if param.name == "png" else "png")
+        if other is not None and other.resolve() == path.resolve():
+            self.fail("-o and --png must be two files", param, ctx)
         if param.name == "png":
             _need_matplotlib()
         return path
+
+
+def _exists(path: Path) -> bool:
+    """Return whether a path is taken; raises OSError where it cannot be (a long name)."""
+    try:
+        path.stat()
+    except FileNotFoundError:
+        return False
+    return True
 
 
 def _need_matplotlib() -> None:
@@ -143,7 +167,7 @@ def devices(as_json: bool) -> None:
     """List OpenCL devices, and say which one is used and why.
 
     \b
-    Example:  CLSAS_DEVICE=cpu clsas devices
+    Example:  CLSAS_DEVICE=0 clsas devices
     """
     used, reason = choose()
     found = clsas.list_devices()
@@ -247,7 +271,10 @@ def compress(
 @click.option("--taps", type=int, help="Fix the interpolator's taps: 2, 4, 6 or 8.")
 @click.option("--upsampling", type=float, help="Fix how much lines are upsampled.")
 @_png("the image in dB")
-@click.option("--dynamic-range-db", type=float, default=60.0, show_default=True, help="Of the PNG.")
+@click.option(
+    "--dynamic-range-db", type=float, default=60.0, show_default=True, help="Of the PNG.",
+    callback=lambda ctx, param, value: positive("dynamic_range_db", value, "dB"),
+)  # fmt: skip
 @click.option("--profile", is_flag=True, help="Also report the time of every kernel.")
 @_as_json
 def image(
@@ -277,8 +304,13 @@ def image(
         raise click.UsageError("--x and --y go together, and --z with them")
     if scene is None and x is None:
         raise click.UsageError("a grid is needed: --scene, or --x and --y")
+    if None not in (accuracy_db, taps, upsampling):
+        raise click.UsageError(
+            "--accuracy-db plays no part where --taps and --upsampling are given"
+        )
     described = read_scene(scene) if scene is not None else SceneFile(name="")
     grid = clsas.Grid.plane(x, y, z or 0.0) if x and y else described.need("grid")[0]
+    validate.memory("--x and --y" if x else "[grid]", 8 * grid.size)
     options = _options(described.image, accuracy_db=accuracy_db, taps=taps, upsampling=upsampling)
     _warn_of_sampling(described, grid)
     lines = _load(lines_file, clsas.RangeLines)
@@ -384,7 +416,7 @@ def demo(out: Path, device: str | None, as_json: bool) -> None:
 def bench(
     case: str | None, device: str | None, accuracy_db: float, repeats: int, as_json: bool
 ) -> None:
-    """Time a benchmark case and measure its error; every case unless one is named.
+    """Time a benchmark case and measure its error; without CASE, all of them run.
 
     With --json every case is one line.
 
@@ -428,6 +460,8 @@ def _show_warning(message: Warning | str, *_: Any, **__: Any) -> None:
 def _message(error: BaseException) -> str:
     if isinstance(error, OSError) and error.strerror:
         return f"{error.strerror}: {error.filename}" if error.filename else error.strerror
+    if isinstance(error, MemoryError):
+        return f"out of memory: {error}" if str(error) else "out of memory"
     return str(error) or type(error).__name__
 
 
@@ -436,6 +470,7 @@ def _load(path: Path, kind: type) -> Any:
     if isinstance(obj, kind):
         return obj
     hint = {
+        clsas.Echoes: " (clsas simulate makes them)",
         clsas.RangeLines: " (clsas compress makes them)",
         clsas.Image: " (clsas image makes it)",
     }

@@ -62,8 +62,8 @@ def compress(
     Raises
     ------
     TypeError, ValueError
-        If an argument is outside its limits, the band is not inside what was sampled, or the
-        recording is no longer than the pulse.
+        If an argument is of another type or outside its limits, the band is not inside what was
+        sampled, the recording is no longer than the pulse, or the lines do not fit into memory.
 
     Notes
     -----
@@ -76,9 +76,11 @@ def compress(
     fades out smoothly in the padding behind that, so the sum is that linear convolution:
     nothing wraps around, and nothing is cut off.
     """
+    validate.instance("echoes", echoes, Echoes)
+    validate.progress(progress)
+    check_options(window=window, oversampling=oversampling)
     pulse, rate = echoes.pulse, echoes.sample_rate_hz
     band = _band(echoes, bandwidth_hz)
-    oversampling = validate.number("oversampling", oversampling, least=1.0)
     weights = band_window(window, band)
     duration = 0.0 if pulse is None else pulse.duration_s
     whole = echoes.length - 1 - duration * rate
@@ -88,8 +90,14 @@ def compress(
             f"got {(echoes.length - 1) / rate:g} s"
         )
 
-    ratio = _fraction(oversampling * band / rate)
     fade = EDGE_PRODUCT * rate / (_BAND_EDGE * band)
+    wanted = float(oversampling) * band / rate
+    # The lines, and one padded channel in work before and after resampling.
+    validate.memory(
+        "oversampling" if wanted > 1 else "bandwidth_hz",
+        8 * echoes.channels * whole * wanted + 32 * (echoes.length + fade) * (1 + wanted),
+    )
+    ratio = _fraction(wanted)
     units = fft.next_fast_len(math.ceil(2 * (echoes.length + fade) / ratio.denominator))
     padded, resampled = units * ratio.denominator, units * ratio.numerator
     length = int(whole * ratio + 1e-9) + 1
@@ -125,6 +133,12 @@ def compress(
     )
 
 
+def check_options(*, window: Window = "none", oversampling: float = 2.0) -> None:
+    """Raise TypeError or ValueError unless `compress` takes these for any echoes."""
+    band_window(window, 1.0)
+    validate.number("oversampling", oversampling, least=1.0)
+
+
 def band_window(
     window: Window, bandwidth_hz: float
 ) -> Callable[[NDArray[np.float64]], NDArray[np.float64]]:
@@ -148,7 +162,7 @@ def band_window(
     count = 4097
     try:
         values = get_window(window, count, fftbins=False)
-    except (ValueError, TypeError) as error:
+    except (ValueError, TypeError, IndexError) as error:
         raise ValueError(
             f"window must be 'none' or a window of scipy.signal.get_window, "
             f"got {window!r} ({error})"

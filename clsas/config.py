@@ -22,8 +22,12 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from clsas import validate
+from clsas.backproject import BEST_ACCURACY_DB
+from clsas.compress import check_options as check_compression
 from clsas.grid import Grid
+from clsas.interpolation import TAPS
 from clsas.scene import PointTargets
+from clsas.simulate import check_options as check_simulation
 from clsas.sonar import Pulse, Sonar, line_array
 from clsas.track import Motion, Pointing, Track
 
@@ -73,10 +77,11 @@ def read_scene(path: str | os.PathLike) -> SceneFile:
     Raises
     ------
     ValueError
-        If it is not TOML, or a key is unknown, missing, of a wrong type or outside its limits:
-        one line per mistake, each with the key's path, what was given and what is allowed.
+        If it is not TOML, a key is unknown, missing, of a wrong type or outside its limits (one
+        line per mistake, each with the key's path, what was given and what is allowed), or a file
+        that it names cannot be read.
     OSError
-        If it, or a file that it names, cannot be read.
+        If it cannot be read.
     """
     path = Path(path)
     return parse_scene(path.read_bytes(), name=str(path), folder=path.parent)
@@ -180,7 +185,8 @@ class _Motion(_Table):
     def _motion(self, name: str, unit: str, scale: float = 1.0) -> Motion:
         amplitude = scale * validate.number(name, getattr(self, name), unit)
         period = validate.positive("period_s", self.period_s, "s")
-        phases, frequencies = np.radians([self.phase_deg]), np.array([1 / period])
+        phase = validate.number("phase_deg", self.phase_deg, "degrees")
+        phases, frequencies = np.radians([phase]), np.array([1 / period])
         if self.random_seed is not None:
             if "phase_deg" in self.model_fields_set:
                 raise ValueError("phase_deg must be left out with random_seed")
@@ -230,7 +236,12 @@ class _Track(_Table):
             if others:
                 raise ValueError(f"[track] file must stand alone, got also {', '.join(others)}")
             with _in("[track] file"):
-                return read_track(folder / self.file)
+                try:
+                    return read_track(folder / self.file)
+                except OSError as error:
+                    raise ValueError(
+                        f"must be readable: {error.strerror}: {folder / self.file}"
+                    ) from None
         course = ("start_m", "velocity_m_s", "pings", "ping_interval_s")
         for name in course:
             if getattr(self, name) is None:
@@ -277,8 +288,10 @@ class _Pointing(_Table):
     def build(self) -> Pointing:
         with _in("[simulate.pointing]"):
             if self.spot_m is None:
-                angles = np.radians(self.squint_deg)
-                return Pointing.scan(angles, depression_rad=np.radians(self.depression_deg))
+                squint = np.atleast_1d(self.squint_deg)
+                squint = validate.array("squint_deg", squint, np.float64, (None,))
+                depression = validate.number("depression_deg", self.depression_deg, "degrees")
+                return Pointing.scan(np.radians(squint), depression_rad=np.radians(depression))
             if len(self.model_fields_set) > 1:
                 raise ValueError("spot_m must stand alone: it sets the angles")
             return Pointing.spot(self.spot_m)
@@ -292,16 +305,43 @@ class _Simulate(_Table):
     seed: int = 0
     pointing: _Pointing | None = None
 
+    def build(self) -> dict[str, Any]:
+        options = self.given()
+        if self.pointing is not None:
+            options["pointing"] = self.pointing.build()
+        with _in("[simulate]"):
+            check_simulation(**options)
+        return options
+
 
 class _Compress(_Table):
     window: str | list[str | float] = "none"
     oversampling: float = 2.0
+
+    def build(self) -> dict[str, Any]:
+        options = self.given()
+        if isinstance(self.window, list):
+            options["window"] = tuple(self.window)
+        with _in("[compress]"):
+            check_compression(**options)
+        return options
 
 
 class _Image(_Table):
     accuracy_db: float = -60.0
     taps: int | None = None
     upsampling: float | None = None
+
+    def build(self) -> dict[str, Any]:
+        with _in("[image]"):
+            validate.number(
+                "accuracy_db", self.accuracy_db, "dB", least=BEST_ACCURACY_DB, below=0.0
+            )
+            if self.taps is not None and self.taps not in TAPS:
+                raise ValueError(f"taps must be one of {TAPS}, got {self.taps}")
+            if self.upsampling is not None:
+                validate.number("upsampling", self.upsampling, least=1.0, most=64.0)
+        return self.given()
 
 
 class _Scene(_Table):
@@ -321,21 +361,15 @@ class _Scene(_Table):
                     np.reshape([target.position_m for target in self.targets], (-1, 3)),
                     np.array([target.amplitude for target in self.targets], complex),
                 )
-        simulate = self.simulate.given()
-        if self.simulate.pointing is not None:
-            simulate["pointing"] = self.simulate.pointing.build()
-        compress = self.compress.given()
-        if isinstance(self.compress.window, list):
-            compress["window"] = tuple(self.compress.window)
         return SceneFile(
             name=name,
             sonar=self.sonar.build() if self.sonar else None,
             track=self.track.build(folder) if self.track else None,
             targets=targets,
             grid=self.grid.build() if self.grid else None,
-            simulate=simulate,
-            compress=compress,
-            image=self.image.given(),
+            simulate=self.simulate.build(),
+            compress=self.compress.build(),
+            image=self.image.build(),
         )
 
 
@@ -353,7 +387,8 @@ def read_track(path: str | os.PathLike) -> Track:
     Raises
     ------
     ValueError
-        If a column is unknown or missing, a value is not a finite number, or time does not ascend.
+        If a column is unknown, missing or there twice, a value is not a finite number, or time
+        does not ascend.
     OSError
         If the file cannot be read.
     """
@@ -366,7 +401,7 @@ def read_track(path: str | os.PathLike) -> Track:
         if name not in known:
             raise ValueError(f"{path}: unknown column {name!r}{_near(name, known)}")
     velocity = _VELOCITY if set(names) & set(_VELOCITY) else ()
-    for name in (*_POSITION, *velocity):
+    for name in (*_POSITION, *velocity, *names):
         if names.count(name) != 1:
             raise ValueError(f"{path}: column {name!r} must be there once")
     values = np.empty((len(rows), len(names)))

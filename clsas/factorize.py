@@ -9,6 +9,7 @@ import numpy as np
 import pyopencl as cl
 from numpy.typing import NDArray
 
+from clsas import validate
 from clsas.backproject import float_pairs
 from clsas.device import Device, open_device
 from clsas.geometry import pairwise_range_m
@@ -77,6 +78,7 @@ def factorize(
     varies slowly with its direction, and is interpolated from those of fewer, virtual channels:
     f_n ~ sum_m a_nm f_m. Hence sum_n s_n f_n ~ sum_m (sum_n a_nm s_n) f_m.
     """
+    validate.progress(progress)
     chosen = plan_or_tolerance
     if not isinstance(chosen, Plan):
         chosen = plan(lines, grid, tolerance_db=chosen)

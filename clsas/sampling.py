@@ -53,7 +53,13 @@ def check_sampling(sonar: Sonar, track: Track, grid: Grid) -> list[Finding]:
     -------
     list of Finding
         Empty if all is well.
+
+    Raises
+    ------
+    TypeError
+        If an argument is of another type.
     """
+    validate.instance("grid", grid, Grid)
     tx, rx, _ = channels(sonar, track)
     corners = _corners_m(grid)
     ranges = bistatic_range_m(corners[:, None], tx, rx)
@@ -174,9 +180,12 @@ def ping_advance_m(sonar: Sonar) -> float:
 
     Raises
     ------
+    TypeError
+        If `sonar` is not a Sonar.
     ValueError
         If the sonar has one receiver and no element length.
     """
+    validate.instance("sonar", sonar, Sonar)
     if sonar.receivers > 1:
         return float(np.ptp(sonar.rx_m[:, 0]) / (sonar.receivers - 1) * sonar.receivers / 2)
     if sonar.element_length_m is None:

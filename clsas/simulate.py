@@ -32,6 +32,7 @@ from scipy import fft
 
 from clsas import validate
 from clsas.compress import Window, compress
+from clsas.compress import check_options as check_compression
 from clsas.echoes import Echoes
 from clsas.geometry import legs_m
 from clsas.lines import RangeLines
@@ -89,9 +90,9 @@ def simulate(
         every echo.
     snr_db : float, optional
         Add complex white Gaussian noise: the power of the strongest noise-free sample of all
-        channels over the noise's mean power per sample, before compression.
+        channels over the noise's mean power per sample, before compression; -200 to 300 dB.
     seed : int
-        Seeds the noise; the same seed gives the same noise.
+        Seeds the noise, at least 0; the same seed gives the same noise.
     workers : int, optional
         Threads; as many as there are cores unless given.
     progress : callable, optional
@@ -105,22 +106,28 @@ def simulate(
     Raises
     ------
     TypeError, ValueError
-        If an argument is outside its limits, `pointing` has nothing to act on, a point lies on
-        an element while spreading or patterns are asked for, or no echo is received to set the
-        noise by.
+        If an argument is of another type or outside its limits, `pointing` has nothing to act on,
+        a point lies on an element while spreading or patterns are asked for, no echo is received
+        to set the noise by, or the echoes do not fit into memory.
 
     Warns
     -----
     ClsasWarning
         If no echo at all falls into the receive window.
     """
+    validate.instance("sonar", sonar, Sonar)
+    validate.instance("track", track, Track)
+    validate.instance("scene", scene, PointTargets)
+    validate.progress(progress)
+    check_options(
+        pointing=pointing, spreading=spreading, motion_in_flight=motion_in_flight,
+        range_m=range_m, snr_db=snr_db, seed=seed,
+    )  # fmt: skip
     beams = None
     if not sonar.is_omnidirectional:
         beams = _Beams(sonar, (pointing or Pointing.broadside()).axes(track))
     elif pointing is not None:
         raise ValueError("pointing has nothing to act on: the sonar's elements have no sizes")
-    if snr_db is not None:
-        snr_db = validate.number("snr_db", snr_db, "dB")
     pulse, rate, sound = sonar.pulse, sonar.sample_rate_hz, sonar.sound_speed_m_s
     geometry = channels(sonar, track, motion_in_flight=motion_in_flight)
     paths = _Paths(scene, geometry, sound, spreading, beams)
@@ -130,12 +137,14 @@ def simulate(
         start = nearest - ringing
         longest = np.max(farthest + ringing - start)
     else:
-        near, far = validate.array("range_m", range_m, np.float64, (2,))
-        if not 0 <= near < far:
-            raise ValueError(f"range_m must be 0 <= near < far in m, got ({near:g}, {far:g})")
+        near, far = map(float, range_m)
         start = np.full(paths.channels, 2 * near / sound)
         longest = 2 * (far - near) / sound
-    length = math.ceil((longest + pulse.duration_s) * rate) + 1
+    duration = longest + pulse.duration_s
+    validate.memory(
+        "track and scene" if range_m is None else "range_m", 8 * paths.channels * duration * rate
+    )
+    length = math.ceil(duration * rate) + 1
 
     samples = _record(
         paths,
@@ -151,11 +160,33 @@ def simulate(
         progress=progress,
     )
     if snr_db is not None:
-        _add_noise(samples, snr_db, seed)
+        _add_noise(samples, float(snr_db), seed)
     return Echoes(
         samples, start, rate, pulse.carrier_hz, geometry.tx_m, geometry.rx_m, sound, pulse,
         geometry.rx_velocity_m_s,
     )  # fmt: skip
+
+
+def check_options(
+    *,
+    pointing: Pointing | None = None,
+    spreading: bool = False,
+    motion_in_flight: bool = False,
+    range_m: ArrayLike | None = None,
+    snr_db: float | None = None,
+    seed: int = 0,
+) -> None:
+    """Raise TypeError or ValueError unless `simulate` takes these for some survey."""
+    validate.instance("pointing", pointing, Pointing, type(None))
+    validate.instance("spreading", spreading, bool)
+    validate.instance("motion_in_flight", motion_in_flight, bool)
+    if range_m is not None:
+        near, far = validate.array("range_m", range_m, np.float64, (2,))
+        if not 0 <= near < far:
+            raise ValueError(f"range_m must be 0 <= near < far in m, got ({near:g}, {far:g})")
+    if snr_db is not None:
+        validate.number("snr_db", snr_db, "dB", least=-200.0, most=300.0)
+    validate.count("seed", seed, least=0)
 
 
 def simulate_lines(
@@ -211,7 +242,8 @@ def simulate_lines(
     Raises
     ------
     TypeError, ValueError
-        If an argument is outside its limits or shapes disagree.
+        If an argument is of another type or outside its limits, shapes disagree, or the lines do
+        not fit into memory.
 
     Warns
     -----
@@ -220,24 +252,29 @@ def simulate_lines(
     """
     carrier = validate.number("carrier_hz", carrier_hz, "Hz", least=0.0)
     band = validate.positive("bandwidth_hz", bandwidth_hz, "Hz")
-    oversampling = validate.number("oversampling", oversampling, least=1.0)
+    check_compression(window=window, oversampling=oversampling)
+    validate.instance("scene", scene, PointTargets)
+    validate.progress(progress)
     sound = validate.positive("sound_speed_m_s", sound_speed_m_s, "m/s")
     paths = _Paths(scene, _channels(tx_m, rx_m, rx_velocity_m_s), sound)
     if (first_range_m is None) != (length is None):
         raise ValueError("first_range_m and length must be given together or not at all")
     # The receiver's filter needs room outside the band.
     every = 1 if oversampling * PASSBAND >= 1 else 2
-    rate = every * oversampling * band
+    rate = every * float(oversampling) * band
     step = every / rate
     if first_range_m is None or length is None:
         nearest, farthest = paths.delay_limits_s(workers)
         nearest, farthest = nearest - _RINGING * step, farthest + _RINGING * step
-        length = math.ceil(np.max(farthest - nearest) / step) + 1
+        samples_wanted = np.max(farthest - nearest) / step
+        validate.memory("oversampling", 8 * every * paths.channels * samples_wanted)
+        length = math.ceil(samples_wanted) + 1
     else:
         first = validate.array(
             "first_range_m", first_range_m, np.float64, (paths.channels,), broadcast=True
         )
         length = validate.count("length", length)
+        validate.memory("length", 8 * every * paths.channels * length)
         nearest = 2 * first / sound
         farthest = nearest + (length - 1) * step
 

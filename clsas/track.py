@@ -121,6 +121,7 @@ class Track:
         start = validate.array("start_m", start_m, np.float64, (3,))
         velocity = validate.array("velocity_m_s", velocity_m_s, np.float64, (3,))
         pings = validate.count("pings", pings)
+        validate.memory("pings", 80 * pings)  # the ten numbers of a pose, its time and velocity
         interval = validate.positive("ping_interval_s", ping_interval_s, "s")
         time = interval * np.arange(pings, dtype=np.float64)
         heading = np.arctan2(velocity[1], velocity[0])
@@ -167,7 +168,17 @@ def channels(sonar: Sonar, track: Track, *, motion_in_flight: bool = False) -> C
     Channels
         tx_m, rx_m and rx_velocity_m_s (None unless asked for); channel = ping * receivers +
         receiver.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If an argument is of another type, or there are more channels than memory holds.
     """
+    validate.instance("sonar", sonar, Sonar)
+    validate.instance("track", track, Track)
+    validate.instance("motion_in_flight", motion_in_flight, bool)
+    # Positions of transmitter and receiver, and the latter's velocity.
+    validate.memory("sonar and track", 72 * track.pings * sonar.receivers)
     turn = track.rotations.as_matrix()
     tx = track.positions_m + turn @ sonar.tx_m
     rx = track.positions_m[:, None] + sonar.rx_m @ turn.transpose(0, 2, 1)
@@ -235,9 +246,12 @@ class Pointing:
 
         Raises
         ------
+        TypeError
+            If `track` is not a Track.
         ValueError
             If a spot lies straight ahead or astern, where an element's length has no direction.
         """
+        validate.instance("track", track, Track)
         if self.spot_m is None:
             squint = np.resize(self.squint_rad, track.pings)
             # Squint turns x and y clockwise seen from above; depression then tips the beam down.

@@ -6,6 +6,7 @@ Every check raises one exception that names the argument, what was given and wha
 from __future__ import annotations
 
 import math
+import os
 import sys
 import warnings
 from collections.abc import Sequence
@@ -103,6 +104,27 @@ def instance(name: str, value: object, *kinds: type) -> None:
     if not isinstance(value, kinds):
         names = " or ".join(kind.__name__ for kind in kinds)
         raise TypeError(f"{name} must be of type {names}, got {type(value).__name__}")
+
+
+def progress(given: object) -> None:
+    """Raise TypeError unless `given`, a progress argument, can be called or is None."""
+    if not (given is None or callable(given)):
+        raise TypeError(f"progress must be a function or None, got {given!r}")
+
+
+def memory(name: str, size_bytes: float) -> None:
+    """Raise ValueError if what argument `name` asks for is larger than this machine's memory.
+
+    Where the system does not tell its memory nothing is refused.
+    """
+    if "SC_PHYS_PAGES" not in getattr(os, "sysconf_names", ()):
+        return
+    available = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    if size_bytes > available:
+        raise ValueError(
+            f"{name} must ask for at most {available / 2**30:.3g} GiB, this machine's memory, "
+            f"got {size_bytes / 2**30:.3g} GiB"
+        )
 
 
 def array(

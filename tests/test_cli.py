@@ -182,13 +182,18 @@ def test_a_grid_that_no_line_reaches_is_a_warning(made, tmp_path):
 
 
 GRID = ["--x", "0:1:4", "--y", "19:20:4"]
+FIXED = ["--taps", "4", "--upsampling", "2"]
 
 
 @pytest.mark.parametrize(
     ("args", "code", "message"),
     [
         (["image", "echoes.h5", *GRID, "-o", "new.h5"], 1, "must hold RangeLines (clsas compress"),
-        (["compress", "image.h5", "-o", "new.h5"], 1, "image.h5 must hold Echoes, got Image"),
+        (
+            ["compress", "image.h5", "-o", "new.h5"],
+            1,
+            "image.h5 must hold Echoes (clsas simulate makes them), got Image",
+        ),
         (["quality", "scene.toml"], 1, "scene.toml is not an HDF5 file"),
         (["simulate", "lines.h5", "-o", "new.h5"], 1, "lines.h5: is not TOML"),
         (["simulate", "typo.toml", "-o", "new.h5"], 1, "in [grid]: did you mean 'z_m'?"),
@@ -204,6 +209,26 @@ GRID = ["--x", "0:1:4", "--y", "19:20:4"]
         (["simulate", "none.toml", "-o", "new.h5"], 2, "'none.toml' does not exist"),
         (["simulate", "scene.toml"], 2, "Missing option '-o'"),
         (["simulate", "scene.toml", "-o", "no/new.h5"], 2, "there is no folder 'no'"),
+        (["simulate", "scene.toml", "-o", "/proc/new.h5"], 2, "'/proc/new.h5' cannot be written: "),
+        (["simulate", "scene.toml", "-o", "n" * 300], 2, "cannot be written: File name too long"),
+        (["simulate", "scene.toml", "-o", "/dev/null"], 2, "'/dev/null' is not an ordinary file"),
+        (["simulate", "scene.toml", "-o", "new", "--png", "./new"], 2, "must be two files"),
+        (["compress", "echoes.h5", "--png", "new", "-o", "new"], 2, "must be two files"),
+        (
+            ["image", "lines.h5", *GRID, "-o", "new.h5", "--png", "a", "--dynamic-range-db", "-5"],
+            1,
+            "dynamic_range_db must be finite and > 0 dB, got -5",
+        ),
+        (
+            ["image", "lines.h5", "--x", "0:1:1000000", "--y", "0:1:1000000", "-o", "new.h5"],
+            1,
+            "--x and --y must ask for at most ",
+        ),
+        (
+            ["image", "lines.h5", *GRID, "-o", "new.h5", *FIXED, "--accuracy-db", "-60"],
+            2,
+            "--accuracy-db plays no part",
+        ),
         (["image", "lines.h5", "-o", "new.h5"], 2, "a grid is needed: --scene, or --x and --y"),
         (["image", "lines.h5", *GRID[:2], "-o", "new.h5"], 2, "--x and --y go together"),
         (["image", "lines.h5", "--x", "0:1", *GRID[2:], "-o", "new.h5"], 2, "START:STOP:N"),
@@ -228,6 +253,22 @@ def test_errors_are_one_message_and_leave_nothing(made, monkeypatch, args, code,
     assert set(folder.iterdir()) == before
 
 
+def test_a_pipe_is_no_output(made, tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    _, stderr = run("simulate", made[0] / "scene.toml", "-o", tmp_path / "pipe", code=2)
+    assert "is not an ordinary file" in stderr
+    assert (tmp_path / "pipe").is_fifo()
+
+
+def test_running_out_of_memory_is_told(made, tmp_path, monkeypatch):
+    def exhaust(*_, **__):
+        raise MemoryError("Unable to allocate 7 TiB")
+
+    monkeypatch.setattr(clsas, "compress", exhaust)
+    _, stderr = run("compress", made[0] / "echoes.h5", "-o", tmp_path / "lines.h5", code=1)
+    assert stderr == "Error: out of memory: Unable to allocate 7 TiB\n"
+
+
 def test_traceback_on_request(made):
     args = ["--traceback", "quality", str(made[0] / "image.h5"), "--near", "9,9"]
     result = CliRunner().invoke(cli.main, args)
@@ -247,13 +288,17 @@ def test_pictures_without_matplotlib_are_refused_before_any_work(made, tmp_path,
 def test_help_shows_an_example_that_parses(monkeypatch):
     for name, command in cli.main.commands.items():
         text, _ = run(name, "--help")
-        (example,) = re.findall(r"Example:  (?:\w+=\w+ )?clsas (.*)", text)
+        ((variable, value, example),) = re.findall(r"Example:  (?:(\w+)=(\w+) )?clsas (.*)", text)
         given, *args = shlex.split(example)
         assert given == name
         files = [p.type for p in command.params if getattr(p.type, "exists", False)]
         for file in files:
             monkeypatch.setattr(file, "exists", False)  # an example's are nowhere
         command.make_context(name, args)
+        if variable:
+            with monkeypatch.context() as environment:
+                environment.setenv(variable, value)
+                assert variable in run(given, *args)[0]
         assert all(p.help for p in command.params if isinstance(p, click.Option)), name
     assert run("--version")[0] == f"clsas, version {clsas.__version__}\n"
 

@@ -246,6 +246,11 @@ GOOD = Echoes(np.zeros((2, 900), complex), 0.0, 200e3, CARRIER, [0, 0, 0], [0, 0
         ({"window": "square"}, ValueError, "window must be 'none' or .* got 'square'"),
         ({"window": "kaiser"}, ValueError, "window must be 'none' or .* got 'kaiser'"),
         ({"window": None}, ValueError, "window must be 'none' or .* got None"),
+        ({"window": ()}, ValueError, r"window must be 'none' or .* got \(\)"),
+        ({"echoes": None}, TypeError, "echoes must be of type Echoes, got NoneType"),
+        ({"progress": 1}, TypeError, "progress must be a function or None, got 1"),
+        ({"oversampling": 1e12}, ValueError, "oversampling must ask for at most .* GiB"),
+        ({"bandwidth_hz": 1e-300}, ValueError, "bandwidth_hz must ask for at most .* GiB"),
         ({"bandwidth_hz": 300e3}, ValueError, "bandwidth_hz must be .* <= 200000 Hz, got 300000"),
         ({"bandwidth_hz": 0}, ValueError, "bandwidth_hz must be finite and > 0 .*, got 0"),
         ({"bandwidth_hz": None}, ValueError, "bandwidth_hz must be given for echoes without"),
@@ -253,7 +258,7 @@ GOOD = Echoes(np.zeros((2, 900), complex), 0.0, 200e3, CARRIER, [0, 0, 0], [0, 0
 )
 def test_bad_arguments(arguments, error, message):
     with pytest.raises(error, match=message):
-        compress(GOOD, **{"bandwidth_hz": BAND, **arguments})
+        compress(**{"echoes": GOOD, "bandwidth_hz": BAND, **arguments})
 
 
 def test_recording_shorter_than_the_pulse():
@@ -299,3 +304,9 @@ def test_echoes_keep_the_callers_array_writable():
     echoes = replace(GOOD, samples=samples)
     assert not echoes.samples.flags.writeable
     samples[0, 0] = 1
+
+
+def test_numbers_of_any_width():
+    narrow = compress(GOOD, bandwidth_hz=np.float32(BAND), oversampling=np.float32(2))
+    wide = compress(GOOD, bandwidth_hz=BAND, oversampling=2.0)
+    np.testing.assert_array_equal(narrow.samples, wide.samples)

@@ -187,6 +187,7 @@ def test_track_file(tmp_path):
         ("time_s,x_m,y_m,z\n", "unknown column 'z': did you mean 'z_m'"),
         ("time_s,x_m,y_m\n", "column 'z_m' must be there once"),
         ("time_s,x_m,y_m,z_m,z_m\n", "column 'z_m' must be there once"),
+        ("time_s,x_m,y_m,z_m,yaw_deg,yaw_deg\n", "column 'yaw_deg' must be there once"),
         ("time_s,x_m,y_m,z_m,vx_m_s\n", "column 'vy_m_s' must be there once"),
         ("", "column 'time_s' must be there once"),
         ("time_s,x_m,y_m,z_m\n", "must have shape"),
@@ -277,6 +278,25 @@ def test_bad_track_files(tmp_path, text, message):
             "[simulate.pointing]\nspot_m = [0, 1, 0]\nsquint_deg = 3",
             "[simulate.pointing] spot_m must stand alone",
         ),
+        ("[simulate.pointing]\nsquint_deg = nan", "[simulate.pointing] squint_deg must be finite"),
+        (
+            "[simulate.pointing]\ndepression_deg = inf",
+            "[simulate.pointing] depression_deg must be finite degrees, got inf",
+        ),
+        (
+            f"{TRACK}[track.roll]\namplitude_deg = 1\nperiod_s = 1\nphase_deg = nan",
+            "[track.roll] phase_deg must be finite degrees, got nan",
+        ),
+        (TRACK.replace("400", "10_000_000_000_000"), "[track] pings must ask for at most"),
+        ("[simulate]\nsnr_db = nan", "[simulate] snr_db must be finite"),
+        ("[simulate]\nseed = -1", "[simulate] seed must be at least 0, got -1"),
+        ("[simulate]\nrange_m = [5, 1]", "[simulate] range_m must be 0 <= near < far in m, got"),
+        ("[compress]\nwindow = 'foo'", "[compress] window must be 'none' or a window of scipy"),
+        ("[compress]\nwindow = []", "[compress] window must be 'none' or a window of scipy"),
+        ("[compress]\noversampling = 0", "[compress] oversampling must be finite and >= 1, got 0"),
+        ("[image]\ntaps = 3", "[image] taps must be one of (2, 4, 6, 8), got 3"),
+        ("[image]\naccuracy_db = 5", "[image] accuracy_db must be finite and < 0 and >= -85 dB"),
+        ("[image]\nupsampling = nan", "[image] upsampling must be finite and >= 1 and <= 64"),
     ],
 )
 def test_mistakes_are_named_with_their_place(text, message):
@@ -305,5 +325,7 @@ def test_files_that_cannot_be_read(tmp_path):
     with pytest.raises(ValueError, match=r"scene\.toml: is not TOML"):
         config.read_scene(tmp_path / "scene.toml")
     (tmp_path / "scene.toml").write_text("[track]\nfile = 'none.csv'")
-    with pytest.raises(FileNotFoundError, match=r"none\.csv"):
+    with pytest.raises(
+        ValueError, match=r"scene\.toml: \[track\] file must be readable: No such file .*none\.csv"
+    ):
         config.read_scene(tmp_path / "scene.toml")

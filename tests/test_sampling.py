@@ -175,3 +175,19 @@ def test_one_ping_of_one_receiver_and_one_point():
 def test_bad_arguments(call, message):
     with pytest.raises(ValueError, match=message):
         call()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ((None, track(WIDE, 0.5), GRID), "sonar must be of type Sonar, got NoneType"),
+        ((WIDE, GRID, GRID), "track must be of type Track, got Grid"),
+        ((WIDE, track(WIDE, 0.5), None), "grid must be of type Grid, got NoneType"),
+    ],
+)
+def test_arguments_of_another_type(arguments, message):
+    with pytest.raises(TypeError, match=message):
+        check_sampling(*arguments)
+    if arguments[0] is None:
+        with pytest.raises(TypeError, match=message):
+            ping_advance_m(arguments[0])

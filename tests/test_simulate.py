@@ -415,14 +415,26 @@ def test_points_outside_a_line_give_it_nothing():
         ({"range_m": (40, 30)}, ValueError, r"range_m must be 0 <= near < far in m, got \(40, 30"),
         ({"range_m": (-1, 30)}, ValueError, r"range_m must be 0 <= .* got \(-1, 30\)"),
         ({"range_m": 40}, ValueError, r"range_m must have shape \(2\)"),
-        ({"snr_db": np.nan}, ValueError, "snr_db must be finite dB, got nan"),
+        ({"snr_db": np.nan}, ValueError, "snr_db must be finite .* dB, got nan"),
+        ({"snr_db": -1e5}, ValueError, "snr_db must be .* >= -200 and <= 300 dB, got -100000"),
+        ({"seed": -1}, ValueError, "seed must be at least 0, got -1"),
+        ({"seed": 1.5}, TypeError, "seed must be a whole number, got 1.5"),
+        ({"spreading": 1}, TypeError, "spreading must be of type bool, got int"),
+        ({"motion_in_flight": "no"}, TypeError, "motion_in_flight must be of type bool, got str"),
+        ({"pointing": 0.1}, TypeError, "pointing must be of type Pointing or NoneType, got float"),
+        ({"progress": 1}, TypeError, "progress must be a function or None, got 1"),
+        ({"sonar": None}, TypeError, "sonar must be of type Sonar, got NoneType"),
+        ({"track": SMOOTH}, TypeError, "track must be of type Track, got Sonar"),
+        ({"scene": [[0, 40, 0]]}, TypeError, "scene must be of type PointTargets, got list"),
+        ({"range_m": (0, 1e12)}, ValueError, r"range_m must ask for at most .* GiB, .* got .* GiB"),
+        ({"range_m": (0, 1e308)}, ValueError, "range_m must ask for at most .* got inf GiB"),
         ({"workers": 0}, ValueError, "workers must be at least 1, got 0"),
         ({"pointing": Pointing.squint(0.1)}, ValueError, "pointing has nothing to act on"),
     ],
 )
 def test_bad_arguments(arguments, error, message):
     with pytest.raises(error, match=message):
-        simulate(SMOOTH, TRACK, SCENE, **arguments)
+        simulate(**{"sonar": SMOOTH, "track": TRACK, "scene": SCENE, **arguments})
 
 
 def test_point_on_an_element_with_spreading():
@@ -456,6 +468,9 @@ def test_nothing_in_the_window():
     [
         ({"bandwidth_hz": 0}, "bandwidth_hz must be finite and > 0 Hz, got 0"),
         ({"carrier_hz": -1}, "carrier_hz must be finite and >= 0 Hz, got -1"),
+        ({"window": "square"}, "window must be 'none' or .* got 'square'"),
+        ({"oversampling": 1e12}, "oversampling must ask for at most .* GiB"),
+        ({"first_range_m": 1.0, "length": 10**13}, "length must ask for at most .* GiB"),
         ({"oversampling": 0.9}, "oversampling must be finite and >= 1, got 0.9"),
         ({"sound_speed_m_s": 0}, "sound_speed_m_s must be finite and > 0 m/s"),
         ({"first_range_m": 1.0}, "first_range_m and length must be given together"),
@@ -471,6 +486,13 @@ def test_bad_lines(arguments, message):
     good = {"tx_m": [0, 0, 0], "rx_m": np.zeros((2, 3)), "carrier_hz": 1e6, "bandwidth_hz": 1e5}
     with pytest.raises(ValueError, match=message):
         simulate_lines(scene=SCENE, **{**good, **arguments})
+
+
+@pytest.mark.parametrize("arguments", [{"scene": None}, {"progress": 1}])
+def test_line_arguments_of_another_type(arguments):
+    good = {"scene": SCENE, "carrier_hz": CARRIER, "bandwidth_hz": BAND}
+    with pytest.raises(TypeError, match=f"{next(iter(arguments))} must be "):
+        simulate_lines([0, 0, 0], [0, 0, 0], **{**good, **arguments})
 
 
 @pytest.mark.parametrize(

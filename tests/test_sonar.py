@@ -164,3 +164,8 @@ def test_bad_line_array():
         line_array(0, 0.1)
     with pytest.raises(ValueError, match="spacing_m must be finite and > 0 m, got 0"):
         line_array(4, 0.0)
+
+
+def test_more_than_the_machine_holds_is_refused():
+    with pytest.raises(ValueError, match=r"receivers must ask for at most .* GiB, .* got .* GiB"):
+        line_array(10**13, 0.01)

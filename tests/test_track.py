@@ -203,3 +203,15 @@ def test_bad_pointing():
         Pointing.broadside(depression_rad=np.nan)
     with pytest.raises(ValueError, match=r"spot_m must not lie straight ahead or astern.*ping 0"):
         Pointing.spot([9, 0, 0]).axes(one_ping())
+
+
+def test_channels_and_axes_of_other_types():
+    sonar, track = Sonar.edgetech(), one_ping()
+    with pytest.raises(TypeError, match="sonar must be of type Sonar, got Track"):
+        channels(track, sonar)
+    with pytest.raises(TypeError, match="track must be of type Track, got NoneType"):
+        channels(sonar, None)
+    with pytest.raises(TypeError, match="motion_in_flight must be of type bool, got int"):
+        channels(sonar, track, motion_in_flight=1)
+    with pytest.raises(TypeError, match="track must be of type Track, got Sonar"):
+        Pointing.broadside().axes(sonar)
