@@ -7,8 +7,7 @@
  *
  * Build options
  *   WIDTH   lanes: consecutive samples of a line (common.h).
- *   TAPS    of the range interpolation h, even: the weight of the tap at +-(pair + 0.5) from the middle
- *           is E(nu^2) +- nu O(nu^2), nu in [-0.5, 0.5].
+ *   TAPS    of the range interpolation h, even (filter_weights in common.h).
  *
  * Global size (channels, children).
  *   parent      lines, float, `parent_pitch` samples each: [parents][channels][2][parent_pitch], real
@@ -17,8 +16,7 @@
  *   start       int [children][channels]: parent sample of tap 0 for k = 0. Samples outside the parent's
  *               line are never read: the place is moved inside, where the host has put zeros.
  *   nu, cycles  float [children][channels].
- *   filter      float [TAPS / 2][2][TAPS / 2]: per pair from the innermost the coefficients of E and
- *               O, highest power first.
+ *   filter      float [TAPS / 2][2][TAPS / 2]: of filter_weights.
  *   aligned     lines [children][channels][2][length], `length` a multiple of WIDTH.
  */
 
@@ -42,18 +40,7 @@ __kernel void align(__global const float *parent, int parent_pitch, __global con
     aligned += place * 2 * length;
 
     float weight[TAPS];
-    const float position = nu[place], square = position * position;
-#pragma unroll
-    for (int pair = 0; pair < TAPS / 2; pair++) {
-        float even = filter[pair * TAPS], odd = filter[pair * TAPS + TAPS / 2];
-#pragma unroll
-        for (int power = 1; power < TAPS / 2; power++) {
-            even = even * square + filter[pair * TAPS + power];
-            odd = odd * square + filter[pair * TAPS + TAPS / 2 + power];
-        }
-        weight[TAPS / 2 + pair] = even + position * odd;
-        weight[TAPS / 2 - 1 - pair] = even - position * odd;
-    }
+    filter_weights(filter, nu[place], weight);
     vfloat sine, cosine;
     sincos_cycles(cycles[place], &sine, &cosine);
 

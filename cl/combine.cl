@@ -6,8 +6,7 @@
  * where a interpolates the aperture: channel n contributes to TAPS consecutive virtual channels. With the
  * channels in the order of their virtual channels one pass suffices: TAPS sums are open at a time.
  *
- * Build options: WIDTH, lanes: consecutive samples of a line; TAPS, even (polynomial weights as in
- * align.cl).
+ * Build options: WIDTH, lanes: consecutive samples of a line; TAPS, even (filter_weights in common.h).
  */
 
 /* The weights of every (child, channel), float [children][channels][TAPS], at nu, float
@@ -16,19 +15,11 @@ __kernel void aperture_weights(__global const float *nu, __global const float *f
                                __global float *weights)
 {
     const size_t place = get_global_id(1) * get_global_size(0) + get_global_id(0);
-    __global float *weight = weights + place * TAPS;
-    const float position = nu[place], square = position * position;
+    float weight[TAPS];
+    filter_weights(filter, nu[place], weight);
 #pragma unroll
-    for (int pair = 0; pair < TAPS / 2; pair++) {
-        float even = filter[pair * TAPS], odd = filter[pair * TAPS + TAPS / 2];
-#pragma unroll
-        for (int power = 1; power < TAPS / 2; power++) {
-            even = even * square + filter[pair * TAPS + power];
-            odd = odd * square + filter[pair * TAPS + TAPS / 2 + power];
-        }
-        weight[TAPS / 2 + pair] = even + position * odd;
-        weight[TAPS / 2 - 1 - pair] = even - position * odd;
-    }
+    for (int t = 0; t < TAPS; t++)
+        weights[place * TAPS + t] = weight[t];
 }
 
 /* Global size (length / WIDTH, children).

@@ -63,3 +63,24 @@ INLINE void sincos_cycles(vfloat t, vfloat *sine, vfloat *cosine)
     c = c * z - 19.7389825f;
     *cosine = c * z + 0.999999222f;
 }
+
+/* The TAPS (build option) weights of an interpolation at nu in [-0.5, 0.5] from the middle of its taps: the one
+ * at +-(pair + 0.5) has E(nu^2) +- nu O(nu^2). filter: float [TAPS / 2][2][TAPS / 2], per pair from
+ * the innermost the coefficients of E, then O, highest power first. */
+#ifdef TAPS
+INLINE void filter_weights(__global const float *filter, float nu, float *weight)
+{
+    const float square = nu * nu;
+#pragma unroll
+    for (int pair = 0; pair < TAPS / 2; pair++) {
+        float even = filter[pair * TAPS], odd = filter[pair * TAPS + TAPS / 2];
+#pragma unroll
+        for (int power = 1; power < TAPS / 2; power++) {
+            even = even * square + filter[pair * TAPS + power];
+            odd = odd * square + filter[pair * TAPS + TAPS / 2 + power];
+        }
+        weight[TAPS / 2 + pair] = even + nu * odd;
+        weight[TAPS / 2 - 1 - pair] = even - nu * odd;
+    }
+}
+#endif

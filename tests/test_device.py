@@ -182,6 +182,7 @@ def test_a_failed_build_shows_the_compilers_log(platform, monkeypatch):
     assert platform.info.label in message
 
 
+@pytest.mark.filterwarnings("ignore::pyopencl.CompilerWarning")
 def test_the_vector_widths_give_their_values(device):
     """Uploads, a build and a run: the smallest job, through the header all kernels share."""
     width = device.info.width
