@@ -86,13 +86,15 @@ def factorize(
     side = chosen.sides[0]
     rows, columns = grid.shape
     pixels = np.empty(grid.shape, np.complex64)
+    done = 0
     try:
         for row in range(0, rows, side):
             for column in range(0, columns, side):
                 part = np.s_[row : row + side, column : column + side]
                 pixels[part] = run.root(row, column)[: rows - row, : columns - column]
+                done += pixels[part].size
                 if progress is not None:
-                    progress(row * columns + pixels[part].shape[0] * (column + side), grid.size)
+                    progress(done, grid.size)
     finally:
         run.device.finish()
     return Image(pixels, grid)

@@ -49,6 +49,17 @@ def test_any_channels(platform, track):
     assert relative_error_db(image, exact) <= -45
 
 
+def test_progress_counts_pixels(platform):
+    grid = patch(0.3, 42, 70, 33)
+    calls = []
+    factorize(
+        wide_beam(grid), grid, -30, device=platform, progress=lambda *call: calls.append(call)
+    )
+    done, total = zip(*calls, strict=True)
+    assert set(total) == {grid.size} == {done[-1]}
+    assert sorted(set(done)) == list(done)
+
+
 def test_moving_receivers_are_refused():
     grid = patch(0.3, 42, 10, 10)
     lines = wide_beam(grid, velocity=np.ones((len(APERTURE), 3)))
