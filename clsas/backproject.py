@@ -53,7 +53,7 @@ class Preparation:
     @property
     def cycles_per_m(self) -> float:
         """Phase to restore per metre of range, cycles: of the lines' spectral centre."""
-        return _carrier_cycles_per_m(self.lines) + (
+        return self.lines.carrier_cycles_per_m + (
             self.resampling.centre_cycles_per_sample / self.lines.range_step_m
         )
 
@@ -153,7 +153,7 @@ def prepare(
     spectrum = interpolation.measure_spectrum(lines)
     # What rounding a range costs: phase, and place within the lines' band, 0.3 Nyquist rms.
     cycles_per_m = math.hypot(
-        _carrier_cycles_per_m(lines) + spectrum.centre / lines.range_step_m,
+        lines.carrier_cycles_per_m + spectrum.centre / lines.range_step_m,
         0.3 / lines.range_step_m,
     )
     antennas_m = np.unique(np.concatenate([lines.tx_m, lines.rx_m]), axis=0)
@@ -262,7 +262,9 @@ class _Run:
         lines = self.p.lines.select(channels)
         line_slot = next(self.line_slots)
         line_slot.wait()
-        line_slot.fill("samples", self._samples(lines))
+        upsampled = self.p.resampling.apply(lines.samples)
+        width = self.p.device.info.width
+        line_slot.fill("samples", padded_lines(upsampled, width, self.margin, self.pitch))
         line_slot.fill("geometry", self._geometry(lines))
         for parts in _slices(band, self.parts_at_once):
             slot = next(self.part_slots)
@@ -329,19 +331,6 @@ class _Run:
             wait_for=line_slot.filled + slot.filled,
         )
 
-    def _samples(self, lines: RangeLines) -> NDArray[np.float32]:
-        """Return upsampled lines within margins of zeros, as cl/backproject.cl wants them."""
-        upsampled = self.p.resampling.apply(lines.samples)
-        inside = slice(self.margin, self.margin + upsampled.shape[1])
-        if self.p.device.info.width == 1:
-            samples = np.zeros((lines.channels, self.pitch), np.complex64)
-            samples[:, inside] = upsampled
-            return samples.view(np.float32)
-        samples = np.zeros((lines.channels, 2, self.pitch), np.float32)
-        samples[:, 0, inside] = upsampled.real
-        samples[:, 1, inside] = upsampled.imag
-        return samples
-
     def _geometry(self, lines: RangeLines) -> NDArray[np.float32]:
         """Return positions about the origin and velocities over sound speed, [rows, channels]."""
         rows = [float_pairs(lines.tx_m - self.origin_m)]
@@ -359,7 +348,7 @@ class _Run:
             centres_m, lines.tx_m, lines.rx_m, lines.rx_velocity_m_s, lines.sound_speed_m_s
         )
         place = (range_m - lines.first_range_m) / lines.range_step_m + resampling.lead
-        range_m *= _carrier_cycles_per_m(lines)
+        range_m *= lines.carrier_cycles_per_m
         cycles = range_m + place * resampling.centre_cycles_per_sample
         cycles -= np.rint(cycles)
         place *= resampling.ratio
@@ -389,6 +378,25 @@ class _Run:
             self.progress(self.done, self.p.layout.parts * self.p.lines.channels)
 
 
+def padded_lines(
+    samples: NDArray[np.complex64], width: int, margin: int, pitch: int
+) -> NDArray[np.float32]:
+    """Return lines as the kernels want them: `pitch` samples each, zeros before and after.
+
+    With one lane per work-item they stay interleaved, [channels, 2 pitch]; with more, real and
+    imaginary parts are planes, [channels, 2, pitch].
+    """
+    inside = slice(margin, margin + samples.shape[1])
+    if width == 1:
+        padded = np.zeros((len(samples), pitch), np.complex64)
+        padded[:, inside] = samples
+        return padded.view(np.float32)
+    padded = np.zeros((len(samples), 2, pitch), np.float32)
+    padded[:, 0, inside] = samples.real
+    padded[:, 1, inside] = samples.imag
+    return padded
+
+
 def float_pairs(positions_m: NDArray[np.float64]) -> NDArray[np.float32]:
     """Return float32 [n, 6]: positions [n, 3] as nearest float32 numbers, and what these leave."""
     nearest = positions_m.astype(np.float32)
@@ -398,11 +406,6 @@ def float_pairs(positions_m: NDArray[np.float64]) -> NDArray[np.float32]:
 def _room(taps: int) -> float:
     """Return how many samples a block may reach from its middle within the lookup window."""
     return _WINDOW / 2 - 2 - taps / 2
-
-
-def _carrier_cycles_per_m(lines: RangeLines) -> float:
-    """Phase of the carrier per metre of range, cycles."""
-    return 2 * lines.carrier_hz / lines.sound_speed_m_s
 
 
 def _channel_pitch(lines: RangeLines) -> int:

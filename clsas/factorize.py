@@ -10,7 +10,7 @@ import pyopencl as cl
 from numpy.typing import NDArray
 
 from clsas import validate
-from clsas.backproject import float_pairs
+from clsas.backproject import float_pairs, padded_lines
 from clsas.device import Device, open_device
 from clsas.geometry import pairwise_range_m
 from clsas.grid import Grid
@@ -109,9 +109,8 @@ class _Run:
         self.samples_per_m = chosen.resampling.ratio / lines.range_step_m
         self.half = half_lengths(grid, chosen.sides, chosen.align, chosen.final, self.samples_per_m)
         resampling = chosen.resampling
-        self.carrier_cycles_per_m = 2 * lines.carrier_hz / lines.sound_speed_m_s
         self.cycles_per_m = (
-            self.carrier_cycles_per_m + resampling.centre_cycles_per_sample / lines.range_step_m
+            lines.carrier_cycles_per_m + resampling.centre_cycles_per_sample / lines.range_step_m
         )
         self.filters = {
             name: device.upload(getattr(chosen, name).coefficients.astype(np.float32))
@@ -139,7 +138,9 @@ class _Run:
         # Zeros around a line: a subimage may reach beyond its end, or lie outside it.
         self.margin = 2 * self.half[0] + 64
         self.pitch = resampling.length + 2 * self.margin
-        self.samples = device.upload(self._padded(resampling.apply(lines.samples)))
+        upsampled = resampling.apply(lines.samples)
+        padded = padded_lines(upsampled, self.width, self.margin, self.pitch)
+        self.samples = device.upload(padded)
 
     def root(self, row: int, column: int) -> NDArray[np.complex64]:
         """Return the pixels of the root subimage that begins at a pixel."""
@@ -227,7 +228,7 @@ class _Run:
         if parent is None:
             range_m = pairwise_range_m(centres_m, raw.tx_m, raw.rx_m)
             place = (range_m - raw.first_range_m) / raw.range_step_m + resampling.lead
-            cycles = self.carrier_cycles_per_m * range_m
+            cycles = raw.carrier_cycles_per_m * range_m
             cycles += place * resampling.centre_cycles_per_sample
             place = place * resampling.ratio + self.margin - resampling.first
             return place, cycles, direction_angles(self.grid, centres_m, raw.tx_m, raw.rx_m)
@@ -329,18 +330,6 @@ class _Run:
         image = np.empty((side, side), np.complex64)
         cl.enqueue_copy(device.queue, image, pixels)
         return image
-
-    def _padded(self, samples: NDArray[np.complex64]) -> NDArray[np.float32]:
-        """Return lines within margins of zeros, as the kernels want them."""
-        inside = slice(self.margin, self.margin + samples.shape[1])
-        if self.width == 1:
-            padded = np.zeros((len(samples), self.pitch), np.complex64)
-            padded[:, inside] = samples
-            return padded.view(np.float32)
-        padded = np.zeros((len(samples), 2, self.pitch), np.float32)
-        padded[:, 0, inside] = samples.real
-        padded[:, 1, inside] = samples.imag
-        return padded
 
 
 def _mean_track(lines: RangeLines) -> Callable[[NDArray[np.float64]], NDArray[np.float64]]:

@@ -104,6 +104,11 @@ class RangeLines:
         return 2 * np.pi * self.carrier_hz / self.sound_speed_m_s
 
     @property
+    def carrier_cycles_per_m(self) -> float:
+        """Phase of the carrier per metre of range (two ways), cycles."""
+        return 2 * self.carrier_hz / self.sound_speed_m_s
+
+    @property
     def last_range_m(self) -> NDArray[np.float64]:
         """Range of each channel's last sample, metres, shape [channels]."""
         return self.first_range_m + (self.length - 1) * self.range_step_m

@@ -99,7 +99,7 @@ def plan(lines: RangeLines, grid: Grid, *, tolerance_db: float) -> Plan:
     spectrum = interpolation.measure_spectrum(lines)
     occupied = spectrum.frequency[np.cumsum(spectrum.power) < 1 - 1e-6]
     highest = (
-        abs(2 * lines.carrier_hz / lines.sound_speed_m_s + spectrum.centre / lines.range_step_m)
+        abs(lines.carrier_cycles_per_m + spectrum.centre / lines.range_step_m)
         + (occupied[-1] if len(occupied) else 0.5) / lines.range_step_m
     )
     largest = 2 ** math.ceil(math.log2(max(*grid.shape, min(_LEAF_SIDES))))
