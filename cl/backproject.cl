@@ -9,28 +9,36 @@
  * Build options
  *   WIDTH      lanes of a work-item (common.h); they form a block of BLOCK_COLUMNS x BLOCK_ROWS
  *              pixels, and a work-item computes four such blocks, one below the other.
- *   TILE       pixels along a tile's side, 16 or a multiple.
+ *   TILE_ROWS, TILE_COLUMNS  pixels of a tile, multiples of 4 blocks' rows and of a block's columns.
  *   TAPS       2, 4, 6 or 8 samples per interpolation.
  *   PERMUTE    fetch samples from a window of 32 per component held in two AVX-512 registers, five
  *              times as fast as a gather. The host asks for it where all lanes' samples lie
  *              within 32, and the compiler decides whether it can (WIDTH 16 only).
  *   BISTATIC   receiver positions differ from the transmitter's.
- *   OWN_LINES  every tile has lines and geometry of its own: one set after the other.
  *   MOVING     receivers move at `velocity` (in units of the sound speed) during the echo's flight.
+ *   BEAM       intervals of the table of the channels' weights by aspect angle; 0 is no weights.
+ *   NORMALISE  with BEAM: sum the weights too.
  *
  * Buffers
  *   samples    float, each line with `pitch` samples including its zero margins: WIDTH > 1 a plane
  *              of real parts, then one of imaginary parts, [channels][2][pitch]; WIDTH == 1
  *              interleaved [channels][pitch][2].
- *   geometry   float [15][channel_pitch]: transmitter x y z and what float32 leaves of them, the
+ *   geometry   float [18][geometry_pitch]: transmitter x y z and what float32 leaves of them, the
  *              receiver's likewise (m, from the grid's origin), receiver velocity x y z over sound
- *              speed. Rows that no option uses are absent.
+ *              speed, the track's direction x y z times intervals of `beam` per sine. Rows that no
+ *              option uses are absent.
  *   centres    float [parts][6]: of tiles or groups, x y z and what float32 leaves of them (m, from
  *              the grid's origin). With the pairs a short distance between far points is exact.
- *   reference  per (tile, channel): nearest sample (int, counted from the line's first margin
+ *   ranges     int [parts][3]: the first channel that a tile or group sees, the one after the last,
+ *              and the first one's line. What is held per (part, channel) begins with that channel.
+ *   reference  per (part, channel): nearest sample (int, counted from the line's first margin
  *              sample), the fraction to the tile centre's range (samples) and phase (cycles in
- *              [-0.5, 0.5]), each [tiles][channel_pitch].
+ *              [-0.5, 0.5]), each [parts][channel_pitch].
  *   pixels     float2 [rows][columns], padded to whole tiles.
+ *   beam       float [BEAM][4]: the weight as cubics of a place in this table, constant terms first,
+ *              from 0 to 1 each. A pixel's place is along.e - lowest, with e the unit vector to it
+ *              from the middle of transmitter and receiver; beyond low and high the weight is 0.
+ *   sums       float2, as pixels: the sum of the weights, twice.
  */
 
 #if PERMUTE && defined(__AVX512F__)
@@ -60,7 +68,7 @@
 #endif
 #define STACK 4
 #define ITEM_ROWS (BLOCK_ROWS * STACK)
-#define BLOCKS_ACROSS (TILE / BLOCK_COLUMNS)
+#define BLOCKS_ACROSS (TILE_COLUMNS / BLOCK_COLUMNS)
 
 /* The TAPS samples around a position: indices lower, lower + 1, ... of one component. */
 #ifdef WINDOW
@@ -166,13 +174,57 @@ INLINE void add_to_image(const vfloat *re, const vfloat *im, __global float2 *pi
 #define TX 0
 #define RX 6
 #define VELOCITY 12
-#define ROW(first, axis) geometry[((first) + (axis)) * channel_pitch + channel]
-#define ROWS(first, axis) LOAD(geometry + ((first) + (axis)) * channel_pitch + channel)
+#define ALONG (6 + 6 * BISTATIC + 3 * MOVING)
+#define ROW(first, axis) geometry[((first) + (axis)) * geometry_pitch + channel]
+#define ROWS(first, axis) LOAD(geometry + ((first) + (axis)) * geometry_pitch + channel)
 /* Component of the vector from an antenna to a centre, for one channel and for WIDTH of them. */
 #define FROM(first, axis)                                                                          \
     ((centre[axis] - ROW(first, axis)) + (centre[(axis) + 3] - ROW(first, (axis) + 3)))
 #define FROMS(first, axis)                                                                         \
     ((centre[axis] - ROWS(first, axis)) + (centre[(axis) + 3] - ROWS(first, (axis) + 3)))
+
+#if BEAM
+#define EXPAND_ARGUMENTS , float lowest
+#if NORMALISE
+#define BEAM_ARGUMENTS , __global const float *beam, float lowest, float low, float high, __global float2 *sums
+#else
+#define BEAM_ARGUMENTS , __global const float *beam, float lowest, float low, float high
+#endif
+
+/* The interval at a place in the table, as a float; no number leaves the table. */
+#define INTERVAL(type, place, nearest)                                                             \
+    type nearest = ((place) - 0.5f + ROUNDER) - ROUNDER;                                           \
+    nearest = nearest > 0.0f ? nearest : (type)0.0f;                                               \
+    nearest = nearest < BEAM - 1.0f ? nearest : (type)(BEAM - 1.0f);
+
+/* A cubic at x where x lies within (low, high), else 0. */
+INLINE vfloat beam_weight(vfloat c0, vfloat c1, vfloat c2, vfloat c3, vfloat x, vfloat low, vfloat high)
+{
+    vfloat weight = c0 + x * (c1 + x * (c2 + x * c3));
+    weight = x > low ? weight : (vfloat)0.0f;
+    return x < high ? weight : (vfloat)0.0f;
+}
+
+/* The weights at places, each with a cubic of its own. */
+INLINE vfloat beam_weights(__global const float *beam, vfloat place, float low, float high)
+{
+    INTERVAL(vfloat, place, nearest)
+    const vint interval = ROUNDED_VINT(nearest + ROUNDER);
+    vfloat c0, c1, c2, c3;
+#pragma unroll
+    for (int lane = 0; lane < WIDTH; lane++) {
+        __global const float *cubic = beam + 4 * ((const int *)&interval)[lane];
+        ((float *)&c0)[lane] = cubic[0];
+        ((float *)&c1)[lane] = cubic[1];
+        ((float *)&c2)[lane] = cubic[2];
+        ((float *)&c3)[lane] = cubic[3];
+    }
+    return beam_weight(c0, c1, c2, c3, place - nearest, low - nearest, high - nearest);
+}
+#else
+#define EXPAND_ARGUMENTS
+#define BEAM_ARGUMENTS
+#endif
 
 /* Expands every channel's range about every tile's centre to third order in pixels (i along columns,
  * j along rows), WIDTH channels per work-item:
@@ -186,9 +238,20 @@ INLINE void add_to_image(const vfloat *re, const vfloat *im, __global float2 *pi
  *     d2p  = (dx'P_t dx / R_t + dy'P_r dy / R_r) / (1 + e_r.b),   dy = dx - b dp,   P = 1 - e e',
  *     d3|D| = -3 (e.dx) (dx'P dx) / R^2, where b is left out: its share is |b| of the smallest term.
  *
- * Global size (channel_pitch / WIDTH, tiles). step_column, step_row: m per pixel; samples_per_m: samples per metre of range (half a path).
- * expansion: float [tiles][TERMS][channel_pitch]: g0, g1, h0, h1, h2, k0, k1, k2, k3. */
+ * With BEAM the place along.e - lowest follows, e the unit vector from the antennas' middle: q = along.D/R has
+ * a numerator without curvature, so that of the terms X_n of order n in a quotient of Taylor series
+ *
+ *     q_1 = (along.dx - R_1 q_0)/R_0,   q_2 = -(R_1 q_1 + R_2 q_0)/R_0,   q_3 = -(R_1 q_2 + R_2 q_1 + R_3 q_0)/R_0.
+ *
+ * Global size (channel_pitch / WIDTH, tiles). step_column, step_row: m per pixel; samples_per_m: samples per metre of range (half a path);
+ * drift: samples per column and row that every range gains less.
+ * expansion: float [tiles][TERMS][channel_pitch]: g0, g1, h0, h1, h2, k0, k1, k2, k3, then the
+ * place and its factors in the same order. */
+#if BEAM
+#define TERMS 19
+#else
 #define TERMS 9
+#endif
 
 typedef struct {
     vfloat g0, g1, h00, h01, h11, k0, k1, k2, k3;
@@ -214,15 +277,15 @@ INLINE Derivatives distance_derivatives(vfloat x, vfloat y, vfloat z, float4 a, 
 }
 
 __kernel void expand_tiles(__global const float *geometry, int channel_pitch,
+                           int geometry_pitch, __global const int *ranges,
                            __global const float *centres, float4 step_column, float4 step_row,
-                           float samples_per_m, __global float *expansion)
+                           float samples_per_m, float2 drift, __global float *expansion EXPAND_ARGUMENTS)
 {
-    const int channel = get_global_id(0) * WIDTH;
+    const int entry = get_global_id(0) * WIDTH;
     const int tile = get_global_id(1);
+    /* What lies beyond a tile's channels is not used. */
+    const int channel = clamp(ranges[3 * tile] + entry, 0, geometry_pitch - WIDTH);
     __global const float *centre = centres + 6 * tile;
-#if OWN_LINES
-    geometry += (size_t)tile * 6 * channel_pitch;
-#endif
 
     const vfloat tx = FROMS(TX, 0), ty = FROMS(TX, 1), tz = FROMS(TX, 2);
     const Derivatives t = distance_derivatives(tx, ty, tz, step_column, step_row);
@@ -270,9 +333,9 @@ __kernel void expand_tiles(__global const float *geometry, int channel_pitch,
     const vfloat h00 = t.h00, h01 = t.h01, h11 = t.h11;
     const vfloat k0 = t.k0, k1 = t.k1, k2 = t.k2, k3 = t.k3;
 #endif
-    __global float *row = expansion + (size_t)tile * TERMS * channel_pitch + channel;
-    STORE(g0, row);
-    STORE(g1, row + channel_pitch);
+    __global float *row = expansion + (size_t)tile * TERMS * channel_pitch + entry;
+    STORE(g0 - drift.x, row);
+    STORE(g1 - drift.y, row + channel_pitch);
     STORE(h00 * (0.5f * scale), row + 2 * channel_pitch);
     STORE(h01 * scale, row + 3 * channel_pitch);
     STORE(h11 * (0.5f * scale), row + 4 * channel_pitch);
@@ -280,6 +343,33 @@ __kernel void expand_tiles(__global const float *geometry, int channel_pitch,
     STORE(k1 * scale, row + 6 * channel_pitch);
     STORE(k2 * scale, row + 7 * channel_pitch);
     STORE(k3 * scale, row + 8 * channel_pitch);
+#if BEAM
+#if BISTATIC
+    const vfloat x = 0.5f * (tx + FROMS(RX, 0)), y = 0.5f * (ty + FROMS(RX, 1)), z = 0.5f * (tz + FROMS(RX, 2));
+    const Derivatives d = distance_derivatives(x, y, z, step_column, step_row);
+#else
+    const vfloat x = tx, y = ty, z = tz;
+    const Derivatives d = t;
+#endif
+    const vfloat ux = ROWS(ALONG, 0), uy = ROWS(ALONG, 1), uz = ROWS(ALONG, 2);
+    const vfloat near = 1.0f / sqrt(x * x + y * y + z * z);
+    const vfloat q = (ux * x + uy * y + uz * z) * near;
+    const vfloat q0 = (ux * step_column.x + uy * step_column.y + uz * step_column.z - q * d.g0) * near;
+    const vfloat q1 = (ux * step_row.x + uy * step_row.y + uz * step_row.z - q * d.g1) * near;
+    STORE(q - lowest, row + 9 * channel_pitch);
+    STORE(q0, row + 10 * channel_pitch);
+    STORE(q1, row + 11 * channel_pitch);
+    const vfloat q00 = (q0 * d.g0 + q * 0.5f * d.h00) * -near;
+    const vfloat q01 = (q0 * d.g1 + q1 * d.g0 + q * d.h01) * -near;
+    const vfloat q11 = (q1 * d.g1 + q * 0.5f * d.h11) * -near;
+    STORE(q00, row + 12 * channel_pitch);
+    STORE(q01, row + 13 * channel_pitch);
+    STORE(q11, row + 14 * channel_pitch);
+    STORE((q00 * d.g0 + q0 * 0.5f * d.h00 + q * d.k0) * -near, row + 15 * channel_pitch);
+    STORE((q01 * d.g0 + q00 * d.g1 + q1 * 0.5f * d.h00 + q0 * d.h01 + q * d.k1) * -near, row + 16 * channel_pitch);
+    STORE((q11 * d.g0 + q01 * d.g1 + q1 * d.h01 + q0 * 0.5f * d.h11 + q * d.k2) * -near, row + 17 * channel_pitch);
+    STORE((q11 * d.g1 + q1 * 0.5f * d.h11 + q * d.k3) * -near, row + 18 * channel_pitch);
+#endif
 }
 
 /* Planar grids: pixels of a tile by the expansion of expand_tiles.
@@ -288,13 +378,17 @@ __kernel void backproject_tiles(__global const float *samples, int pitch,
                                 __global const int *reference_sample,
                                 __global const float *reference_fraction,
                                 __global const float *reference_phase,
-                                __global const float *expansion, int channels, int channel_pitch,
-                                float cycles_per_sample, __global const float *weights,
-                                __global float2 *pixels, int columns, int first_tile)
+                                __global const float *expansion, int channel_pitch,
+                                __global const int *ranges, float cycles_per_sample,
+                                __global const float *weights, __global float2 *pixels, int columns,
+                                int first_tile BEAM_ARGUMENTS)
 {
     const int item = get_global_id(0);
     const int tile = get_global_id(1);
-    const int tiles_across = columns / TILE;
+    const int begin = ranges[3 * tile], end = ranges[3 * tile + 1];
+    if (begin >= end)
+        return;
+    const int tiles_across = columns / TILE_COLUMNS;
     const int block_column = item % BLOCKS_ACROSS * BLOCK_COLUMNS;
     const int block_row = item / BLOCKS_ACROSS * ITEM_ROWS;
     const size_t first = (size_t)tile * channel_pitch;
@@ -302,22 +396,51 @@ __kernel void backproject_tiles(__global const float *samples, int pitch,
     reference_fraction += first;
     reference_phase += first;
     expansion += TERMS * first;
-#if OWN_LINES
-    samples += (size_t)tile * channels * 2 * pitch;
-#endif
+    samples += (size_t)ranges[3 * tile + 2] * 2 * pitch;
 
     /* Lanes from their block's centre, blocks' centres from the tile's, in pixels. */
     const vfloat lane_i = LANE_COLUMNS, lane_j = LANE_ROWS;
-    const float i = block_column + 0.5f * (BLOCK_COLUMNS - TILE);
-    const float4 j = block_row + 0.5f * (BLOCK_ROWS - TILE) + BLOCK_ROWS * (float4)(0.0f, 1.0f, 2.0f, 3.0f);
+    const float i = block_column + 0.5f * (BLOCK_COLUMNS - TILE_COLUMNS);
+    const float4 j = block_row + 0.5f * (BLOCK_ROWS - TILE_ROWS) + BLOCK_ROWS * (float4)(0.0f, 1.0f, 2.0f, 3.0f);
 
     vfloat re[STACK], im[STACK];
 #pragma unroll
     for (int block = 0; block < STACK; block++)
         re[block] = im[block] = 0.0f;
+#if BEAM && NORMALISE
+    vfloat sum[STACK];
+#pragma unroll
+    for (int block = 0; block < STACK; block++)
+        sum[block] = 0.0f;
+#endif
 
-    for (int channel = 0; channel < channels; channel++) {
-        __global const float *term = expansion + channel;
+    for (int channel = begin; channel < end; channel++) {
+        const int entry = channel - begin;
+        __global const float *term = expansion + entry;
+#if BEAM
+        /* The place in the beam and its slopes at the four blocks' centres. */
+        const float q_0 = term[10 * channel_pitch], q_1 = term[11 * channel_pitch];
+        const float q_00 = term[12 * channel_pitch], q_01 = term[13 * channel_pitch],
+                    q_11 = term[14 * channel_pitch];
+        const float q_000 = term[15 * channel_pitch], q_001 = term[16 * channel_pitch],
+                    q_011 = term[17 * channel_pitch], q_111 = term[18 * channel_pitch];
+        const float q_j = q_1 + i * (q_01 + i * q_001);
+        const float q_jj = q_11 + i * q_011;
+        const float4 place = (term[9 * channel_pitch] + i * (q_0 + i * (q_00 + i * q_000)))
+            + j * (q_j + j * (q_jj + j * q_111));
+        const float4 q_slope_i = (q_0 + i * (2.0f * q_00 + i * (3.0f * q_000)))
+            + j * ((q_01 + i * (2.0f * q_001)) + j * q_011);
+        const float4 q_slope_j = q_j + j * (2.0f * q_jj + j * (3.0f * q_111));
+        /* Half a pixel more than the lanes reach leaves room for the curvature. */
+        const float4 q_reach = 0.5f * BLOCK_COLUMNS * fabs(q_slope_i) + 0.5f * BLOCK_ROWS * fabs(q_slope_j);
+        const int4 seen = (place + q_reach > low) & (place - q_reach < high);
+        if (!(seen.s0 | seen.s1 | seen.s2 | seen.s3))
+            continue;
+        INTERVAL(float4, place, nearest)
+        const int4 interval = as_int4(nearest + ROUNDER) - 0x4B400000;
+        const float4 middle = place - nearest, first_x = low - nearest, last_x = high - nearest;
+        const vfloat q_curvature = lane_i * (lane_i * q_00 + lane_j * q_01) + lane_j * lane_j * q_11;
+#endif
         const float g0 = term[0], g1 = term[channel_pitch];
         const float h0 = term[2 * channel_pitch], h1 = term[3 * channel_pitch], h2 = term[4 * channel_pitch];
         const float k0 = term[5 * channel_pitch], k1 = term[6 * channel_pitch], k2 = term[7 * channel_pitch],
@@ -335,14 +458,14 @@ __kernel void backproject_tiles(__global const float *samples, int pitch,
             + lane_j * lane_j * (h2 + k2 * i);
         const vfloat bend = lane_i * (lane_i * k1 + lane_j * (2.0f * k2)) + lane_j * lane_j * (3.0f * k3);
 
-        const float4 position = move + reference_fraction[channel];
+        const float4 position = move + reference_fraction[entry];
         const float4 shifted = position + ROUNDER;
         const float4 start = position - (shifted - ROUNDER) - 0.5f;
-        const int4 centre = reference_sample[channel] + (as_int4(shifted) - 0x4B400000);
-        const float4 cycles = move * cycles_per_sample + reference_phase[channel];
+        const int4 centre = reference_sample[entry] + (as_int4(shifted) - 0x4B400000);
+        const float4 cycles = move * cycles_per_sample + reference_phase[entry];
         const float4 phase = cycles - ((cycles + ROUNDER) - ROUNDER);
 
-        __global const float *line = samples + (size_t)channel * 2 * pitch;
+        __global const float *line = samples + (size_t)entry * 2 * pitch;
 #pragma unroll
         for (int block = 0; block < STACK; block++) {
             const vfloat d = lane_i * AT(slope_i, block)
@@ -350,12 +473,27 @@ __kernel void backproject_tiles(__global const float *samples, int pitch,
             vfloat line_re, line_im, sine, cosine;
             interpolate(line, pitch, AT(centre, block), d + AT(start, block), weights, &line_re, &line_im);
             sincos_cycles(d * cycles_per_sample + AT(phase, block), &sine, &cosine);
+#if BEAM
+            __global const float *cubic = beam + 4 * AT(interval, block);
+            const vfloat x = lane_i * AT(q_slope_i, block)
+                + (lane_j * AT(q_slope_j, block) + (q_curvature + AT(middle, block)));
+            const vfloat weight = beam_weight(cubic[0], cubic[1], cubic[2], cubic[3], x, AT(first_x, block), AT(last_x, block));
+            sine *= weight;
+            cosine *= weight;
+#if NORMALISE
+            sum[block] += weight;
+#endif
+#endif
             re[block] += line_re * cosine - line_im * sine;
             im[block] += line_re * sine + line_im * cosine;
         }
     }
-    add_to_image(re, im, pixels, columns, ((first_tile + tile) / tiles_across) * TILE + block_row,
-                 ((first_tile + tile) % tiles_across) * TILE + block_column);
+    add_to_image(re, im, pixels, columns, ((first_tile + tile) / tiles_across) * TILE_ROWS + block_row,
+                 ((first_tile + tile) % tiles_across) * TILE_COLUMNS + block_column);
+#if BEAM && NORMALISE
+    add_to_image(sum, sum, sums, columns, ((first_tile + tile) / tiles_across) * TILE_ROWS + block_row,
+                 ((first_tile + tile) % tiles_across) * TILE_COLUMNS + block_column);
+#endif
 }
 
 /* Distance |D + d| - |D| without cancellation; 0 where D and d are 0. */
@@ -374,16 +512,21 @@ __kernel void backproject_points(__global const float *samples, int pitch,
                                  __global const int *reference_sample,
                                  __global const float *reference_fraction,
                                  __global const float *reference_phase,
-                                 __global const float *geometry, int channels, int channel_pitch,
-                                 float cycles_per_sample, __global const float *weights,
-                                 __global float2 *pixels, int first_group, __global const float *centres,
-                                 __global const float *offsets, int points, float samples_per_m)
+                                 __global const float *geometry, int geometry_pitch, int channel_pitch,
+                                 __global const int *ranges, float cycles_per_sample,
+                                 __global const float *weights, __global float2 *pixels, int first_group,
+                                 __global const float *centres, __global const float *offsets, int points,
+                                 float samples_per_m BEAM_ARGUMENTS)
 {
     const int group = get_global_id(0);
+    const int begin = ranges[3 * group], end = ranges[3 * group + 1];
+    if (begin >= end)
+        return;
     const size_t first = (size_t)group * channel_pitch;
     reference_sample += first;
     reference_fraction += first;
     reference_phase += first;
+    samples += (size_t)ranges[3 * group + 2] * 2 * pitch;
     offsets += (size_t)group * STACK * WIDTH;
     __global const float *centre = centres + 6 * group;
 
@@ -391,11 +534,21 @@ __kernel void backproject_points(__global const float *samples, int pitch,
 #pragma unroll
     for (int block = 0; block < STACK; block++)
         re[block] = im[block] = 0.0f;
+#if BEAM && NORMALISE
+    vfloat sum[STACK];
+#pragma unroll
+    for (int block = 0; block < STACK; block++)
+        sum[block] = 0.0f;
+#endif
 
-    for (int channel = 0; channel < channels; channel++) {
+    for (int channel = begin; channel < end; channel++) {
+        const int entry = channel - begin;
         const float tx = FROM(TX, 0), ty = FROM(TX, 1), tz = FROM(TX, 2);
 #if BISTATIC
         float rx = FROM(RX, 0), ry = FROM(RX, 1), rz = FROM(RX, 2);
+#if BEAM
+        const float px = 0.5f * (tx + rx), py = 0.5f * (ty + ry), pz = 0.5f * (tz + rz);
+#endif
 #if MOVING
         /* Where the receiver is when the centre's echo arrives. */
         const float bx = ROW(VELOCITY, 0), by = ROW(VELOCITY, 1), bz = ROW(VELOCITY, 2);
@@ -408,13 +561,26 @@ __kernel void backproject_points(__global const float *samples, int pitch,
             rz = az - bz * path;
         }
 #endif
+#elif BEAM
+        const float px = tx, py = ty, pz = tz;
 #endif
-        __global const float *line = samples + (size_t)channel * 2 * pitch;
+#if BEAM
+        const float ux = ROW(ALONG, 0), uy = ROW(ALONG, 1), uz = ROW(ALONG, 2);
+#endif
+        __global const float *line = samples + (size_t)entry * 2 * pitch;
 #pragma unroll
         for (int block = 0; block < STACK; block++) {
             const vfloat dx = LOAD(offsets + block * WIDTH);
             const vfloat dy = LOAD(offsets + block * WIDTH + points);
             const vfloat dz = LOAD(offsets + block * WIDTH + 2 * (size_t)points);
+#if BEAM
+            const vfloat x = px + dx, y = py + dy, z = pz + dz;
+            const vfloat q = (ux * x + uy * y + uz * z) / sqrt(x * x + y * y + z * z + FLT_MIN);
+            const vfloat weight = beam_weights(beam, q - lowest, low, high);
+#if NORMALISE
+            sum[block] += weight;
+#endif
+#endif
             const vfloat out_change = distance_change(tx, ty, tz, dx, dy, dz);
 #if MOVING
             vfloat path = out_change + distance_change(rx, ry, rz, dx, dy, dz);
@@ -427,19 +593,26 @@ __kernel void backproject_points(__global const float *samples, int pitch,
             const vfloat path = 2.0f * out_change;
 #endif
             const vfloat move = path * (0.5f * samples_per_m);
-            const vfloat t = move + reference_fraction[channel];
+            const vfloat t = move + reference_fraction[entry];
 #ifndef WINDOW
             const int whole = 0;
 #else
             const int whole = ROUNDED_INT(t.s5 + ROUNDER); /* a lane in the block's middle */
 #endif
             vfloat line_re, line_im, sine, cosine;
-            interpolate(line, pitch, reference_sample[channel] + whole, t - (whole + 0.5f), weights, &line_re,
+            interpolate(line, pitch, reference_sample[entry] + whole, t - (whole + 0.5f), weights, &line_re,
                         &line_im);
-            sincos_cycles(move * cycles_per_sample + reference_phase[channel], &sine, &cosine);
+            sincos_cycles(move * cycles_per_sample + reference_phase[entry], &sine, &cosine);
+#if BEAM
+            sine *= weight;
+            cosine *= weight;
+#endif
             re[block] += line_re * cosine - line_im * sine;
             im[block] += line_re * sine + line_im * cosine;
         }
     }
     add_to_image(re, im, pixels, BLOCK_COLUMNS, (first_group + group) * ITEM_ROWS, 0);
+#if BEAM && NORMALISE
+    add_to_image(sum, sum, sums, BLOCK_COLUMNS, (first_group + group) * ITEM_ROWS, 0);
+#endif
 }

@@ -68,12 +68,12 @@ INLINE void sincos_cycles(vfloat t, vfloat *sine, vfloat *cosine)
  * at +-(pair + 0.5) has E(nu^2) +- nu O(nu^2). filter: float [TAPS / 2][2][TAPS / 2], per pair from
  * the innermost the coefficients of E, then O, highest power first. */
 #ifdef TAPS
-INLINE void filter_weights(__global const float *filter, float nu, float *weight)
+INLINE void filter_weights(__global const float *filter, vfloat nu, vfloat *weight)
 {
-    const float square = nu * nu;
+    const vfloat square = nu * nu;
 #pragma unroll
     for (int pair = 0; pair < TAPS / 2; pair++) {
-        float even = filter[pair * TAPS], odd = filter[pair * TAPS + TAPS / 2];
+        vfloat even = filter[pair * TAPS], odd = filter[pair * TAPS + TAPS / 2];
 #pragma unroll
         for (int power = 1; power < TAPS / 2; power++) {
             even = even * square + filter[pair * TAPS + power];

@@ -4,10 +4,13 @@ from clsas.backproject import backproject
 from clsas.compress import compress
 from clsas.device import DeviceError, list_devices
 from clsas.echoes import Echoes
+from clsas.factorize import factorize
 from clsas.grid import Grid
 from clsas.image import Image
 from clsas.io import FileFormatError, load, save, to_xarray
 from clsas.lines import RangeLines
+from clsas.plan import Plan
+from clsas.planner import plan
 from clsas.quality import contrast, entropy, measure_point, relative_error_db
 from clsas.sampling import check_sampling
 from clsas.scene import PointTargets
@@ -15,16 +18,19 @@ from clsas.simulate import simulate, simulate_lines
 from clsas.sonar import Pulse, Sonar
 from clsas.track import Pointing, Track, channels
 from clsas.validate import ClsasWarning
+from clsas.window import BeamWindow
 
 __version__ = "0.1.0"
 
 __all__ = [
+    "BeamWindow",
     "ClsasWarning",
     "DeviceError",
     "Echoes",
     "FileFormatError",
     "Grid",
     "Image",
+    "Plan",
     "PointTargets",
     "Pointing",
     "Pulse",
@@ -37,9 +43,11 @@ __all__ = [
     "compress",
     "contrast",
     "entropy",
+    "factorize",
     "list_devices",
     "load",
     "measure_point",
+    "plan",
     "relative_error_db",
     "save",
     "simulate",

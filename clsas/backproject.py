@@ -9,28 +9,32 @@ from dataclasses import dataclass
 
 import numpy as np
 import pyopencl as cl
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from clsas import interpolation, validate
 from clsas.device import Device, Slot, open_device
-from clsas.geometry import pairwise_range_m
+from clsas.geometry import bistatic_range_m, pairwise_range_m
 from clsas.grid import Grid
 from clsas.image import Image
 from clsas.interpolation import Interpolator, Resampling
 from clsas.layout import GEOMETRY_ERROR, STACK, Groups, Tiles, lay_out
 from clsas.lines import RangeLines
+from clsas.window import INTERVALS, BeamWindow, channel_ranges, sines
 
 BEST_ACCURACY_DB = -85.0
 """The best accuracy that may be asked for: what float32 allows."""
 
 _WINDOW = 32  # samples that the permuting lookup holds in registers
 _EXPANSION_TERMS = 9  # coefficients per (tile, channel)
+_BEAM_TERMS = 10  # further ones with a beam
 _LARGEST_DISTANCE_M = 1e9
 _SMALLEST_STEP_M = 1e-9
 _MOST_CYCLES = 1e10  # float64 leaves 1e-6 of a cycle
 _LARGEST_SUM = 1e37
 _FASTEST = 0.05  # of a receiver, in sound speeds: cl/backproject.cl iterates on it
 _CHANNELS_AT_ONCE = 512  # bounds a float32 partial sum; lines that stay in a CPU's cache
+_UNSEEN = 1e-6  # a sum of weights that is none
 _PART_BYTES = 64 << 20  # device memory for one set of parts: a job of some tenths of a second
 
 
@@ -44,6 +48,9 @@ class Preparation:
     layout: Tiles | Groups
     interpolator: Interpolator
     resampling: Resampling
+    beam: BeamWindow | None = None
+    along: NDArray[np.float64] | None = None
+    """The track's unit direction for every channel, [channels, 3]; None without a beam."""
 
     @property
     def samples_per_m(self) -> float:
@@ -66,6 +73,7 @@ def backproject(
     accuracy_db: float = -60.0,
     taps: int | None = None,
     upsampling: float | None = None,
+    beam: BeamWindow | None = None,
     accumulate: Image | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Image:
@@ -87,6 +95,9 @@ def backproject(
     upsampling : float, optional
         By how much lines are upsampled before interpolation, instead of the fastest choice. With
         `taps` too, `accuracy_db` plays no part.
+    beam : BeamWindow, optional
+        Weights of the channels by aspect angle; what a channel does not see costs nothing. Without
+        one every channel weighs 1 everywhere.
     accumulate : Image, optional
         Image on the same grid that this one is added to, so that data may arrive in pieces.
     progress : callable, optional
@@ -100,7 +111,8 @@ def backproject(
     Raises
     ------
     TypeError, ValueError
-        If an argument is not what is allowed, `accumulate` is on another grid, receivers move
+        If an argument is not what is allowed, `accumulate` is on another grid or beside a beam
+        that normalises, the beam's track cannot be told from the lines, receivers move
         faster than 0.05 sound speeds, or numbers are so large or small that float32 sums or
         float64 phases could not hold them.
     DeviceError
@@ -109,7 +121,7 @@ def backproject(
     Warns
     -----
     ClsasWarning
-        If no pixel lies within any line's range, so that the lines add nothing.
+        If no pixel lies within any line's range, or the beam, so that the lines add nothing.
 
     Notes
     -----
@@ -118,15 +130,23 @@ def backproject(
     spectral centre and as zero beyond their ends: a pixel outside a line's range (by more than
     the taps of one interpolation) gets nothing from it.
 
-    Lines know no beam: a pixel behind the antennas, at the range of one before them, is its mirror
-    image. Ranges and phases are referred in float64 to centres near the pixels; the device sees
-    float32 differences only.
+    With a beam each term is multiplied by its weight. With or without one a pixel behind the
+    antennas, at the range of one before them, is its mirror image. Ranges and phases are referred
+    in float64 to centres near the pixels; the device sees float32 differences only.
     """
     preparation = prepare(
-        lines, grid, device=device, accuracy_db=accuracy_db, taps=taps, upsampling=upsampling
+        lines,
+        grid,
+        device=device,
+        accuracy_db=accuracy_db,
+        taps=taps,
+        upsampling=upsampling,
+        beam=beam,
     )
     if accumulate is not None:
         _check_same_grid(accumulate, grid)
+        if beam is not None and beam.normalise:
+            raise ValueError("accumulate must be None with a beam that normalises: it is a mean")
     image = execute(preparation, progress=progress)
     if accumulate is None:
         return image
@@ -141,6 +161,7 @@ def prepare(
     accuracy_db: float = -60.0,
     taps: int | None = None,
     upsampling: float | None = None,
+    beam: BeamWindow | None = None,
 ) -> Preparation:
     """Decide how `backproject` forms an image; parameters and errors are its."""
     validate.instance("lines", lines, RangeLines)
@@ -148,7 +169,15 @@ def prepare(
     accuracy_db = validate.number(
         "accuracy_db", accuracy_db, "dB", least=BEST_ACCURACY_DB, below=0.0
     )
-    _check_numbers(lines)
+    along, window_sine, heaviest = None, math.inf, 1.0
+    if beam is not None:
+        validate.instance("beam", beam, BeamWindow)
+        if beam.shape == "inverse" and not lines.carrier_hz:
+            raise ValueError("carrier_hz must be above 0 for a beam of the shape 'inverse'")
+        along = beam.directions(lines)
+        window_sine = float(np.diff(np.clip(beam.limits, -1, 1))[0])
+        heaviest = max(float(beam.table(wavelength_m(lines)).max()), 1.0)
+    _check_numbers(lines, heaviest)
     device = open_device(device)
     spectrum = interpolation.measure_spectrum(lines)
     # What rounding a range costs: phase, and place within the lines' band, 0.3 Nyquist rms.
@@ -157,7 +186,16 @@ def prepare(
         0.3 / lines.range_step_m,
     )
     antennas_m = np.unique(np.concatenate([lines.tx_m, lines.rx_m]), axis=0)
-    layout = lay_out(grid, antennas_m, cycles_per_m, device.info.width, speed_ratio=_fastest(lines))
+    if beam is not None:
+        antennas_m = np.concatenate([antennas_m, (lines.tx_m + lines.rx_m) / 2])
+    layout = lay_out(
+        grid,
+        antennas_m,
+        cycles_per_m,
+        device.info.width,
+        speed_ratio=_fastest(lines),
+        window_sine=window_sine,
+    )
     _check_distances(antennas_m, layout)
     interpolator = interpolation.choose(
         spectrum,
@@ -171,7 +209,7 @@ def prepare(
         / max(layout.block_radius_m, 1e-30),
     )
     resampling = interpolation.resampling(lines.length, interpolator, spectrum)
-    return Preparation(device, lines, grid, layout, interpolator, resampling)
+    return Preparation(device, lines, grid, layout, interpolator, resampling, beam, along)
 
 
 def execute(
@@ -181,25 +219,54 @@ def execute(
 
     The image is formed in bands that fit the device, each from blocks of channels, each block in
     jobs of so many (part, channel) pairs; a job is prepared on the host while the one before runs.
+    With a beam only pairs that see each other are prepared.
     """
     validate.progress(progress)
     p = preparation
     layout, device = p.layout, p.device
     pixels = np.empty(layout.parts * layout.part_pixels, np.complex64)
+    normalise = p.beam is not None and p.beam.normalise
     try:
         run = _Run(p, progress)
         for band in _slices(slice(0, layout.parts), _band_parts(p)):
             part = slice(band.start * layout.part_pixels, band.stop * layout.part_pixels)
-            on_device = device.zeros(pixels[part].nbytes)
+            on_device = [device.zeros(pixels[part].nbytes) for _ in range(1 + normalise)]
             for channels in _slices(slice(0, p.lines.channels), run.channels_at_once):
                 run.add(channels, band, on_device)
-            cl.enqueue_copy(device.queue, pixels[part], on_device)
+            cl.enqueue_copy(device.queue, pixels[part], on_device[0])
+            if normalise:
+                sums = np.empty_like(pixels[part])
+                cl.enqueue_copy(device.queue, sums, on_device[1])
+                pixels[part] *= normalising(sums.real, p.lines.channels)
     finally:
         device.finish()  # an interrupted run leaves nothing in use
     image = Image(layout.collect(pixels), p.grid)
     if not image.pixels.any() and p.lines.samples.any():
         _warn_unseen(p)
     return image
+
+
+def normalising(sums: NDArray[np.floating], channels: int) -> NDArray[np.floating]:
+    """Return what a normalising beam multiplies pixels by whose weights have these sums."""
+    return np.where(sums > _UNSEEN, channels / np.maximum(sums, _UNSEEN), 0).astype(sums.dtype)
+
+
+def wavelength_m(lines: RangeLines) -> float:
+    """Return the wavelength of the carrier, infinite without one."""
+    return lines.sound_speed_m_s / lines.carrier_hz if lines.carrier_hz else math.inf
+
+
+def beam_arguments(
+    device: Device, beam: BeamWindow | None, lines: RangeLines
+) -> tuple[float, tuple[object, ...]]:
+    """Return table intervals per sine, and what kernels with BEAM take at their ends."""
+    if beam is None:
+        return 0.0, ()
+    low, high = (float(limit) for limit in beam.limits)
+    lowest, highest = max(low, -1.0), min(high, 1.0)
+    per_sine = INTERVALS / (highest - lowest)
+    places = (lowest * per_sine, (low - lowest) * per_sine, (high - lowest) * per_sine)
+    return per_sine, (device.upload(beam.table(wavelength_m(lines))), *places)
 
 
 class _Run:
@@ -213,10 +280,11 @@ class _Run:
         self.tiled = isinstance(layout, Tiles)
         self.moving = p.lines.rx_velocity_m_s is not None
         self.bistatic = self.moving or not np.array_equal(p.lines.tx_m, p.lines.rx_m)
+        self.radius_m = layout.radius_m
         self.origin_m = layout.centres_m(slice(0, 1))[0]
 
         # Zeros around a line on the device: a part may reach beyond its end by a radius.
-        self.reach = math.ceil(layout.radius_m * p.samples_per_m * 1.1) + p.interpolator.taps
+        self.reach = math.ceil(self.radius_m * p.samples_per_m * 1.1) + p.interpolator.taps
         self.margin = 2 * self.reach + _WINDOW
         self.pitch = _round_up(p.resampling.length + 2 * self.margin, 16)
         if self.pitch % 256 == 0:  # lines at equal places in cache sets would evict each other
@@ -226,11 +294,13 @@ class _Run:
         options = {
             "WIDTH": device.info.width,
             "TAPS": p.interpolator.taps,
-            "TILE": layout.side if self.tiled else 16,
+            "TILE_ROWS": layout.side if self.tiled else 16,
+            "TILE_COLUMNS": layout.side if self.tiled else 16,
             "PERMUTE": int(device.info.permute and fits),
             "BISTATIC": int(self.bistatic),
             "MOVING": int(self.moving),
-            "OWN_LINES": 0,
+            "BEAM": 0 if p.beam is None else INTERVALS,
+            "NORMALISE": int(p.beam is not None and p.beam.normalise),
         }
         name = "backproject_tiles" if self.tiled else "backproject_points"
         self.kernel = device.kernel("backproject", name, **options)
@@ -238,7 +308,8 @@ class _Run:
 
         # Device memory: an eighth for either set of lines, a sixteenth for either of references.
         line_bytes = 8 * self.pitch
-        part_bytes = 52 * _CHANNELS_AT_ONCE if self.tiled else 16 * _CHANNELS_AT_ONCE
+        self.terms = _EXPANSION_TERMS + (0 if p.beam is None else _BEAM_TERMS)
+        part_bytes = _CHANNELS_AT_ONCE * (16 + 4 * self.terms if self.tiled else 16)
         part_bytes += 12 * layout.part_pixels
         most = device.info.max_buffer_bytes
         room = min(most, device.info.memory_bytes // 8)
@@ -254,29 +325,61 @@ class _Run:
         self.line_slots = itertools.cycle([Slot(device), Slot(device)])
         self.part_slots = itertools.cycle([Slot(device), Slot(device)])
         self.weights = device.upload(p.interpolator.coefficients.astype(np.float32))
+        self.per_sine, self.beam = beam_arguments(device, p.beam, p.lines)
         self.progress = progress
         self.done = 0
 
-    def add(self, channels: slice, band: slice, pixels: cl.Buffer) -> None:
-        """Add some channels to the pixels of a band of parts."""
+    def add(self, channels: slice, band: slice, pixels: list[cl.Buffer]) -> None:
+        """Add some channels to the pixels of a band of parts, and to the sums of their weights."""
+        ranges = self._ranges(channels, band)
+        seen = ranges[:, 1] > ranges[:, 0]
+        if not seen.any():
+            self._report((band.stop - band.start) * (channels.stop - channels.start))
+            return
+        # Lines that no part sees are left out.
+        first, end = int(ranges[seen].min()), int(ranges[seen].max())
+        ranges[seen] -= first
+        of_all = channels.stop - channels.start
+        channels = slice(channels.start + first, channels.start + end)
         lines = self.p.lines.select(channels)
         line_slot = next(self.line_slots)
         line_slot.wait()
         upsampled = self.p.resampling.apply(lines.samples)
         width = self.p.device.info.width
         line_slot.fill("samples", padded_lines(upsampled, width, self.margin, self.pitch))
-        line_slot.fill("geometry", self._geometry(lines))
+        geometry = self._geometry(lines, channels)
+        line_slot.fill("geometry", geometry)
         for parts in _slices(band, self.parts_at_once):
-            slot = next(self.part_slots)
-            slot.wait()
-            centres_m = self.p.layout.centres_m(parts)
-            slot.fill("centres", float_pairs(centres_m - self.origin_m))
-            for name, values in self._references(centres_m, lines).items():
-                slot.fill(name, values)
-            event = self._launch(lines, line_slot, slot, parts, parts.start - band.start, pixels)
-            slot.busy = line_slot.busy = event
-            self.p.device.queue.flush()
-            self._report((parts.stop - parts.start) * lines.channels)
+            of_parts = ranges[parts.start - band.start : parts.stop - band.start]
+            if of_parts.any():
+                slot = next(self.part_slots)
+                slot.wait()
+                centres_m = self.p.layout.centres_m(parts)
+                slot.fill("centres", float_pairs(centres_m - self.origin_m))
+                slot.fill("ranges", np.column_stack([of_parts, of_parts[:, 0]]))
+                references = self._references(centres_m, lines, of_parts)
+                for name, values in references.items():
+                    slot.fill(name, values)
+                pitches = (references["sample"].shape[1], geometry.shape[1])
+                first_part = parts.start - band.start
+                event = self._launch(lines, line_slot, slot, parts, pitches, first_part, pixels)
+                slot.busy = line_slot.busy = event
+                self.p.device.queue.flush()
+            self._report((parts.stop - parts.start) * of_all)
+
+    def _ranges(self, channels: slice, band: slice) -> NDArray[np.int32]:
+        """Return which of some channels each part of a band sees, [parts, 2]: first and end."""
+        p = self.p
+        count = channels.stop - channels.start
+        if p.beam is None:
+            return np.tile(np.array([0, count], np.int32), (band.stop - band.start, 1))
+        lines, along = p.lines.select(channels), p.along[channels]
+        return np.concatenate(
+            [
+                channel_ranges(p.beam, lines, along, p.layout.centres_m(parts), self.radius_m)
+                for parts in _slices(band, self.parts_at_once)
+            ]
+        )
 
     def _launch(
         self,
@@ -284,33 +387,43 @@ class _Run:
         line_slot: Slot,
         slot: Slot,
         parts: slice,
+        pitches: tuple[int, int],
         first_part: int,
-        pixels: cl.Buffer,
+        pixels: list[cl.Buffer],
     ) -> cl.Event:
-        """Run the kernels of one job on buffers that are being filled."""
+        """Run the kernels of one job on buffers that are being filled.
+
+        `pitches` are those of channels in what is held per part, and in the geometry.
+        """
         p, device, layout = self.p, self.p.device, self.p.layout
         count = parts.stop - parts.start
-        pitch = _channel_pitch(lines)
+        pitch, geometry_pitch = pitches
         if self.tiled:
-            geometry = slot.buffer("expansion", 4 * _EXPANSION_TERMS * count * pitch)
+            geometry = slot.buffer("expansion", 4 * self.terms * count * pitch)
             steps_m = (p.grid.column_step_m, p.grid.row_step_m)
             device.run(
                 self.expand,
                 (pitch // device.info.width, count),
                 line_slot["geometry"],
                 pitch,
+                geometry_pitch,
+                slot["ranges"],
                 slot["centres"],
                 *(np.append(step, 0).astype(np.float32) for step in steps_m),
                 p.samples_per_m,
+                np.zeros(2, np.float32),
                 geometry,
+                *self.beam[1:2],
                 wait_for=line_slot.filled + slot.filled,
             )
             size = (layout.part_pixels // (device.info.width * STACK), count)
+            pitches = (pitch,)
             rest = (layout.across * layout.side, first_part)
         else:
             geometry = line_slot["geometry"]
             slot.fill("offsets", layout.offset_m[parts].reshape(-1, 3).T)
             size = (count,)
+            pitches = (geometry_pitch, pitch)
             points = count * layout.part_pixels
             rest = (first_part, slot["centres"], slot["offsets"], points, p.samples_per_m)
         return device.run(
@@ -322,32 +435,58 @@ class _Run:
             slot["fraction"],
             slot["phase"],
             geometry,
-            lines.channels,
-            pitch,
+            *pitches,
+            slot["ranges"],
             p.cycles_per_m / p.samples_per_m,
             self.weights,
-            pixels,
+            pixels[0],
             *rest,
+            *self.beam,
+            *pixels[1:],
             wait_for=line_slot.filled + slot.filled,
         )
 
-    def _geometry(self, lines: RangeLines) -> NDArray[np.float32]:
-        """Return positions about the origin and velocities over sound speed, [rows, channels]."""
+    def _geometry(self, lines: RangeLines, channels: slice) -> NDArray[np.float32]:
+        """Return positions about the origin, velocities over sound speed and directions.
+
+        That is float32 [rows, channels]. A vector may begin at any channel.
+        """
         rows = [float_pairs(lines.tx_m - self.origin_m)]
         if self.bistatic:
             rows.append(float_pairs(lines.rx_m - self.origin_m))
         if self.moving:
             rows.append((lines.rx_velocity_m_s / lines.sound_speed_m_s).astype(np.float32))
+        if self.p.beam is not None:
+            rows.append((self.p.along[channels] * self.per_sine).astype(np.float32))
+        pitch = _channel_pitch(lines.channels) + 16
         geometry = np.concatenate(rows, axis=1).T
-        return np.pad(geometry, ((0, 0), (0, _channel_pitch(lines) - lines.channels)), mode="edge")
+        return np.pad(geometry, ((0, 0), (0, pitch - lines.channels)), mode="edge")
 
-    def _references(self, centres_m: NDArray[np.float64], lines: RangeLines) -> dict[str, NDArray]:
-        """Return where each centre's echo lies in each line, and its phase, reduced in float64."""
+    def _references(
+        self, centres_m: NDArray[np.float64], lines: RangeLines, ranges: NDArray[np.int32]
+    ) -> dict[str, NDArray]:
+        """Return where each centre's echo lies in each line, and its phase, reduced in float64.
+
+        These are [parts, channels], from the first channel in a part's range on.
+        """
         resampling = self.p.resampling
-        range_m = pairwise_range_m(
-            centres_m, lines.tx_m, lines.rx_m, lines.rx_velocity_m_s, lines.sound_speed_m_s
-        )
-        place = (range_m - lines.first_range_m) / lines.range_step_m + resampling.lead
+        seen = ranges[:, 1] > ranges[:, 0]
+        count = int((ranges[:, 1] - ranges[:, 0]).max())
+        if count == lines.channels and not ranges[:, 0].any():
+            seen[:] = True
+            range_m = pairwise_range_m(
+                centres_m,
+                lines.tx_m,
+                lines.rx_m,
+                lines.rx_velocity_m_s,
+                lines.sound_speed_m_s,
+            )
+            first_range_m = lines.first_range_m
+        else:
+            range_m, first_range_m = _windowed_ranges(
+                centres_m[seen], lines, ranges[seen, 0], count
+            )
+        place = (range_m - first_range_m) / lines.range_step_m + resampling.lead
         range_m *= lines.carrier_cycles_per_m
         cycles = range_m + place * resampling.centre_cycles_per_sample
         cycles -= np.rint(cycles)
@@ -361,21 +500,52 @@ class _Run:
             self.margin - self.reach,
             self.margin + resampling.length + self.reach,
         )
-        shape = (len(centres_m), _channel_pitch(lines))
+        shape = (len(centres_m), _channel_pitch(count))
         references = {
-            "sample": np.empty(shape, np.int32),
-            "fraction": np.empty(shape, np.float32),
-            "phase": np.empty(shape, np.float32),
+            "sample": np.zeros(shape, np.int32),
+            "fraction": np.zeros(shape, np.float32),
+            "phase": np.zeros(shape, np.float32),
         }
         for array, values in zip(references.values(), (nearest, place, cycles), strict=True):
-            array[:, : lines.channels] = values
-            array[:, lines.channels :] = 0
+            array[seen, :count] = values
         return references
 
     def _report(self, pairs: int) -> None:
         self.done += pairs
         if self.progress is not None:
             self.progress(self.done, self.p.layout.parts * self.p.lines.channels)
+
+
+def _windowed_ranges(
+    centres_m: NDArray[np.float64], lines: RangeLines, first: NDArray[np.int32], count: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the ranges of centres to `count` channels from each one's first, [centres, count].
+
+    Beside them those of the lines' first samples. The last channel stands for those beyond it.
+    """
+
+    def window(values: NDArray[np.float64]) -> NDArray[np.float64]:
+        return sliding_window_view(np.pad(values, (0, count - 1), mode="edge"), count)[first]
+
+    def distance_m(antennas_m: NDArray[np.float64]) -> NDArray[np.float64]:
+        square = np.zeros((len(first), count))
+        for axis in range(3):
+            offset_m = window(antennas_m[:, axis])
+            offset_m -= centres_m[:, axis, None]
+            offset_m *= offset_m
+            square += offset_m
+        return np.sqrt(square, out=square)
+
+    if lines.rx_velocity_m_s is not None:
+        antennas = (lines.tx_m, lines.rx_m, lines.rx_velocity_m_s)
+        moving = (np.stack([window(axis) for axis in each.T], axis=-1) for each in antennas)
+        range_m = bistatic_range_m(centres_m[:, None], *moving, lines.sound_speed_m_s)
+    else:
+        range_m = distance_m(lines.tx_m)
+        if not np.array_equal(lines.tx_m, lines.rx_m):
+            range_m += distance_m(lines.rx_m)
+            range_m *= 0.5
+    return range_m, window(lines.first_range_m)
 
 
 def padded_lines(
@@ -408,9 +578,9 @@ def _room(taps: int) -> float:
     return _WINDOW / 2 - 2 - taps / 2
 
 
-def _channel_pitch(lines: RangeLines) -> int:
+def _channel_pitch(channels: int) -> int:
     """Channels with padding to whole vectors of any width."""
-    return _round_up(lines.channels, 16)
+    return _round_up(channels, 16)
 
 
 def _round_up(number: int, multiple: int) -> int:
@@ -426,7 +596,10 @@ def _slices(whole: slice, most: int) -> Iterator[slice]:
 def _band_parts(p: Preparation) -> int:
     """Return how many parts' pixels may be on the device at once: whole rows of tiles."""
     info = p.device.info
-    most = min(info.max_buffer_bytes, info.memory_bytes // 4) // (8 * p.layout.part_pixels)
+    pixel_bytes = 8 * (1 + (p.beam is not None and p.beam.normalise))
+    most = min(info.max_buffer_bytes, info.memory_bytes // 4) // (
+        pixel_bytes * p.layout.part_pixels
+    )
     return max(most // p.layout.across, 1) * p.layout.across
 
 
@@ -436,8 +609,11 @@ def _check_same_grid(image: Image, grid: Grid) -> None:
         raise ValueError("accumulate must be an image on the same grid")
 
 
-def _check_numbers(lines: RangeLines) -> None:
-    """Refuse lines whose numbers would leave what float32 sums or float64 phases can hold."""
+def _check_numbers(lines: RangeLines, heaviest: float) -> None:
+    """Refuse lines whose numbers would leave what float32 sums or float64 phases can hold.
+
+    `heaviest` is the largest weight of a channel.
+    """
     validate.number(
         "range_step_m", lines.range_step_m, "m", least=_SMALLEST_STEP_M, most=_LARGEST_DISTANCE_M
     )
@@ -449,7 +625,7 @@ def _check_numbers(lines: RangeLines) -> None:
             f"carrier_hz = {lines.carrier_hz:g} Hz makes {cycles:.3g} cycles over {farthest_m:g} m "
             f"at {lines.sound_speed_m_s:g} m/s; float64 holds the phase of {_MOST_CYCLES:g}"
         )
-    largest, most = float(np.abs(lines.samples).max()), _LARGEST_SUM / lines.channels
+    largest, most = float(np.abs(lines.samples).max()), _LARGEST_SUM / heaviest / lines.channels
     if largest > most:
         raise ValueError(
             f"samples must be at most {most:.3g} for the sum of {lines.channels} channels to stay "
@@ -489,8 +665,24 @@ def _warn_unseen(p: Preparation) -> None:
         some.rx_velocity_m_s,
         some.sound_speed_m_s,
     )
+    spans = (
+        f"the lines span {lines.first_range_m.min():.6g} to {lines.last_range_m.max():.6g} m, the "
+        f"grid lies at {range_m.min():.6g} to {range_m.max():.6g} m"
+    )
+    if p.beam is None:
+        validate.warn(
+            f"no pixel of the grid lies within any line's range, so the image is zero: {spans}"
+        )
+        return
+    sine = sines(
+        centres_m[:: max(len(centres_m) // 1024, 1)],
+        some,
+        p.along[:: max(lines.channels // 64, 1)],
+    )
+    low, high = np.degrees(np.arcsin(np.clip([sine.min(), sine.max()], -1, 1)))
+    first, last = np.degrees(p.beam.limits_rad)
     validate.warn(
-        f"no pixel of the grid lies within any line's range, so the image is zero: the lines span "
-        f"{lines.first_range_m.min():.6g} to {lines.last_range_m.max():.6g} m, the grid lies at "
-        f"{range_m.min():.6g} to {range_m.max():.6g} m"
+        f"no pixel of the grid lies within the beam and the range of any line, so the image is "
+        f"zero: the beam spans {first:.4g} to {last:.4g} degrees, the grid lies at {low:.4g} to "
+        f"{high:.4g} degrees; {spans}"
     )

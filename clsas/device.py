@@ -142,13 +142,15 @@ class Device:
         size: tuple[int, ...],
         *arguments: object,
         wait_for: Sequence[cl.Event] = (),
+        local: tuple[int, ...] | None = None,
     ) -> cl.Event:
         """Enqueue a kernel over `size` work-items; plain ints and floats become 32-bit.
 
-        Work-items that hold vectors are work-groups of their own (PoCL compiles a kernel anew for
-        every local size); otherwise the driver chooses.
+        Unless `local` says otherwise, work-items that hold vectors are work-groups of their own
+        (PoCL compiles a kernel anew for every local size), and else the driver chooses.
         """
-        local = (1,) * len(size) if self.info.width > 1 else None
+        if local is None and self.info.width > 1:
+            local = (1,) * len(size)
         event = kernel(self.queue, size, local, *map(_argument, arguments), wait_for=wait_for)
         if self._events is not None:
             self._events.append((kernel.function_name, event))
@@ -219,6 +221,12 @@ class Slot:
         """Return a buffer of at least so many bytes."""
         if name not in self._buffers or self._buffers[name].size < bytes_:
             self._buffers[name] = self.device.buffer(bytes_)
+        return self._buffers[name]
+
+    def zeros(self, name: str, bytes_: int) -> cl.Buffer:
+        """Return a buffer of at least so many bytes, that held zeros when it was made."""
+        if name not in self._buffers or self._buffers[name].size < bytes_:
+            self._buffers[name] = self.device.zeros(bytes_)
         return self._buffers[name]
 
     def fill(self, name: str, array: np.ndarray) -> None:

@@ -2,39 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
 import pyopencl as cl
 from numpy.typing import NDArray
 
-from clsas import validate
-from clsas.backproject import float_pairs, padded_lines
-from clsas.device import Device, open_device
+from clsas import tree, validate
+from clsas.aperture import cycles_per_pixel, drift, mean_track, phase_centres_m
+from clsas.backproject import backproject, beam_arguments, float_pairs, padded_lines
+from clsas.device import Device, Slot, open_device
 from clsas.geometry import pairwise_range_m
 from clsas.grid import Grid
 from clsas.image import Image
 from clsas.layout import STACK
 from clsas.lines import RangeLines
-from clsas.plan import Plan, aperture_coordinate, direction_angles, half_lengths, plan
+from clsas.plan import GUARD, Plan
+from clsas.planner import plan
+from clsas.tree import Division, Nodes, Ranges
+from clsas.window import INTERVALS, BeamWindow
 
-# Zeros that the last stage's lookup may touch on either side of a line.
-_GUARD = 16
-# Points at which the mean track is looked up, and how far beyond its ends, in its lengths.
-_CURVE_POINTS = 257
-_CURVE_BEYOND = 0.5
-
-
-@dataclass(frozen=True, eq=False)
-class _Stage:
-    """Lines of some subimages on the device, each aligned on its subimage's centre."""
-
-    lines: cl.Buffer
-    pitch: int
-    centre_sample: int
-    centres_m: NDArray[np.float64]  # [subimages, 3]
-    positions_m: NDArray[np.float64]  # of the virtual channels, [subimages, channels, 3]
+_GROUP = 64  # work-items that share a subimage where each has one lane
+_LINES_AT_ONCE = 256  # upsampled together: what stays in a CPU's cache
 
 
 def factorize(
@@ -42,301 +32,440 @@ def factorize(
     grid: Grid,
     plan_or_tolerance: Plan | float,
     *,
+    beam: BeamWindow | None = None,
     device: Device | str | int | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Image:
-    """Form the image of range lines on a plane, fast, to a tolerance.
+    """Form the image of range lines fast, to a tolerance.
 
     Parameters
     ----------
     lines : RangeLines
-        Monostatic or bistatic, at rest during flight, from a track that a cubic describes but for
-        small motion.
+        Any number of channels, monostatic, bistatic or moving.
     grid : Grid
-        A plane.
+        Any number of pixels. Off a plane the image is backprojected plainly.
     plan_or_tolerance : Plan or float
-        A plan made for these lines and this grid, or the relative rms error wanted, dB.
+        A plan made by `clsas.plan` for these lines and this grid, or the relative rms error
+        wanted against the exact image, dB, from -75 to -10.
+    beam : BeamWindow, optional
+        Weights of the channels; a plan holds its own.
     device : Device, str or int, optional
         See `clsas.device.choose`.
     progress : callable, optional
-        Called as progress(pixels done, pixels).
+        Called as progress(done, total).
 
     Returns
     -------
     Image
+        complex64, phase-preserving.
 
     Raises
     ------
     TypeError, ValueError
-        If an argument is not what is allowed.
+        If an argument is not what is allowed, the plan was made for other lines or another grid,
+        or `beam` is given beside a plan.
     DeviceError
         If there is no such device.
 
     Notes
     -----
     Aligned on a subimage's centre c, channel n's steering function exp(j 2 k (rho_n(x) - rho_n(c)))
-    varies slowly with its direction, and is interpolated from those of fewer, virtual channels:
-    f_n ~ sum_m a_nm f_m. Hence sum_n s_n f_n ~ sum_m (sum_n a_nm s_n) f_m.
+    varies slowly along the track, and is interpolated from those of fewer, virtual channels:
+    f_n ~ sum_m a_nm f_m. Hence sum_n s_n f_n ~ sum_m (sum_n a_nm s_n) f_m: the virtual channels'
+    lines are weighted sums of aligned lines, and so again from stage to stage.
     """
+    validate.instance("lines", lines, RangeLines)
+    validate.instance("grid", grid, Grid)
     validate.progress(progress)
-    chosen = plan_or_tolerance
-    if not isinstance(chosen, Plan):
-        chosen = plan(lines, grid, tolerance_db=chosen)
-    run = _Run(lines, grid, chosen, open_device(device))
-    side = chosen.sides[0]
+    device = open_device(device)
+    if not isinstance(plan_or_tolerance, Plan):
+        chosen = plan(lines, grid, tolerance_db=plan_or_tolerance, beam=beam, device=device)
+    elif beam is not None:
+        raise ValueError("beam must be left out with a plan, which holds its own")
+    else:
+        chosen = plan_or_tolerance
+        chosen.check(lines, grid)
+    if chosen.is_exact:
+        return backproject(
+            lines,
+            grid,
+            device=device,
+            accuracy_db=chosen.predicted_error_db,
+            beam=chosen.beam,
+            progress=progress,
+        )
     rows, columns = grid.shape
     pixels = np.empty(grid.shape, np.complex64)
-    done = 0
+    (height, width), done = chosen.sides[0], 0
     try:
-        for row in range(0, rows, side):
-            for column in range(0, columns, side):
-                part = np.s_[row : row + side, column : column + side]
-                pixels[part] = run.root(row, column)[: rows - row, : columns - column]
+        run = _Run(lines, grid, chosen, device)
+        for roots, squares in run.batches():
+            for (row, column), square in zip(roots, squares, strict=True):
+                part = np.s_[row : row + height, column : column + width]
+                pixels[part] = square[: rows - row, : columns - column]
                 done += pixels[part].size
-                if progress is not None:
-                    progress(done, grid.size)
+            if progress is not None:
+                progress(done, grid.size)
     finally:
-        run.device.finish()
+        device.finish()  # an interrupted run leaves nothing in use
     return Image(pixels, grid)
+
+
+@dataclass(frozen=True)
+class _Level:
+    """The lines of one stage: `half` samples to either side of a subimage's centre."""
+
+    half: int
+    length: int
+
+    @property
+    def pitch(self) -> int:
+        """Samples of a line with the zeros around it."""
+        return self.length + 2 * GUARD
+
+    @property
+    def centre(self) -> int:
+        """Sample of the subimage's centre."""
+        return self.half + GUARD
+
+
+@dataclass(frozen=True, eq=False)
+class _Batch:
+    """Some roots: where their subimages are, and which virtual channels they have.
+
+    Attributes
+    ----------
+    root_m : float64 [roots, 3]
+        Middles of the roots.
+    relative_m : list of float64 [roots, subimages, 3]
+        Middles of the subimages from those of their roots, stage by stage.
+    nodes : list of Nodes
+    needs : list of Ranges
+    """
+
+    root_m: NDArray[np.float64]
+    relative_m: list[NDArray[np.float64]]
+    nodes: list[Nodes]
+    needs: list[Ranges]
+
+    def stride(self, level: int) -> int:
+        """Return how many lines a subimage of a stage has at most."""
+        need = self.needs[level]
+        return int((need.last - need.first).max())
 
 
 class _Run:
     """A plan at work on a device."""
 
     def __init__(self, lines: RangeLines, grid: Grid, chosen: Plan, device: Device) -> None:
-        self.raw, self.grid, self.plan, self.device = lines, grid, chosen, device
+        self.lines, self.grid, self.plan, self.device = lines, grid, chosen, device
         self.width = device.info.width
-        self.samples_per_m = chosen.resampling.ratio / lines.range_step_m
-        self.half = half_lengths(grid, chosen.sides, chosen.align, chosen.final, self.samples_per_m)
         resampling = chosen.resampling
+        self.samples_per_m = resampling.ratio / lines.range_step_m
         self.cycles_per_m = (
             lines.carrier_cycles_per_m + resampling.centre_cycles_per_sample / lines.range_step_m
         )
+        self.division = Division(grid, chosen.sides)
+        self.track = mean_track(lines)
+        self.along = None
+        if chosen.beam is not None:
+            self.along = tree.beam_directions(chosen.beam, lines, self.track, self.track.samples)
+        self.phase_centres_m = phase_centres_m(lines)
+        self.drift = drift(lines)
+        self.levels = [
+            _Level(half, -(-(2 * half + 1) // self.width) * self.width)
+            for half in chosen.half_lengths
+        ]
         self.filters = {
             name: device.upload(getattr(chosen, name).coefficients.astype(np.float32))
-            for name in ("align", "aperture", "final")
+            for name in ("align", "final")
         }
-        aperture = {"WIDTH": self.width, "TAPS": chosen.aperture.taps}
-        self.align = device.kernel("align", "align", WIDTH=self.width, TAPS=chosen.align.taps)
-        self.weigh = device.kernel("combine", "aperture_weights", **aperture)
-        self.combine = device.kernel("combine", "combine", **aperture)
+        options = {"WIDTH": self.width, "TAPS": chosen.align.taps}
+        options["APERTURE_TAPS"] = chosen.aperture.taps
+        self.first_stage = device.kernel("stage", "stage", GIVEN=1, **options)
+        self.later_stage = device.kernel("stage", "stage", GIVEN=0, **options)
         last = {
             "WIDTH": self.width,
             "TAPS": chosen.final.taps,
-            "TILE": chosen.sides[-1],
+            "TILE_ROWS": chosen.tile[0],
+            "TILE_COLUMNS": chosen.tile[1],
             "PERMUTE": int(device.info.permute),
             "BISTATIC": 0,
             "MOVING": 0,
-            "OWN_LINES": 1,
+            "BEAM": 0 if chosen.beam is None else INTERVALS,
+            "NORMALISE": 0,
         }
         self.expand = device.kernel("backproject", "expand_tiles", **last)
         self.backproject = device.kernel("backproject", "backproject_tiles", **last)
-        self.coordinates = [
-            aperture_coordinate(grid, side, chosen.highest_cycles_per_m) for side in chosen.sides
-        ]
-        self.track_m = _mean_track(lines)
+        self.per_sine, self.beam = beam_arguments(device, chosen.beam, lines)
         # Zeros around a line: a subimage may reach beyond its end, or lie outside it.
-        self.margin = 2 * self.half[0] + 64
-        self.pitch = resampling.length + 2 * self.margin
-        upsampled = resampling.apply(lines.samples)
-        padded = padded_lines(upsampled, self.width, self.margin, self.pitch)
-        self.samples = device.upload(padded)
+        self.margin = 2 * self.levels[0].half + 64
+        self.pitch = -(-(resampling.length + 2 * self.margin) // 16) * 16
+        self.pitch += 16 * (self.pitch % 256 == 0)
+        self.samples = self._upload_lines()
+        self.slots = [Slot(device) for _ in self.levels]
+        self.last_slot = Slot(device)
 
-    def root(self, row: int, column: int) -> NDArray[np.complex64]:
-        """Return the pixels of the root subimage that begins at a pixel."""
-        sides = self.plan.sides
-        stage = None
-        for level, side in enumerate(sides):
-            across = sides[0] // side
-            down, right = np.divmod(np.arange(across**2), across)
-            middle = (side - 1) / 2
-            centres_m = (
-                self.grid.origin_m
-                + (row + down * side + middle)[:, None] * self.grid.row_step_m
-                + (column + right * side + middle)[:, None] * self.grid.column_step_m
+    def _upload_lines(self) -> cl.Buffer:
+        """Return all lines on the device, upsampled."""
+        device, resampling, count = self.device, self.plan.resampling, self.lines.channels
+        line_bytes = 8 * self.pitch
+        if count * line_bytes > device.info.max_buffer_bytes:
+            raise ValueError(
+                f"{count} lines of {self.lines.length} samples need "
+                f"{count * line_bytes / 2**20:.0f} MiB when upsampled, more than a buffer of "
+                f"{device.info.label}, {device.info.max_buffer_bytes / 2**20:.0f} MiB: image "
+                f"a part of them, or backproject exactly"
             )
-            factor = sides[max(level - 1, 0)] // side
-            parent_of = down // factor * (across // factor) + right // factor
-            stage = self._divide(stage, level, centres_m, parent_of)
-        return self._backproject(stage)
+        buffer = device.buffer(count * line_bytes)
+        for start in range(0, count, _LINES_AT_ONCE):
+            upsampled = resampling.apply(self.lines.samples[start : start + _LINES_AT_ONCE])
+            padded = padded_lines(upsampled, self.width, self.margin, self.pitch)
+            cl.enqueue_copy(device.queue, buffer, padded, dst_offset=start * line_bytes)
+        return buffer
 
-    def _divide(
-        self,
-        parent: _Stage | None,
-        level: int,
-        centres_m: NDArray[np.float64],
-        parent_of: NDArray[np.int64],
-    ) -> _Stage:
-        """Return the stage of some subimages from their parents', or from the raw lines."""
-        device, half = self.device, self.half[level]
-        taps = self.plan.aperture.taps
-        place, cycles, angle = self._references(parent, centres_m, parent_of)
-        lines, pitch = (
-            (self.samples, self.pitch) if parent is None else (parent.lines, parent.pitch)
-        )
-        place -= half
-        lower = np.floor(place)
-        start = np.clip(lower + 1 - self.plan.align.taps // 2, -half, pitch).astype(np.int32)
-        first, order, nu, positions_m = self._nodes(level, centres_m, angle)
-        children, channels = angle.shape
-        nodes = positions_m.shape[1]
-        length = -(-(2 * half + 1) // self.width) * self.width
+    def batches(self) -> Iterator[tuple[NDArray[np.int64], NDArray[np.complex64]]]:
+        """Yield roots, [n, 2], with their pixels, [n, rows, columns]."""
+        roots = self.division.roots
+        for start in range(0, len(roots), self.plan.roots_at_once):
+            some = roots[start : start + self.plan.roots_at_once]
+            batch = self._batch(some)
+            if not batch.stride(0):
+                yield some, np.zeros((len(some), *self.plan.sides[0]), np.complex64)
+                continue
+            for level in range(len(self.levels)):
+                self._stage(batch, level)
+            yield some, self._backproject(batch)
 
-        weights = device.buffer(4 * children * channels * taps)
-        size = (channels, children)
-        device.run(self.weigh, size, device.upload(nu), self.filters["aperture"], weights)
-        aligned = device.buffer(8 * children * channels * length)
-        device.run(
-            self.align,
-            size,
-            lines,
-            pitch,
-            device.upload(parent_of.astype(np.int32)),
-            device.upload(start),
-            device.upload((place - lower - 0.5).astype(np.float32)),
-            device.upload((cycles - np.rint(cycles)).astype(np.float32)),
+    def _batch(self, roots: NDArray[np.int64]) -> _Batch:
+        division, chosen, track = self.division, self.plan, self.track
+        corners = [division.corners(level, roots) for level in range(len(self.levels))]
+        centres_m = [division.centres_m(*each) for each in enumerate(corners)]
+        root_m = centres_m[0][:, 0]
+        place = track.places_seen_from(root_m, self.phase_centres_m)
+        nodes = []
+        if chosen.nearest:
+            position_m = np.broadcast_to(self.phase_centres_m, (*place.shape, 3))
+            for factor in chosen.nearest:
+                nodes.append(tree.nearest_nodes(place, position_m, factor))
+                place, position_m = nodes[-1].place, nodes[-1].position_m
+        else:
+            rates = cycles_per_pixel(
+                track,
+                self.grid,
+                root_m,
+                chosen.sides[0],
+                chosen.highest_cycles_per_m,
+                division.radius_m(len(self.levels) - 1),
+            )
+            for level, (rows, columns) in enumerate(chosen.sides):
+                rate = rows * rates[0] + columns * rates[1]
+                if chosen.beam is not None and level == len(self.levels) - 1:
+                    rate += chosen.beam_cycles * tree.beam_rate(
+                        chosen.beam, track, self.along, root_m
+                    )
+                nodes.append(tree.interpolated_nodes(track, rate, place, chosen.aperture))
+                place = nodes[-1].place
+        half_m = np.array(chosen.sides[-1])[:, None] / 2
+        half_m = half_m * [self.grid.row_step_m, self.grid.column_step_m]
+        seen = tree.seen_from(chosen.beam, track, self.along, centres_m[-1], half_m)
+        inside = np.all(corners[-1] < self.grid.shape, axis=-1)
+        needs = tree.ranges(division, nodes, seen, inside)
+        return _Batch(root_m, [each - root_m[:, None] for each in centres_m], nodes, needs)
+
+    def _stage(self, batch: _Batch, level: int) -> None:
+        """Form the lines of a stage from those of the one before, or from the raw ones."""
+        device, slot, shape = self.device, self.slots[level], self.levels[level]
+        nodes, need, stride = batch.nodes[level], batch.needs[level], batch.stride(level)
+        roots, subimages = need.first.shape
+        children = np.zeros((roots, subimages, 8), np.int32)
+        children[..., 1] = np.arange(roots)[:, None]
+        children[..., 2], children[..., 3] = need.begin, need.end
+        children[..., 5], children[..., 6] = need.first, need.last - need.first
+        slot.wait()
+        slot.fill("base", _padded(nodes.base, np.int32))
+        slot.fill("aperture", _padded(nodes.weights, np.float32))
+        if level == 0:
+            kernel, parent, parent_pitch = self.first_stage, self.samples, self.pitch
+            for name, values in self._references(batch, shape.half).items():
+                slot.fill(name, values)
+            geometry = [slot[name] for name in ("order", "start", "nu", "cycles")]
+        else:
+            kernel, before = self.later_stage, self.levels[level - 1]
+            parent, parent_pitch = self.slots[level - 1]["lines"], before.pitch
+            parents, parent_m = self.division.parents(level), batch.relative_m[level - 1]
+            index = np.arange(roots)[:, None] * parent_m.shape[1] + parents
+            children[..., 0] = index * batch.stride(level - 1)
+            children[..., 4] = batch.needs[level - 1].first[:, parents]
+            position_m = batch.nodes[level - 1].position_m - batch.root_m[:, None]
+            slot.fill("positions", _padded(position_m, np.float32).swapaxes(1, 2))
+            offsets = [parent_m[:, parents], batch.relative_m[level] - parent_m[:, parents]]
+            slot.fill("offsets", np.concatenate(offsets, axis=-1).astype(np.float32))
+            geometry = [
+                slot["positions"],
+                slot["offsets"],
+                np.append(self.drift, 0).astype(np.float32),
+                self.samples_per_m,
+                self.cycles_per_m,
+                before.centre,
+                shape.half,
+            ]
+        slot.fill("children", children)
+        items = _GROUP if self.width == 1 else 1
+        slot.busy = device.run(
+            kernel,
+            (roots * subimages * items,),
+            parent,
+            parent_pitch,
+            slot["children"],
+            slot["base"],
+            slot["aperture"],
+            _pitch(nodes.base.shape[1]),
+            *geometry,
             self.filters["align"],
-            aligned,
-            length,
+            slot.zeros("lines", 8 * roots * subimages * stride * shape.pitch),
+            stride,
+            shape.pitch,
+            shape.length,
+            GUARD,
+            wait_for=slot.filled,
+            local=(items,),
         )
-        pitch = length + 2 * _GUARD
-        combined = device.zeros(8 * children * nodes * pitch)
-        device.run(
-            self.combine,
-            (length // self.width, children),
-            aligned,
-            length,
-            channels,
-            device.upload(order),
-            device.upload(first),
-            weights,
-            nodes,
-            combined,
-            pitch,
-            _GUARD,
+
+    def _references(self, batch: _Batch, half: int) -> dict[str, NDArray]:
+        """Return how roots see the raw channels, in the order of their nodes.
+
+        First sample, place between samples, phase in cycles; all from float64.
+        """
+        lines, resampling = self.lines, self.plan.resampling
+        range_m = pairwise_range_m(
+            batch.root_m, lines.tx_m, lines.rx_m, lines.rx_velocity_m_s, lines.sound_speed_m_s
         )
-        return _Stage(combined, pitch, half + _GUARD, centres_m, positions_m)
+        place = (range_m - lines.first_range_m) / lines.range_step_m + resampling.lead
+        cycles = lines.carrier_cycles_per_m * range_m
+        cycles += place * resampling.centre_cycles_per_sample
+        place *= resampling.ratio
+        place += self.margin - resampling.first - half
+        lower = np.floor(place)
+        start = np.clip(lower + 1 - self.plan.align.taps // 2, -half, self.pitch)
+        order = batch.nodes[0].order
 
-    def _references(
-        self, parent: _Stage | None, centres_m: NDArray[np.float64], parent_of: NDArray[np.int64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-        """Return how each centre sees the channels of its parent, [subimages, channels].
+        def ordered(values: NDArray[np.float64], kind: type) -> NDArray:
+            return _padded(np.take_along_axis(values, order, axis=1), kind)
 
-        That is the place in their lines, in samples, the phase in cycles, and the angle.
-        """
-        raw, resampling = self.raw, self.plan.resampling
-        if parent is None:
-            range_m = pairwise_range_m(centres_m, raw.tx_m, raw.rx_m)
-            place = (range_m - raw.first_range_m) / raw.range_step_m + resampling.lead
-            cycles = raw.carrier_cycles_per_m * range_m
-            cycles += place * resampling.centre_cycles_per_sample
-            place = place * resampling.ratio + self.margin - resampling.first
-            return place, cycles, direction_angles(self.grid, centres_m, raw.tx_m, raw.rx_m)
-        shape = (len(centres_m), parent.positions_m.shape[1])
-        range_m, angle = np.empty(shape), np.empty(shape)
-        for index, positions_m in enumerate(parent.positions_m):
-            mine = np.flatnonzero(parent_of == index)
-            own = parent.centres_m[index : index + 1]
-            range_m[mine] = pairwise_range_m(centres_m[mine], positions_m, positions_m)
-            range_m[mine] -= pairwise_range_m(own, positions_m, positions_m)
-            angle[mine] = direction_angles(self.grid, centres_m[mine], positions_m)
-        place = parent.centre_sample + range_m * self.samples_per_m
-        return place, self.cycles_per_m * range_m, angle
+        return {
+            "order": _padded(order, np.int32),
+            "start": ordered(start, np.int32),
+            "nu": ordered(place - lower - 0.5, np.float32),
+            "cycles": ordered(cycles - np.rint(cycles), np.float32),
+        }
 
-    def _nodes(
-        self, level: int, centres_m: NDArray[np.float64], angle: NDArray[np.float64]
-    ) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.float32], NDArray[np.float64]]:
-        """Return the virtual channels of some subimages and what each channel gives to them.
+    def _backproject(self, batch: _Batch) -> NDArray[np.complex64]:
+        """Return the pixels of roots from their last stage."""
+        device, slot, chosen, level = self.device, self.last_slot, self.plan, self.levels[-1]
+        nodes, need, stride = batch.nodes[-1], batch.needs[-1], batch.stride(len(self.levels) - 1)
+        roots = len(batch.root_m)
+        tiles = Division(self.grid, (chosen.sides[0], chosen.sides[-1], chosen.tile))
+        per_root, leaf_of = tiles.per_root(2), tiles.parents(2)
+        relative_m = tiles.centres_m(2, tiles.corners(2, np.zeros((1, 2), np.int64)))
+        relative_m = relative_m - tiles.centres_m(0, np.zeros((1, 1, 2), np.int64))
+        first, last = need.first[:, leaf_of], need.last[:, leaf_of]
+        ranges = np.empty((roots, per_root, 3), np.int32)
+        root = np.arange(roots)[:, None]
+        ranges[..., 0] = root * nodes.place.shape[1] + first
+        ranges[..., 1] = root * nodes.place.shape[1] + last
+        ranges[..., 2] = (root * need.first.shape[1] + leaf_of) * stride
+        pitch = -(-stride // 16) * 16
 
-        Returns
-        -------
-        first : int32 [subimages, nodes + 1]
-        order : int32 [subimages, channels]
-            See cl/combine.cl.
-        nu : float32 [subimages, channels]
-            Position of each channel between its middle two nodes, -0.5 to 0.5.
-        positions_m : float64 [subimages, nodes, 3]
-            On the mean track, equally spaced in the aperture coordinate.
-        """
-        angles, turned = self.coordinates[level]
-        aperture = self.plan.aperture
-        density = 2 * aperture.upsampling
-        place = density * np.interp(angle, angles, turned)
-        base = np.floor(place.min(axis=1, keepdims=True)) - (aperture.taps // 2 - 1)
-        place -= base
-        lower = np.floor(place).astype(np.int32)
-        first_node = lower - (aperture.taps // 2 - 1)
-        nodes = int(first_node.max()) + aperture.taps
-        order = np.argsort(first_node, axis=1, kind="stable").astype(np.int32)
-        flat = first_node + (nodes + 1) * np.arange(len(place))[:, None]
-        counts = np.bincount(flat.ravel(), minlength=len(place) * (nodes + 1))
-        before = np.cumsum(counts.reshape(-1, nodes + 1), axis=1)
-        first = np.pad(before[:, :-1], ((0, 0), (1, 0))).astype(np.int32)
-
-        node_angle = np.interp((base + np.arange(nodes)) / density, turned, angles)
-        along = np.linspace(-1 - _CURVE_BEYOND, 1 + _CURVE_BEYOND, _CURVE_POINTS)
-        seen = direction_angles(self.grid, centres_m, self.track_m(along))
-        node_along = np.empty_like(node_angle)
-        for each, (wanted, curve) in enumerate(zip(node_angle, seen, strict=True)):
-            falling = curve[0] > curve[-1]
-            backwards = slice(None, None, -1 if falling else 1)
-            node_along[each] = np.interp(wanted, curve[backwards], along[backwards])
-        nu = (place - lower - 0.5).astype(np.float32)
-        return first, order, nu, self.track_m(node_along)
-
-    def _backproject(self, stage: _Stage) -> NDArray[np.complex64]:
-        """Return the pixels of a root from its last stage."""
-        device, side = self.device, self.plan.sides[0]
-        tiles, nodes = stage.positions_m.shape[:2]
-        channel_pitch = -(-nodes // 16) * 16
-        origin_m = stage.centres_m[0]
-        geometry = float_pairs((stage.positions_m - origin_m).reshape(-1, 3))
-        geometry = geometry.reshape(tiles, nodes, 6).swapaxes(1, 2)
-        geometry = np.pad(geometry, ((0, 0), (0, 0), (0, channel_pitch - nodes)), mode="edge")
-        geometry = device.upload(geometry)
-        expansion = device.buffer(4 * 9 * tiles * channel_pitch)
-        steps = (self.grid.column_step_m, self.grid.row_step_m)
-        device.run(
+        position_m = nodes.position_m - batch.root_m[:, None]
+        rows = [float_pairs(position_m.reshape(-1, 3))]
+        if chosen.beam is not None:
+            along = tree.beam_directions(chosen.beam, self.lines, self.track, nodes.place)
+            rows.append((along * self.per_sine).astype(np.float32).reshape(-1, 3))
+        geometry = np.pad(np.concatenate(rows, axis=1).T, ((0, 0), (0, 16)), mode="edge")
+        slot.wait()
+        slot.fill("geometry", geometry)
+        slot.fill("ranges", ranges)
+        centres_m = np.broadcast_to(relative_m, (roots, per_root, 3))
+        slot.fill("centres", float_pairs(centres_m.reshape(-1, 3)))
+        for name, values in self._leaf_references(batch, leaf_of, centres_m, pitch).items():
+            slot.fill(name, values)
+        steps_m = (self.grid.column_step_m, self.grid.row_step_m)
+        terms = 9 + (10 if chosen.beam is not None else 0)
+        expansion = slot.buffer("expansion", 4 * terms * roots * per_root * pitch)
+        slot.busy = device.run(
             self.expand,
-            (channel_pitch // self.width, tiles),
-            geometry,
-            channel_pitch,
-            device.upload(float_pairs(stage.centres_m - origin_m)),
-            *(np.append(step, 0).astype(np.float32) for step in steps),
+            (pitch // self.width, roots * per_root),
+            slot["geometry"],
+            pitch,
+            geometry.shape[1],
+            slot["ranges"],
+            slot["centres"],
+            *(np.append(step, 0).astype(np.float32) for step in steps_m),
             self.samples_per_m,
+            np.array([self.drift @ s * self.samples_per_m for s in steps_m], np.float32),
             expansion,
+            *self.beam[1:2],
+            wait_for=slot.filled,
         )
-        # Every line is aligned on its tile's centre: nothing is left to refer to.
-        zeros = device.zeros(4 * tiles * channel_pitch)
-        centre = np.full((tiles, channel_pitch), stage.centre_sample, np.int32)
-        pixels = device.zeros(8 * side**2)
+        height, width = chosen.sides[0]
+        pixels = device.zeros(8 * roots * height * width)
         device.run(
             self.backproject,
-            (self.plan.sides[-1] ** 2 // (self.width * STACK), tiles),
-            stage.lines,
-            stage.pitch,
-            device.upload(centre),
-            zeros,
-            zeros,
+            (chosen.tile[0] * chosen.tile[1] // (self.width * STACK), roots * per_root),
+            self.slots[-1]["lines"],
+            level.pitch,
+            slot["sample"],
+            slot["fraction"],
+            slot["phase"],
             expansion,
-            nodes,
-            channel_pitch,
+            pitch,
+            slot["ranges"],
             self.cycles_per_m / self.samples_per_m,
             self.filters["final"],
             pixels,
-            side,
+            width,
             0,
+            *self.beam,
         )
-        image = np.empty((side, side), np.complex64)
+        image = np.empty((roots, height, width), np.complex64)
         cl.enqueue_copy(device.queue, image, pixels)
         return image
 
+    def _leaf_references(
+        self, batch: _Batch, leaf_of: NDArray[np.int64], centres_m: NDArray[np.float64], pitch: int
+    ) -> dict[str, NDArray]:
+        """Return where tiles' centres lie in the lines of their leaves, [tiles, pitch].
 
-def _mean_track(lines: RangeLines) -> Callable[[NDArray[np.float64]], NDArray[np.float64]]:
-    """Return a cubic through the phase centres: a function from -1..1 to positions [..., 3]."""
-    centres_m = (lines.tx_m + lines.rx_m) / 2
-    middle_m = centres_m.mean(axis=0)
-    along = (centres_m - middle_m) @ np.linalg.svd(centres_m - middle_m, full_matrices=False)[2][0]
-    reach_m = np.abs(along).max() or 1.0
-    cubic = np.polyfit(along / reach_m, centres_m - middle_m, min(3, lines.channels - 1))
-    return lambda place: middle_m + np.polyval(cubic[:, None], place[..., None])
+        Where tile and leaf are one, every line is aligned on its centre.
+        """
+        level, shape = self.levels[-1], (*centres_m.shape[:2], pitch)
+        sample = np.full(shape, level.centre, np.int32)
+        fraction, phase = np.zeros((2, *shape), np.float32)
+        if self.plan.tile != self.plan.sides[-1]:
+            nodes, need = batch.nodes[-1], batch.needs[-1]
+            for root, position_m in enumerate(nodes.position_m - batch.root_m[:, None]):
+                first, last = need.first[root].min(), need.last[root].max()
+                node_m = position_m[first:last]
+                leaf_m = batch.relative_m[-1][root, leaf_of]
+                range_m = pairwise_range_m(centres_m[root], node_m, node_m)
+                range_m -= pairwise_range_m(leaf_m, node_m, node_m)
+                range_m -= (centres_m[root] - leaf_m) @ self.drift[:, None]
+                place = range_m * self.samples_per_m
+                used = np.s_[root, :, : last - first]
+                sample[used] += np.rint(place).astype(np.int32)
+                fraction[used] = place - np.rint(place)
+                phase[used] = np.remainder(self.cycles_per_m * range_m + 0.5, 1) - 0.5
+        return {"sample": sample, "fraction": fraction, "phase": phase}
+
+
+def _pitch(channels: int) -> int:
+    """Channels of a row in a table, with room for a vector that begins at the last."""
+    return -(-channels // 16) * 16 + 16
+
+
+def _padded(values: NDArray, kind: type) -> NDArray:
+    """Return [roots, channels, ...] as the stages' kernel wants it: rows of whole vectors."""
+    padding = [(0, 0)] * values.ndim
+    padding[1] = (0, _pitch(values.shape[1]) - values.shape[1])
+    return np.pad(values.astype(kind), padding)

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.fft
 from numpy.typing import NDArray
+from scipy.linalg import lstsq
 
 from clsas import validate
 from clsas.lines import RangeLines
@@ -17,11 +18,11 @@ UPSAMPLINGS = (1.0, 1.25, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0, 12.0, 16
 
 # Device time per pixel and channel by taps, relative to 4 taps: measured with PoCL and Intel's
 # runtime on an AVX-512 CPU (scripts/bench taps).
-_COST = {2: 0.75, 4: 1.0, 6: 1.3, 8: 1.55}
+COST = {2: 0.75, 4: 1.0, 6: 1.3, 8: 1.55}
 # The same for one upsampled sample: an FFT on the host.
-_UPSAMPLING_COST = 40.0
+_UPSAMPLINGCOST = 40.0
 _FREQUENCIES = 128
-_POSITIONS = 33
+_POSITIONS = 17
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,7 +136,7 @@ def design(taps: int, upsampling: float, spectrum: Spectrum) -> Interpolator:
             solution = np.array([(0.5, 1.0)[part]])
         else:
             weighted = (matrix * share[..., None]).reshape(-1, matrix.shape[-1])
-            solution = np.linalg.lstsq(weighted, (wanted * share).ravel(), rcond=None)[0]
+            solution = lstsq(weighted, (wanted * share).ravel(), lapack_driver="gelsy")[0]
         coefficients[:, part] = solution.reshape(taps // 2, taps // 2)
         residual = matrix @ solution - wanted
         error += float(np.sum(spectrum.power * np.mean(residual**2, axis=1)))
@@ -202,8 +203,8 @@ def choose(
 
     def cost(candidate: Interpolator) -> tuple[bool, float]:
         slow = candidate.upsampling > most_upsampling
-        upsampling_cost = _UPSAMPLING_COST * candidate.upsampling / pixels_per_sample
-        return slow, _COST[candidate.taps] + upsampling_cost
+        upsampling_cost = _UPSAMPLINGCOST * candidate.upsampling / pixels_per_sample
+        return slow, COST[candidate.taps] + upsampling_cost
 
     return min(candidates, key=cost)
 

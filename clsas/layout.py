@@ -157,6 +157,7 @@ def lay_out(
     width: int,
     *,
     speed_ratio: float = 0.0,
+    window_sine: float = np.inf,
 ) -> Tiles | Groups:
     """Return how to divide a grid so that the geometry's share of the error stays below -90 dB.
 
@@ -172,6 +173,8 @@ def lay_out(
         Float lanes per work-item.
     speed_ratio : float
         Speed of the fastest receiver over that of sound.
+    window_sine : float
+        Width of a beam's window in the sine of the aspect angle; infinite for none.
 
     Notes
     -----
@@ -179,8 +182,11 @@ def lay_out(
     r^4/(8 R^3) at most, r its half diagonal and R the distance of the nearest antenna. The rms
     over a tile's pixels and directions is 0.15 of it. Within a block the third order is left out
     too: 0.19 r^3/R^2 at most, 0.04 of r^3/R^2 rms; and what receivers' motion does to the third
-    order of a tile, 0.2 of it times the speed ratio. Where even the smallest tile is too large,
-    near the antennas, and off a plane, pixels go into groups, which expand nothing.
+    order of a tile, 0.2 of it times the speed ratio. With a window the aspect angle's sine is
+    expanded to third order too, to a millionth of the window's width (float32 holds no less than
+    1e-7), and a block, where the window is a cubic, must be small against it. Where even the
+    smallest tile is too large, near the antennas, and off a plane, pixels go into groups, which
+    expand nothing.
     """
     if grid.is_planar:
         tree = KDTree(antennas_m)
@@ -192,7 +198,13 @@ def lay_out(
             remainder_m += 0.04 * tiles.block_radius_m**3 / nearest**2
             remainder_m += 0.2 * speed_ratio * tiles.radius_m**3 / nearest**2
             rounding = _FLOAT32_ERROR * cycles_per_m * tiles.radius_m
-            if np.hypot(2 * np.pi * cycles_per_m * remainder_m, rounding) <= GEOMETRY_ERROR:
+            error = np.hypot(2 * np.pi * cycles_per_m * remainder_m, rounding)
+            sine_error = 0.1 * (tiles.radius_m / nearest) ** 4
+            if (
+                error <= GEOMETRY_ERROR
+                and sine_error <= max(1e-6 * window_sine, 1e-7)
+                and tiles.block_radius_m / nearest <= 0.05 * window_sine
+            ):
                 return tiles
     with np.errstate(divide="ignore"):
         largest_radius_m = GEOMETRY_ERROR / _FLOAT32_ERROR / np.float64(cycles_per_m)

@@ -10,12 +10,13 @@ import scipy.fft
 from numpy.typing import ArrayLike, NDArray
 
 from clsas import validate
-from clsas.backproject import Preparation
+from clsas.backproject import Preparation, normalising, wavelength_m
 from clsas.geometry import pairwise_range_m
 from clsas.image import Image
 from clsas.interpolation import measure_spectrum
 from clsas.lines import RangeLines
 from clsas.quality import relative_error_db
+from clsas.window import BeamWindow, sines
 
 Progress = Callable[[int, int], None] | None
 Evaluate = Callable[[NDArray[np.complex128], NDArray[np.float64]], NDArray[np.complex128]]
@@ -34,8 +35,8 @@ def same_interpolator(
     Parameters
     ----------
     preparation : Preparation
-        What `clsas.backproject.prepare` decided: the lines and how they are interpolated. The
-        device itself is not used.
+        What `clsas.backproject.prepare` decided: the lines, how they are interpolated, and the
+        beam. The device itself is not used.
     points_m : array_like, [..., 3]
         Positions, metres.
     progress : callable, optional
@@ -70,11 +71,16 @@ def same_interpolator(
             total += inside * weights[..., tap] * taken
         return total * np.exp(2j * np.pi * resampling.centre_cycles_per_sample * place)
 
-    return _sum_channels(preparation.lines, points_m, evaluate, progress)
+    return _sum_channels(preparation.lines, points_m, evaluate, progress, preparation.beam)
 
 
 def ideal(
-    lines: RangeLines, points_m: ArrayLike, *, padding: int = 64, progress: Progress = None
+    lines: RangeLines,
+    points_m: ArrayLike,
+    *,
+    beam: BeamWindow | None = None,
+    padding: int = 64,
+    progress: Progress = None,
 ) -> NDArray[np.complex128]:
     """Return the ideal image at some points: every line evaluated exactly, in float64.
 
@@ -84,6 +90,8 @@ def ideal(
         What to image.
     points_m : array_like, [..., 3]
         Positions, metres.
+    beam : BeamWindow, optional
+        Weights of the channels by aspect angle.
     padding : int
         Zeros taken around a line, in samples at each end. It matters only for lines that are cut
         off in the middle of strong echoes: what is beyond their ends is not known, and which
@@ -98,17 +106,21 @@ def ideal(
     Raises
     ------
     TypeError, ValueError
-        If an argument is of a wrong kind or shape, or a position is not finite.
+        If an argument is of a wrong kind or shape, a position is not finite, or the beam's track
+        cannot be told from the lines.
 
     Notes
     -----
-    I(x) = sum_i s_i(rho_i(x)) exp(+j 2 k rho_i(x)), with s_i the trigonometric polynomial through
-    the line's samples and zeros around them whose frequencies lie within half a cycle per sample of
-    the lines' spectral centre. A point beyond a line's first or last sample gets nothing from it.
-    The polynomial is summed by a type-2 non-uniform FFT, to twelve digits.
+    I(x) = sum_i w_i(x) s_i(rho_i(x)) exp(+j 2 k rho_i(x)), with w_i the beam's weights (1 without
+    one) and s_i the trigonometric polynomial through the line's samples and zeros around them whose
+    frequencies lie within half a cycle per sample of the lines' spectral centre. A point beyond a
+    line's first or last sample gets nothing from it. The polynomial is summed by a type-2
+    non-uniform FFT, to twelve digits.
     """
     validate.instance("lines", lines, RangeLines)
     padding = validate.count("padding", padding, least=0)
+    if beam is not None:
+        validate.instance("beam", beam, BeamWindow)
     modes = scipy.fft.next_fast_len(lines.length + 2 * padding)
     shift = round(measure_spectrum(lines).centre * modes)
 
@@ -126,7 +138,7 @@ def ideal(
             )
         return values
 
-    return _sum_channels(lines, points_m, evaluate, progress)
+    return _sum_channels(lines, points_m, evaluate, progress, beam)
 
 
 def sampled_error_db(
@@ -163,13 +175,19 @@ def sampled_error_db(
 
 
 def _sum_channels(
-    lines: RangeLines, points_m: ArrayLike, evaluate: Evaluate, progress: Progress
+    lines: RangeLines,
+    points_m: ArrayLike,
+    evaluate: Evaluate,
+    progress: Progress,
+    beam: BeamWindow | None,
 ) -> NDArray[np.complex128]:
-    """Return the sum over channels of evaluate(samples, places in samples) with its phase."""
+    """Return the sum over channels of evaluate(samples, places), in phase and weighted."""
     leading = np.shape(points_m)[:-1]
     points = validate.array("points_m", points_m, np.float64, (*(None,) * len(leading), 3))
     points = points.reshape(-1, 3)
     image = np.zeros(len(points), np.complex128)
+    sums = np.zeros(len(points))
+    along = None if beam is None else beam.directions(lines)
     step = max(_PAIRS_AT_ONCE // len(points), 1)
     for first in range(0, lines.channels, step):
         block = lines.select(slice(first, first + step))
@@ -178,7 +196,14 @@ def _sum_channels(
         ).T
         place = (range_m - block.first_range_m[:, None]) / block.range_step_m
         values = evaluate(block.samples.astype(np.complex128), place)
+        if beam is not None:
+            q = sines(points, block, along[first : first + step])
+            weights = beam.weights(q, wavelength_m(lines))
+            values *= weights
+            sums += weights.sum(axis=0)
         image += np.sum(values * np.exp(2j * block.wavenumber_rad_m * range_m), axis=0)
         if progress is not None:
             progress(first + block.channels, lines.channels)
+    if beam is not None and beam.normalise:
+        image *= normalising(sums, lines.channels)
     return image.reshape(leading)

@@ -388,6 +388,7 @@ def good():
         ("upsampling", 0.9, ValueError, "upsampling must be .*>= 1.*got 0.9"),
         ("upsampling", 1e9, ValueError, "upsampling must be .*<= 64.*got 1e"),
         ("upsampling", np.inf, ValueError, "upsampling .*finite.*inf"),
+        ("beam", 20.0, TypeError, "beam must be .*BeamWindow.*float"),
         ("accumulate", np.zeros((4, 4), complex), TypeError, "accumulate must be .*Image"),
     ],
 )

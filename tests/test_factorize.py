@@ -2,10 +2,10 @@ import numpy as np
 import pytest
 from cases import along_x, beside, patch, thesis_lines
 
+from clsas import plan
 from clsas.backproject import backproject
 from clsas.factorize import factorize
 from clsas.grid import Grid
-from clsas.plan import plan
 from clsas.quality import relative_error_db
 
 APERTURE = along_x(400, 8.25e-3)

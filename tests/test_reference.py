@@ -161,6 +161,7 @@ def test_an_error_is_measured_at_random_pixels():
         (lambda lines: ideal(lines, [0, 0]), ValueError, "points_m"),
         (lambda lines: ideal(lines, [0, 0, np.nan]), ValueError, "points_m"),
         (lambda lines: ideal(lines, [0, 0, 1j]), TypeError, "points_m"),
+        (lambda lines: ideal(lines, [0, 0, 0], beam=20), TypeError, "beam must be .*BeamWindow"),
         (lambda lines: ideal(lines, [0, 0, 0], padding=-1), ValueError, "padding"),
         (lambda lines: same_interpolator(lines, [0, 0, 0]), TypeError, "preparation must be"),
         (lambda lines: sampled_error_db(lines, None), TypeError, "image must be .*Image"),

@@ -1,0 +1,267 @@
+/* A stage of factorized backprojection: the lines of a parent subimage become fewer, virtual lines of each
+ * child,
+ *
+ *     v_m(k) = sum_n a_nm exp(j 2 pi cycles_n) sum_t h_t(nu_n) s_n(start_n + k + t),
+ *
+ * that is, every line is brought to the child's centre (a constant shift: a short filter h over contiguous
+ * samples, and a phase), and summed with weights a that interpolate the aperture. Channels come in the order
+ * of the virtual channels they contribute to: channel n adds to APERTURE_TAPS consecutive ones from
+ * base[n] on, so that as many sums are open at a time.
+ *
+ * Build options
+ *   WIDTH          lanes: consecutive samples of a line, or consecutive channels (common.h).
+ *   TAPS           of the range interpolation h, even (filter_weights in common.h).
+ *   APERTURE_TAPS  of the aperture interpolation a.
+ *   GIVEN          1: shifts and phases come from the host (the first stage, whose channels may be
+ *                  anything); 0: from the positions of virtual channels.
+ *
+ * Buffers
+ *   parent      lines of float, `parent_pitch` samples each: [...][2][parent_pitch], real parts and
+ *               imaginary ones; with WIDTH 1 interleaved.
+ *   children    int [children][8]: the parent's first line; the root; the channels [begin, end) that the
+ *               child uses; what to subtract from a channel to find its line among the parent's; the
+ *               child's first virtual channel and how many it has; unused.
+ *   Per root and channel, [roots][channel_pitch]:
+ *   base        int: the first virtual channel it contributes to, never decreasing.
+ *   aperture    float [APERTURE_TAPS]: its weights a.
+ *   GIVEN only  order (int: its line), start (int: parent sample of tap 0 for k = 0), nu and cycles (float).
+ *   otherwise   positions  float [roots][3][channel_pitch]: of channels, m from the root's centre.
+ *               offsets    float [children][6]: the parent's centre from the root's, the child's from
+ *                          its parent's, m.
+ *               drift      velocity of receivers over the sound speed: what motion in flight adds to the
+ *                          range to x is -drift.(x - channel), to first order.
+ *               parent_centre: sample of a parent line that is its subimage's centre.
+ *               half: samples of a line before the one of the child's centre.
+ *   lines       [children][lines_per_child][2][pitch], samples `guard` to guard + length - 1 written,
+ *               `length` a multiple of WIDTH.
+ *
+ * Work-groups (any size along axis 0; 1 with WIDTH > 1) form a child each.
+ * Samples outside the parent's line are never read: the place is moved inside, where the host has put zeros.
+ */
+
+/* Calls that are not inlined would spill every open sum. */
+#define KEEP(x, low, high) ((x) < (low) ? (low) : (x) > (high) ? (high) : (x))
+
+#define CHUNK 32 /* channels whose weights are kept at a time */
+#define BLOCK (WIDTH > 1 ? 8 * WIDTH : 1)
+
+#if WIDTH == 1
+#define LOAD_RE(line, k, pitch) (line)[2 * (k)]
+#define LOAD_IM(line, k, pitch) (line)[2 * (k) + 1]
+#define STORE_RE(value, line, k, pitch) (line)[2 * (k)] = (value)
+#define STORE_IM(value, line, k, pitch) (line)[2 * (k) + 1] = (value)
+#define STORE_LOCAL(value, p) (*(p) = (value))
+#define TOGETHER barrier(CLK_LOCAL_MEM_FENCE)
+#else
+#define LOAD_RE(line, k, pitch) LOAD((line) + (k))
+#define LOAD_IM(line, k, pitch) LOAD((line) + (k) + (pitch))
+#define STORE_RE(value, line, k, pitch) STORE(value, (line) + (k))
+#define STORE_IM(value, line, k, pitch) STORE(value, (line) + (k) + (pitch))
+#ifdef __clang__
+#define STORE_LOCAL(value, p) (*(__local vfloat_anywhere *)(p) = (value))
+#else
+#define STORE_LOCAL(value, p) JOIN(vstore, WIDTH)(value, 0, p)
+#endif
+#define TOGETHER
+#endif
+
+/* sum_t weight[t] line[place + t]: of `low`, the vector at `place`, and `high`, the one after it. Loads that cross
+ * cache lines are slow; shuffles by constants are not. */
+#if defined(__clang__) && WIDTH >= 8
+#define SLIDING
+#if WIDTH == 16
+#define SHIFTED(low, high, t)                                                                          \
+    __builtin_shufflevector(low, high, t, t + 1, t + 2, t + 3, t + 4, t + 5, t + 6, t + 7, t + 8, t + 9, \
+                            t + 10, t + 11, t + 12, t + 13, t + 14, t + 15)
+#else
+#define SHIFTED(low, high, t) \
+    __builtin_shufflevector(low, high, t, t + 1, t + 2, t + 3, t + 4, t + 5, t + 6, t + 7)
+#endif
+INLINE vfloat filtered(const float *weight, vfloat low, vfloat high)
+{
+    vfloat sum = weight[0] * low + weight[1] * SHIFTED(low, high, 1);
+#if TAPS > 2
+    sum += weight[2] * SHIFTED(low, high, 2) + weight[3] * SHIFTED(low, high, 3);
+#endif
+#if TAPS > 4
+    sum += weight[4] * SHIFTED(low, high, 4) + weight[5] * SHIFTED(low, high, 5);
+#endif
+#if TAPS > 6
+    sum += weight[6] * SHIFTED(low, high, 6) + weight[7] * SHIFTED(low, high, 7);
+#endif
+    return sum;
+}
+#endif
+
+/* The line of virtual channel `node`. */
+#define NODE_LINE(node) (lines + (size_t)((node) - first_node) * 2 * pitch + (WIDTH == 1 ? 2 : 1) * guard)
+#define HAS(node) ((node) >= first_node && (node) < end_node)
+
+__kernel void stage(__global const float *parent, int parent_pitch, __global const int *children,
+                    __global const int *base, __global const float *aperture, int channel_pitch,
+#if GIVEN
+                    __global const int *order, __global const int *start, __global const float *nu,
+                    __global const float *cycles,
+#else
+                    __global const float *positions, __global const float *offsets, float4 drift,
+                    float samples_per_m, float cycles_per_m, int parent_centre, int half_length,
+#endif
+                    __global const float *filter, __global float *lines, int lines_per_child, int pitch,
+                    int length, int guard)
+{
+    __local float taps[TAPS][CHUNK], cosine[CHUNK], sine[CHUNK];
+    __local int first[CHUNK];
+#if WIDTH > 1
+    vfloat aligned_re[CHUNK][BLOCK / WIDTH], aligned_im[CHUNK][BLOCK / WIDTH];
+#else
+    float aligned_re[CHUNK][1], aligned_im[CHUNK][1];
+#endif
+
+    const int child = get_group_id(0), item = get_local_id(0), items = get_local_size(0);
+    children += 8 * child;
+    const int root = children[1], begin = children[2], end = children[3];
+    const int first_node = children[5], end_node = first_node + children[6];
+    parent += (size_t)children[0] * 2 * parent_pitch;
+    lines += (size_t)child * lines_per_child * 2 * pitch;
+    base += root * channel_pitch;
+    aperture += root * channel_pitch * APERTURE_TAPS;
+#if GIVEN
+    order += root * channel_pitch;
+    start += root * channel_pitch;
+    nu += root * channel_pitch;
+    cycles += root * channel_pitch;
+#else
+    positions += root * 3 * channel_pitch;
+    offsets += 6 * child;
+    const float dx = offsets[3], dy = offsets[4], dz = offsets[5];
+    const float drifted = drift.x * dx + drift.y * dy + drift.z * dz;
+#endif
+
+    int chunk_node = first_node - APERTURE_TAPS + 1;
+    for (int chunk = begin; chunk < end; chunk += CHUNK) {
+        const int count = end - chunk < CHUNK ? end - chunk : CHUNK;
+        TOGETHER;
+        for (int c = item * WIDTH; c < count; c += items * WIDTH) {
+#if GIVEN
+            const vfloat between = LOAD(nu + chunk + c), turns = LOAD(cycles + chunk + c);
+            for (int lane = 0; lane < WIDTH; lane++)
+                first[c + lane] = start[chunk + c + lane];
+#else
+            /* The change of range from the parent's centre to the child's, without cancellation. */
+            __global const float *position = positions + chunk + c;
+            const vfloat x = offsets[0] - LOAD(position);
+            const vfloat y = offsets[1] - LOAD(position + channel_pitch);
+            const vfloat z = offsets[2] - LOAD(position + 2 * channel_pitch);
+            const vfloat square = x * x + y * y + z * z;
+            const vfloat more = dx * (2.0f * x + dx) + dy * (2.0f * y + dy) + dz * (2.0f * z + dz);
+            const vfloat change =
+                more / (sqrt(max(square + more, 0.0f)) + sqrt(square) + FLT_MIN) - drifted;
+            const vfloat turns = change * cycles_per_m;
+            const vfloat shift = change * samples_per_m - 0.5f;
+            const vfloat shifted = shift + ROUNDER;
+            const vfloat between = shift - (shifted - ROUNDER);
+            const vint whole = ROUNDED_VINT(shifted) + (parent_centre - half_length + 1 - TAPS / 2);
+            for (int lane = 0; lane < WIDTH; lane++)
+                first[c + lane] = ((const int *)&whole)[lane];
+#endif
+            vfloat weight[TAPS], s, co;
+            filter_weights(filter, between, weight);
+            sincos_cycles(turns, &s, &co);
+#pragma unroll
+            for (int t = 0; t < TAPS; t++)
+                STORE_LOCAL(weight[t], taps[t] + c);
+            STORE_LOCAL(co, cosine + c);
+            STORE_LOCAL(s, sine + c);
+        }
+        TOGETHER;
+        int node = chunk_node;
+        for (int block = item * BLOCK; block < length; block += items * BLOCK) {
+            const int block_end = length - block < BLOCK ? length : block + BLOCK;
+            for (int c = 0; c < count; c++) {
+#if GIVEN
+                __global const float *line = parent + (size_t)order[chunk + c] * 2 * parent_pitch;
+#else
+                __global const float *line = parent + (size_t)(chunk + c - children[4]) * 2 * parent_pitch;
+#endif
+                float weight[TAPS];
+#pragma unroll
+                for (int t = 0; t < TAPS; t++)
+                    weight[t] = taps[t][c];
+                const float turn_re = cosine[c], turn_im = sine[c];
+                const int start = first[c];
+#ifdef SLIDING
+                const int before = KEEP(start + block, 0, parent_pitch - TAPS - WIDTH);
+                vfloat re_low = LOAD_RE(line, before, parent_pitch), im_low = LOAD_IM(line, before, parent_pitch);
+#endif
+                for (int k = block; k < block_end; k += WIDTH) {
+#ifdef SLIDING
+                    const int after = KEEP(start + k + WIDTH, 0, parent_pitch - WIDTH);
+                    const vfloat re_high = LOAD_RE(line, after, parent_pitch), im_high = LOAD_IM(line, after, parent_pitch);
+                    const vfloat a = filtered(weight, re_low, re_high), b = filtered(weight, im_low, im_high);
+                    re_low = re_high;
+                    im_low = im_high;
+#else
+                    const int place = KEEP(start + k, 0, parent_pitch - TAPS - WIDTH);
+                    vfloat a = 0.0f, b = 0.0f;
+#pragma unroll
+                    for (int t = 0; t < TAPS; t++) {
+                        a += weight[t] * LOAD_RE(line, place + t, parent_pitch);
+                        b += weight[t] * LOAD_IM(line, place + t, parent_pitch);
+                    }
+#endif
+                    aligned_re[c][(k - block) / WIDTH] = a * turn_re - b * turn_im;
+                    aligned_im[c][(k - block) / WIDTH] = a * turn_im + b * turn_re;
+                }
+            }
+            for (int k = block; k < block_end; k += WIDTH) {
+            vfloat re[APERTURE_TAPS], im[APERTURE_TAPS];
+            node = chunk_node;
+#pragma unroll
+            for (int t = 0; t < APERTURE_TAPS; t++) {
+                re[t] = im[t] = 0.0f;
+                if (chunk > begin && HAS(node + t)) {
+                    re[t] = LOAD_RE(NODE_LINE(node + t), k, pitch);
+                    im[t] = LOAD_IM(NODE_LINE(node + t), k, pitch);
+                }
+            }
+            for (int c = 0; c < count; c++) {
+                const int channel = chunk + c;
+                for (; node < base[channel]; node++) {
+                    /* No later channel reaches this virtual channel. */
+                    if (HAS(node)) {
+                        STORE_RE(re[0], NODE_LINE(node), k, pitch);
+                        STORE_IM(im[0], NODE_LINE(node), k, pitch);
+                    }
+#pragma unroll
+                    for (int t = 0; t + 1 < APERTURE_TAPS; t++) {
+                        re[t] = re[t + 1];
+                        im[t] = im[t + 1];
+                    }
+                    re[APERTURE_TAPS - 1] = im[APERTURE_TAPS - 1] = 0.0f;
+                }
+                const vfloat a = aligned_re[c][(k - block) / WIDTH], b = aligned_im[c][(k - block) / WIDTH];
+                __global const float *weight = aperture + channel * APERTURE_TAPS;
+#pragma unroll
+                for (int t = 0; t < APERTURE_TAPS; t++) {
+                    re[t] += weight[t] * a;
+                    im[t] += weight[t] * b;
+                }
+            }
+#pragma unroll
+            for (int t = 0; t < APERTURE_TAPS; t++)
+                if (HAS(node + t)) {
+                    STORE_RE(re[t], NODE_LINE(node + t), k, pitch);
+                    STORE_IM(im[t], NODE_LINE(node + t), k, pitch);
+                }
+            }
+        }
+        /* Where this work-item had no samples it passed no channel. */
+        chunk_node = max(chunk_node, base[chunk + count - 1]);
+    }
+    /* Virtual channels beyond the last that any channel reaches. */
+    for (int node = end > begin ? max(chunk_node + APERTURE_TAPS, first_node) : first_node; node < end_node; node++)
+        for (int k = item * WIDTH; k < length; k += items * WIDTH) {
+            STORE_RE(0.0f, NODE_LINE(node), k, pitch);
+            STORE_IM(0.0f, NODE_LINE(node), k, pitch);
+        }
+}

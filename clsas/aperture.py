@@ -1,0 +1,222 @@
+"""The aperture as a curve: where channels lie on it, and how densely a subimage must sample it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import BSpline, make_lsq_spline
+
+from clsas.grid import Grid
+from clsas.lines import RangeLines
+
+_POINTS = 257  # along the track, where rates are evaluated
+_BEYOND = 12  # points past either end, each twice as far as the one before
+_CHANNELS_PER_KNOT = 16
+_MOST_INTERVALS = 64
+_CLOSE_ENOUGH = 0.01  # distance of phase centres from the track, wavelengths rms
+
+
+@dataclass(frozen=True, eq=False)
+class MeanTrack:
+    """A smooth curve along the phase centres, (tx + rx)/2, continued straight past its ends.
+
+    Attributes
+    ----------
+    spline : BSpline
+        Position in metres [3] over the parameter, 0 to 1.
+    place : float64 [channels]
+        Parameter of the point of the curve next to each phase centre.
+    """
+
+    spline: BSpline
+    place: NDArray[np.float64]
+
+    def positions_m(self, place: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the curve's positions, [..., 3]."""
+        inside = np.clip(place, 0, 1)
+        return self.spline(inside) + (place - inside)[..., None] * self.spline(inside, 1)
+
+    def tangents_m(self, place: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the derivative of the position by the parameter, [..., 3]."""
+        return self.spline(np.clip(place, 0, 1), 1)
+
+    @property
+    def samples(self) -> NDArray[np.float64]:
+        """Parameters at which rates along the curve are evaluated, past its ends too, [n]."""
+        beyond = 2.0 ** np.arange(1 - _BEYOND, 1) * 4
+        return np.concatenate([-beyond[::-1], np.linspace(0, 1, _POINTS), 1 + beyond])
+
+    def places_seen_from(
+        self, points_m: NDArray[np.float64], phase_centres_m: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Return where phase centres appear on the curve when seen from some points.
+
+        A channel off the curve is replaced by the point of the curve in the same direction: what
+        is left is a difference of distance, which matters least.
+
+        Parameters
+        ----------
+        points_m : float64 [points, 3]
+        phase_centres_m : float64 [channels, 3]
+            The channels of `place`.
+
+        Returns
+        -------
+        float64 [points, channels]
+        """
+        curve_m = self.positions_m(self.place)
+        off_m = phase_centres_m - curve_m
+        shape = (len(points_m), len(self.place))
+        if not np.abs(off_m).max() > 1e-9:
+            return np.broadcast_to(self.place, shape)
+        tangent = self.tangents_m(self.place)
+        sight = points_m[:, None] - phase_centres_m
+        square = np.einsum("pci,pci->pc", sight, sight)
+        square = np.maximum(square, 1e-30)
+        along = np.einsum("pci,ci->pc", sight, tangent)
+        across = np.einsum("pci,ci->pc", sight, off_m)
+        both = np.einsum("ci,ci->c", tangent, off_m) - along * across / square
+        length = np.einsum("ci,ci->c", tangent, tangent)
+        # Where the curve leads towards the point, direction says nothing about the place.
+        seen = np.maximum(length - along**2 / square, 0.01 * length)
+        return self.place + both / seen
+
+
+def mean_track(lines: RangeLines) -> MeanTrack | None:
+    """Return a curve along the phase centres of lines, or None where they all coincide.
+
+    The channels may come in any order: as given, along the principal axis and around the middle
+    are tried, and the shortest way through the phase centres is taken. The curve gets as many
+    intervals as it takes to follow them.
+    """
+    centres_m = phase_centres_m(lines)
+    order, along = _order(centres_m)
+    if along[-1] == 0:
+        return None
+    position_m, along = centres_m[order], along / along[-1]
+    close_m = _CLOSE_ENOUGH * lines.sound_speed_m_s / max(lines.carrier_hz, 1.0)
+    best, best_m, intervals = None, np.inf, 1
+    while intervals <= min(_MOST_INTERVALS, max(lines.channels // _CHANNELS_PER_KNOT, 1)):
+        spline = _fit(along, position_m, intervals)
+        off_m = np.sqrt(np.mean(np.sum((spline(along) - position_m) ** 2, axis=1)))
+        if off_m < 0.8 * best_m:
+            best, best_m = spline, off_m
+        if best_m <= close_m:
+            break
+        intervals *= 2
+    place = np.empty(len(along))
+    place[order] = along
+    track = MeanTrack(best, place)
+    for _ in range(3):
+        tangent = track.tangents_m(place)
+        away = centres_m - track.positions_m(place)
+        square = np.maximum(np.einsum("ci,ci->c", tangent, tangent), 1e-30)
+        place = place + np.clip(np.einsum("ci,ci->c", away, tangent) / square, -0.1, 0.1)
+        track = MeanTrack(best, place)
+    return track
+
+
+def phase_centres_m(lines: RangeLines) -> NDArray[np.float64]:
+    """Return the middles between transmitters and receivers, [channels, 3]."""
+    return (lines.tx_m + lines.rx_m) / 2
+
+
+def drift(lines: RangeLines) -> NDArray[np.float64]:
+    """Return the mean velocity of the receivers over the sound speed, [3].
+
+    Motion during flight makes the range to a point x smaller by drift.(x - channel), to first
+    order: what lines of one velocity share.
+    """
+    if lines.rx_velocity_m_s is None:
+        return np.zeros(3)
+    return lines.rx_velocity_m_s.mean(axis=0) / lines.sound_speed_m_s
+
+
+def cycles_per_pixel(
+    track: MeanTrack,
+    grid: Grid,
+    centres_m: NDArray[np.float64],
+    sides: tuple[int, int],
+    cycles_per_m: float,
+    nearest_m: float,
+) -> NDArray[np.float64]:
+    """Return how fast phases turn along the track for subimages inside larger ones.
+
+    A channel's range to a pixel at d from a subimage's centre c exceeds that to c by e.d, with e
+    the direction from the channel to c. Along the track, of tangent t, that changes by
+    -(t - e (e.t)).d / R: for subimages of some rows and columns the phase turns by at most their
+    number times the results, in cycles per unit of the track's parameter.
+
+    Parameters
+    ----------
+    centres_m : float64 [n, 3]
+        Middles of rectangles of `sides` pixels; the result holds everywhere within them.
+    sides : (rows, columns)
+    cycles_per_m : float
+        Phase per metre of range.
+    nearest_m : float
+        Distance below which the track is taken not to come.
+
+    Returns
+    -------
+    float64 [2, n, samples]
+        Per row and per column, at `track.samples`.
+    """
+    place = track.samples
+    position, tangent = track.positions_m(place), track.tangents_m(place)
+    steps = np.stack([grid.row_step_m, grid.column_step_m])
+    tangent_steps = tangent @ steps.T
+    rates = np.zeros((len(centres_m), len(place), 2))
+    for down in (-0.5, 0, 0.5):
+        for right in (-0.5, 0, 0.5):
+            corner = down * sides[0] * grid.row_step_m + right * sides[1] * grid.column_step_m
+            sight = (centres_m + corner)[:, None] - position
+            distance = np.maximum(np.linalg.norm(sight, axis=-1), nearest_m)
+            sight /= distance[..., None]
+            along = np.einsum("psi,si->ps", sight, tangent)
+            turn = np.abs(tangent_steps - along[..., None] * (sight @ steps.T))
+            np.maximum(rates, turn / distance[..., None], out=rates)
+    return cycles_per_m / 2 * np.moveaxis(rates, -1, 0)
+
+
+def turned(
+    track: MeanTrack, rate: NDArray[np.float64], *, floor: float = 1e-3
+) -> NDArray[np.float64]:
+    """Return the integral of rates [..., samples] along the track: cycles at `track.samples`.
+
+    No rate counts as less than `floor` times the largest: where the track leads straight towards
+    a subimage nothing turns, and yet nodes must have places.
+    """
+    rate = np.maximum(rate, floor * rate.max(axis=-1, keepdims=True))
+    steps = np.diff(track.samples) * (rate[..., 1:] + rate[..., :-1]) / 2
+    return np.concatenate([np.zeros((*rate.shape[:-1], 1)), np.cumsum(steps, axis=-1)], axis=-1)
+
+
+def _order(centres_m: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Return the order of phase centres along the track, and how far along it each lies, metres."""
+    away = centres_m - centres_m.mean(axis=0)
+    first, second = np.linalg.svd(away, full_matrices=False)[2][:2] @ away.T
+    candidates = (
+        np.arange(len(centres_m)),
+        np.argsort(first, kind="stable"),
+        np.argsort(np.arctan2(second, first), kind="stable"),
+    )
+    best = None
+    for order in candidates:
+        steps = np.linalg.norm(np.diff(centres_m[order], axis=0), axis=1)
+        if best is None or steps.sum() < 0.999 * best[1][-1]:
+            best = order, np.concatenate([[0.0], np.cumsum(steps)])
+    return best
+
+
+def _fit(along: NDArray[np.float64], position_m: NDArray[np.float64], intervals: int) -> BSpline:
+    """Return the least-squares cubic spline of positions [n, 3], with knots where channels are."""
+    distinct, index = np.unique(along, return_index=True)
+    degree = min(3, len(distinct) - 1)
+    inner = np.quantile(distinct, np.arange(1, intervals) / intervals)
+    knots = np.concatenate([[0.0] * (degree + 1), inner, [1.0] * (degree + 1)])
+    middle = position_m.mean(axis=0)
+    fitted = make_lsq_spline(distinct, position_m[index] - middle, knots, k=degree)
+    return BSpline(fitted.t, fitted.c + middle, degree)

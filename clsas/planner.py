@@ -1,0 +1,656 @@
+"""Choosing a plan: what every division costs and errs by, and the fastest within a tolerance."""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import KDTree
+
+from clsas import interpolation, validate
+from clsas.aperture import cycles_per_pixel, drift, mean_track, phase_centres_m, turned
+from clsas.costs import Costs
+from clsas.costs import load as load_costs
+from clsas.device import Device, open_device
+from clsas.geometry import pairwise_range_m
+from clsas.grid import Grid
+from clsas.interpolation import Interpolator, Spectrum
+from clsas.layout import BLOCKS
+from clsas.lines import RangeLines
+from clsas.nearest import stage_errors_m
+from clsas.plan import GUARD, Plan, Stage, grid_digest, lines_digest
+from clsas.tree import Division, beam_directions, beam_rate, interpolated_nodes
+from clsas.window import BeamWindow, touches_rectangles
+
+BEST_TOLERANCE_DB = -75.0
+"""The tightest tolerance that may be asked for: what float32 leaves of a factorized image."""
+WORST_TOLERANCE_DB = -10.0
+
+_ROWS = (16, 32, 64, 128, 256, 512, 1024, 2048)  # of subimages
+_COLUMNS = (4, 8, 16, 32, 64, 128, 256, 512, 1024, 2048)
+_MOST_STAGES = 5
+_ALIGN_TAPS, _APERTURE_TAPS, _FINAL_TAPS = (4, 6, 8), (4, 6, 8), (2, 4, 6, 8)
+_RATES = tuple(np.round(np.geomspace(1, 12, 36), 2))
+_DENSITIES = tuple(np.round(np.geomspace(1.1, 8, 48), 3))
+NEAREST_UPSAMPLING = 8.0
+"""By how much lines are upsampled before the linear interpolation of given stages."""
+
+_MARGIN_DB = 1.0  # between prediction and tolerance, for what measured errors scatter
+_FLOAT32 = 1.2e-7  # rms error of a phase in the stages over the phase across a root: measured
+_MEMORY_SHARE = 8  # of the device's memory that the lines of roots may take: one in so many
+_MOST_BATCH_BYTES = 256 << 20
+_SPOTS = (0.02, 0.25, 0.5, 0.75, 0.98)  # of rows and columns, where the geometry is looked at
+_CHANNELS, _PIXELS = 256, 24  # at which the motion error is evaluated
+
+
+def plan(
+    lines: RangeLines,
+    grid: Grid,
+    *,
+    tolerance_db: float | None = None,
+    tolerance_wavelengths: float | None = None,
+    stages: Sequence[tuple[int, int]] | None = None,
+    beam: BeamWindow | None = None,
+    device: Device | str | int | None = None,
+    costs: Costs | None = None,
+) -> Plan:
+    """Choose the fastest way to an image of a given error.
+
+    Exactly one of `tolerance_db`, `tolerance_wavelengths` and `stages` must be given.
+
+    Parameters
+    ----------
+    lines : RangeLines
+        What to image.
+    grid : Grid
+        Where.
+    tolerance_db : float
+        Wanted relative rms error against the exact image, dB, from -75 to -10.
+    tolerance_wavelengths : float
+        The same as a range error, in wavelengths of the carrier: that which is spread evenly
+        between minus and plus so much, 4 pi/sqrt(3) radians rms per wavelength.
+    stages : sequence of (QR, QI)
+        Form the image as THESIS chapter 4 does: in every stage QR neighbouring lines are summed
+        and the subimages divided by QI along either side; then the last ones are backprojected.
+        No stage is plain backprojection. Range is interpolated linearly.
+    beam : BeamWindow, optional
+        Weights of the channels.
+    device : Device, str or int, optional
+        Whose costs count; see `clsas.device.choose`.
+    costs : Costs, optional
+        Instead of those stored for the device.
+
+    Returns
+    -------
+    Plan
+        With empty `sides`, plain backprojection, where nothing is faster: near the aperture, with
+        few channels or pixels, and off a plane.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If an argument is not what is allowed.
+    DeviceError
+        If there is no such device.
+    """
+    validate.instance("lines", lines, RangeLines)
+    validate.instance("grid", grid, Grid)
+    if beam is not None:
+        validate.instance("beam", beam, BeamWindow)
+    given = [tolerance_db, tolerance_wavelengths, stages]
+    if sum(value is not None for value in given) != 1:
+        raise ValueError(
+            "exactly one of tolerance_db, tolerance_wavelengths and stages must be given, "
+            f"got {tolerance_db}, {tolerance_wavelengths}, {stages}"
+        )
+    if tolerance_wavelengths is not None:
+        tolerance_db = decibels(tolerance_wavelengths)
+    if tolerance_db is not None:
+        tolerance_db = validate.number(
+            "tolerance_db", tolerance_db, "dB", least=BEST_TOLERANCE_DB, most=WORST_TOLERANCE_DB
+        )
+    device = open_device(device)
+    costs = costs or load_costs(device)
+    view = View(lines, grid, beam)
+    if stages is not None:
+        return _nearest(view, _checked_stages(stages, lines, grid), device, costs)
+    exact = _exact(view, tolerance_db, device, costs)
+    if view.track is None or grid.size == 1 or (beam is not None and beam.normalise):
+        return exact
+    limit = math.inf
+    beam_cycles = 0.0 if beam is None else 1.0
+    while True:
+        found = _search(view, tolerance_db, limit, beam_cycles, device, costs)
+        if found is None or found.predicted_seconds >= exact.predicted_seconds:
+            return exact
+        if found.predicted_error_db <= tolerance_db:
+            return found
+        # What a root adds to the error grows at least linearly with its size; what a beam adds
+        # falls with the density of nodes.
+        of_beam = _beam_error(view, found.sides[-1], found.aperture, beam_cycles)
+        if of_beam > 0.1 * 10 ** (tolerance_db / 10):
+            beam_cycles *= 2
+        else:
+            limit = 0.7 * Division(grid, found.sides).radius_m(0)
+
+
+def decibels(wavelengths: float) -> float:
+    """Return the relative rms error of range errors spread evenly up to some wavelengths, dB."""
+    wavelengths = validate.positive("tolerance_wavelengths", wavelengths, "wavelengths")
+    return 20 * math.log10(4 * math.pi * wavelengths / math.sqrt(3))
+
+
+class View:
+    """How the track sees the grid at some spots: what costs and errors depend on.
+
+    Attributes
+    ----------
+    spots_m : float64 [spots, 3]
+        Over the whole grid, its corners among them.
+    rates : float64 [2, spots, samples]
+        Cycles per pixel row and column and per unit of the track's parameter.
+    """
+
+    def __init__(self, lines: RangeLines, grid: Grid, beam: BeamWindow | None) -> None:
+        self.lines, self.grid, self.beam = lines, grid, beam
+        self.spectrum = interpolation.measure_spectrum(lines)
+        occupied = self.spectrum.frequency[np.cumsum(self.spectrum.power) < 1 - 1e-6]
+        half_band = (occupied[-1] if len(occupied) else 0.5) / lines.range_step_m
+        centre = lines.carrier_cycles_per_m + self.spectrum.centre / lines.range_step_m
+        self.highest_cycles_per_m = abs(centre) + half_band
+        self.track = mean_track(lines) if grid.is_planar else None
+        if self.track is None:
+            return
+        self.steps_m = np.stack([grid.row_step_m, grid.column_step_m])
+        self.spots_m = self._pixels_m(_SPOTS)
+        position = self.track.positions_m(self.track.samples)
+        sight = self.spots_m[:, None] - position
+        self.distance_m = np.maximum(np.linalg.norm(sight, axis=-1), 1e-9)
+        self.sight = sight / self.distance_m[..., None]
+        self.on_track = np.abs(self.track.samples - 0.5) <= 0.5
+        # Between the places that are looked at a pixel may come nearer.
+        dense_m = self._pixels_m(np.linspace(0, 1, 65))
+        cell_m = np.linalg.norm(self.steps_m, axis=1) @ (np.array(grid.shape) - 1) / 128
+        nearest_m = KDTree(phase_centres_m(lines)).query(dense_m)[0].min() - cell_m
+        self.nearest_m = max(float(nearest_m), 1e-9)
+        self.rates = cycles_per_pixel(
+            self.track, grid, self.spots_m, (0, 0), self.highest_cycles_per_m, self.nearest_m
+        )
+        if beam is not None:
+            self.along = beam_directions(beam, lines, self.track, self.track.samples)
+            self.beam_rates = beam_rate(beam, self.track, self.along, self.spots_m)
+
+    def _pixels_m(self, places: Sequence[float]) -> NDArray[np.float64]:
+        """Return positions at some parts of the rows and columns, [n, 3]."""
+        index = np.array(list(product(places, places))) * (np.array(self.grid.shape) - 1)
+        return self.grid.origin_m + index @ self.steps_m
+
+    def seen(self, rows: float, columns: float) -> NDArray[np.bool_]:
+        """Return from where channels see anything of subimages at the spots, [spots, samples]."""
+        seen = np.broadcast_to(self.on_track, self.distance_m.shape)
+        if self.beam is None:
+            return seen
+        half_m = np.array([[rows], [columns]]) / 2 * self.steps_m
+        return seen & touches_rectangles(self.beam, self.sight, self.distance_m, self.along, half_m)
+
+    def cycles(self, rates: NDArray[np.float64], seen: NDArray[np.bool_]) -> float:
+        """Return how far a phase turns while it is seen, on average over the spots."""
+        return float(turned(self.track, np.where(seen, rates, 0.0), floor=0.0)[:, -1].mean())
+
+    @functools.cached_property
+    def slopes_m(self) -> tuple[float, float]:
+        """Largest change of range per row and per column."""
+        seen = self.seen(16, 16)
+        slopes = np.abs(self.sight @ self.steps_m.T)
+        slopes = slopes[seen] if seen.any() else slopes.reshape(-1, 2)
+        return tuple(1.02 * slopes.max(axis=0))
+
+    def reach_m(self, side: tuple[int, int]) -> float:
+        """Return by how much a pixel's range may differ from that of its subimage's centre."""
+        radius_m = Division(self.grid, (side,)).radius_m(0)
+        bend_m = radius_m**2 / (2 * max(self.nearest_m, radius_m))
+        return min(float(np.dot(side, self.slopes_m)) / 2 + bend_m, radius_m)
+
+    def half_lengths(
+        self,
+        sides: Sequence[tuple[int, int]],
+        align: Interpolator,
+        final: Interpolator,
+        ratio: float,
+    ) -> tuple[int, ...]:
+        """Return the samples to either side of a centre that the lines of each stage must hold."""
+        samples_per_m = ratio / self.lines.range_step_m
+        return tuple(
+            math.ceil(self.reach_m(side) * samples_per_m)
+            + (len(sides) - 1 - level) * (align.taps // 2 + 1)
+            + final.taps // 2
+            + 1
+            for level, side in enumerate(sides)
+        )
+
+
+@dataclass(frozen=True)
+class _Filters:
+    align: Interpolator
+    aperture: Interpolator
+    final: Interpolator
+
+    def error_db(self, stages: int) -> float:
+        """Return the error of every interpolation of a plan, added in power."""
+        each = _power(self.align) + _power(self.aperture)
+        return _decibel(stages * each + _power(self.final))
+
+
+def _search(
+    view: View,
+    tolerance_db: float,
+    most_radius_m: float,
+    beam_cycles: float,
+    device: Device,
+    costs: Costs,
+) -> Plan | None:
+    """Return the fastest plan whose roots are not larger than a radius; None where there is none.
+
+    For every number of stages and choice of filters, the fastest way from the whole grid to the
+    leaves is a shortest path over the sizes that subimages may have.
+    """
+    lines, grid = view.lines, view.grid
+    rows, columns = (
+        [side for side in sides if side < 2 * max(n, min(sides))]
+        for sides, n in zip((_ROWS, _COLUMNS), grid.shape, strict=True)
+    )
+    sides = np.array(list(product(rows, columns)))
+    steps_m = np.linalg.norm(view.steps_m, axis=1)
+    radius_m = np.hypot(*(sides * steps_m).T) / 2
+    fits = radius_m <= most_radius_m
+    counts = np.prod(-(-np.array(grid.shape) // sides), axis=1)
+    seen = [view.seen(*side) for side in sides]
+    share = np.array([s[:, view.on_track].mean() for s in seen])
+    # Cycles while a subimage of size i is seen, of phases that turn as for size j.
+    cycles = np.array([[view.cycles(rate, s) for rate in view.rates] for s in seen]) @ sides.T
+    divides = (sides[:, None] % sides == 0).all(axis=-1) & (sides[:, None] != sides).any(axis=-1)
+    leaf_error = _leaf_error(view, sides, device)
+    reach_m = np.array([view.reach_m(side) for side in sides])
+
+    for_beam = 0.0
+    if view.beam is not None:
+        for_beam = beam_cycles * np.array([view.cycles(view.beam_rates, s) for s in seen])
+
+    best = None
+    for stages in range(1, _MOST_STAGES + 1):
+        for filters in _candidates(view.spectrum, tolerance_db, stages):
+            ratio = filters.align.upsampling
+            density = 2 * filters.aperture.upsampling
+            samples = 2 * reach_m * ratio / lines.range_step_m + filters.final.taps + 16
+            nodes = density * (np.diag(cycles) + for_beam)
+            nodes += 1 if view.beam else filters.aperture.taps
+            taps = filters.align.taps + filters.aperture.taps
+            sample_ns = costs.sample_ns + costs.sample_tap_ns * taps
+            per_channel = counts * (samples * sample_ns + costs.channel_ns)
+            first = (
+                share * lines.channels * per_channel + counts * lines.channels * costs.reference_ns
+            )
+            first[~fits] = np.inf
+            # Channels of a parent of size j that a child of size i uses.
+            used = density * cycles + 2 * filters.aperture.taps
+            step = np.where(divides.T, used * per_channel[:, None], np.inf)
+            last = np.prod(-(-np.array(grid.shape) // sides) * sides, axis=1) * nodes
+            last = last * costs.pixel_ns * interpolation.COST[filters.final.taps]
+            last = last + counts * nodes * costs.channel_ns
+            last[leaf_error > 0.1 * 10 ** (tolerance_db / 10)] = np.inf
+            total, path = first, []
+            for _ in range(stages - 1):
+                through = total + step
+                path.append(through.argmin(axis=1))
+                total = through.min(axis=1)
+            leaf = int((total + last).argmin())
+            upsampling = costs.upsampled_sample_ns * lines.channels * lines.length * ratio
+            seconds = 1e-9 * (total[leaf] + last[leaf] + upsampling + stages * costs.batch_ns)
+            if math.isfinite(seconds) and (best is None or seconds < best[0]):
+                chain = [leaf]
+                for parents in reversed(path):
+                    chain.append(int(parents[chain[-1]]))
+                best = seconds, filters, chain[::-1], nodes, samples
+    if best is None:
+        return None
+    seconds, filters, chain, nodes, samples = best
+    chosen = [tuple(map(int, sides[i])) for i in chain]
+    return _plan(view, tolerance_db, filters, chosen, device, costs, beam_cycles=beam_cycles)
+
+
+def _candidates(spectrum: Spectrum, tolerance_db: float, stages: int) -> list[_Filters]:
+    """Return filters of every number of taps whose errors together leave room to the tolerance."""
+    each_db = tolerance_db - _MARGIN_DB - 10 * math.log10(2 * stages + 1)
+    flat = Spectrum(0.0, (np.arange(64) + 0.5) / 128, np.full(64, 1 / 64))
+    result = []
+    for align_taps, aperture_taps in product(_ALIGN_TAPS, _APERTURE_TAPS):
+        align = _least(align_taps, _RATES, each_db, spectrum)
+        aperture = _least(aperture_taps, _DENSITIES, each_db, flat)
+        if align is None or aperture is None:
+            continue
+        finals = (interpolation.design(t, align.upsampling, spectrum) for t in _FINAL_TAPS)
+        final = next((f for f in finals if f.error_db <= each_db), None)
+        if final is not None:
+            result.append(_Filters(align, aperture, final))
+    return result
+
+
+def _least(
+    taps: int, rates: Sequence[float], error_db: float, spectrum: Spectrum
+) -> Interpolator | None:
+    """Return the interpolator with the least upsampling that errs by no more."""
+    low, high = 0, len(rates) - 1
+    if _designed(taps, rates[high], spectrum).error_db > error_db:
+        return None
+    while low < high:
+        middle = (low + high) // 2
+        if _designed(taps, rates[middle], spectrum).error_db <= error_db:
+            high = middle
+        else:
+            low = middle + 1
+    return _designed(taps, rates[low], spectrum)
+
+
+def _designed(taps: int, rate: float, spectrum: Spectrum) -> Interpolator:
+    key = spectrum.frequency.tobytes(), spectrum.power.tobytes()
+    return _design(taps, float(rate), *key)
+
+
+@functools.lru_cache(maxsize=512)
+def _design(taps: int, rate: float, frequency: bytes, power: bytes) -> Interpolator:
+    spectrum = Spectrum(0.0, np.frombuffer(frequency), np.frombuffer(power))
+    return interpolation.design(taps, rate, spectrum)
+
+
+def _leaf_error(view: View, sides: NDArray[np.int64], device: Device) -> NDArray[np.float64]:
+    """Return the power of the error that expanding leaves of some sizes adds.
+
+    See `layout.lay_out`: the fourth order of a tile, and the third within a block.
+    """
+    steps_m = np.linalg.norm(view.steps_m, axis=1)
+    radius_m = np.hypot(*(sides * steps_m).T) / 2
+    block_m = np.hypot(*(np.array(BLOCKS[device.info.width]) * steps_m)) / 2
+    nearest_m = np.maximum(view.nearest_m, 1e-6)
+    remainder_m = 0.15 * radius_m**4 / (8 * nearest_m**3) + 0.04 * block_m**3 / nearest_m**2
+    return (2 * np.pi * view.highest_cycles_per_m * remainder_m) ** 2
+
+
+def _plan(
+    view: View,
+    tolerance_db: float | None,
+    filters: _Filters,
+    sides: list[tuple[int, int]],
+    device: Device,
+    costs: Costs,
+    nearest: Sequence[tuple[int, int]] = (),
+    beam_cycles: float = 0.0,
+) -> Plan:
+    """Return a plan with all that is expected of it."""
+    lines, grid = view.lines, view.grid
+    align, aperture, final = filters.align, filters.aperture, filters.final
+    resampling = interpolation.resampling(lines.length, align, view.spectrum)
+    halves = view.half_lengths(sides, align, final, resampling.ratio)
+    density = 2 * aperture.upsampling
+    stages, channels, total, root_bytes = [], float(lines.channels), 0.0, 0
+    width = device.info.width
+    sample_ns = costs.sample_ns + costs.sample_tap_ns * (align.taps + aperture.taps)
+    used = channels * view.seen(*sides[0])[:, view.on_track].mean()
+    for level, side in enumerate(sides):
+        count = math.prod(-(-n // s) for n, s in zip(grid.shape, side, strict=True))
+        samples = -(-(2 * halves[level] + 1) // width) * width
+        seen = view.seen(*side)
+        turns = sum(view.cycles(n * rate, seen) for n, rate in zip(side, view.rates, strict=True))
+        if level:
+            used = min(channels, density * before(seen) + 2 * aperture.taps)
+        if nearest:
+            used = channels
+            channels = math.ceil(channels / nearest[level][0])
+        else:
+            if view.beam is not None and level == len(sides) - 1:
+                turns += beam_cycles * view.cycles(view.beam_rates, seen)
+            channels = density * turns + (1 if view.beam else aperture.taps)
+        operations = count * used * samples
+        seconds = 1e-9 * (operations * sample_ns + count * used * costs.channel_ns + costs.batch_ns)
+        if not level:
+            seconds += 1e-9 * count * lines.channels * costs.reference_ns
+            seconds += 1e-9 * costs.upsampled_sample_ns * lines.channels * resampling.length
+        error = _power(align) + (0.0 if nearest else _power(aperture))
+        stages.append(
+            Stage(*side, count, round(channels), samples, operations, _decibel(error), seconds)
+        )
+        per_root = math.prod(a // b for a, b in zip(sides[0], side, strict=True))
+        root_bytes += 8 * per_root * (1.3 * channels + 2) * (samples + 2 * GUARD)
+
+        def before(seen: NDArray[np.bool_], side: tuple[int, int] = side) -> float:
+            return sum(
+                view.cycles(n * rate, seen) for n, rate in zip(side, view.rates, strict=True)
+            )
+
+    pixels = count * math.prod(side)
+    operations = pixels * channels
+    seconds = 1e-9 * costs.pixel_ns * interpolation.COST[final.taps] * operations
+    seconds += 1e-9 * count * channels * costs.channel_ns
+    stages.append(
+        Stage(*side, count, round(channels), samples, operations, final.error_db, seconds)
+    )
+    root_bytes += 8 * math.prod(sides[0]) + 60 * per_root * (channels + 16)
+    line_bytes = 8 * lines.channels * (resampling.length + 4 * halves[0] + 128)
+    room = min(device.info.memory_bytes // _MEMORY_SHARE, _MOST_BATCH_BYTES)
+    roots = stages[0].subimages
+    at_once = min(max(int(room // root_bytes), 1), roots)
+    error = sum(10 ** (stage.error_db / 10) for stage in stages)
+    error += _leaf_error(view, np.array([sides[-1]]), device)[0]
+    error += _nearest_error(view, nearest) if nearest else _motion_error(view, sides[0])
+    if view.beam is not None and not nearest:
+        error += _beam_error(view, sides[-1], aperture, beam_cycles)
+    root_m = Division(grid, tuple(sides)).radius_m(0)
+    error += (2 * np.pi * _FLOAT32 * view.highest_cycles_per_m * root_m) ** 2
+    return Plan(
+        tolerance_db=tolerance_db,
+        sides=tuple(sides),
+        tile=_tile(view, sides[-1], device) if nearest else sides[-1],
+        nearest=tuple(beams for beams, _ in nearest),
+        align=align,
+        aperture=aperture,
+        final=final,
+        resampling=resampling,
+        half_lengths=halves,
+        highest_cycles_per_m=view.highest_cycles_per_m,
+        roots_at_once=at_once,
+        stages=tuple(stages),
+        predicted_error_db=_decibel(error) + (_MARGIN_DB if not nearest else 0.0),
+        predicted_seconds=sum(stage.seconds for stage in stages),
+        exact_seconds=_exact_seconds(view, costs),
+        memory_bytes=int(line_bytes + at_once * root_bytes),
+        device=device.info.label,
+        lines_digest=lines_digest(lines),
+        grid_digest=grid_digest(grid),
+        beam=view.beam,
+        beam_cycles=beam_cycles,
+    )
+
+
+def _motion_error(view: View, side: tuple[int, int]) -> float:
+    """Return the power of the error of putting every channel on the mean track.
+
+    Evaluated as it is: over channels, roots and pixels of these at random, the difference of how a
+    range changes from a root's centre to a pixel for the channel and for the place on the track
+    that stands for it. That holds what a cubic does not follow, different transmitter and receiver
+    positions, and motion during flight.
+    """
+    lines, track = view.lines, view.track
+    some = lines.select(np.arange(0, lines.channels, -(-lines.channels // _CHANNELS)))
+    from dataclasses import replace
+
+    index = np.arange(0, lines.channels, -(-lines.channels // _CHANNELS))
+    part = replace(track, place=track.place[index])
+    random = np.random.default_rng(0)
+    rows, columns = view.grid.shape
+    power = []
+    for spot_m in view.spots_m[:: max(len(view.spots_m) // 8, 1)]:
+        offset_m = random.uniform(-0.5, 0.5, (_PIXELS, 2)) * side @ view.steps_m
+        points_m = np.concatenate([spot_m[None], spot_m + offset_m])
+        range_m = pairwise_range_m(
+            points_m, some.tx_m, some.rx_m, some.rx_velocity_m_s, some.sound_speed_m_s
+        )
+        place = part.places_seen_from(spot_m[None], phase_centres_m(some))[0]
+        virtual_m = track.positions_m(place)
+        on_track_m = pairwise_range_m(points_m, virtual_m, virtual_m)
+        on_track_m -= (points_m @ drift(lines))[:, None]
+        away_m = (range_m - range_m[0]) - (on_track_m - on_track_m[0])
+        power.append(np.mean(away_m[1:] ** 2))
+    return float((2 * np.pi * view.highest_cycles_per_m) ** 2 * np.mean(power))
+
+
+def _beam_error(
+    view: View, side: tuple[int, int], aperture: Interpolator, beam_cycles: float
+) -> float:
+    """Return the power of the error that a beam's weights add to those of the last stage's nodes.
+
+    Evaluated as it is, for leaves and pixels of them at random: weighted steering functions
+    between nodes against what interpolation makes of them.
+    """
+    if view.beam is None:
+        return 0.0
+    track, random = view.track, np.random.default_rng(0)
+    wavelength = view.lines.sound_speed_m_s / max(view.lines.carrier_hz, 1e-3)
+    seen = view.seen(*side)
+    wrong = total = 0.0
+    for spot in np.flatnonzero(seen.any(axis=1))[::3]:
+        places = track.samples[seen[spot]]
+        place = np.linspace(places[0], places[-1], 1000)
+        rate = side[0] * view.rates[0, spot] + side[1] * view.rates[1, spot]
+        rate = rate + beam_cycles * view.beam_rates[spot]
+        nodes = interpolated_nodes(track, rate[None], place[None], aperture)
+        offset_m = random.uniform(-0.5, 0.5, (_PIXELS, 2)) * side @ view.steps_m
+        points_m = view.spots_m[spot] + np.concatenate([np.zeros((1, 3)), offset_m])
+
+        def steering(at: NDArray[np.float64], points_m: NDArray[np.float64] = points_m) -> NDArray:
+            sight = points_m[:, None] - track.positions_m(at)
+            range_m = np.linalg.norm(sight, axis=-1)
+            along = np.stack([np.interp(at, track.samples, axis) for axis in view.along.T], axis=-1)
+            sine = np.einsum("psi,si->ps", sight, along) / range_m
+            turns = view.highest_cycles_per_m * (range_m - range_m[0])
+            return view.beam.weights(sine[1:], wavelength) * np.exp(2j * np.pi * turns[1:])
+
+        of_nodes = steering(nodes.place[0])
+        index = nodes.base[0][:, None] + np.arange(nodes.taps)
+        between = np.einsum("pct,ct->pc", of_nodes[:, index], nodes.weights[0])
+        exact = steering(place[nodes.order[0]])
+        wrong += np.sum(np.abs(between - exact) ** 2)
+        total += np.sum(np.abs(exact) ** 2)
+    return max(wrong / max(total, 1e-30) - _power(aperture), 0.0)
+
+
+def _nearest(view: View, stages: Sequence[tuple[int, int]], device: Device, costs: Costs) -> Plan:
+    """Return the plan of THESIS chapter 4: nearest beams, linear interpolation in range."""
+    if not stages:
+        return _exact(view, None, device, costs)
+    rows, columns = view.grid.shape
+    division = math.prod(divisions for _, divisions in stages)
+    # Whole work-items: 16 rows by 4 columns.
+    leaf = 16 * math.ceil(rows / division / 16), 4 * math.ceil(columns / division / 4)
+    sides = []
+    for _, divisions in reversed(stages):
+        sides.append(leaf)
+        leaf = leaf[0] * divisions, leaf[1] * divisions
+    linear = interpolation.design(2, NEAREST_UPSAMPLING, view.spectrum)
+    beams = Interpolator(1, 1.0, np.zeros((0, 2, 0)), 0.0)
+    return _plan(view, None, _Filters(linear, beams, linear), sides[::-1], device, costs, stages)
+
+
+def _nearest_error(view: View, stages: Sequence[tuple[int, int]]) -> float:
+    """Return the power of the error of nearest beams: THESIS [45], spread evenly."""
+    centres_m = phase_centres_m(view.lines)[np.argsort(view.track.place)]
+    spacing_m = np.linalg.norm(np.diff(centres_m, axis=0), axis=1).mean()
+    image_m = np.max(np.array(view.grid.shape) * np.linalg.norm(view.steps_m, axis=1))
+    total_m = sum(stage_errors_m(stages, spacing_m, image_m, view.nearest_m))
+    return (2 * math.pi * view.lines.carrier_cycles_per_m * total_m) ** 2 / 3
+
+
+def _tile(view: View, leaf: tuple[int, int], device: Device) -> tuple[int, int]:
+    """Return the largest parts of a leaf that may be expanded about their centres."""
+    parts = [
+        (rows, columns)
+        for rows in range(16, min(leaf[0], 64) + 1, 16)
+        for columns in range(4, min(leaf[1], 64) + 1, 4)
+        if leaf[0] % rows == 0 and leaf[1] % columns == 0
+    ]
+    fit = [part for part in parts if _leaf_error(view, np.array([part]), device)[0] < 1e-8]
+    return max(fit or parts[:1], key=math.prod)
+
+
+def _checked_stages(stages: Sequence[tuple[int, int]], lines: RangeLines, grid: Grid) -> list:
+    """Return (QR, QI) of every stage, or raise what is wrong with them."""
+    try:
+        pairs = [(stage[0], stage[1]) for stage in stages if len(stage) == 2]
+        whole = len(pairs) == len(stages)
+    except TypeError:
+        whole = False
+    if not whole:
+        raise TypeError(f"stages must be a sequence of (QR, QI), got {stages!r}")
+    pairs = [
+        (validate.count("QR of stages", beams), validate.count("QI of stages", divisions))
+        for beams, divisions in pairs
+    ]
+    if not pairs:
+        return pairs
+    if not grid.is_planar:
+        raise ValueError("grid must be a plane for stages")
+    most_beams, most_divisions = lines.channels, max(min(grid.shape), 1)
+    beams, divisions = (math.prod(numbers) for numbers in zip(*pairs, strict=True))
+    if beams > most_beams or divisions > most_divisions:
+        raise ValueError(
+            f"stages must leave a line and a pixel: they sum {beams} of {lines.channels} lines and "
+            f"divide {grid.shape[0]} x {grid.shape[1]} pixels by {divisions} along either side"
+        )
+    return pairs
+
+
+def _exact(view: View, tolerance_db: float | None, device: Device, costs: Costs) -> Plan:
+    """Return plain backprojection as a plan."""
+    seconds = _exact_seconds(view, costs)
+    return Plan(
+        tolerance_db=tolerance_db,
+        sides=(),
+        tile=(0, 0),
+        nearest=(),
+        align=None,
+        aperture=None,
+        final=None,
+        resampling=None,
+        half_lengths=(),
+        highest_cycles_per_m=view.highest_cycles_per_m,
+        roots_at_once=1,
+        stages=(),
+        predicted_error_db=-60.0 if tolerance_db is None else tolerance_db,
+        predicted_seconds=seconds,
+        exact_seconds=seconds,
+        memory_bytes=0,
+        device=device.info.label,
+        lines_digest=lines_digest(view.lines),
+        grid_digest=grid_digest(view.grid),
+        beam=view.beam,
+    )
+
+
+def _exact_seconds(view: View, costs: Costs) -> float:
+    lines = view.lines
+    share = 1.0
+    if view.beam is not None and view.track is not None:
+        share = view.seen(16, 16)[:, view.on_track].mean()
+    pairs = lines.channels * view.grid.size * share
+    return 1e-9 * (costs.pixel_ns * pairs + 2 * costs.upsampled_sample_ns * lines.samples.size)
+
+
+def _power(interpolator: Interpolator) -> float:
+    return 10 ** (interpolator.error_db / 10)
+
+
+def _decibel(power: float) -> float:
+    return 10 * math.log10(max(power, 1e-30))

@@ -1,0 +1,396 @@
+"""Beam windows: what a channel weighs in a pixel, by the angle at which it sees it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.signal import savgol_filter
+from scipy.spatial.distance import cdist
+
+from clsas import validate
+from clsas.lines import RangeLines
+from clsas.sonar import element_pattern
+
+SHAPES = ("rectangular", "hann", "hamming", "taylor", "tukey", "inverse")
+
+INTERVALS = 1024
+"""Cubics of a table: enough for the kinks of a Tukey window."""
+
+_NARROWEST = 1e-3  # degrees: float32 holds a hundredth of it
+_BEYOND = 2.0  # for a limit at end-fire: a sine that rounding does not reach
+_HALF_POWER = 0.442946  # sinc^2 is 1/2 here
+_MOST_WEIGHT = 100.0
+_TAYLOR_TERMS, _TAYLOR_SIDE_LOBES_DB = 4, 30.0  # SciPy's choice
+_TRACK_SHARE = 4  # the track's direction is that of a cubic through this part of the pings
+_ROUNDING = 1e-5  # of sines on the device, amply
+_CHANNELS_TOGETHER = 16
+
+
+@dataclass(frozen=True, eq=False)
+class BeamWindow:
+    """Weights of the channels by aspect angle, so that an image uses a part of the beam only.
+
+    A pixel x is seen by a channel at the aspect angle theta from broadside,
+
+        sin(theta) = t . (x - p)/|x - p|,   p = (tx + rx)/2,
+
+    with t the unit direction of the track, and weighs a function of theta - squint.
+
+    Parameters
+    ----------
+    width_deg : float
+        Full width, 0.001 to 180 degrees; beyond half of it on either side the weight is 0.
+    shape : str
+        "rectangular", "hann", "hamming", "taylor" (4 terms, side lobes at -30 dB), "tukey" or
+        "inverse"; all but the last are 1 in the middle, and functions of (theta - squint)/width.
+        "inverse" divides by the two-way pattern sinc^2(L/lambda sin(theta - squint)) of elements
+        of length L at the lines' carrier.
+    squint_deg : float
+        Middle of the window, degrees ahead of broadside; the whole window lies within +-90.
+    taper : float
+        For "tukey": which part of the width, 0 to 1, its two raised-cosine edges take together.
+    element_length_m : float, optional
+        For "inverse": L. It may amplify by 40 dB at most.
+    along : array_like, [3] or [channels, 3], optional
+        Direction of the track, of any length. Unless given it is that of a smooth curve through
+        the lines' phase centres, see `directions`.
+    normalise : bool
+        Multiply every pixel by channels / sum_i w_i(x), w_i the weights: a point has the amplitude
+        it has without a window, also near the ends of the aperture, where fewer channels see it.
+        (Noise there grows, by the root of that.) Channels weigh in the sum whether or not the
+        pixel lies within their lines. Pixels whose sum is below 1e-6 are 0.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If a value is of a wrong kind or outside its limits.
+    """
+
+    width_deg: float
+    shape: str = "rectangular"
+    squint_deg: float = 0.0
+    taper: float = 0.5
+    element_length_m: float | None = None
+    along: NDArray[np.float64] | None = None
+    normalise: bool = False
+
+    def __post_init__(self) -> None:  # noqa: D105
+        width = validate.number(
+            "width_deg", self.width_deg, "degrees", least=_NARROWEST, most=180.0
+        )
+        room = 90 - width / 2
+        fields = {
+            "width_deg": width,
+            "shape": validate.one_of("shape", self.shape, SHAPES),
+            "squint_deg": validate.number(
+                "squint_deg", self.squint_deg, "degrees", least=-room, most=room
+            ),
+            "taper": validate.number("taper", self.taper, least=0.0, most=1.0),
+        }
+        if self.element_length_m is not None:
+            length = validate.positive("element_length_m", self.element_length_m, "m")
+            fields["element_length_m"] = length
+        elif self.shape == "inverse":
+            raise ValueError("element_length_m must be given for the shape 'inverse'")
+        if self.along is not None:
+            shape = (3,) if np.ndim(self.along) == 1 else (None, 3)
+            along = validate.array("along", self.along, np.float64, shape)
+            length = np.linalg.norm(along, axis=-1, keepdims=True)
+            if not length.all():
+                raise ValueError("along must hold directions of some length, got zeros")
+            fields["along"] = along / length
+        if not isinstance(self.normalise, (bool, np.bool_)):
+            raise TypeError(f"normalise must be True or False, got {self.normalise!r}")
+        for name, value in fields.items():
+            object.__setattr__(self, name, value)
+
+    @classmethod
+    def of_element(
+        cls, length_m: float, wavelength_m: float, shape: str = "rectangular", **others: object
+    ) -> BeamWindow:
+        """Return the window as wide as an element's beam.
+
+        Its edges are where one element's pattern is at -3 dB and the two-way one at -6 dB,
+        sin(width/2) = 0.443 wavelength/length: the half-power beamwidth of the textbooks, 0.886
+        wavelength/length, which resolves half an element. An element shorter than 0.443
+        wavelengths has no such edge: the window is 180 degrees wide.
+
+        Parameters
+        ----------
+        length_m : float
+            Of the element along the track.
+        wavelength_m : float
+            At the carrier.
+        shape : str
+            See `BeamWindow`.
+        **others
+            Further parameters of `BeamWindow`; `element_length_m` is `length_m` unless given.
+
+        Raises
+        ------
+        TypeError, ValueError
+            As `BeamWindow` does.
+        """
+        length = validate.positive("length_m", length_m, "m")
+        wavelength = validate.positive("wavelength_m", wavelength_m, "m")
+        width = 2 * math.degrees(math.asin(min(_HALF_POWER * wavelength / length, 1.0)))
+        return cls(width, shape, **({"element_length_m": length} | others))
+
+    @property
+    def limits_rad(self) -> tuple[float, float]:
+        """Aspect angles at which the window begins and ends."""
+        return (
+            math.radians(self.squint_deg - self.width_deg / 2),
+            math.radians(self.squint_deg + self.width_deg / 2),
+        )
+
+    @property
+    def limits(self) -> tuple[float, float]:
+        """Sines between which a weight is not 0: of `limits_rad`, and -+2 at end-fire."""
+        low, high = (math.sin(angle) for angle in self.limits_rad)
+        return (low if low > -1 + 1e-12 else -_BEYOND), (high if high < 1 - 1e-12 else _BEYOND)
+
+    @property
+    def edge(self) -> float:
+        """Over which part of the sine it rises from nothing to all, roughly."""
+        low, high = np.clip(self.limits, -1, 1)
+        return (high - low) / 2 * (max(self.taper, 0.02) if self.shape == "tukey" else 1.0)
+
+    def weights(self, q: ArrayLike, wavelength_m: float = math.inf) -> NDArray[np.float64]:
+        """Return the weights at sines `q` of the aspect angle; `wavelength_m` is for "inverse"."""
+        q = np.asarray(q, np.float64)
+        low, high = self.limits
+        return np.where((q > low) & (q < high), self._inside(q, wavelength_m), 0.0)
+
+    def table(self, wavelength_m: float = math.inf) -> NDArray[np.float32]:
+        """Return the weights as cubics, float32 [INTERVALS, 4], constant terms first.
+
+        Their argument runs from 0 to 1 over each of equal intervals of the sine between `limits`,
+        or -1 and 1.
+
+        Raises
+        ------
+        ValueError
+            If "inverse" would have to amplify by more than 40 dB.
+        """
+        low, high = np.clip(self.limits, -1, 1)
+        place = np.array([0.0, 0.25, 0.75, 1.0])
+        q = low + (high - low) * (np.arange(INTERVALS)[:, None] + place) / INTERVALS
+        values = self._inside(q, wavelength_m)
+        if not values.max() <= _MOST_WEIGHT:
+            raise ValueError(
+                f"width_deg must keep 'inverse' within -40 dB of an element of "
+                f"{self.element_length_m:g} m at a wavelength of {wavelength_m:g} m, "
+                f"got {self.width_deg:g} degrees"
+            )
+        cubics = np.linalg.solve(np.vander(place, increasing=True), values.T).T
+        return cubics.astype(np.float32)
+
+    def directions(self, lines: RangeLines) -> NDArray[np.float64]:
+        """Return the unit direction of the track for every channel, float64 [channels, 3].
+
+        That is `along`, or from the lines the tangent of local cubics, least-squares fits to the
+        phase centres of a quarter of the pings each. Successive channels of one transmitter
+        position are a ping.
+
+        Raises
+        ------
+        ValueError
+            If `along` is of another number of channels, or not given where there is one ping only
+            or a track stands still.
+        """
+        if self.along is not None:
+            if self.along.ndim == 2 and len(self.along) != lines.channels:
+                raise ValueError(
+                    f"along must hold one direction or one for each of {lines.channels} channels, "
+                    f"got {len(self.along)}"
+                )
+            return np.broadcast_to(self.along, (lines.channels, 3))
+        new = np.append(True, (np.diff(lines.tx_m, axis=0) != 0).any(axis=1))
+        first = np.flatnonzero(new)
+        pings = len(first)
+        if pings < 2:
+            raise ValueError(
+                f"along must be given: {lines.channels} channels of one transmitter position have "
+                f"no track"
+            )
+        sums = np.add.reduceat((lines.tx_m + lines.rx_m) / 2, first, axis=0)
+        centres_m = sums / np.diff(np.append(first, lines.channels))[:, None]
+        # Odd, and four pings at least where there are as many.
+        window = min(max(2 * (pings // (2 * _TRACK_SHARE)) + 1, 5), pings - 1 + pings % 2)
+        if window < 2:
+            tangent = np.diff(centres_m, axis=0).repeat(2, axis=0)
+        else:
+            order = min(3, window - 1)
+            tangent = savgol_filter(centres_m, window, order, deriv=1, axis=0, mode="interp")
+        speed = np.linalg.norm(tangent, axis=1)
+        extent_m = np.linalg.norm(np.ptp(centres_m, axis=0))
+        if not speed.min() > 1e-3 * extent_m / pings:
+            raise ValueError("along must be given: the lines' phase centres stand still")
+        return (tangent / speed[:, None])[np.cumsum(new) - 1]
+
+    def _inside(self, q: NDArray[np.float64], wavelength_m: float) -> NDArray[np.float64]:
+        """Return the weights as if the window had no end."""
+        angle = np.arcsin(np.clip(q, -1, 1)) - math.radians(self.squint_deg)
+        u = angle / math.radians(self.width_deg)
+        if self.shape == "hann":
+            return np.cos(np.pi * u) ** 2
+        if self.shape == "hamming":
+            return 0.54 + 0.46 * np.cos(2 * np.pi * u)
+        if self.shape == "taylor":
+            return _taylor(u)
+        if self.shape == "tukey":
+            edge = max(self.taper / 2, 1e-30)
+            return np.sin(np.pi / 2 * np.clip((0.5 - np.abs(u)) / edge, 0, 1)) ** 2
+        if self.shape == "inverse":
+            one_way = element_pattern(self.element_length_m, np.sin(angle), 1.0, wavelength_m)
+            return 1 / np.maximum(one_way**2, 1e-30)
+        return np.ones_like(q)
+
+
+def sines(
+    points_m: NDArray[np.float64], lines: RangeLines, along: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return the sine of the aspect angle of every point, float64 [channels, points].
+
+    Takes points [points, 3] and the direction of every channel, [channels, 3]; a phase centre's own
+    sine is 0.
+    """
+    offset_m = points_m - (lines.tx_m + lines.rx_m)[:, None] / 2
+    distance_m = np.linalg.norm(offset_m, axis=2)
+    return np.einsum("cpi,ci->cp", offset_m, along) / np.maximum(distance_m, 1e-30)
+
+
+def channel_ranges(
+    window: BeamWindow,
+    lines: RangeLines,
+    along: NDArray[np.float64],
+    centres_m: NDArray[np.float64],
+    radius_m: float,
+) -> NDArray[np.int32]:
+    """Return which channels may see balls of one radius about centres [parts, 3], int32 [parts, 2].
+
+    That is the first channel whose window touches a ball and the one after the last; both 0 where
+    there is none. Runs of channels are tried before single ones.
+    """
+    phase_centres_m = (lines.tx_m + lines.rx_m) / 2
+    count, run = lines.channels, _CHANNELS_TOGETHER
+    starts = np.arange(0, count, run)
+    run_of = np.arange(count) // run
+    # A run is one channel in its middle, less sharp by how far its channels lie and point apart.
+    middle_m = np.add.reduceat(phase_centres_m, starts, axis=0) / np.bincount(run_of)[:, None]
+    reach_m = np.linalg.norm(phase_centres_m - middle_m[run_of], axis=1)
+    direction = along[starts]
+    spread = np.linalg.norm(along - direction[run_of], axis=1)
+    sine, distance_m = _sines(centres_m, middle_m, direction)
+    seen = _touches(
+        window,
+        sine,
+        distance_m,
+        radius_m + np.maximum.reduceat(reach_m, starts),
+        np.maximum.reduceat(spread, starts),
+    )
+    some = np.flatnonzero(seen.any(axis=1))
+    ranges = np.zeros((len(centres_m), 2), np.int32)
+    if not some.size:
+        return ranges
+    seen = seen[some]
+
+    def touched(runs: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Return which channels of one run for each part touch it; the last stands for none."""
+        index = np.minimum(runs[:, None] * run + np.arange(run), count - 1)
+        square, sine = np.zeros(index.shape), np.zeros(index.shape)
+        for axis in range(3):
+            offset_m = centres_m[some, axis, None] - phase_centres_m[index, axis]
+            sine += offset_m * along[index, axis]
+            square += offset_m * offset_m
+        distance_m = np.sqrt(square)
+        return _touches(window, sine / np.maximum(distance_m, 1e-30), distance_m, radius_m)
+
+    first = seen.argmax(axis=1)
+    last = len(starts) - 1 - seen[:, ::-1].argmax(axis=1)
+    inside = touched(first)
+    begin = run * first + np.where(inside.any(axis=1), inside.argmax(axis=1), run)
+    inside = touched(last)
+    end = run * (last + 1) - np.where(inside.any(axis=1), inside[:, ::-1].argmax(axis=1), run)
+    end = np.minimum(end, count)
+    ranges[some, 0] = np.where(begin < end, begin, 0)
+    ranges[some, 1] = np.where(begin < end, end, 0)
+    return ranges
+
+
+def touches_rectangles(
+    window: BeamWindow,
+    sight: NDArray[np.float64],
+    distance_m: NDArray[np.float64],
+    along: NDArray[np.float64],
+    half_m: NDArray[np.float64],
+) -> NDArray[np.bool_]:
+    """Return whether a window may touch rectangles, bool [rectangles, places].
+
+    Parameters
+    ----------
+    sight : float64 [rectangles, places, 3]
+        Unit vectors from places on the track to the rectangles' middles.
+    distance_m : float64 [rectangles, places]
+    along : float64 [places, 3]
+        The track's unit direction.
+    half_m : float64 [2, 3]
+        Half the rectangles' sides, as vectors.
+    """
+    sine = np.einsum("psi,si->ps", sight, along)
+    reach = sum(np.abs(along @ half - sine * (sight @ half)) for half in half_m) / distance_m
+    reach += (np.linalg.norm(np.abs(half_m).sum(axis=0)) / distance_m) ** 2
+    low, high = window.limits
+    return (sine + reach > low) & (sine - reach < high)
+
+
+def _sines(
+    points_m: NDArray[np.float64], centres_m: NDArray[np.float64], along: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return sines of aspect angles and distances, [points, centres]; no sine is right at 0 m."""
+    origin_m = centres_m[0]  # so that little cancels
+    distance_m = cdist(points_m, centres_m)
+    sine = (points_m - origin_m) @ along.T
+    sine -= np.einsum("ci,ci->c", centres_m - origin_m, along)
+    sine /= np.maximum(distance_m, 1e-30)
+    return sine, distance_m
+
+
+def _touches(
+    window: BeamWindow,
+    sine: NDArray[np.float64],
+    distance_m: NDArray[np.float64],
+    radius_m: float | NDArray[np.float64],
+    spread: float | NDArray[np.float64] = 0.0,
+) -> NDArray[np.bool_]:
+    """Return whether a window may touch a ball, seen at a sine and a distance.
+
+    `spread` is by how much the direction may be another: the length of a unit vector's change.
+    """
+    low, high = window.limits
+    ratio = radius_m / np.maximum(distance_m, 1e-30)
+    # The way to a point of the ball turns by asin(ratio) at most, its unit vector by that chord.
+    wider = ratio * (1 + 0.42 * ratio * ratio) + (spread + _ROUNDING)
+    return (ratio >= 1) | ((sine + wider > low) & (sine - wider < high))
+
+
+def _taylor(u: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the Taylor window at u from -0.5 to 0.5, 1 in its middle.
+
+    1 + sum_m F_m cos(2 pi m u), with Taylor's factors for near side lobes of one height.
+    """
+    terms = np.arange(1, _TAYLOR_TERMS)
+    a = math.acosh(10 ** (_TAYLOR_SIDE_LOBES_DB / 20)) / np.pi
+    stretch = _TAYLOR_TERMS**2 / (a**2 + (_TAYLOR_TERMS - 0.5) ** 2)
+    factors = []
+    for m in terms:
+        zeros = np.prod(1 - m**2 / stretch / (a**2 + (terms - 0.5) ** 2))
+        others = np.prod([1 - m**2 / n**2 for n in terms if n != m])
+        factors.append((-1) ** (m + 1) * zeros / others)
+    factors = np.array(factors)
+    total = 1 + np.cos(2 * np.pi * np.asarray(u)[..., None] * terms) @ factors
+    return total / (1 + factors.sum())
