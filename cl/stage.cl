@@ -93,6 +93,18 @@ INLINE vfloat filtered(const float *weight, vfloat low, vfloat high)
 }
 #endif
 
+/* Lines of different channels lie apart: a CPU fetches those of the channel after the next meanwhile. */
+#if defined(__clang__) && WIDTH > 1
+#define PREFETCH(p) __builtin_prefetch((const void *)(size_t)(p))
+#define AHEAD 2
+#endif
+
+#if GIVEN
+#define PARENT_LINE(c) (parent + (size_t)order[chunk + (c)] * 2 * parent_pitch)
+#else
+#define PARENT_LINE(c) (parent + (size_t)(chunk + (c) - children[4]) * 2 * parent_pitch)
+#endif
+
 /* The line of virtual channel `node`. */
 #define NODE_LINE(node) (lines + (size_t)((node) - first_node) * 2 * pitch + (WIDTH == 1 ? 2 : 1) * guard)
 #define HAS(node) ((node) >= first_node && (node) < end_node)
@@ -112,9 +124,9 @@ __kernel void stage(__global const float *parent, int parent_pitch, __global con
     __local float taps[TAPS][CHUNK], cosine[CHUNK], sine[CHUNK];
     __local int first[CHUNK];
 #if WIDTH > 1
-    vfloat aligned_re[CHUNK][BLOCK / WIDTH], aligned_im[CHUNK][BLOCK / WIDTH];
+    vfloat aligned_re[BLOCK / WIDTH][CHUNK], aligned_im[BLOCK / WIDTH][CHUNK];
 #else
-    float aligned_re[CHUNK][1], aligned_im[CHUNK][1];
+    float aligned_re[1][CHUNK], aligned_im[1][CHUNK];
 #endif
 
     const int child = get_group_id(0), item = get_local_id(0), items = get_local_size(0);
@@ -178,10 +190,11 @@ __kernel void stage(__global const float *parent, int parent_pitch, __global con
         for (int block = item * BLOCK; block < length; block += items * BLOCK) {
             const int block_end = length - block < BLOCK ? length : block + BLOCK;
             for (int c = 0; c < count; c++) {
-#if GIVEN
-                __global const float *line = parent + (size_t)order[chunk + c] * 2 * parent_pitch;
-#else
-                __global const float *line = parent + (size_t)(chunk + c - children[4]) * 2 * parent_pitch;
+                __global const float *line = PARENT_LINE(c);
+#ifdef PREFETCH
+                const int ahead = c + AHEAD < count ? c + AHEAD : count - 1;
+                __global const float *next =
+                    PARENT_LINE(ahead) + KEEP(first[ahead] + block, 0, parent_pitch - BLOCK - WIDTH) - block;
 #endif
                 float weight[TAPS];
 #pragma unroll
@@ -194,6 +207,10 @@ __kernel void stage(__global const float *parent, int parent_pitch, __global con
                 vfloat re_low = LOAD_RE(line, before, parent_pitch), im_low = LOAD_IM(line, before, parent_pitch);
 #endif
                 for (int k = block; k < block_end; k += WIDTH) {
+#ifdef PREFETCH
+                    PREFETCH(next + k);
+                    PREFETCH(next + k + parent_pitch);
+#endif
 #ifdef SLIDING
                     const int after = KEEP(start + k + WIDTH, 0, parent_pitch - WIDTH);
                     const vfloat re_high = LOAD_RE(line, after, parent_pitch), im_high = LOAD_IM(line, after, parent_pitch);
@@ -209,8 +226,8 @@ __kernel void stage(__global const float *parent, int parent_pitch, __global con
                         b += weight[t] * LOAD_IM(line, place + t, parent_pitch);
                     }
 #endif
-                    aligned_re[c][(k - block) / WIDTH] = a * turn_re - b * turn_im;
-                    aligned_im[c][(k - block) / WIDTH] = a * turn_im + b * turn_re;
+                    aligned_re[(k - block) / WIDTH][c] = a * turn_re - b * turn_im;
+                    aligned_im[(k - block) / WIDTH][c] = a * turn_im + b * turn_re;
                 }
             }
             for (int k = block; k < block_end; k += WIDTH) {
@@ -239,7 +256,7 @@ __kernel void stage(__global const float *parent, int parent_pitch, __global con
                     }
                     re[APERTURE_TAPS - 1] = im[APERTURE_TAPS - 1] = 0.0f;
                 }
-                const vfloat a = aligned_re[c][(k - block) / WIDTH], b = aligned_im[c][(k - block) / WIDTH];
+                const vfloat a = aligned_re[(k - block) / WIDTH][c], b = aligned_im[(k - block) / WIDTH][c];
                 __global const float *weight = aperture + channel * APERTURE_TAPS;
 #pragma unroll
                 for (int t = 0; t < APERTURE_TAPS; t++) {

@@ -17,6 +17,7 @@ from clsas.scene import PointTargets
 from clsas.simulate import simulate, simulate_lines
 from clsas.sonar import Pulse, Sonar
 from clsas.track import Pointing, Track, channels
+from clsas.tradeoff import Tradeoff, tradeoff
 from clsas.validate import ClsasWarning
 from clsas.window import BeamWindow
 
@@ -37,6 +38,7 @@ __all__ = [
     "RangeLines",
     "Sonar",
     "Track",
+    "Tradeoff",
     "backproject",
     "channels",
     "check_sampling",
@@ -53,4 +55,5 @@ __all__ = [
     "simulate",
     "simulate_lines",
     "to_xarray",
+    "tradeoff",
 ]

@@ -5,19 +5,24 @@ from __future__ import annotations
 import statistics
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
 import numpy as np
 
 from clsas import reference, validate
-from clsas.backproject import execute, prepare
+from clsas.backproject import backproject, execute, prepare
 from clsas.device import Device, open_device
+from clsas.factorize import factorize
 from clsas.grid import Grid
 from clsas.lines import RangeLines
+from clsas.planner import plan
+from clsas.quality import relative_error_db
 from clsas.scene import PointTargets
 from clsas.simulate import simulate_lines
+from clsas.tradeoff import REFERENCE_DB
+from clsas.window import BeamWindow
 
 _PIXELS = 300  # random pixels at which errors are measured
 _POINTS = 1000
@@ -39,6 +44,8 @@ class Case:
         Extent of the image.
     pixels : int
         Along either side.
+    beam : BeamWindow, optional
+        Weights of the channels.
     """
 
     channels: int
@@ -48,6 +55,7 @@ class Case:
     x_m: tuple[float, float]
     y_m: tuple[float, float]
     pixels: int
+    beam: BeamWindow | None = None
 
     @property
     def grid(self) -> Grid:
@@ -78,6 +86,34 @@ CASES = {
     "bp-thesis": Case(640, 8.25e-3, 1e6, 100e3, (-2.5, 2.5), (40.0, 45.0), 1024),
     "bp-2k": Case(2048, 15e-3, 120e3, 30e3, (-20.0, 20.0), (40.0, 80.0), 2048),
 }
+"""Cases of exact imaging."""
+
+_BEAM = BeamWindow(20.0, "hann")
+
+FACTORIZED = {
+    "ffbp-thesis": CASES["bp-thesis"],
+    "ffbp-2k": Case(2000, 15e-3, 120e3, 30e3, (-20.48, 20.46), (40.0, 80.0), 2048, _BEAM),
+    # The same pixels and spacing, over a longer track and further out.
+    "ffbp-8k": Case(8192, 15e-3, 120e3, 30e3, (-40.96, 40.94), (40.0, 121.9), 4096, _BEAM),
+}
+"""Cases of factorized imaging."""
+
+
+def scaled(size: int) -> Case:
+    """Return ffbp-2k with `size` channels and `size` x `size` pixels over the same extents.
+
+    Frequencies grow with the size, so that pixels and channels stay as far apart in wavelengths.
+    """
+    case = FACTORIZED["ffbp-2k"]
+    finer = size / case.pixels
+    return replace(
+        case,
+        channels=size,
+        spacing_m=case.spacing_m * case.channels / size,
+        carrier_hz=case.carrier_hz * finer,
+        bandwidth_hz=case.bandwidth_hz * finer,
+        pixels=size,
+    )
 
 
 def run(
@@ -140,12 +176,8 @@ def run(
         "accuracy_db": accuracy_db,
         "taps": preparation.interpolator.taps,
         "upsampling": round(preparation.resampling.ratio, 3),
-        "seconds": {
-            "median": statistics.median(seconds),
-            "min": min(seconds),
-            "max": max(seconds),
-            "included": "all of clsas.backproject, from choosing the interpolation to readback",
-        },
+        "seconds": _statistics(seconds)
+        | {"included": "all of clsas.backproject, from choosing the interpolation to readback"},
         "gbp_per_s": pairs / statistics.median(seconds) / 1e9,
         "kernel_seconds": min(kernel_seconds),
         "kernel_gbp_per_s": pairs / min(kernel_seconds) / 1e9,
@@ -159,6 +191,93 @@ def run(
             image, partial(reference.ideal, lines), pixels=_PIXELS
         ),
     }
+
+
+def run_factorized(
+    case: str | Case,
+    *,
+    device: Device | str | int | None = None,
+    tolerance_db: float = -50.0,
+    repeats: int = 5,
+    progress: Callable[[int, int], None] | None = None,
+) -> dict[str, Any]:
+    """Measure factorized against exact imaging, which take turns.
+
+    Parameters
+    ----------
+    case : str or Case
+        One of `FACTORIZED`, or another case.
+    device : Device, str or int, optional
+        See `clsas.device.choose`.
+    tolerance_db : float
+        As for `clsas.plan`; the exact image that is timed is as accurate.
+    repeats : int
+        Timed runs of either, after one that builds the kernels.
+    progress : callable, optional
+        Called as progress(images done, images).
+
+    Returns
+    -------
+    dict
+        What was measured, ready for JSON. `seconds` are of the whole call of `clsas.factorize` with
+        the plan given, `exact_seconds` of `clsas.backproject`, and `speedup` is the ratio of their
+        medians. Planning took `plan_seconds`, once. `error_db` is against an exact image of
+        -80 dB.
+    """
+    if not isinstance(case, Case):
+        validate.one_of("case", case, tuple(FACTORIZED))
+        name, case = case, FACTORIZED[case]
+    else:
+        name = f"{case.channels} channels"
+    device = open_device(device)
+    lines, grid, images, done = case.lines(), case.grid, 2 * repeats + 3, 0
+    start = time.perf_counter()
+    chosen = plan(lines, grid, tolerance_db=tolerance_db, beam=case.beam, device=device)
+    plan_seconds = time.perf_counter() - start
+    imagers = {
+        "factorized": partial(factorize, lines, grid, chosen, device=device),
+        "exact": partial(
+            backproject, lines, grid, accuracy_db=tolerance_db, beam=case.beam, device=device
+        ),
+    }
+    seconds: dict[str, list[float]] = {name: [] for name in imagers}
+    for _ in range(repeats + 1):
+        for imager, form in imagers.items():
+            start = time.perf_counter()
+            image = form()
+            seconds[imager].append(time.perf_counter() - start)
+            if imager == "factorized":
+                fast = image
+            done += 1
+            if progress is not None:
+                progress(done, images)
+    del image
+    exact = backproject(lines, grid, accuracy_db=REFERENCE_DB, beam=case.beam, device=device)
+    if progress is not None:
+        progress(images, images)
+    taken, exactly = (_statistics(seconds[imager][1:]) for imager in imagers)
+    return {
+        "case": name,
+        "device": device.info.label,
+        "driver": device.info.driver,
+        "channels": lines.channels,
+        "samples": lines.length,
+        "pixels": list(grid.shape),
+        "tolerance_db": tolerance_db,
+        "seconds": taken | {"included": "all of clsas.factorize, the plan given"},
+        "plan_seconds": plan_seconds,
+        "exact_seconds": exactly | {"included": "all of clsas.backproject, as accurate"},
+        "speedup": exactly["median"] / taken["median"],
+        "error_db": relative_error_db(fast, exact),
+        "predicted_error_db": chosen.predicted_error_db,
+        "predicted_seconds": chosen.predicted_seconds,
+        "predicted_exact_seconds": chosen.exact_seconds,
+        "plan": chosen.describe(),
+    }
+
+
+def _statistics(seconds: list[float]) -> dict[str, float]:
+    return {"median": statistics.median(seconds), "min": min(seconds), "max": max(seconds)}
 
 
 def flops_per_pair(taps: int) -> int:

@@ -15,7 +15,8 @@ import time
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
-from dataclasses import fields, is_dataclass
+from dataclasses import fields, is_dataclass, replace
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -29,10 +30,14 @@ import clsas
 from clsas import demo as demonstration
 from clsas import validate
 from clsas.backproject import execute, prepare
-from clsas.config import SceneFile, read_scene
-from clsas.device import choose
+from clsas.config import DIAL, EXACT, SceneFile, read_scene
+from clsas.device import choose, open_device
 from clsas.quality import Cut, PointResponse
+from clsas.tradeoff import TOLERANCES_DB, summary
 from clsas.validate import positive
+from clsas.window import SHAPES
+
+_DEFAULT = {"tolerance_db": -50.0}
 
 # What users cause, and what machines lack.
 _ERRORS = (
@@ -89,6 +94,27 @@ class _Place(click.ParamType):
             self.fail(f"{value!r} must be X,Y in metres", param, ctx)
 
 
+class _Ratio(click.ParamType):
+    name = "NUMBER"
+
+    def convert(self, value: Any, param: Any, ctx: Any) -> float:
+        try:
+            return float(Fraction(value))
+        except (ValueError, ZeroDivisionError, OverflowError):
+            self.fail(f"{value!r} must be a number or a fraction such as 1/30", param, ctx)
+
+
+class _Stages(click.ParamType):
+    name = "stages"
+
+    def convert(self, value: Any, param: Any, ctx: Any) -> tuple[tuple[int, int], ...]:
+        try:
+            pairs = [stage.lower().split("x") for stage in value.split(",")]
+            return tuple((int(beams), int(divisions)) for beams, divisions in pairs)
+        except ValueError:
+            self.fail(f"{value!r} must be QRxQI for every stage, such as 2x2,2x2", param, ctx)
+
+
 class _Output(click.Path):
     """A file to write: what would keep it from being written is said before any work."""
 
@@ -107,10 +133,11 @@ class _Output(click.Path):
             self.fail(f"{str(path)!r} cannot be written: {error.strerror}", param, ctx)
         if special:
             self.fail(f"{str(path)!r} is not an ordinary file", param, ctx)
-        # Whichever of the two comes second on the command line finds the first one here.
-        other = ctx.params.get("output" if param.name == "png" else "png")
-        if other is not None and other.resolve() == path.resolve():
-            self.fail("-o and --png must be two files", param, ctx)
+        for other in ctx.command.params:
+            # Whichever comes second on the command line finds the first one here.
+            taken = ctx.params.get(other.name) if isinstance(other.type, _Output) else None
+            if other is not param and taken is not None and taken.resolve() == path.resolve():
+                self.fail(f"{other.opts[0]} and {param.opts[0]} must be two files", param, ctx)
         if param.name == "png":
             _need_matplotlib()
         return path
@@ -144,6 +171,47 @@ def _png(what: str) -> Callable:
 _as_json = click.option("--json", "as_json", is_flag=True, help="Print results as JSON.")
 _scene = click.option("--scene", type=_INPUT, help="Scene file for what the options leave out.")
 _device = click.option("--device", help="Index or part of the name, as `clsas devices` shows.")
+
+
+def _together(*options: Callable) -> Callable:
+    """Return several options as one decorator, in the order in which --help shows them."""
+
+    def decorate(command: Callable) -> Callable:
+        for option in reversed(options):
+            command = option(command)
+        return command
+
+    return decorate
+
+
+_grid = _together(
+    _scene,
+    click.option("--x", type=_Axis(), help="First and last pixel centre along x (m), how many."),
+    click.option("--y", type=_Axis(), help="The same along y."),
+    click.option("--z", type=float, help="Height of the plane (m). [default: 0]"),
+)
+_dial = _together(
+    click.option(
+        "--tolerance-db", type=float,
+        help="Relative rms error allowed against the exact image. [default: -50]",
+    ),
+    click.option(
+        "--tolerance-wavelengths", type=_Ratio(),
+        help="The same as a range error in wavelengths, such as 1/30.",
+    ),
+    click.option(
+        "--stages", type=_Stages(), metavar="QRxQI,...",
+        help="The thesis's method: QR and QI of every stage, such as 2x2,2x2.",
+    ),
+)  # fmt: skip
+_beam = _together(
+    click.option("--beam-deg", type=float, help="Use a beam of this full width only."),
+    click.option(
+        "--beam-shape", type=click.Choice([shape for shape in SHAPES if shape != "inverse"]),
+        help="Its shape. [default: rectangular]",
+    ),
+    click.option("--squint-deg", type=float, help="Its middle, ahead of broadside. [default: 0]"),
+)  # fmt: skip
 
 
 @click.group(cls=_Commands, context_settings={"help_option_names": ["-h", "--help"]})
@@ -262,14 +330,14 @@ def compress(
 @main.command()
 @click.argument("lines_file", metavar="LINES.H5", type=_INPUT)
 @_output("Image")
-@_scene
-@click.option("--x", type=_Axis(), help="First and last pixel centre along x (m), and how many.")
-@click.option("--y", type=_Axis(), help="The same along y.")
-@click.option("--z", type=float, help="Height of the plane (m). [default: 0]")
-@_device
+@_grid
+@_dial
+@click.option("--exact", is_flag=True, help="Backproject plainly, as the three options below do.")
 @click.option("--accuracy-db", type=float, help="Relative rms error wanted. [default: -60]")
 @click.option("--taps", type=int, help="Fix the interpolator's taps: 2, 4, 6 or 8.")
 @click.option("--upsampling", type=float, help="Fix how much lines are upsampled.")
+@_beam
+@_device
 @_png("the image in dB")
 @click.option(
     "--dynamic-range-db", type=float, default=60.0, show_default=True, help="Of the PNG.",
@@ -281,51 +349,71 @@ def image(
     lines_file: Path,
     output: Path,
     scene: Path | None,
-    x: tuple[float, float, int] | None,
-    y: tuple[float, float, int] | None,
-    z: float | None,
+    exact: bool,
     device: str | None,
-    accuracy_db: float | None,
-    taps: int | None,
-    upsampling: float | None,
     png: Path | None,
     dynamic_range_db: float,
     profile: bool,
     as_json: bool,
+    **given: Any,
 ) -> None:
-    """Form the exact image of range lines.
+    """Form the image of range lines, fast to a tolerance or exactly.
 
-    The grid is that of --scene, or given by --x, --y and --z.
+    The grid is that of --scene, or given by --x, --y and --z. How is told by one of
+    --tolerance-db, --tolerance-wavelengths, --stages and --exact, or by [image] of the scene;
+    otherwise the error against the exact image is to stay below -50 dB. Where nothing is faster
+    within a tolerance, the image is backprojected plainly.
 
     \b
     Example:  clsas image lines.h5 --x -2.5:2.5:1024 --y 40:45:1024 -o image.h5 --png image.png
     """
-    if (x is None) != (y is None) or (z is not None and x is None):
-        raise click.UsageError("--x and --y go together, and --z with them")
-    if scene is None and x is None:
-        raise click.UsageError("a grid is needed: --scene, or --x and --y")
-    if None not in (accuracy_db, taps, upsampling):
-        raise click.UsageError(
-            "--accuracy-db plays no part where --taps and --upsampling are given"
-        )
-    described = read_scene(scene) if scene is not None else SceneFile(name="")
-    grid = clsas.Grid.plane(x, y, z or 0.0) if x and y else described.need("grid")[0]
-    validate.memory("--x and --y" if x else "[grid]", 8 * grid.size)
-    options = _options(described.image, accuracy_db=accuracy_db, taps=taps, upsampling=upsampling)
+    described, grid = _read_grid(scene, given)
+    wish = _wish(described, given, exact)
+    beam = _read_beam(described, given)
     _warn_of_sampling(described, grid)
     lines = _load(lines_file, clsas.RangeLines)
-    with _progress("imaging") as progress:
+    opened = open_device(device)
+    results: dict[str, Any] = {"method": "exact"}
+    chosen = None
+    if wish.keys() & set(DIAL):
         start = time.perf_counter()
-        preparation = prepare(lines, grid, device=device, **options)
-        with preparation.device.profile() if profile else nullcontext({}) as kernels:
+        chosen = clsas.plan(lines, grid, **wish, beam=beam, device=opened)
+        results["plan_seconds"] = time.perf_counter() - start
+        if chosen.is_exact:
+            wish, chosen = {"accuracy_db": chosen.predicted_error_db}, None
+    with (
+        _progress("imaging") as progress,
+        opened.profile() if profile else nullcontext({}) as kernels,
+    ):
+        start = time.perf_counter()
+        if chosen is not None:
+            formed = clsas.factorize(lines, grid, chosen, device=opened, progress=progress)
+            how = f"{summary(chosen)}; error predicted {chosen.predicted_error_db:.0f} dB"
+            results |= {
+                "method": "stages" if chosen.nearest else "factorized",
+                "predicted_error_db": chosen.predicted_error_db,
+                "predicted_seconds": chosen.predicted_seconds,
+            }
+        else:
+            preparation = prepare(lines, grid, device=opened, beam=beam, **wish)
             formed = execute(preparation, progress=progress)
+            interpolator, ratio = preparation.interpolator, preparation.resampling.ratio
+            how = (
+                f"{interpolator.taps} taps on lines upsampled {ratio:.3g} times, "
+                f"{interpolator.error_db:.0f} dB"
+            )
+            results |= {
+                "taps": interpolator.taps,
+                "upsampling": ratio,
+                "interpolation_error_db": interpolator.error_db,
+            }
         seconds = time.perf_counter() - start
     clsas.save(output, formed)
     if png is not None:
         from clsas import plot
 
         plot.save_png(plot.image_db(formed, dynamic_range_db=dynamic_range_db), png)
-    used, interpolator = preparation.device.info, preparation.interpolator
+    planned = f", planned in {results['plan_seconds']:.2f} s" if "plan_seconds" in results else ""
     table = "".join(
         f"\n  {name}: {times.count} runs of {1e3 * times.minimum_s:.3g} to "
         f"{1e3 * times.maximum_s:.3g} ms, median {1e3 * times.median_s:.3g} ms"
@@ -334,11 +422,114 @@ def image(
     _report(
         as_json,
         f"{output}: {' x '.join(map(str, grid.shape))} pixels from {lines.channels} lines in "
-        f"{seconds:.2f} s on {used.label} ({interpolator.taps} taps on lines upsampled "
-        f"{preparation.resampling.ratio:.3g} times, {interpolator.error_db:.0f} dB){table}",
-        file=output, png=png, shape=grid.shape, channels=lines.channels, device=used.label,
-        driver=used.driver, taps=interpolator.taps, upsampling=preparation.resampling.ratio,
-        interpolation_error_db=interpolator.error_db, seconds=seconds, kernels=kernels,
+        f"{seconds:.2f} s{planned} on {opened.info.label} ({how}){table}",
+        file=output, png=png, shape=grid.shape, channels=lines.channels,
+        device=opened.info.label, driver=opened.info.driver, **results, seconds=seconds,
+        kernels=kernels,
+    )  # fmt: skip
+
+
+@main.command()
+@click.argument("lines_file", metavar="LINES.H5", type=_INPUT)
+@_grid
+@_dial
+@_beam
+@_device
+@_as_json
+def plan(
+    lines_file: Path, scene: Path | None, device: str | None, as_json: bool, **given: Any
+) -> None:
+    """Show how an image would be formed, how long it takes and how much it errs.
+
+    Grid, dial and beam as for `clsas image`; where the scene asks for an exact image, a
+    tolerance of -50 dB counts. With --json the plan is printed whole, as Plan.to_json has it.
+
+    \b
+    Example:  clsas plan lines.h5 --x -2.5:2.5:1024 --y 40:45:1024 --tolerance-db -40
+    """
+    described, grid = _read_grid(scene, given)
+    wish = _wish(described, given)
+    beam = _read_beam(described, given)
+    lines = _load(lines_file, clsas.RangeLines)
+    if not wish.keys() & set(DIAL):
+        wish = _DEFAULT
+    chosen = clsas.plan(lines, grid, **wish, beam=beam, device=device)
+    click.echo(chosen.to_json() if as_json else chosen.describe())
+
+
+@main.command()
+@click.argument("lines_file", metavar="[LINES.H5]", type=_INPUT, required=False)
+@click.option("--case", help="A built-in case of `clsas bench` instead: ffbp-thesis, ffbp-2k, ...")
+@_grid
+@click.option(
+    "--tolerance-db",
+    type=float,
+    multiple=True,
+    help=f"Once for every tolerance. [default: {' '.join(f'{db:g}' for db in TOLERANCES_DB)}]",
+)
+@click.option(
+    "--stages",
+    type=_Stages(),
+    metavar="QRxQI,...",
+    multiple=True,
+    help="Once for every plan of the thesis's method. [default: 1 to 5 of 2x2, 2 of 2x4]",
+)
+@_beam
+@_device
+@click.option("--repeats", type=click.IntRange(1), default=3, show_default=True, help="Timed runs.")
+@click.option("--csv", type=_Output(), help="Also write the table.")
+@_png("time over error")
+@_as_json
+def tradeoff(
+    lines_file: Path | None,
+    case: str | None,
+    scene: Path | None,
+    tolerance_db: tuple[float, ...],
+    stages: tuple[tuple[tuple[int, int], ...], ...],
+    device: str | None,
+    repeats: int,
+    csv: Path | None,
+    png: Path | None,
+    as_json: bool,
+    **given: Any,
+) -> None:
+    """Measure speed against accuracy: one image in many ways, timed and compared.
+
+    Range lines of your own on a grid as for `clsas image`, or a built-in case. Resolution and side
+    lobes are those of the strongest point.
+
+    \b
+    Example:  clsas tradeoff --case ffbp-thesis --csv tradeoff.csv --png tradeoff.png
+    """  # fmt: skip
+    if (lines_file is None) == (case is None):
+        raise click.UsageError("either LINES.H5 or --case is needed")
+    if case is None:
+        described, grid = _read_grid(scene, given)
+        beam = _read_beam(described, given)
+        lines = _load(lines_file, clsas.RangeLines)
+    else:
+        if scene is not None or any(given[name] is not None for name in ("x", "y", "z")):
+            raise click.UsageError("--case has its own grid: --scene, --x, --y and --z go without")
+        built_in = _case(case)
+        lines, grid = built_in.lines(), built_in.grid
+        beam = _read_beam(SceneFile(name="", image={"beam": built_in.beam}), given)
+    with _progress("imaging") as progress:
+        measured = clsas.tradeoff(
+            lines, grid,
+            tolerances_db=tolerance_db or TOLERANCES_DB,
+            stages=stages or None,
+            beam=beam, device=device, repeats=repeats, progress=progress,
+        )  # fmt: skip
+    if csv is not None:
+        measured.save_csv(csv)
+    if png is not None:
+        measured.save_png(png, title=case or lines_file.name)
+    _report(
+        as_json,
+        f"{measured.channels} lines, {' x '.join(map(str, measured.pixels))} pixels on "
+        f"{measured.device}, median of {repeats} runs; resolutions over those of the exact "
+        f"image\n{measured.describe()}",
+        **_json_able(measured),
     )  # fmt: skip
 
 
@@ -410,35 +601,69 @@ def demo(out: Path, device: str | None, as_json: bool) -> None:
 @main.command()
 @click.argument("case", required=False)
 @_device
-@click.option("--accuracy-db", type=float, default=-50.0, show_default=True, help="Error wanted.")
+@click.option("--accuracy-db", type=float, help="Error wanted in exact cases. [default: -50]")
+@click.option("--tolerance-db", type=float, help="And in factorized ones. [default: -50]")
 @click.option("--repeats", type=click.IntRange(1), default=5, show_default=True, help="Timed runs.")
 @_as_json
 def bench(
-    case: str | None, device: str | None, accuracy_db: float, repeats: int, as_json: bool
+    case: str | None,
+    device: str | None,
+    accuracy_db: float | None,
+    tolerance_db: float | None,
+    repeats: int,
+    as_json: bool,
 ) -> None:
     """Time a benchmark case and measure its error; without CASE, all of them run.
 
-    With --json every case is one line.
+    Cases bp-... are exact imaging; cases ffbp-... are factorized imaging, compared with exact
+    imaging. With --json every case is one line.
 
     \b
-    Example:  clsas bench bp-thesis --accuracy-db -80 --json
+    Example:  clsas bench ffbp-2k --tolerance-db -40 --json
     """
     from clsas import bench as benchmark
 
-    if case is not None and case not in benchmark.CASES:
-        raise click.BadParameter(f"{case!r} is not one of {', '.join(benchmark.CASES)}")
-    for name in [case] if case else benchmark.CASES:
+    if case is not None:
+        _case(case)
+        if (tolerance_db if case in benchmark.CASES else accuracy_db) is not None:
+            raise click.UsageError("--accuracy-db goes with bp-..., --tolerance-db with ffbp-...")
+    for name in [case] if case else [*benchmark.CASES, *benchmark.FACTORIZED]:
+        exact = name in benchmark.CASES
+        measure = benchmark.run if exact else benchmark.run_factorized
+        option, value = ("accuracy_db", accuracy_db) if exact else ("tolerance_db", tolerance_db)
+        wish = {} if value is None else {option: value}
         with _progress(name) as progress:
-            result = benchmark.run(
-                name, device=device, accuracy_db=accuracy_db, repeats=repeats, progress=progress
-            )
+            result = measure(name, device=device, repeats=repeats, progress=progress, **wish)
         if as_json:
             _print_json(result, indent=None)
             continue
         for key, value in result.items():
             parts = value.items() if isinstance(value, dict) else [("", value)]
             told = ", ".join(f"{part} {_plain(item)}".strip() for part, item in parts)
-            click.echo(f"{key:>20}  {told}")
+            click.echo(f"{key:>24}  " + told.replace("\n", "\n" + 26 * " "))
+
+
+@main.command()
+@_device
+@_as_json
+def calibrate(device: str | None, as_json: bool) -> None:
+    """Measure what the parts of imaging cost on a device, and store it for planning.
+
+    \b
+    Example:  clsas calibrate --device 0
+    """
+    from clsas import costs
+    from clsas.calibrate import calibrate as measure
+
+    opened = open_device(device)
+    with _progress("calibrating") as progress:
+        found = measure(opened, progress=progress)
+    parts = "".join(f"\n{getattr(found, part.name):>12.4g}  {part.name}" for part in fields(found))
+    _report(
+        as_json,
+        f"{opened.info.label}, stored in {costs.path()}{parts}",
+        device=opened.info.label, driver=opened.info.driver, file=costs.path(), costs=found,
+    )  # fmt: skip
 
 
 @contextmanager
@@ -477,6 +702,68 @@ def _load(path: Path, kind: type) -> Any:
     raise ValueError(
         f"{path} must hold {kind.__name__}{hint.get(kind, '')}, got {type(obj).__name__}"
     )
+
+
+def _case(name: str) -> Any:
+    from clsas import bench
+
+    cases = bench.CASES | bench.FACTORIZED
+    if name not in cases:
+        raise click.BadParameter(f"{name!r} is not one of {', '.join(cases)}")
+    return cases[name]
+
+
+def _read_grid(scene: Path | None, given: dict[str, Any]) -> tuple[SceneFile, clsas.Grid]:
+    """Return what a scene file describes, or nothing, and the grid that is wanted."""
+    x, y, z = (given[name] for name in ("x", "y", "z"))
+    if (x is None) != (y is None) or (z is not None and x is None):
+        raise click.UsageError("--x and --y go together, and --z with them")
+    if scene is None and x is None:
+        raise click.UsageError("a grid is needed: --scene, or --x and --y")
+    described = read_scene(scene) if scene is not None else SceneFile(name="")
+    grid = clsas.Grid.plane(x, y, z or 0.0) if x and y else described.need("grid")[0]
+    validate.memory("--x and --y" if x else "[grid]", 8 * grid.size)
+    return described, grid
+
+
+def _wish(described: SceneFile, given: dict[str, Any], exact: bool = False) -> dict[str, Any]:
+    """Return how an image is wanted: one of `DIAL`, or else what the exact image takes."""
+    dial, exactly = (
+        {name: given[name] for name in names if given.get(name) is not None}
+        for names in (DIAL, EXACT)
+    )
+    if len(dial) + exact > 1:
+        raise click.UsageError(
+            "--tolerance-db, --tolerance-wavelengths, --stages and --exact exclude each other"
+        )
+    if dial and exactly:
+        raise click.UsageError(
+            "--accuracy-db, --taps and --upsampling are of the exact image, and play no part with "
+            f"--{next(iter(dial)).replace('_', '-')}"
+        )
+    if len(exactly) == len(EXACT):
+        raise click.UsageError(
+            "--accuracy-db plays no part where --taps and --upsampling are given"
+        )
+    if dial:
+        return dial
+    described_exactly = {key: value for key, value in described.image.items() if key in EXACT}
+    if exact or exactly:
+        return described_exactly | exactly
+    described_dial = {key: value for key, value in described.image.items() if key in DIAL}
+    return described_dial or described_exactly or _DEFAULT
+
+
+def _read_beam(described: SceneFile, given: dict[str, Any]) -> clsas.BeamWindow | None:
+    """Return a scene file's beam, changed by what is given, or the beam that is."""
+    beam = described.image.get("beam")
+    options = {"width_deg": "beam_deg", "shape": "beam_shape", "squint_deg": "squint_deg"}
+    changes = {key: given[name] for key, name in options.items() if given[name] is not None}
+    if beam is not None:
+        return replace(beam, **changes)
+    if changes and "width_deg" not in changes:
+        raise click.UsageError("--beam-shape and --squint-deg go with --beam-deg")
+    return clsas.BeamWindow(**changes) if changes else None
 
 
 def _options(described: dict[str, Any], **given: Any) -> dict[str, Any]:

@@ -26,12 +26,19 @@ from clsas.backproject import BEST_ACCURACY_DB
 from clsas.compress import check_options as check_compression
 from clsas.grid import Grid
 from clsas.interpolation import TAPS
+from clsas.planner import BEST_TOLERANCE_DB, WORST_TOLERANCE_DB
 from clsas.scene import PointTargets
 from clsas.simulate import check_options as check_simulation
 from clsas.sonar import Pulse, Sonar, line_array
 from clsas.track import Motion, Pointing, Track
+from clsas.window import BeamWindow
 
 PRESETS = ("thesis_wide_beam", "edgetech", "sensotek")
+
+DIAL = ("tolerance_db", "tolerance_wavelengths", "stages")
+"""Keys of `[image]` of which `clsas.plan` takes one."""
+EXACT = ("accuracy_db", "taps", "upsampling")
+"""Keys of `[image]` that `clsas.backproject` takes."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +52,8 @@ class SceneFile:
     sonar, track, targets, grid
         The tables of these names.
     simulate, compress, image : dict
-        Keyword arguments for `clsas.simulate`, `clsas.compress` and `clsas.backproject`.
+        Keyword arguments for `clsas.simulate` and `clsas.compress`, and for `clsas.plan` (one of
+        `DIAL`) or `clsas.backproject` (some of `EXACT`), either with a `beam`.
     """
 
     name: str
@@ -327,21 +335,61 @@ class _Compress(_Table):
         return options
 
 
+class _Beam(_Table):
+    width_deg: float
+    shape: str = "rectangular"
+    squint_deg: float = 0.0
+    taper: float = 0.5
+    element_length_m: float | None = None
+    normalise: bool = False
+
+    def build(self) -> BeamWindow:
+        with _in("[image.beam]"):
+            return BeamWindow(**self.given())
+
+
 class _Image(_Table):
-    accuracy_db: float = -60.0
+    tolerance_db: float | None = None
+    tolerance_wavelengths: float | None = None
+    stages: list[Annotated[list[int], Field(min_length=2, max_length=2)]] | None = None
+    accuracy_db: float | None = None
     taps: int | None = None
     upsampling: float | None = None
+    beam: _Beam | None = None
 
     def build(self) -> dict[str, Any]:
+        options = self.given()
         with _in("[image]"):
-            validate.number(
-                "accuracy_db", self.accuracy_db, "dB", least=BEST_ACCURACY_DB, below=0.0
-            )
+            dial = [name for name in DIAL if name in options]
+            if len(dial) > 1 or (dial and options.keys() & set(EXACT)):
+                others = [name for name in (*DIAL, *EXACT) if name in options and name != dial[0]]
+                raise ValueError(f"{dial[0]} must stand alone, got also {', '.join(others)}")
+            if self.tolerance_db is not None:
+                validate.number(
+                    "tolerance_db",
+                    self.tolerance_db,
+                    "dB",
+                    least=BEST_TOLERANCE_DB,
+                    most=WORST_TOLERANCE_DB,
+                )
+            if self.tolerance_wavelengths is not None:
+                validate.positive("tolerance_wavelengths", self.tolerance_wavelengths)
+            for beams, divisions in self.stages or []:
+                validate.count("QR of stages", beams)
+                validate.count("QI of stages", divisions)
+            if self.accuracy_db is not None:
+                validate.number(
+                    "accuracy_db", self.accuracy_db, "dB", least=BEST_ACCURACY_DB, below=0.0
+                )
             if self.taps is not None and self.taps not in TAPS:
                 raise ValueError(f"taps must be one of {TAPS}, got {self.taps}")
             if self.upsampling is not None:
                 validate.number("upsampling", self.upsampling, least=1.0, most=64.0)
-        return self.given()
+        if self.stages is not None:
+            options["stages"] = [tuple(stage) for stage in self.stages]
+        if self.beam is not None:
+            options["beam"] = self.beam.build()
+        return options
 
 
 class _Scene(_Table):

@@ -27,8 +27,10 @@ class Costs:
         Per subimage and channel in a stage: geometry and weights.
     sample_ns, sample_tap_ns : float
         Per aligned sample in a stage, and per tap of either filter.
+    leaf_ns : float
+        Per pixel and virtual channel of the last stage, with 4 taps.
     pixel_ns : float
-        Per pixel and channel of a backprojection with 4 taps.
+        Per pixel and channel of an exact image, with 4 taps.
     """
 
     upsampled_sample_ns: float = 12.0
@@ -37,7 +39,12 @@ class Costs:
     channel_ns: float = 30.0
     sample_ns: float = 0.35
     sample_tap_ns: float = 0.02
+    leaf_ns: float = 0.6
     pixel_ns: float = 0.6
+
+
+WITH_BEAM = 1.3
+"""What a beam multiplies the cost of a pixel and channel by."""
 
 
 def path() -> Path:

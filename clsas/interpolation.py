@@ -60,12 +60,16 @@ class Interpolator:
         [-1/2, 1/2] the position from the middle.
     error_db : float
         Predicted relative rms error of an evaluation of these lines, dB.
+    scatter_db : float
+        What is left of it once the mean of the filter's response over all positions, `response`, is
+        divided out of the lines beforehand.
     """
 
     taps: int
     upsampling: float
     coefficients: NDArray[np.float64]
     error_db: float
+    scatter_db: float
 
     def weights(self, nu: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the taps' weights at positions `nu` from the middle, shape [..., taps]."""
@@ -75,6 +79,17 @@ class Interpolator:
         )
         odd = odd * np.asarray(nu)[..., None]
         return np.concatenate([(even - odd)[..., ::-1], even + odd], axis=-1)
+
+    def response(self, frequency: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the gain at some frequencies, mean over all positions.
+
+        `frequency` is in cycles per sample before upsampling, from the spectral centre.
+        """
+        nu = np.linspace(-0.5, 0.5, _POSITIONS)
+        place = np.arange(self.taps) - (self.taps - 1) / 2
+        away = place - nu[:, None]
+        turns = np.asarray(frequency)[..., None, None] / self.upsampling * away
+        return np.mean(np.sum(self.weights(nu) * np.cos(2 * np.pi * turns), axis=-1), axis=-1)
 
 
 def measure_spectrum(lines: RangeLines, most_channels: int = 256) -> Spectrum:
@@ -128,7 +143,7 @@ def design(taps: int, upsampling: float, spectrum: Spectrum) -> Interpolator:
     # A floor keeps the empty part of the band from making the problem singular.
     share = np.sqrt(spectrum.power + 1e-13)[:, None]
     coefficients = np.empty((taps // 2, 2, taps // 2))
-    error = 0.0
+    residuals = []
     for part in (0, 1):
         matrix = basis[part].reshape(*aim[part].shape[:2], -1)
         wanted = aim[part][..., 0, 0]
@@ -138,9 +153,16 @@ def design(taps: int, upsampling: float, spectrum: Spectrum) -> Interpolator:
             weighted = (matrix * share[..., None]).reshape(-1, matrix.shape[-1])
             solution = lstsq(weighted, (wanted * share).ravel(), lapack_driver="gelsy")[0]
         coefficients[:, part] = solution.reshape(taps // 2, taps // 2)
-        residual = matrix @ solution - wanted
-        error += float(np.sum(spectrum.power * np.mean(residual**2, axis=1)))
-    return Interpolator(taps, upsampling, coefficients, 10 * np.log10(max(error, 1e-30)))
+        residuals.append(matrix @ solution - wanted)
+    # Turned back by the position it is the response less 1; its mean is real.
+    turned = aim[0][..., 0, 0] - 1j * aim[1][..., 0, 0]
+    error = (residuals[0] + 1j * residuals[1]) * turned
+    scatter = (error - (bias := error.mean(axis=1, keepdims=True).real)) / (1 + bias)
+    error_db, scatter_db = (
+        10 * np.log10(max(float(spectrum.power @ np.mean(np.abs(e) ** 2, axis=1)), 1e-30))
+        for e in (error, scatter)
+    )
+    return Interpolator(taps, upsampling, coefficients, error_db, scatter_db)
 
 
 def choose(
@@ -234,12 +256,26 @@ class Resampling:
         """Frequency made zero, cycles per (given) sample."""
         return self.shift_bins / self.fft_length
 
-    def apply(self, samples: NDArray[np.complexfloating]) -> NDArray[np.complexfloating]:
-        """Return lines [channels, n] upsampled, [channels, length], in their own precision."""
+    @property
+    def frequency(self) -> NDArray[np.float64]:
+        """Distance of every frequency of the FFT from the spectral centre, cycles per sample."""
+        return np.abs(scipy.fft.fftfreq(self.fft_length))
+
+    def apply(
+        self,
+        samples: NDArray[np.complexfloating],
+        gain: NDArray[np.float32] | None = None,
+    ) -> NDArray[np.complexfloating]:
+        """Return lines [channels, n] upsampled, [channels, length], in their own precision.
+
+        `gain` multiplies the spectrum at every `frequency`.
+        """
         padded = np.zeros((len(samples), self.fft_length), samples.dtype)
         padded[:, self.lead : self.lead + samples.shape[1]] = samples
         spectrum = scipy.fft.fft(padded, axis=1, workers=-1, overwrite_x=True)
         spectrum = np.roll(spectrum, -self.shift_bins, axis=1)
+        if gain is not None:
+            spectrum *= gain
         upper = self.fft_length // 2  # bins of negative frequency, at the end
         lower = self.fft_length - upper
         wide = np.zeros((len(samples), self.upsampled_length), samples.dtype)

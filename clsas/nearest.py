@@ -8,6 +8,13 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from clsas.aperture import mean_track, phase_centres_m
+from clsas.geometry import pairwise_range_m
+from clsas.grid import Grid
+from clsas.lines import RangeLines
+from clsas.plan import Plan
+from clsas.tree import Division
+
 Stages = Sequence[tuple[int, int]]
 """(QR, QI) of every stage: how many lines are summed, and the division of either image side."""
 
@@ -55,7 +62,9 @@ def stage_errors_m(
     Notes
     -----
     L_A L_I/(4 Rmin) for L_A <= Rmin, else L_I/2, with the subaperture's length L_A and the
-    subimage's side L_I after the stage.
+    subimage's side L_I after the stage. This bounds [40] with t = L_A/2 over the sector L_I/(2 r)
+    to either side, as |d rho/d angle| <= min(r, t). Channels lie less far out, at most
+    (QR - 1)/QR of t; subimages that are seen obliquely span up to sqrt(2) of the sector.
     """
     errors, length_m, side_m = [], aperture_m, image_m
     for beams, divisions in stages:
@@ -95,3 +104,49 @@ def operations(
         channels = math.ceil(channels / beams)
     counts.append(float(channels * pixels))
     return counts
+
+
+def plan_errors_m(
+    plan: Plan, lines: RangeLines, grid: Grid, pixels: ArrayLike
+) -> NDArray[np.float64]:
+    """Return the range errors that a plan of nearest beams makes, followed stage by stage.
+
+    Parameters
+    ----------
+    plan : Plan
+        Made with `stages`, at least one.
+    lines : RangeLines
+        Without motion during flight.
+    grid : Grid
+        A plane.
+    pixels : array_like of int, [n, 2]
+        Rows and columns.
+
+    Returns
+    -------
+    ndarray of float64, shape [n, channels]
+        The range at which a pixel takes a channel's line, less the right one; channels in order
+        along the track.
+
+    Notes
+    -----
+    [42] and [43] applied to every channel: in each stage its line is shifted so that the range of
+    the subimage's centre is right for the mean of its neighbours, which then stands for it.
+    """
+    order = np.argsort(mean_track(lines).place, kind="stable")
+    ends_m = lines.tx_m[order], lines.rx_m[order]
+    division = Division(grid, plan.sides)
+    pixels = np.asarray(pixels)
+    points_m = grid.origin_m + pixels[:, :1] * grid.row_step_m + pixels[:, 1:] * grid.column_step_m
+    errors_m = -pairwise_range_m(points_m, *ends_m)
+    position_m = phase_centres_m(lines)[order]
+    beam = np.arange(lines.channels)  # of the stage before, that holds each channel
+    for level, (side, beams) in enumerate(zip(plan.sides, plan.nearest, strict=True)):
+        centres_m = division.centres_m(level, pixels // side * side)
+        errors_m += pairwise_range_m(centres_m, *ends_m)[:, beam]
+        starts = np.arange(0, len(position_m), beams)
+        counts = np.diff(np.append(starts, len(position_m)))
+        position_m = np.add.reduceat(position_m, starts) / counts[:, None]
+        beam, ends_m = beam // beams, (position_m, position_m)
+        errors_m -= pairwise_range_m(centres_m, *ends_m)[:, beam]
+    return errors_m + pairwise_range_m(points_m, *ends_m)[:, beam]

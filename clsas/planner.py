@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
@@ -14,7 +14,7 @@ from scipy.spatial import KDTree
 
 from clsas import interpolation, validate
 from clsas.aperture import cycles_per_pixel, drift, mean_track, phase_centres_m, turned
-from clsas.costs import Costs
+from clsas.costs import WITH_BEAM, Costs
 from clsas.costs import load as load_costs
 from clsas.device import Device, open_device
 from clsas.geometry import pairwise_range_m
@@ -202,6 +202,10 @@ class View:
         """Return how far a phase turns while it is seen, on average over the spots."""
         return float(turned(self.track, np.where(seen, rates, 0.0), floor=0.0)[:, -1].mean())
 
+    def turns(self, side: tuple[int, int], seen: NDArray[np.bool_]) -> float:
+        """Return `cycles` of the phases of subimages of a size."""
+        return self.cycles(side[0] * self.rates[0] + side[1] * self.rates[1], seen)
+
     @functools.cached_property
     def slopes_m(self) -> tuple[float, float]:
         """Largest change of range per row and per column."""
@@ -240,11 +244,6 @@ class _Filters:
     aperture: Interpolator
     final: Interpolator
 
-    def error_db(self, stages: int) -> float:
-        """Return the error of every interpolation of a plan, added in power."""
-        each = _power(self.align) + _power(self.aperture)
-        return _decibel(stages * each + _power(self.final))
-
 
 def _search(
     view: View,
@@ -277,6 +276,7 @@ def _search(
     leaf_error = _leaf_error(view, sides, device)
     reach_m = np.array([view.reach_m(side) for side in sides])
 
+    leaf_ns = costs.leaf_ns * (1.0 if view.beam is None else WITH_BEAM)
     for_beam = 0.0
     if view.beam is not None:
         for_beam = beam_cycles * np.array([view.cycles(view.beam_rates, s) for s in seen])
@@ -300,7 +300,7 @@ def _search(
             used = density * cycles + 2 * filters.aperture.taps
             step = np.where(divides.T, used * per_channel[:, None], np.inf)
             last = np.prod(-(-np.array(grid.shape) // sides) * sides, axis=1) * nodes
-            last = last * costs.pixel_ns * interpolation.COST[filters.final.taps]
+            last = last * leaf_ns * interpolation.COST[filters.final.taps]
             last = last + counts * nodes * costs.channel_ns
             last[leaf_error > 0.1 * 10 ** (tolerance_db / 10)] = np.inf
             total, path = first, []
@@ -329,27 +329,27 @@ def _candidates(spectrum: Spectrum, tolerance_db: float, stages: int) -> list[_F
     flat = Spectrum(0.0, (np.arange(64) + 0.5) / 128, np.full(64, 1 / 64))
     result = []
     for align_taps, aperture_taps in product(_ALIGN_TAPS, _APERTURE_TAPS):
-        align = _least(align_taps, _RATES, each_db, spectrum)
-        aperture = _least(aperture_taps, _DENSITIES, each_db, flat)
+        align = _least(align_taps, _RATES, each_db, spectrum, "scatter_db")
+        aperture = _least(aperture_taps, _DENSITIES, each_db, flat, "error_db")
         if align is None or aperture is None:
             continue
         finals = (interpolation.design(t, align.upsampling, spectrum) for t in _FINAL_TAPS)
-        final = next((f for f in finals if f.error_db <= each_db), None)
+        final = next((f for f in finals if f.scatter_db <= each_db), None)
         if final is not None:
             result.append(_Filters(align, aperture, final))
     return result
 
 
 def _least(
-    taps: int, rates: Sequence[float], error_db: float, spectrum: Spectrum
+    taps: int, rates: Sequence[float], wanted_db: float, spectrum: Spectrum, error: str
 ) -> Interpolator | None:
     """Return the interpolator with the least upsampling that errs by no more."""
     low, high = 0, len(rates) - 1
-    if _designed(taps, rates[high], spectrum).error_db > error_db:
+    if getattr(_designed(taps, rates[high], spectrum), error) > wanted_db:
         return None
     while low < high:
         middle = (low + high) // 2
-        if _designed(taps, rates[middle], spectrum).error_db <= error_db:
+        if getattr(_designed(taps, rates[middle], spectrum), error) <= wanted_db:
             high = middle
         else:
             low = middle + 1
@@ -396,7 +396,7 @@ def _plan(
     resampling = interpolation.resampling(lines.length, align, view.spectrum)
     halves = view.half_lengths(sides, align, final, resampling.ratio)
     density = 2 * aperture.upsampling
-    stages, channels, total, root_bytes = [], float(lines.channels), 0.0, 0
+    stages, channels, root_bytes = [], float(lines.channels), 0.0
     width = device.info.width
     sample_ns = costs.sample_ns + costs.sample_tap_ns * (align.taps + aperture.taps)
     used = channels * view.seen(*sides[0])[:, view.on_track].mean()
@@ -404,9 +404,9 @@ def _plan(
         count = math.prod(-(-n // s) for n, s in zip(grid.shape, side, strict=True))
         samples = -(-(2 * halves[level] + 1) // width) * width
         seen = view.seen(*side)
-        turns = sum(view.cycles(n * rate, seen) for n, rate in zip(side, view.rates, strict=True))
+        turns = view.turns(side, seen)
         if level:
-            used = min(channels, density * before(seen) + 2 * aperture.taps)
+            used = min(channels, density * view.turns(sides[level - 1], seen) + 2 * aperture.taps)
         if nearest:
             used = channels
             channels = math.ceil(channels / nearest[level][0])
@@ -419,24 +419,20 @@ def _plan(
         if not level:
             seconds += 1e-9 * count * lines.channels * costs.reference_ns
             seconds += 1e-9 * costs.upsampled_sample_ns * lines.channels * resampling.length
-        error = _power(align) + (0.0 if nearest else _power(aperture))
+        error = _power(align) if nearest else 10 ** (align.scatter_db / 10) + _power(aperture)
         stages.append(
             Stage(*side, count, round(channels), samples, operations, _decibel(error), seconds)
         )
         per_root = math.prod(a // b for a, b in zip(sides[0], side, strict=True))
         root_bytes += 8 * per_root * (1.3 * channels + 2) * (samples + 2 * GUARD)
 
-        def before(seen: NDArray[np.bool_], side: tuple[int, int] = side) -> float:
-            return sum(
-                view.cycles(n * rate, seen) for n, rate in zip(side, view.rates, strict=True)
-            )
-
     pixels = count * math.prod(side)
     operations = pixels * channels
-    seconds = 1e-9 * costs.pixel_ns * interpolation.COST[final.taps] * operations
+    leaf_ns = costs.leaf_ns * (1.0 if view.beam is None else WITH_BEAM)
+    seconds = 1e-9 * leaf_ns * interpolation.COST[final.taps] * operations
     seconds += 1e-9 * count * channels * costs.channel_ns
     stages.append(
-        Stage(*side, count, round(channels), samples, operations, final.error_db, seconds)
+        Stage(*side, count, round(channels), samples, operations, final.scatter_db, seconds)
     )
     root_bytes += 8 * math.prod(sides[0]) + 60 * per_root * (channels + 16)
     line_bytes = 8 * lines.channels * (resampling.length + 4 * halves[0] + 128)
@@ -484,13 +480,10 @@ def _motion_error(view: View, side: tuple[int, int]) -> float:
     positions, and motion during flight.
     """
     lines, track = view.lines, view.track
-    some = lines.select(np.arange(0, lines.channels, -(-lines.channels // _CHANNELS)))
-    from dataclasses import replace
-
     index = np.arange(0, lines.channels, -(-lines.channels // _CHANNELS))
+    some = lines.select(index)
     part = replace(track, place=track.place[index])
     random = np.random.default_rng(0)
-    rows, columns = view.grid.shape
     power = []
     for spot_m in view.spots_m[:: max(len(view.spots_m) // 8, 1)]:
         offset_m = random.uniform(-0.5, 0.5, (_PIXELS, 2)) * side @ view.steps_m
@@ -560,7 +553,7 @@ def _nearest(view: View, stages: Sequence[tuple[int, int]], device: Device, cost
         sides.append(leaf)
         leaf = leaf[0] * divisions, leaf[1] * divisions
     linear = interpolation.design(2, NEAREST_UPSAMPLING, view.spectrum)
-    beams = Interpolator(1, 1.0, np.zeros((0, 2, 0)), 0.0)
+    beams = Interpolator(1, 1.0, np.zeros((0, 2, 0)), 0.0, 0.0)
     return _plan(view, None, _Filters(linear, beams, linear), sides[::-1], device, costs, stages)
 
 
@@ -642,8 +635,10 @@ def _exact(view: View, tolerance_db: float | None, device: Device, costs: Costs)
 def _exact_seconds(view: View, costs: Costs) -> float:
     lines = view.lines
     share = 1.0
-    if view.beam is not None and view.track is not None:
-        share = view.seen(16, 16)[:, view.on_track].mean()
+    if view.beam is not None:
+        share = WITH_BEAM
+        if view.track is not None:
+            share *= view.seen(32, 32)[:, view.on_track].mean()
     pairs = lines.channels * view.grid.size * share
     return 1e-9 * (costs.pixel_ns * pairs + 2 * costs.upsampled_sample_ns * lines.samples.size)
 

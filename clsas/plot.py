@@ -19,6 +19,7 @@ from clsas.image import Image
 from clsas.io import replacing
 from clsas.lines import RangeLines
 from clsas.quality import Cut, PointResponse
+from clsas.tradeoff import Tradeoff
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -177,6 +178,71 @@ def range_lines(lines: RangeLines, *, dynamic_range_db: float = 60.0, title: str
     extent = (-0.5, lines.channels - 0.5, first_m, last_m)
     figure, axes = _draw_levels(amplitude, extent, dynamic_range_db, None)
     axes.set(xlabel="channel", ylabel="range (m)", title=title, aspect="auto")
+    return figure
+
+
+def tradeoff(measured: Tradeoff, *, title: str = "") -> Figure:
+    """Draw the time of every image over its error, and what was predicted of it.
+
+    Parameters
+    ----------
+    measured : Tradeoff
+        From `clsas.tradeoff`.
+    title : str
+        Put above, before the sizes and the device.
+
+    Raises
+    ------
+    ImportError
+        If matplotlib is not installed.
+    TypeError
+        If `measured` is of another type.
+    """
+    validate.instance("measured", measured, Tradeoff)
+    figure = _figure(7.0, 5.0)
+    axes = figure.subplots()
+    front = [(row.error_db, row.seconds) for row in measured.front]
+    axes.plot(*zip(*front, strict=True), color="0.7", linewidth=1.5, zorder=1, label="Pareto front")
+    for method, color, marker, label in (
+        ("tolerance", "tab:blue", "o", "to a tolerance"),
+        ("stages", "tab:orange", "s", "thesis's method, QR x QI per stage"),
+        ("exact", "black", "D", "exact"),
+    ):
+        rows = [row for row in measured.rows if row.method == method]
+        if not rows:
+            continue
+        errors_db = [row.error_db for row in rows]
+        axes.plot(errors_db, [row.seconds for row in rows], marker, color=color, label=label)
+        axes.plot(
+            [row.predicted_error_db for row in rows],
+            [row.predicted_seconds for row in rows],
+            marker,
+            color=color,
+            fillstyle="none",
+            alpha=0.6,
+        )
+        for row in rows:
+            axes.annotate(
+                row.label,
+                (row.error_db, row.seconds),
+                xytext=(5, 5),
+                textcoords="offset points",
+                fontsize="x-small",
+                color=color,
+            )
+    axes.plot([], [], "o", color="0.5", fillstyle="none", label="predicted (hollow)")
+    axes.set(
+        yscale="log",
+        xlabel="relative rms error against the exact image (dB)",
+        ylabel="time of the image (s)",
+    )
+    axes.invert_xaxis()  # the better the further right
+    sizes = f"{measured.channels} lines, {' x '.join(map(str, measured.pixels))} pixels"
+    axes.set_title(
+        ", ".join(filter(None, (title, sizes))) + f"\n{measured.device}", fontsize="small"
+    )
+    axes.grid(alpha=0.3, which="both")
+    axes.legend(loc="best", fontsize="small")
     return figure
 
 

@@ -181,10 +181,10 @@ def beam_directions(
 def beam_rate(
     beam: BeamWindow, track: MeanTrack, along: NDArray[np.float64], points_m: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return how fast a beam's weights change along the track, as a rate of phases, [points, samples].
+    """Return how fast a beam's weights change along the track, as a rate of phases.
 
-    Nodes must be dense enough for the weights too: a cycle over an edge of the window.
-    `along` is the track's direction at `track.samples`.
+    That is [points, samples]: nodes must be dense enough for the weights too, with a cycle over an
+    edge of the window. `along` is the track's direction at `track.samples`.
     """
     sight = points_m[:, None] - track.positions_m(track.samples)
     sight /= np.maximum(np.linalg.norm(sight, axis=-1, keepdims=True), 1e-9)

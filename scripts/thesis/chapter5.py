@@ -1,0 +1,292 @@
+"""The scene of THESIS chapter 5 (Odegaard 2004), and what its figures' scripts share.
+
+One point reflector in the middle of 5 m x 5 m from 40 m, seen by 10 pings of 64 receivers: 640
+phase centres over 5.28 m at 1 MHz. The thesis gives no bandwidth; 100 kHz is chosen here.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import math
+import statistics
+import time
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+
+import clsas
+from clsas import nearest, plot
+from clsas.device import Device, open_device
+from clsas.sonar import Sonar, line_array
+
+Stages = Sequence[tuple[int, int]]  # (QR, QI)
+
+WAVELENGTH_M = 1.5e-3
+SPACING_M = 8.25e-3
+SIDE_M, PIXELS = 5.0, 1024
+NEAREST_M = 40.0
+ACCURACY_DB = -60.0  # of plain backprojection: exact beside any plan here
+GUARD_M = 25e-3  # around the point: what is beyond counts as a far side lobe
+WIDTH, PSLR_DB, LOSS_DB = 1.2, 3.0, 3.0  # how much worse a usable image may be
+
+
+@dataclass(frozen=True)
+class Scene:
+    """The point, its lines and its image.
+
+    Attributes
+    ----------
+    device : Device
+    pixels : int
+        Along either side; the pixel stays 4.9 mm, so that fewer make a smaller scene.
+    bistatic : bool
+        Whether every receiver stands where it is, half an array from the transmitter; else
+        transmitter and receiver stand at their phase centre (THESIS [32]).
+    """
+
+    device: Device
+    pixels: int = PIXELS
+    bistatic: bool = False
+
+    @property
+    def side_m(self) -> float:
+        """Of the image: [45]'s L_I before the first stage."""
+        return SIDE_M * self.pixels / PIXELS
+
+    @cached_property
+    def grid(self) -> clsas.Grid:
+        """The image's grid."""
+        half = (self.side_m - SIDE_M / PIXELS) / 2
+        middle = NEAREST_M + self.side_m / 2
+        return clsas.Grid.plane(
+            (-half, half, self.pixels), (middle - half, middle + half, self.pixels)
+        )
+
+    @property
+    def point_m(self) -> tuple[float, float]:
+        """Where the reflector is: in the middle, where subimages of every stage meet."""
+        return 0.0, NEAREST_M + self.side_m / 2
+
+    @cached_property
+    def lines(self) -> clsas.RangeLines:
+        """The reflector's compressed lines, with the elements' beam patterns."""
+        thesis = Sonar.thesis_wide_beam()
+        pings, spacing_m = 10, 64 * SPACING_M
+        sonar = thesis
+        if not self.bistatic:
+            pings, spacing_m = 640, SPACING_M
+            sonar = Sonar(
+                thesis.pulse, line_array(1, SPACING_M), tx_length_m=15e-3, rx_length_m=15e-3
+            )
+        track = clsas.Track.straight(
+            ((1 - pings) / 2 * spacing_m, 0, 0), (spacing_m, 0, 0), pings, ping_interval_s=1.0
+        )
+        point = clsas.PointTargets([[*self.point_m, 0.0]])
+        return clsas.compress(clsas.simulate(sonar, track, point), oversampling=1.25)
+
+    @cached_property
+    def exact(self) -> clsas.Image:
+        """The image by plain backprojection."""
+        return self.backproject()
+
+    def backproject(self) -> clsas.Image:
+        """Form the exact image."""
+        return clsas.backproject(self.lines, self.grid, accuracy_db=ACCURACY_DB, device=self.device)
+
+    def plan(self, **wish: object) -> clsas.Plan:
+        """Return a plan by `stages`, `tolerance_db` or `tolerance_wavelengths`."""
+        return clsas.plan(self.lines, self.grid, device=self.device, **wish)
+
+    def form(self, plan: clsas.Plan) -> clsas.Image:
+        """Form the image by a plan."""
+        return clsas.factorize(self.lines, self.grid, plan, device=self.device)
+
+    def error_m(self, stages: Stages) -> float:
+        """Return the error of all stages by [45]."""
+        return sum(nearest.stage_errors_m(stages, SPACING_M, self.side_m, NEAREST_M))
+
+    def largest_error_m(self, plan: clsas.Plan) -> float:
+        """Return the largest range error that a nearest-beam plan makes, over 2000 pixels."""
+        random = np.random.default_rng(1)
+        pixels = random.integers(0, self.pixels, (2000, 2))
+        ends = [0, self.pixels // 2 - 1, self.pixels // 2, self.pixels - 1]
+        pixels = np.concatenate([pixels, list(product(ends, ends))])
+        return float(np.abs(nearest.plan_errors_m(plan, self.lines, self.grid, pixels)).max())
+
+    @cached_property
+    def exact_quality(self) -> Quality:
+        """What is measured on the exact image."""
+        return self.measure(self.exact)
+
+    def measure(self, image: clsas.Image) -> Quality:
+        """Measure the point in an image."""
+        x_m, _ = image.grid.axes_m
+        level = profile(image)
+        peak = np.abs(self.exact.pixels).max()
+        far = np.abs(x_m - self.point_m[0]) > GUARD_M
+        error_db = -math.inf
+        if image is not self.exact:
+            error_db = clsas.relative_error_db(image, self.exact)
+        nothing = Quality(math.nan, math.nan, math.nan, math.nan, error_db)
+        try:
+            with warnings.catch_warnings():
+                # A side lobe above the peak is what a broken image has.
+                warnings.simplefilter("ignore", clsas.ClsasWarning)
+                found = clsas.measure_point(image, self.point_m, search_m=GUARD_M)
+        except ValueError:
+            return nothing  # no point response is left
+        highest = level[far].max(initial=1e-30) / found.amplitude
+        cut = found.azimuth
+        return Quality(
+            cut.resolution_m,
+            max(*cut.pslr_db, 20 * math.log10(highest)),
+            cut.islr_db,
+            20
+            * math.log10(peak / np.abs(image.pixels).max(initial=1e-30, where=near(self, image))),
+            error_db,
+        )
+
+
+@dataclass(frozen=True)
+class Quality:
+    """What is measured on the point.
+
+    Attributes
+    ----------
+    resolution_m : float
+        -3 dB width in azimuth.
+    pslr_db : float
+        Highest side lobe over the peak: along azimuth through it, or anywhere else beyond
+        `GUARD_M` in azimuth.
+    islr_db : float
+        Energy of the nearest 10 side lobes to either side over the main lobe's, in azimuth.
+    loss_db : float
+        Exact peak over this one.
+    error_db : float
+        Relative rms error of the whole image against the exact one.
+    """
+
+    resolution_m: float
+    pslr_db: float
+    islr_db: float
+    loss_db: float
+    error_db: float
+
+    def usable(self, exact: Quality) -> bool:
+        """Whether the point is still one: as wide, as clean and as strong, nearly."""
+        return (
+            abs(self.resolution_m / exact.resolution_m - 1) <= WIDTH - 1
+            and self.pslr_db <= exact.pslr_db + PSLR_DB
+            and self.loss_db <= LOSS_DB
+        )
+
+    def cells(self) -> dict[str, str]:
+        """Return columns of a table."""
+        return {
+            "azimuth mm": f"{1e3 * self.resolution_m:.2f}",
+            "PSLR dB": f"{self.pslr_db:.1f}",
+            "ISLR dB": f"{self.islr_db:.1f}",
+            "loss dB": f"{self.loss_db:.2f}",
+            "image error dB": f"{self.error_db:.1f}",
+        }
+
+
+def near(scene: Scene, image: clsas.Image) -> np.ndarray:
+    """Return which pixels lie within `GUARD_M` of the point."""
+    x_m, y_m = image.grid.axes_m
+    x, y = scene.point_m
+    return (np.abs(y_m - y) <= GUARD_M)[:, None] & (np.abs(x_m - x) <= GUARD_M)
+
+
+def profile(image: clsas.Image) -> np.ndarray:
+    """Return the thesis's azimuth point-spread function: the maximum over range."""
+    return np.abs(image.pixels).max(axis=0)
+
+
+def decibels(amplitude: np.ndarray, reference: float) -> np.ndarray:
+    """Return levels over a reference, not below -200 dB."""
+    return 20 * np.log10(np.maximum(amplitude / reference, 1e-10))
+
+
+def fraction(error_m: float) -> str:
+    """Write an error as a part of the wavelength."""
+    return f"λ/{WAVELENGTH_M / error_m:.4g}"
+
+
+def name(stages: Stages) -> str:
+    """Write stages as QR x QI."""
+    return " ".join(f"{beams}x{divisions}" for beams, divisions in stages) or "backprojection"
+
+
+def equal_stages(number: int) -> Stages:
+    """Return the thesis's plan of some stages with QR = QI = 2; one stage is backprojection."""
+    return [(2, 2)] * (number - 1)
+
+
+def in_turn(work: dict[object, Callable[[], object]], repeats: int) -> dict[object, float]:
+    """Return the median seconds of every piece of work, done in turn after one warm-up."""
+    taken: dict[object, list[float]] = {key: [] for key in work}
+    for repeat in range(repeats + 1):
+        for key, do in work.items():
+            start = time.perf_counter()
+            do()
+            if repeat:
+                taken[key].append(time.perf_counter() - start)
+    return {key: statistics.median(each) for key, each in taken.items()}
+
+
+def arguments(description: str, repeats: int | None = None) -> tuple[argparse.Namespace, Scene]:
+    """Return what the command line says, and the scene for it."""
+    parser = argparse.ArgumentParser(description=description.splitlines()[0])
+    parser.add_argument("--out", type=Path, default=Path("thesis"), help="folder for CSV and PNG")
+    parser.add_argument("--device", help="as `clsas devices` lists it; the fastest unless given")
+    parser.add_argument(
+        "--pixels", type=int, default=PIXELS, help="along either side, 4.9 mm each (%(default)s)"
+    )
+    parser.add_argument(
+        "--bistatic", action="store_true", help="with receivers apart from the transmitter"
+    )
+    if repeats is not None:
+        parser.add_argument(
+            "--repeats", type=int, default=repeats, help="timed runs of each (%(default)s)"
+        )
+    given = parser.parse_args()
+    given.out.mkdir(parents=True, exist_ok=True)
+    scene = Scene(open_device(given.device), given.pixels, given.bistatic)
+    print(
+        f"{scene.device.info.label}: {scene.lines.channels} lines, {given.pixels} x {given.pixels} "
+        f"pixels of {scene.side_m:g} m x {scene.side_m:g} m from {NEAREST_M:g} m"
+    )
+    return given, scene
+
+
+def report(out: Path, stem: str, rows: Sequence[dict[str, object]]) -> None:
+    """Print rows as a Markdown table and write them as CSV."""
+    header = list(rows[0])
+    print("|", " | ".join(header), "|")
+    print("|", " | ".join("---" for _ in header), "|")
+    for row in rows:
+        print("|", " | ".join(str(row[column]) for column in header), "|")
+    with open(out / f"{stem}.csv", "w", newline="") as file:
+        writer = csv.DictWriter(file, header)
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+def figure(width: float = 6.0, height: float = 4.0):
+    """Return an empty matplotlib figure."""
+    from matplotlib.figure import Figure
+
+    return Figure(figsize=(width, height), layout="constrained")
+
+
+def save(drawn, out: Path, stem: str, dpi: float = 100.0) -> None:
+    """Write a figure as PNG."""
+    plot.save_png(drawn, out / f"{stem}.png", dpi=dpi)
+    print(f"wrote {out / stem}.csv and .png")

@@ -1,0 +1,90 @@
+#!/usr/bin/env python3
+"""THESIS figures 21 to 36: images and azimuth responses by errors; and of interpolated plans."""
+
+import chapter5
+import numpy as np
+from chapter5 import decibels
+
+# Three beams into one, and sides divided by powers of two: within 3 % of lambda/121.2, /60.6,
+# /30.3 ... /1.9, of which the thesis's labels 121, 60, 30, 15, 7, 3 and 1 are the whole parts.
+ERRORS = {121: (3, 64), 60: (3, 32), 30: (3, 16), 15: (3, 8), 7: (3, 4), 3: (3, 2), 1: (6, 2)}
+# The halving from 30.3, which the thesis gives for QR = 2 and QI = 4, by powers of two.
+HALVINGS = {121: (2, 16), 60: (2, 8), 30: (2, 4), 15: (2, 2), 7: (4, 2), 3: (8, 2), 1: (16, 2)}
+TOLERANCES_DB = (-20, -40)
+DYNAMIC_RANGE_DB = 40  # as in the thesis's pictures
+PANEL = 256  # dots along a picture's side
+
+
+def coarse(amplitude: np.ndarray) -> np.ndarray:
+    """Return the greatest of the pixels that share a dot."""
+    for axis in (0, 1):
+        count = amplitude.shape[axis]
+        first = np.linspace(0, count, min(count, PANEL), endpoint=False).astype(int)
+        amplitude = np.maximum.reduceat(amplitude, first, axis)
+    return amplitude
+
+
+def main() -> None:
+    given, scene = chapter5.arguments(__doc__)
+    images = {"backprojection": scene.exact}
+    rows = [
+        {
+            "image": "backprojection", "QR x QI": "", "[45]": "", "measured": "",
+            **scene.exact_quality.cells(), "usable": "yes",
+        }
+    ]  # fmt: skip
+
+    def add(title: str, plan, stages=None, kept: bool = True) -> None:
+        image = scene.form(plan)
+        quality = scene.measure(image)
+        rows.append(
+            {
+                "image": title,
+                "QR x QI": chapter5.name(stages) if stages else "",
+                "[45]": chapter5.fraction(scene.error_m(stages)) if stages else "",
+                "measured": chapter5.fraction(scene.largest_error_m(plan)) if stages else "",
+                **quality.cells(),
+                "usable": "yes" if quality.usable(scene.exact_quality) else "no",
+            }
+        )
+        if kept:
+            images[title] = image
+
+    for label, pair in ERRORS.items():
+        add(f"nearest, λ/{label}", scene.plan(stages=[pair]), [pair])
+    for db in TOLERANCES_DB:
+        add(f"interpolated, {db} dB", scene.plan(tolerance_db=db))
+    for label, pair in HALVINGS.items():
+        add(f"nearest, thesis's λ/{label}?", scene.plan(stages=[pair]), [pair], kept=False)
+    chapter5.report(given.out, "figures_21_36", rows)
+
+    x_m, y_m = scene.grid.axes_m
+    half = (x_m[1] - x_m[0]) / 2
+    extent = (x_m[0] - half, x_m[-1] + half, y_m[0] - half, y_m[-1] + half)
+    pictures, responses = chapter5.figure(13, 5.6), chapter5.figure(13, 5.6)
+    panels = pictures.subplots(2, 5, sharex=True, sharey=True).ravel()
+    curves = responses.subplots(2, 5, sharex=True, sharey=True).ravel()
+    for (title, image), panel, curve in zip(images.items(), panels, curves, strict=True):
+        amplitude = np.abs(image.pixels)
+        level = decibels(coarse(amplitude), amplitude.max())
+        drawn = panel.imshow(
+            level, origin="lower", extent=extent, cmap="gray", vmin=-DYNAMIC_RANGE_DB, vmax=0
+        )
+        panel.set(title=title, aspect="equal")
+        response = chapter5.profile(image)
+        # The thesis's responses are each over their own peak; over the exact one the loss shows.
+        curve.plot(x_m, decibels(response, chapter5.profile(scene.exact).max()), linewidth=0.8)
+        curve.set(title=title, ylim=(-80, 3))
+        curve.grid(alpha=0.3)
+    for below, left in ((panels[5:], panels[::5]), (curves[5:], curves[::5])):
+        for axes in below:
+            axes.set_xlabel("azimuth (m)")
+        for axes in left:
+            axes.set_ylabel("range (m)" if axes in panels else "over the exact peak (dB)")
+    pictures.colorbar(drawn, ax=list(panels), label="over the picture's peak (dB)", shrink=0.8)
+    chapter5.save(pictures, given.out, "figures_21_36_images", dpi=72)
+    chapter5.save(responses, given.out, "figures_21_36", dpi=72)
+
+
+if __name__ == "__main__":
+    main()
