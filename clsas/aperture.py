@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,6 +12,7 @@ from scipy.interpolate import BSpline, make_lsq_spline
 
 from clsas.grid import Grid
 from clsas.lines import RangeLines
+from clsas.window import BeamWindow
 
 _POINTS = 257  # along the track, where rates are evaluated
 _BEYOND = 12  # points past either end, each twice as far as the one before
@@ -42,7 +45,7 @@ class MeanTrack:
         """Return the derivative of the position by the parameter, [..., 3]."""
         return self.spline(np.clip(place, 0, 1), 1)
 
-    @property
+    @functools.cached_property
     def samples(self) -> NDArray[np.float64]:
         """Parameters at which rates along the curve are evaluated, past its ends too, [n]."""
         beyond = 2.0 ** np.arange(1 - _BEYOND, 1) * 4
@@ -141,6 +144,9 @@ def cycles_per_pixel(
     sides: tuple[int, int],
     cycles_per_m: float,
     nearest_m: float,
+    beam: BeamWindow | None = None,
+    along: NDArray[np.float64] | None = None,
+    every: int = 1,
 ) -> NDArray[np.float64]:
     """Return how fast phases turn along the track for subimages inside larger ones.
 
@@ -158,26 +164,38 @@ def cycles_per_pixel(
         Phase per metre of range.
     nearest_m : float
         Distance below which the track is taken not to come.
+    beam : BeamWindow, optional
+        What it does not see does not count.
+    along : float64 [samples, 3]
+        With a beam, the track's unit direction at `track.samples`.
+    every : int
+        Of the track's samples only one in so many.
 
     Returns
     -------
     float64 [2, n, samples]
         Per row and per column, at `track.samples`.
     """
-    place = track.samples
+    place = track.samples[::every]
+    along = along if along is None else along[::every]
     position, tangent = track.positions_m(place), track.tangents_m(place)
     steps = np.stack([grid.row_step_m, grid.column_step_m])
     tangent_steps = tangent @ steps.T
     rates = np.zeros((len(centres_m), len(place), 2))
-    for down in (-0.5, 0, 0.5):
-        for right in (-0.5, 0, 0.5):
-            corner = down * sides[0] * grid.row_step_m + right * sides[1] * grid.column_step_m
-            sight = (centres_m + corner)[:, None] - position
-            distance = np.maximum(np.linalg.norm(sight, axis=-1), nearest_m)
-            sight /= distance[..., None]
-            along = np.einsum("psi,si->ps", sight, tangent)
-            turn = np.abs(tangent_steps - along[..., None] * (sight @ steps.T))
-            np.maximum(rates, turn / distance[..., None], out=rates)
+    across = np.linspace(-0.5, 0.5, 3 if beam is None else 5)
+    extents_m = np.array(sides)[:, None] * steps
+    between_m = np.linalg.norm(np.abs(extents_m).sum(axis=0)) * (across[1] - across[0]) / 2
+    for down, right in product(across, across):
+        sight = (centres_m + [down, right] @ extents_m)[:, None] - position
+        distance = np.maximum(np.linalg.norm(sight, axis=-1), nearest_m)
+        sight /= distance[..., None]
+        turn = np.einsum("psi,si->ps", sight, tangent)[..., None] * (sight @ steps.T)
+        turn = np.abs(tangent_steps - turn) / distance[..., None]
+        if beam is not None:
+            low, high = beam.limits
+            sine, reach = np.einsum("psi,si->ps", sight, along), between_m / distance
+            turn[(sine + reach < low) | (sine - reach > high)] = 0
+        np.maximum(rates, turn, out=rates)
     return cycles_per_m / 2 * np.moveaxis(rates, -1, 0)
 
 

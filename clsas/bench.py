@@ -214,7 +214,7 @@ def run_factorized(
     repeats : int
         Timed runs of either, after one that builds the kernels.
     progress : callable, optional
-        Called as progress(images done, images).
+        Called as progress(runs done, runs).
 
     Returns
     -------
@@ -230,32 +230,30 @@ def run_factorized(
     else:
         name = f"{case.channels} channels"
     device = open_device(device)
-    lines, grid, images, done = case.lines(), case.grid, 2 * repeats + 3, 0
+    lines, grid = case.lines(), case.grid
     start = time.perf_counter()
     chosen = plan(lines, grid, tolerance_db=tolerance_db, beam=case.beam, device=device)
     plan_seconds = time.perf_counter() - start
-    imagers = {
-        "factorized": partial(factorize, lines, grid, chosen, device=device),
-        "exact": partial(
-            backproject, lines, grid, accuracy_db=tolerance_db, beam=case.beam, device=device
-        ),
-    }
-    seconds: dict[str, list[float]] = {name: [] for name in imagers}
-    for _ in range(repeats + 1):
-        for imager, form in imagers.items():
-            start = time.perf_counter()
-            image = form()
-            seconds[imager].append(time.perf_counter() - start)
-            if imager == "factorized":
-                fast = image
-            done += 1
-            if progress is not None:
-                progress(done, images)
-    del image
-    exact = backproject(lines, grid, accuracy_db=REFERENCE_DB, beam=case.beam, device=device)
+    fast = partial(factorize, lines, grid, chosen, device=device)
+    exact = partial(backproject, lines, grid, beam=case.beam, device=device)
+    images = [fast(), exact(accuracy_db=REFERENCE_DB)]
+    error_db = relative_error_db(*images)
+    del images
+    fast_seconds: list[float] = []
+    exact_seconds: list[float] = []
+    exact(accuracy_db=tolerance_db)
+    for repeat in range(repeats):
+        if progress is not None:
+            progress(repeat + 1, repeats + 1)
+        start = time.perf_counter()
+        fast()
+        middle = time.perf_counter()
+        exact(accuracy_db=tolerance_db)
+        fast_seconds.append(middle - start)
+        exact_seconds.append(time.perf_counter() - middle)
     if progress is not None:
-        progress(images, images)
-    taken, exactly = (_statistics(seconds[imager][1:]) for imager in imagers)
+        progress(repeats + 1, repeats + 1)
+    taken, exactly = _statistics(fast_seconds), _statistics(exact_seconds)
     return {
         "case": name,
         "device": device.info.label,
@@ -268,7 +266,7 @@ def run_factorized(
         "plan_seconds": plan_seconds,
         "exact_seconds": exactly | {"included": "all of clsas.backproject, as accurate"},
         "speedup": exactly["median"] / taken["median"],
-        "error_db": relative_error_db(fast, exact),
+        "error_db": error_db,
         "predicted_error_db": chosen.predicted_error_db,
         "predicted_seconds": chosen.predicted_seconds,
         "predicted_exact_seconds": chosen.exact_seconds,

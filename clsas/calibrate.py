@@ -46,8 +46,8 @@ def calibrate(
     Returns
     -------
     Costs
-        Fitted with least squares, and none below zero, to the times of some images of a built-in scene;
-        the least of three runs each.
+        None below zero, fitted with least relative squares to the times of some images of a
+        built-in scene, the least of three runs each.
 
     Raises
     ------

@@ -18,7 +18,7 @@ from clsas.grid import Grid
 from clsas.image import Image
 from clsas.layout import STACK
 from clsas.lines import RangeLines
-from clsas.plan import GUARD, Plan
+from clsas.plan import GUARD, Plan, margin, padded_length
 from clsas.planner import plan
 from clsas.tree import Division, Nodes, Ranges
 from clsas.window import INTERVALS, BeamWindow
@@ -199,10 +199,8 @@ class _Run:
         self.expand = device.kernel("backproject", "expand_tiles", **last)
         self.backproject = device.kernel("backproject", "backproject_tiles", **last)
         self.per_sine, self.beam = beam_arguments(device, chosen.beam, lines)
-        # Zeros around a line: a subimage may reach beyond its end, or lie outside it.
-        self.margin = 2 * self.levels[0].half + 64
-        self.pitch = -(-(resampling.length + 2 * self.margin) // 16) * 16
-        self.pitch += 16 * (self.pitch % 256 == 0)
+        self.margin = margin(self.levels[0].half)
+        self.pitch = padded_length(resampling, self.levels[0].half)
         self.samples = self._upload_lines()
         self.slots = [Slot(device) for _ in self.levels]
         self.last_slot = Slot(device)
@@ -264,6 +262,8 @@ class _Run:
                 chosen.sides[0],
                 chosen.highest_cycles_per_m,
                 division.radius_m(len(self.levels) - 1),
+                chosen.beam,
+                self.along,
             )
             for level, (rows, columns) in enumerate(chosen.sides):
                 rate = rows * rates[0] + columns * rates[1]

@@ -64,7 +64,8 @@ def stage_errors_m(
     L_A L_I/(4 Rmin) for L_A <= Rmin, else L_I/2, with the subaperture's length L_A and the
     subimage's side L_I after the stage. This bounds [40] with t = L_A/2 over the sector L_I/(2 r)
     to either side, as |d rho/d angle| <= min(r, t). Channels lie less far out, at most
-    (QR - 1)/QR of t; subimages that are seen obliquely span up to sqrt(2) of the sector.
+    (QR - 1)/QR of t; corners of square subimages that are seen obliquely, at 22.5 degrees most,
+    err by up to (1 + sqrt 2)/2 more.
     """
     errors, length_m, side_m = [], aperture_m, image_m
     for beams, divisions in stages:

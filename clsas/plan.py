@@ -224,6 +224,21 @@ class Plan:
                 )
 
 
+def padded_length(resampling: Resampling, half_length: int) -> int:
+    """Return the samples of an upsampled line on the device, with zeros around it.
+
+    A subimage may reach beyond the line's end by `half_length`, or lie outside it. Lines at equal
+    places in a cache's sets would evict each other.
+    """
+    length = -(-(resampling.length + 2 * margin(half_length)) // 16) * 16
+    return length + 16 * (length % 256 == 0)
+
+
+def margin(half_length: int) -> int:
+    """Return the zeros before an upsampled line on the device."""
+    return 2 * half_length + 64
+
+
 def lines_digest(lines: RangeLines) -> str:
     """Return a digest of everything about lines but their samples."""
     velocity = lines.rx_velocity_m_s

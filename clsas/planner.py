@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import copy
 import functools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 
@@ -23,7 +24,7 @@ from clsas.interpolation import Interpolator, Spectrum
 from clsas.layout import BLOCKS
 from clsas.lines import RangeLines
 from clsas.nearest import stage_errors_m
-from clsas.plan import GUARD, Plan, Stage, grid_digest, lines_digest
+from clsas.plan import GUARD, Plan, Stage, grid_digest, lines_digest, padded_length
 from clsas.tree import Division, beam_directions, beam_rate, interpolated_nodes
 from clsas.window import BeamWindow, touches_rectangles
 
@@ -35,16 +36,17 @@ _ROWS = (16, 32, 64, 128, 256, 512, 1024, 2048)  # of subimages
 _COLUMNS = (4, 8, 16, 32, 64, 128, 256, 512, 1024, 2048)
 _MOST_STAGES = 5
 _ALIGN_TAPS, _APERTURE_TAPS, _FINAL_TAPS = (4, 6, 8), (4, 6, 8), (2, 4, 6, 8)
-_RATES = tuple(np.round(np.geomspace(1, 12, 36), 2))
-_DENSITIES = tuple(np.round(np.geomspace(1.1, 8, 48), 3))
+_RATES = tuple(np.geomspace(1, 12, 16))  # where filters' errors are looked at
+_FLAT = Spectrum(0.0, (np.arange(64) + 0.5) / 128, np.full(64, 1 / 64))
 NEAREST_UPSAMPLING = 8.0
 """By how much lines are upsampled before the linear interpolation of given stages."""
 
 _MARGIN_DB = 1.0  # between prediction and tolerance, for what measured errors scatter
 _FLOAT32 = 1.2e-7  # rms error of a phase in the stages over the phase across a root: measured
-_MEMORY_SHARE = 8  # of the device's memory that the lines of roots may take: one in so many
 _MOST_BATCH_BYTES = 256 << 20
 _SPOTS = (0.02, 0.25, 0.5, 0.75, 0.98)  # of rows and columns, where the geometry is looked at
+_COARSER = 4  # of the track's samples: where roots are compared
+_LEAST_BEAM_CYCLES, _MOST_BEAM_CYCLES = 0.5, 64.0
 _CHANNELS, _PIXELS = 256, 24  # at which the motion error is evaluated
 
 
@@ -57,6 +59,7 @@ def plan(
     stages: Sequence[tuple[int, int]] | None = None,
     beam: BeamWindow | None = None,
     device: Device | str | int | None = None,
+    memory_bytes: int | None = None,
     costs: Costs | None = None,
 ) -> Plan:
     """Choose the fastest way to an image of a given error.
@@ -82,6 +85,8 @@ def plan(
         Weights of the channels.
     device : Device, str or int, optional
         Whose costs count; see `clsas.device.choose`.
+    memory_bytes : int, optional
+        Device memory that may be used; half of the device's unless given.
     costs : Costs, optional
         Instead of those stored for the device.
 
@@ -94,7 +99,7 @@ def plan(
     Raises
     ------
     TypeError, ValueError
-        If an argument is not what is allowed.
+        If an argument is not what is allowed, or the memory holds not even one root subimage.
     DeviceError
         If there is no such device.
     """
@@ -116,27 +121,49 @@ def plan(
         )
     device = open_device(device)
     costs = costs or load_costs(device)
+    if memory_bytes is None:
+        memory_bytes = device.info.memory_bytes // 2
+    memory_bytes = validate.count("memory_bytes", memory_bytes)
     view = View(lines, grid, beam)
     if stages is not None:
-        return _nearest(view, _checked_stages(stages, lines, grid), device, costs)
+        return _nearest(view, _checked_stages(stages, lines, grid), device, costs, memory_bytes)
     exact = _exact(view, tolerance_db, device, costs)
     if view.track is None or grid.size == 1 or (beam is not None and beam.normalise):
         return exact
-    limit = math.inf
-    beam_cycles = 0.0 if beam is None else 1.0
-    while True:
-        found = _search(view, tolerance_db, limit, beam_cycles, device, costs)
+    allowed = 10 ** (tolerance_db / 10)
+    needed = 0
+    limit_m, spared = math.inf, 0.0
+    beam_cycles = 0.0 if beam is None else _LEAST_BEAM_CYCLES
+    while beam_cycles <= _MOST_BEAM_CYCLES:
+        filters_db = _decibel(allowed - spared) - _MARGIN_DB
+        found = _search(
+            view, tolerance_db, filters_db, limit_m, beam_cycles, device, costs, memory_bytes
+        )
+        if found is None and needed:
+            raise ValueError(
+                f"memory_bytes must be at least {needed / 2**20:.1f} MiB to factorize, "
+                f"got {memory_bytes / 2**20:.1f} MiB; clsas.backproject needs less"
+            )
         if found is None or found.predicted_seconds >= exact.predicted_seconds:
             return exact
+        if found.memory_bytes > memory_bytes:
+            needed = found.memory_bytes
+            limit_m = 0.7 * Division(grid, found.sides).radius_m(0)
+            continue
         if found.predicted_error_db <= tolerance_db:
             return found
-        # What a root adds to the error grows at least linearly with its size; what a beam adds
-        # falls with the density of nodes.
-        of_beam = _beam_error(view, found.sides[-1], found.aperture, beam_cycles)
-        if of_beam > 0.1 * 10 ** (tolerance_db / 10):
+        # What roots add to the error grows at least linearly with their size; what a beam adds
+        # falls with the density of nodes; the rest is taken from what filters may add.
+        others = _other_errors(view, found.sides, found.aperture, beam_cycles, device)
+        if others.beam > 0.2 * allowed:
             beam_cycles *= 2
+        elif others.roots > 0.3 * allowed:
+            limit_m = 0.7 * Division(grid, found.sides).radius_m(0)
         else:
-            limit = 0.7 * Division(grid, found.sides).radius_m(0)
+            spared = spared + 0.05 * allowed + others.total
+        if spared > 0.7 * allowed:
+            limit_m, spared = 0.7 * Division(grid, found.sides).radius_m(0), 0.0
+    return exact
 
 
 def decibels(wavelengths: float) -> float:
@@ -178,12 +205,11 @@ class View:
         cell_m = np.linalg.norm(self.steps_m, axis=1) @ (np.array(grid.shape) - 1) / 128
         nearest_m = KDTree(phase_centres_m(lines)).query(dense_m)[0].min() - cell_m
         self.nearest_m = max(float(nearest_m), 1e-9)
-        self.rates = cycles_per_pixel(
-            self.track, grid, self.spots_m, (0, 0), self.highest_cycles_per_m, self.nearest_m
-        )
+        self.along = None
         if beam is not None:
             self.along = beam_directions(beam, lines, self.track, self.track.samples)
             self.beam_rates = beam_rate(beam, self.track, self.along, self.spots_m)
+        self.rates = self._rates((0, 0), self.spots_m)
 
     def _pixels_m(self, places: Sequence[float]) -> NDArray[np.float64]:
         """Return positions at some parts of the rows and columns, [n, 3]."""
@@ -196,15 +222,61 @@ class View:
         if self.beam is None:
             return seen
         half_m = np.array([[rows], [columns]]) / 2 * self.steps_m
-        return seen & touches_rectangles(self.beam, self.sight, self.distance_m, self.along, half_m)
+        origin_m = self.spots_m[0]
+        track_m = self.track.positions_m(self.track.samples) - origin_m
+        return seen & touches_rectangles(
+            self.beam, self.spots_m - origin_m, half_m, track_m, self.along
+        )
 
-    def cycles(self, rates: NDArray[np.float64], seen: NDArray[np.bool_]) -> float:
+    def cycles(
+        self,
+        rates: NDArray[np.float64],
+        seen: NDArray[np.bool_],
+        over: Callable[[NDArray[np.float64]], float] = np.mean,
+    ) -> float:
         """Return how far a phase turns while it is seen, on average over the spots."""
-        return float(turned(self.track, np.where(seen, rates, 0.0), floor=0.0)[:, -1].mean())
+        return float(over(turned(self.track, np.where(seen, rates, 0.0), floor=0.0)[:, -1]))
 
-    def turns(self, side: tuple[int, int], seen: NDArray[np.bool_]) -> float:
+    def turns(
+        self,
+        side: tuple[int, int],
+        seen: NDArray[np.bool_],
+        over: Callable[[NDArray[np.float64]], float] = np.mean,
+    ) -> float:
         """Return `cycles` of the phases of subimages of a size."""
-        return self.cycles(side[0] * self.rates[0] + side[1] * self.rates[1], seen)
+        return self.cycles(side[0] * self.rates[0] + side[1] * self.rates[1], seen, over)
+
+    def within(self, root: tuple[int, int]) -> View:
+        """Return this view with the rates of subimages in roots of a size."""
+        view = copy.copy(self)
+        view.rates = self._rates(root, self.spots_m)
+        return view
+
+    def cycles_in_root(self, root: tuple[int, int], seen: NDArray[np.bool_]) -> NDArray[np.float64]:
+        """Return `cycles` per row and column in roots of a size, roughly, [n, 2].
+
+        `seen` is [n, spots, samples]: while which of some subimages are seen.
+        """
+        middle = np.arange(len(_SPOTS) ** 2).reshape(len(_SPOTS), -1)[1:-1, 1:-1].ravel()
+        rates = self._rates(root, self.spots_m[middle], _COARSER)
+        steps = np.gradient(self.track.samples[::_COARSER])
+        while_seen = seen[:, middle, ::_COARSER] * steps
+        return np.einsum("nps,kps->nk", while_seen, rates) / len(middle)
+
+    def _rates(
+        self, root: tuple[int, int], centres_m: NDArray[np.float64], every: int = 1
+    ) -> NDArray[np.float64]:
+        return cycles_per_pixel(
+            self.track,
+            self.grid,
+            centres_m,
+            root,
+            self.highest_cycles_per_m,
+            self.nearest_m,
+            self.beam,
+            self.along,
+            every,
+        )
 
     @functools.cached_property
     def slopes_m(self) -> tuple[float, float]:
@@ -245,15 +317,30 @@ class _Filters:
     final: Interpolator
 
 
+@dataclass(frozen=True)
+class _Choice:
+    """Taps and rates of filters that are not designed yet."""
+
+    align_taps: int
+    rate: float
+    aperture_taps: int
+    density: float
+    final_taps: int
+
+
 def _search(
     view: View,
     tolerance_db: float,
+    filters_db: float,
     most_radius_m: float,
     beam_cycles: float,
     device: Device,
     costs: Costs,
+    memory_bytes: int,
 ) -> Plan | None:
-    """Return the fastest plan whose roots are not larger than a radius; None where there is none.
+    """Return the fastest plan whose filters err by no more than `filters_db` together.
+
+    None where there is none with roots within a radius.
 
     For every number of stages and choice of filters, the fastest way from the whole grid to the
     leaves is a shortest path over the sizes that subimages may have.
@@ -266,12 +353,10 @@ def _search(
     sides = np.array(list(product(rows, columns)))
     steps_m = np.linalg.norm(view.steps_m, axis=1)
     radius_m = np.hypot(*(sides * steps_m).T) / 2
-    fits = radius_m <= most_radius_m
     counts = np.prod(-(-np.array(grid.shape) // sides), axis=1)
+    pixels = counts * np.prod(sides, axis=1)
     seen = [view.seen(*side) for side in sides]
     share = np.array([s[:, view.on_track].mean() for s in seen])
-    # Cycles while a subimage of size i is seen, of phases that turn as for size j.
-    cycles = np.array([[view.cycles(rate, s) for rate in view.rates] for s in seen]) @ sides.T
     divides = (sides[:, None] % sides == 0).all(axis=-1) & (sides[:, None] != sides).any(axis=-1)
     leaf_error = _leaf_error(view, sides, device)
     reach_m = np.array([view.reach_m(side) for side in sides])
@@ -282,28 +367,31 @@ def _search(
         for_beam = beam_cycles * np.array([view.cycles(view.beam_rates, s) for s in seen])
 
     best = None
-    for stages in range(1, _MOST_STAGES + 1):
-        for filters in _candidates(view.spectrum, tolerance_db, stages):
-            ratio = filters.align.upsampling
-            density = 2 * filters.aperture.upsampling
-            samples = 2 * reach_m * ratio / lines.range_step_m + filters.final.taps + 16
+    choices = {
+        stages: _choices(view.spectrum, filters_db - 10 * math.log10(2 * stages + 1))
+        for stages in range(1, _MOST_STAGES + 1)
+    }
+    for root in np.flatnonzero(radius_m <= most_radius_m):
+        # Cycles while a subimage of size i is seen, of phases that turn as for size j in this root.
+        cycles = view.cycles_in_root(tuple(sides[root]), np.array(seen)) @ sides.T
+        for stages, choice in ((n, c) for n, several in choices.items() for c in several):
+            ratio, density = choice.rate, 2 * choice.density
+            samples = 2 * reach_m * ratio / lines.range_step_m + choice.final_taps + 16
             nodes = density * (np.diag(cycles) + for_beam)
-            nodes += 1 if view.beam else filters.aperture.taps
-            taps = filters.align.taps + filters.aperture.taps
+            nodes += 1 if view.beam else choice.aperture_taps
+            taps = choice.align_taps + choice.aperture_taps
             sample_ns = costs.sample_ns + costs.sample_tap_ns * taps
             per_channel = counts * (samples * sample_ns + costs.channel_ns)
-            first = (
-                share * lines.channels * per_channel + counts * lines.channels * costs.reference_ns
-            )
-            first[~fits] = np.inf
+            total = np.full(len(sides), np.inf)
+            total[root] = lines.channels * share[root] * per_channel[root]
+            total[root] += lines.channels * counts[root] * costs.reference_ns
             # Channels of a parent of size j that a child of size i uses.
-            used = density * cycles + 2 * filters.aperture.taps
+            used = density * cycles + 2 * choice.aperture_taps
             step = np.where(divides.T, used * per_channel[:, None], np.inf)
-            last = np.prod(-(-np.array(grid.shape) // sides) * sides, axis=1) * nodes
-            last = last * leaf_ns * interpolation.COST[filters.final.taps]
+            last = pixels * nodes * leaf_ns * interpolation.COST[choice.final_taps]
             last = last + counts * nodes * costs.channel_ns
             last[leaf_error > 0.1 * 10 ** (tolerance_db / 10)] = np.inf
-            total, path = first, []
+            path = []
             for _ in range(stages - 1):
                 through = total + step
                 path.append(through.argmin(axis=1))
@@ -315,56 +403,53 @@ def _search(
                 chain = [leaf]
                 for parents in reversed(path):
                     chain.append(int(parents[chain[-1]]))
-                best = seconds, filters, chain[::-1], nodes, samples
+                best = seconds, choice, chain[::-1]
     if best is None:
         return None
-    seconds, filters, chain, nodes, samples = best
+    _, choice, chain = best
+    filters = _Filters(
+        interpolation.design(choice.align_taps, choice.rate, view.spectrum),
+        interpolation.design(choice.aperture_taps, choice.density, _FLAT),
+        interpolation.design(choice.final_taps, choice.rate, view.spectrum),
+    )
     chosen = [tuple(map(int, sides[i])) for i in chain]
-    return _plan(view, tolerance_db, filters, chosen, device, costs, beam_cycles=beam_cycles)
+    return _plan(
+        view, tolerance_db, filters, chosen, device, costs, memory_bytes, beam_cycles=beam_cycles
+    )
 
 
-def _candidates(spectrum: Spectrum, tolerance_db: float, stages: int) -> list[_Filters]:
-    """Return filters of every number of taps whose errors together leave room to the tolerance."""
-    each_db = tolerance_db - _MARGIN_DB - 10 * math.log10(2 * stages + 1)
-    flat = Spectrum(0.0, (np.arange(64) + 0.5) / 128, np.full(64, 1 / 64))
+def _choices(spectrum: Spectrum, each_db: float) -> list[_Choice]:
+    """Return taps with the least rates at which every interpolation errs by no more."""
     result = []
     for align_taps, aperture_taps in product(_ALIGN_TAPS, _APERTURE_TAPS):
-        align = _least(align_taps, _RATES, each_db, spectrum, "scatter_db")
-        aperture = _least(aperture_taps, _DENSITIES, each_db, flat, "error_db")
-        if align is None or aperture is None:
+        rate = _least(align_taps, each_db, spectrum, "scatter_db")
+        density = _least(aperture_taps, each_db, _FLAT, "error_db")
+        if rate is None or density is None:
             continue
-        finals = (interpolation.design(t, align.upsampling, spectrum) for t in _FINAL_TAPS)
-        final = next((f for f in finals if f.scatter_db <= each_db), None)
-        if final is not None:
-            result.append(_Filters(align, aperture, final))
+        needed = {taps: _least(taps, each_db, spectrum, "scatter_db") for taps in _FINAL_TAPS}
+        final_taps = next(t for t in _FINAL_TAPS if needed[t] is not None and needed[t] <= rate)
+        result.append(_Choice(align_taps, rate, aperture_taps, density, final_taps))
     return result
 
 
-def _least(
-    taps: int, rates: Sequence[float], wanted_db: float, spectrum: Spectrum, error: str
-) -> Interpolator | None:
-    """Return the interpolator with the least upsampling that errs by no more."""
-    low, high = 0, len(rates) - 1
-    if getattr(_designed(taps, rates[high], spectrum), error) > wanted_db:
-        return None
-    while low < high:
-        middle = (low + high) // 2
-        if getattr(_designed(taps, rates[middle], spectrum), error) <= wanted_db:
-            high = middle
-        else:
-            low = middle + 1
-    return _designed(taps, rates[low], spectrum)
-
-
-def _designed(taps: int, rate: float, spectrum: Spectrum) -> Interpolator:
+def _least(taps: int, wanted_db: float, spectrum: Spectrum, error: str) -> float | None:
+    """Return the least rate at which a filter errs by no more, None where no rate is enough."""
     key = spectrum.frequency.tobytes(), spectrum.power.tobytes()
-    return _design(taps, float(rate), *key)
+    errors = _errors_db(taps, error, *key)
+    if errors[-1] > wanted_db:
+        return None
+    if errors[0] <= wanted_db:
+        return _RATES[0]
+    # Errors fall with the rate; a half per cent of rate and a tenth of a decibel are for rounding.
+    return 1.005 * float(np.exp(np.interp(0.1 - wanted_db, -errors, np.log(_RATES))))
 
 
-@functools.lru_cache(maxsize=512)
-def _design(taps: int, rate: float, frequency: bytes, power: bytes) -> Interpolator:
+@functools.lru_cache(maxsize=64)
+def _errors_db(taps: int, error: str, frequency: bytes, power: bytes) -> NDArray[np.float64]:
+    """Return the errors of filters at all `_RATES`."""
     spectrum = Spectrum(0.0, np.frombuffer(frequency), np.frombuffer(power))
-    return interpolation.design(taps, rate, spectrum)
+    found = [getattr(interpolation.design(taps, rate, spectrum), error) for rate in _RATES]
+    return np.minimum.accumulate(found)
 
 
 def _leaf_error(view: View, sides: NDArray[np.int64], device: Device) -> NDArray[np.float64]:
@@ -387,16 +472,19 @@ def _plan(
     sides: list[tuple[int, int]],
     device: Device,
     costs: Costs,
+    memory_bytes: int,
     nearest: Sequence[tuple[int, int]] = (),
     beam_cycles: float = 0.0,
 ) -> Plan:
     """Return a plan with all that is expected of it."""
     lines, grid = view.lines, view.grid
+    view = view if nearest else view.within(sides[0])
     align, aperture, final = filters.align, filters.aperture, filters.final
     resampling = interpolation.resampling(lines.length, align, view.spectrum)
     halves = view.half_lengths(sides, align, final, resampling.ratio)
     density = 2 * aperture.upsampling
-    stages, channels, root_bytes = [], float(lines.channels), 0.0
+    stages, channels = [], float(lines.channels)
+    tile = _tile(view, sides[-1], device) if nearest else sides[-1]
     width = device.info.width
     sample_ns = costs.sample_ns + costs.sample_tap_ns * (align.taps + aperture.taps)
     used = channels * view.seen(*sides[0])[:, view.on_track].mean()
@@ -423,9 +511,6 @@ def _plan(
         stages.append(
             Stage(*side, count, round(channels), samples, operations, _decibel(error), seconds)
         )
-        per_root = math.prod(a // b for a, b in zip(sides[0], side, strict=True))
-        root_bytes += 8 * per_root * (1.3 * channels + 2) * (samples + 2 * GUARD)
-
     pixels = count * math.prod(side)
     operations = pixels * channels
     leaf_ns = costs.leaf_ns * (1.0 if view.beam is None else WITH_BEAM)
@@ -434,22 +519,19 @@ def _plan(
     stages.append(
         Stage(*side, count, round(channels), samples, operations, final.scatter_db, seconds)
     )
-    root_bytes += 8 * math.prod(sides[0]) + 60 * per_root * (channels + 16)
-    line_bytes = 8 * lines.channels * (resampling.length + 4 * halves[0] + 128)
-    room = min(device.info.memory_bytes // _MEMORY_SHARE, _MOST_BATCH_BYTES)
-    roots = stages[0].subimages
-    at_once = min(max(int(room // root_bytes), 1), roots)
+    line_bytes = 8 * lines.channels * padded_length(resampling, halves[0])
+    root_bytes = _root_bytes(view, sides, tile, stages, filters, beam_cycles, bool(nearest))
+    room = min(memory_bytes - line_bytes, _MOST_BATCH_BYTES)
+    at_once = min(max(int(room // root_bytes), 1), stages[0].subimages)
     error = sum(10 ** (stage.error_db / 10) for stage in stages)
-    error += _leaf_error(view, np.array([sides[-1]]), device)[0]
-    error += _nearest_error(view, nearest) if nearest else _motion_error(view, sides[0])
-    if view.beam is not None and not nearest:
-        error += _beam_error(view, sides[-1], aperture, beam_cycles)
-    root_m = Division(grid, tuple(sides)).radius_m(0)
-    error += (2 * np.pi * _FLOAT32 * view.highest_cycles_per_m * root_m) ** 2
+    if nearest:
+        error += _nearest_error(view, nearest)
+    else:
+        error += _other_errors(view, sides, aperture, beam_cycles, device).total
     return Plan(
         tolerance_db=tolerance_db,
         sides=tuple(sides),
-        tile=_tile(view, sides[-1], device) if nearest else sides[-1],
+        tile=tile,
         nearest=tuple(beams for beams, _ in nearest),
         align=align,
         aperture=aperture,
@@ -468,6 +550,75 @@ def _plan(
         grid_digest=grid_digest(grid),
         beam=view.beam,
         beam_cycles=beam_cycles,
+    )
+
+
+def _root_bytes(
+    view: View,
+    sides: Sequence[tuple[int, int]],
+    tile: tuple[int, int],
+    stages: Sequence[Stage],
+    filters: _Filters,
+    beam_cycles: float,
+    nearest: bool,
+) -> float:
+    """Return the device memory that a root takes while it is worked on: see `factorize`."""
+    taps, channels, result = filters.aperture.taps, view.lines.channels, 0.0
+    for level, side in enumerate(sides):
+        seen = view.seen(*side)
+        # Virtual channels of the whole aperture, and those of the subimage that sees most.
+        everywhere, most = (
+            2 * filters.aperture.upsampling * view.turns(side, where, np.max) + taps + 2
+            for where in (np.ones_like(seen), seen)
+        )
+        if view.beam is not None and level == len(sides) - 1:
+            most += (
+                2
+                * filters.aperture.upsampling
+                * beam_cycles
+                * view.cycles(view.beam_rates, seen, np.max)
+            )
+        if nearest:
+            everywhere = most = stages[level].channels
+        subimages = _subimages(sides[0], side)
+        result += 8 * subimages * most * (stages[level].samples + 2 * GUARD)
+        result += subimages * 56 + (channels + 32) * (4 + 4 * taps + (12 if level else 16))
+        channels = everywhere
+    terms = 9 if view.beam is None else 19
+    result += _subimages(sides[0], tile) * ((most + 16) * (12 + 4 * terms) + 36)
+    return result + 36 * channels + 8 * math.prod(sides[0])
+
+
+def _subimages(root: tuple[int, int], side: tuple[int, int]) -> int:
+    return math.prod(a // b for a, b in zip(root, side, strict=True))
+
+
+@dataclass(frozen=True)
+class _Errors:
+    """Powers of the errors that filters do not account for."""
+
+    roots: float
+    leaves: float
+    beam: float
+
+    @property
+    def total(self) -> float:
+        return self.roots + self.leaves + self.beam
+
+
+def _other_errors(
+    view: View,
+    sides: Sequence[tuple[int, int]],
+    aperture: Interpolator,
+    beam_cycles: float,
+    device: Device,
+) -> _Errors:
+    root_m = Division(view.grid, tuple(sides)).radius_m(0)
+    rounding = (2 * np.pi * _FLOAT32 * view.highest_cycles_per_m * root_m) ** 2
+    return _Errors(
+        roots=_motion_error(view, sides[0]) + rounding,
+        leaves=float(_leaf_error(view, np.array([sides[-1]]), device)[0]),
+        beam=_beam_error(view, sides[-1], aperture, beam_cycles),
     )
 
 
@@ -540,7 +691,13 @@ def _beam_error(
     return max(wrong / max(total, 1e-30) - _power(aperture), 0.0)
 
 
-def _nearest(view: View, stages: Sequence[tuple[int, int]], device: Device, costs: Costs) -> Plan:
+def _nearest(
+    view: View,
+    stages: Sequence[tuple[int, int]],
+    device: Device,
+    costs: Costs,
+    memory_bytes: int,
+) -> Plan:
     """Return the plan of THESIS chapter 4: nearest beams, linear interpolation in range."""
     if not stages:
         return _exact(view, None, device, costs)
@@ -553,8 +710,14 @@ def _nearest(view: View, stages: Sequence[tuple[int, int]], device: Device, cost
         sides.append(leaf)
         leaf = leaf[0] * divisions, leaf[1] * divisions
     linear = interpolation.design(2, NEAREST_UPSAMPLING, view.spectrum)
-    beams = Interpolator(1, 1.0, np.zeros((0, 2, 0)), 0.0, 0.0)
-    return _plan(view, None, _Filters(linear, beams, linear), sides[::-1], device, costs, stages)
+    filters = _Filters(linear, Interpolator(1, 1.0, np.zeros((0, 2, 0)), 0.0, 0.0), linear)
+    chosen = _plan(view, None, filters, sides[::-1], device, costs, memory_bytes, stages)
+    if chosen.memory_bytes > memory_bytes:
+        raise ValueError(
+            f"memory_bytes must be at least {chosen.memory_bytes / 2**20:.1f} MiB for these "
+            f"stages, got {memory_bytes / 2**20:.1f} MiB"
+        )
+    return chosen
 
 
 def _nearest_error(view: View, stages: Sequence[tuple[int, int]]) -> float:

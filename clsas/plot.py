@@ -200,32 +200,27 @@ def tradeoff(measured: Tradeoff, *, title: str = "") -> Figure:
     """
     validate.instance("measured", measured, Tradeoff)
     figure = _figure(7.0, 5.0)
+    from matplotlib import ticker
+
     axes = figure.subplots()
     front = [(row.error_db, row.seconds) for row in measured.front]
     axes.plot(*zip(*front, strict=True), color="0.7", linewidth=1.5, zorder=1, label="Pareto front")
     for method, color, marker, label in (
         ("tolerance", "tab:blue", "o", "to a tolerance"),
-        ("stages", "tab:orange", "s", "thesis's method, QR x QI per stage"),
+        ("stages", "tab:orange", "s", "thesis's method: stages of QR x QI"),
         ("exact", "black", "D", "exact"),
     ):
-        rows = [row for row in measured.rows if row.method == method]
-        if not rows:
-            continue
-        errors_db = [row.error_db for row in rows]
-        axes.plot(errors_db, [row.seconds for row in rows], marker, color=color, label=label)
-        axes.plot(
-            [row.predicted_error_db for row in rows],
-            [row.predicted_seconds for row in rows],
-            marker,
-            color=color,
-            fillstyle="none",
-            alpha=0.6,
-        )
-        for row in rows:
+        for row in (row for row in measured.rows if row.method == method):
+            errors_db = row.error_db, row.predicted_error_db
+            seconds = row.seconds, row.predicted_seconds
+            axes.plot(errors_db, seconds, ":", color=color, linewidth=0.8, alpha=0.5)
+            axes.plot(errors_db[1:], seconds[1:], marker, color=color, fillstyle="none")
+            axes.plot(errors_db[:1], seconds[:1], marker, color=color, label=label)
+            label = ""  # one entry in the legend
             axes.annotate(
                 row.label,
                 (row.error_db, row.seconds),
-                xytext=(5, 5),
+                xytext=(6, -9),
                 textcoords="offset points",
                 fontsize="x-small",
                 color=color,
@@ -236,12 +231,16 @@ def tradeoff(measured: Tradeoff, *, title: str = "") -> Figure:
         xlabel="relative rms error against the exact image (dB)",
         ylabel="time of the image (s)",
     )
+    axes.yaxis.set_major_locator(ticker.LogLocator(subs=(1, 2, 5)))
+    axes.yaxis.set_major_formatter(ticker.StrMethodFormatter("{x:g}"))
+    axes.yaxis.set_minor_formatter(ticker.NullFormatter())
+    axes.margins(x=0.08)
     axes.invert_xaxis()  # the better the further right
     sizes = f"{measured.channels} lines, {' x '.join(map(str, measured.pixels))} pixels"
     axes.set_title(
         ", ".join(filter(None, (title, sizes))) + f"\n{measured.device}", fontsize="small"
     )
-    axes.grid(alpha=0.3, which="both")
+    axes.grid(alpha=0.3)
     axes.legend(loc="best", fontsize="small")
     return figure
 

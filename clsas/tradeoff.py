@@ -256,17 +256,15 @@ def tradeoff(
     validate.progress(progress)
     device = open_device(device)
     tolerances_db = np.atleast_1d(tolerances_db).tolist()
-    wishes: list[tuple[str, str, dict]] = [
-        (f"{tolerance_db:g} dB", "tolerance", {"tolerance_db": tolerance_db})
-        for tolerance_db in tolerances_db
+    wishes: list[dict] = [{"tolerance_db": tolerance_db} for tolerance_db in tolerances_db]
+    wishes += [
+        {"stages": given} for given in (_feasible(lines, grid) if stages is None else stages)
     ]
-    for given in _feasible(lines, grid) if stages is None else stages:
-        wishes.append((_label(given), "stages", {"stages": given}))
     ways: list[tuple[Row, Callable[[], Image]]] = []
-    for label, method, wish in wishes:
+    for wish in wishes:
         start = time.perf_counter()
         chosen = plan(lines, grid, **wish, beam=beam, device=device)
-        row = _row(label, method, chosen, time.perf_counter() - start)
+        row = _row(*_name(wish), chosen, time.perf_counter() - start)
         ways.append((row, partial(factorize, lines, grid, chosen, device=device)))
     accuracy_db = min([EXACT_DB, *tolerances_db])
     exact = partial(backproject, lines, grid, device=device, beam=beam)
@@ -334,10 +332,12 @@ def _feasible(lines: RangeLines, grid: Grid) -> list[tuple[tuple[int, int], ...]
     ]
 
 
-def _label(stages: Sequence[tuple[int, int]]) -> str:
-    """Return "3 of 2x2" for equal stages, "2x2,4x2" for others."""
-    each = ["x".join(map(str, np.atleast_1d(stage))) for stage in stages]
-    return f"{len(each)} of {each[0]}" if len(set(each)) == 1 else ",".join(each)
+def _name(wish: dict) -> tuple[str, str]:
+    """Return label and method: "-50 dB", "3 of 2x2" for equal stages, "2x2,4x2" for others."""
+    if "stages" not in wish:
+        return f"{wish['tolerance_db']:g} dB", "tolerance"
+    each = [f"{beams}x{divisions}" for beams, divisions in wish["stages"]]
+    return f"{len(each)} of {each[0]}" if len(set(each)) == 1 else ",".join(each), "stages"
 
 
 def _row(label: str, method: str, chosen: Plan, plan_seconds: float) -> Row:

@@ -14,6 +14,8 @@ from clsas.interpolation import Interpolator
 from clsas.lines import RangeLines
 from clsas.window import BeamWindow, touches_rectangles
 
+_COARSER = 2  # of the track's samples those at which it is decided what they see
+
 
 @dataclass(frozen=True, eq=False)
 class Nodes:
@@ -214,12 +216,14 @@ def seen_from(
     shape = centres_m.shape[:-1]
     if beam is None:
         return np.full(shape, -np.inf), np.full(shape, np.inf)
-    on_track = np.abs(track.samples - 0.5) <= 0.5
-    places = track.samples[on_track]
-    sight = centres_m.reshape(-1, 1, 3) - track.positions_m(places)
-    distance_m = np.maximum(np.linalg.norm(sight, axis=-1), 1e-9)
-    sight /= distance_m[..., None]
-    seen = touches_rectangles(beam, sight, distance_m, along[on_track], half_m)
+    samples = track.samples
+    on_track = np.flatnonzero(np.abs(samples - 0.5) <= 0.5)[::_COARSER]
+    places = samples[on_track]
+    position_m = track.positions_m(places)
+    origin_m = position_m[0]
+    seen = touches_rectangles(
+        beam, centres_m.reshape(-1, 3) - origin_m, half_m, position_m - origin_m, along[on_track]
+    )
     first, last = seen.argmax(axis=1), seen.shape[1] - 1 - seen[:, ::-1].argmax(axis=1)
     # The edge lies between two samples.
     edges = np.concatenate([[-np.inf], places[1:-1], [np.inf]])

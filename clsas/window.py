@@ -324,26 +324,29 @@ def channel_ranges(
 
 def touches_rectangles(
     window: BeamWindow,
-    sight: NDArray[np.float64],
-    distance_m: NDArray[np.float64],
-    along: NDArray[np.float64],
+    centres_m: NDArray[np.float64],
     half_m: NDArray[np.float64],
+    track_m: NDArray[np.float64],
+    along: NDArray[np.float64],
 ) -> NDArray[np.bool_]:
     """Return whether a window may touch rectangles, bool [rectangles, places].
 
     Parameters
     ----------
-    sight : float64 [rectangles, places, 3]
-        Unit vectors from places on the track to the rectangles' middles.
-    distance_m : float64 [rectangles, places]
-    along : float64 [places, 3]
-        The track's unit direction.
+    centres_m : float64 [rectangles, 3]
     half_m : float64 [2, 3]
-        Half the rectangles' sides, as vectors.
+        Half their sides, as vectors.
+    track_m, along : float64 [places, 3]
+        Positions on the track and its unit direction there.
     """
-    sine = np.einsum("psi,si->ps", sight, along)
-    reach = sum(np.abs(along @ half - sine * (sight @ half)) for half in half_m) / distance_m
-    reach += (np.linalg.norm(np.abs(half_m).sum(axis=0)) / distance_m) ** 2
+    sine, distance_m = _sines(centres_m, track_m, along)
+    np.maximum(distance_m, 1e-9, out=distance_m)
+    reach = (np.linalg.norm(np.abs(half_m).sum(axis=0)) / distance_m) ** 2
+    for half in half_m:
+        ahead = (centres_m @ half)[:, None] - track_m @ half
+        ahead /= distance_m
+        ahead *= sine
+        reach += np.abs(along @ half - ahead) / distance_m
     low, high = window.limits
     return (sine + reach > low) & (sine - reach < high)
 
