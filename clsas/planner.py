@@ -46,6 +46,7 @@ _FLOAT32 = 1.2e-7  # rms error of a phase in the stages over the phase across a 
 _MOST_BATCH_BYTES = 256 << 20
 _SPOTS = (0.02, 0.25, 0.5, 0.75, 0.98)  # of rows and columns, where the geometry is looked at
 _COARSER = 4  # of the track's samples: where roots are compared
+_ROOTS_SHARE, _BEAM_SHARE = 0.25, 0.2  # of the error allowed
 _LEAST_BEAM_CYCLES, _MOST_BEAM_CYCLES = 0.5, 64.0
 _CHANNELS, _PIXELS = 256, 24  # at which the motion error is evaluated
 
@@ -131,13 +132,13 @@ def plan(
     if view.track is None or grid.size == 1 or (beam is not None and beam.normalise):
         return exact
     allowed = 10 ** (tolerance_db / 10)
-    needed = 0
-    limit_m, spared = math.inf, 0.0
+    most = _root_limits(view, _ROOTS_SHARE * allowed)
     beam_cycles = 0.0 if beam is None else _LEAST_BEAM_CYCLES
-    while beam_cycles <= _MOST_BEAM_CYCLES:
+    needed, spared = 0, 0.0
+    while most is not None and beam_cycles <= _MOST_BEAM_CYCLES and spared < 0.9 * allowed:
         filters_db = _decibel(allowed - spared) - _MARGIN_DB
         found = _search(
-            view, tolerance_db, filters_db, limit_m, beam_cycles, device, costs, memory_bytes
+            view, tolerance_db, filters_db, most, beam_cycles, device, costs, memory_bytes
         )
         if found is None and needed:
             raise ValueError(
@@ -145,25 +146,39 @@ def plan(
                 f"got {memory_bytes / 2**20:.1f} MiB; clsas.backproject needs less"
             )
         if found is None or found.predicted_seconds >= exact.predicted_seconds:
-            return exact
+            break
         if found.memory_bytes > memory_bytes:
             needed = found.memory_bytes
-            limit_m = 0.7 * Division(grid, found.sides).radius_m(0)
-            continue
-        if found.predicted_error_db <= tolerance_db:
+            rows, columns = found.sides[0]
+            most = (rows // 2, columns) if rows > columns else (rows, columns // 2)
+        elif found.predicted_error_db <= tolerance_db:
             return found
-        # What roots add to the error grows at least linearly with their size; what a beam adds
-        # falls with the density of nodes; the rest is taken from what filters may add.
-        others = _other_errors(view, found.sides, found.aperture, beam_cycles, device)
-        if others.beam > 0.2 * allowed:
-            beam_cycles *= 2
-        elif others.roots > 0.3 * allowed:
-            limit_m = 0.7 * Division(grid, found.sides).radius_m(0)
         else:
-            spared = spared + 0.05 * allowed + others.total
-        if spared > 0.7 * allowed:
-            limit_m, spared = 0.7 * Division(grid, found.sides).radius_m(0), 0.0
+            # What a beam adds falls with the density of nodes; filters must make up for the rest.
+            others = _other_errors(view, found.sides, found.aperture, beam_cycles, device)
+            if others.beam > _BEAM_SHARE * allowed:
+                beam_cycles *= 2
+            else:
+                spared += max(others.total - spared, 0.05 * allowed)
     return exact
+
+
+def _root_limits(view: View, allowed: float) -> tuple[int, int] | None:
+    """Return the largest rows and columns of roots that keep their errors within a power.
+
+    None where there are none.
+    """
+    rows, columns = (
+        min((side for side in sides if side >= n), default=sides[-1])
+        for sides, n in zip((_ROWS, _COLUMNS), view.grid.shape, strict=True)
+    )
+    while _root_error(view, (rows, columns)) > allowed:
+        smaller = [(rows // 2, columns), (rows, columns // 2)]
+        smaller = [side for side in smaller if side[0] >= _ROWS[0] and side[1] >= _COLUMNS[0]]
+        if not smaller:
+            return None
+        rows, columns = min(smaller, key=lambda side: _root_error(view, side))
+    return rows, columns
 
 
 def decibels(wavelengths: float) -> float:
@@ -332,7 +347,7 @@ def _search(
     view: View,
     tolerance_db: float,
     filters_db: float,
-    most_radius_m: float,
+    most: tuple[int, int],
     beam_cycles: float,
     device: Device,
     costs: Costs,
@@ -340,7 +355,7 @@ def _search(
 ) -> Plan | None:
     """Return the fastest plan whose filters err by no more than `filters_db` together.
 
-    None where there is none with roots within a radius.
+    None where there is none with roots of `most` rows and columns.
 
     For every number of stages and choice of filters, the fastest way from the whole grid to the
     leaves is a shortest path over the sizes that subimages may have.
@@ -351,8 +366,6 @@ def _search(
         for sides, n in zip((_ROWS, _COLUMNS), grid.shape, strict=True)
     )
     sides = np.array(list(product(rows, columns)))
-    steps_m = np.linalg.norm(view.steps_m, axis=1)
-    radius_m = np.hypot(*(sides * steps_m).T) / 2
     counts = np.prod(-(-np.array(grid.shape) // sides), axis=1)
     pixels = counts * np.prod(sides, axis=1)
     seen = [view.seen(*side) for side in sides]
@@ -371,7 +384,7 @@ def _search(
         stages: _choices(view.spectrum, filters_db - 10 * math.log10(2 * stages + 1))
         for stages in range(1, _MOST_STAGES + 1)
     }
-    for root in np.flatnonzero(radius_m <= most_radius_m):
+    for root in np.flatnonzero((sides <= most).all(axis=1)):
         # Cycles while a subimage of size i is seen, of phases that turn as for size j in this root.
         cycles = view.cycles_in_root(tuple(sides[root]), np.array(seen)) @ sides.T
         for stages, choice in ((n, c) for n, several in choices.items() for c in several):
@@ -613,42 +626,55 @@ def _other_errors(
     beam_cycles: float,
     device: Device,
 ) -> _Errors:
-    root_m = Division(view.grid, tuple(sides)).radius_m(0)
-    rounding = (2 * np.pi * _FLOAT32 * view.highest_cycles_per_m * root_m) ** 2
     return _Errors(
-        roots=_motion_error(view, sides[0]) + rounding,
+        roots=_root_error(view, sides[0]),
         leaves=float(_leaf_error(view, np.array([sides[-1]]), device)[0]),
         beam=_beam_error(view, sides[-1], aperture, beam_cycles),
     )
 
 
-def _motion_error(view: View, side: tuple[int, int]) -> float:
-    """Return the power of the error of putting every channel on the mean track.
+def _root_error(view: View, side: tuple[int, int]) -> float:
+    """Return the power of the error of roots: of rounding, and of channels put on the mean track.
 
-    Evaluated as it is: over channels, roots and pixels of these at random, the difference of how a
-    range changes from a root's centre to a pixel for the channel and for the place on the track
-    that stands for it. That holds what a cubic does not follow, different transmitter and receiver
-    positions, and motion during flight.
+    The latter is evaluated as it is: over channels, roots and pixels of these at random, how a
+    range changes from a root's centre to a pixel for the channel, less the same for the place on
+    the track that stands for it. That holds what the track does not follow, transmitters and
+    receivers apart, and motion during flight.
     """
     lines, track = view.lines, view.track
     index = np.arange(0, lines.channels, -(-lines.channels // _CHANNELS))
-    some = lines.select(index)
     part = replace(track, place=track.place[index])
+    side = np.minimum(side, view.grid.shape)
+    seen = view.seen(*side)
     random = np.random.default_rng(0)
-    power = []
-    for spot_m in view.spots_m[:: max(len(view.spots_m) // 8, 1)]:
+    powers, total = [], 0
+    for spot in range(0, len(view.spots_m), 3):
+        some = np.interp(part.place, track.samples, seen[spot]) > 0
+        if not some.any():
+            continue
+        channels = lines.select(index[some])
+        near = replace(track, place=part.place[some])
         offset_m = random.uniform(-0.5, 0.5, (_PIXELS, 2)) * side @ view.steps_m
-        points_m = np.concatenate([spot_m[None], spot_m + offset_m])
+        points_m = view.spots_m[spot] + np.concatenate([np.zeros((1, 3)), offset_m])
         range_m = pairwise_range_m(
-            points_m, some.tx_m, some.rx_m, some.rx_velocity_m_s, some.sound_speed_m_s
+            points_m,
+            channels.tx_m,
+            channels.rx_m,
+            channels.rx_velocity_m_s,
+            channels.sound_speed_m_s,
         )
-        place = part.places_seen_from(spot_m[None], phase_centres_m(some))[0]
-        virtual_m = track.positions_m(place)
+        virtual_m = track.positions_m(
+            near.places_seen_from(points_m[:1], phase_centres_m(channels))[0]
+        )
         on_track_m = pairwise_range_m(points_m, virtual_m, virtual_m)
         on_track_m -= (points_m @ drift(lines))[:, None]
         away_m = (range_m - range_m[0]) - (on_track_m - on_track_m[0])
-        power.append(np.mean(away_m[1:] ** 2))
-    return float((2 * np.pi * view.highest_cycles_per_m) ** 2 * np.mean(power))
+        powers.append(np.sum(away_m[1:] ** 2) / _PIXELS)
+        total += len(index[some])
+    off_track = (2 * np.pi * view.highest_cycles_per_m) ** 2 * sum(powers) / max(total, 1)
+    radius_m = np.linalg.norm(side * np.linalg.norm(view.steps_m, axis=1)) / 2
+    rounding = (2 * np.pi * _FLOAT32 * view.highest_cycles_per_m * radius_m) ** 2
+    return float(off_track + rounding)
 
 
 def _beam_error(
