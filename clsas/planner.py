@@ -134,7 +134,7 @@ def plan(
     allowed = 10 ** (tolerance_db / 10)
     most = _root_limits(view, _ROOTS_SHARE * allowed)
     beam_cycles = 0.0 if beam is None else _LEAST_BEAM_CYCLES
-    needed, spared = 0, 0.0
+    needed, spared = 0, 0.0 if most is None else _root_error(view, most) + 0.05 * allowed
     while most is not None and beam_cycles <= _MOST_BEAM_CYCLES and spared < 0.9 * allowed:
         filters_db = _decibel(allowed - spared) - _MARGIN_DB
         found = _search(
@@ -368,58 +368,63 @@ def _search(
     sides = np.array(list(product(rows, columns)))
     counts = np.prod(-(-np.array(grid.shape) // sides), axis=1)
     pixels = counts * np.prod(sides, axis=1)
-    seen = [view.seen(*side) for side in sides]
-    share = np.array([s[:, view.on_track].mean() for s in seen])
+    seen = np.array([view.seen(*side) for side in sides])
+    share = seen[..., view.on_track].mean(axis=(1, 2))
     divides = (sides[:, None] % sides == 0).all(axis=-1) & (sides[:, None] != sides).any(axis=-1)
-    leaf_error = _leaf_error(view, sides, device)
+    too_curved = _leaf_error(view, sides, device) > 0.1 * 10 ** (tolerance_db / 10)
     reach_m = np.array([view.reach_m(side) for side in sides])
 
     leaf_ns = costs.leaf_ns * (1.0 if view.beam is None else WITH_BEAM)
-    for_beam = 0.0
+    for_beam = np.zeros(len(sides))
     if view.beam is not None:
         for_beam = beam_cycles * np.array([view.cycles(view.beam_rates, s) for s in seen])
 
-    best = None
-    choices = {
-        stages: _choices(view.spectrum, filters_db - 10 * math.log10(2 * stages + 1))
-        for stages in range(1, _MOST_STAGES + 1)
-    }
-    for root in np.flatnonzero((sides <= most).all(axis=1)):
-        # Cycles while a subimage of size i is seen, of phases that turn as for size j in this root.
-        cycles = view.cycles_in_root(tuple(sides[root]), np.array(seen)) @ sides.T
-        for stages, choice in ((n, c) for n, several in choices.items() for c in several):
-            ratio, density = choice.rate, 2 * choice.density
-            samples = 2 * reach_m * ratio / lines.range_step_m + choice.final_taps + 16
-            nodes = density * (np.diag(cycles) + for_beam)
-            nodes += 1 if view.beam else choice.aperture_taps
+    choices = []
+    for stages in range(1, _MOST_STAGES + 1):
+        for choice in _choices(view.spectrum, filters_db - 10 * math.log10(2 * stages + 1)):
+            samples = 2 * reach_m * choice.rate / lines.range_step_m + choice.final_taps + 16
             taps = choice.align_taps + choice.aperture_taps
             sample_ns = costs.sample_ns + costs.sample_tap_ns * taps
             per_channel = counts * (samples * sample_ns + costs.channel_ns)
-            total = np.full(len(sides), np.inf)
-            total[root] = lines.channels * share[root] * per_channel[root]
-            total[root] += lines.channels * counts[root] * costs.reference_ns
+            fixed = costs.upsampled_sample_ns * lines.samples.size * choice.rate
+            choices.append((stages, choice, per_channel, fixed + stages * costs.batch_ns))
+    best = math.inf, None, []
+    for root in np.flatnonzero((sides <= most).all(axis=1)):
+        within = np.flatnonzero((sides[root] % sides == 0).all(axis=1))
+        cycles = None
+        for stages, choice, per_channel, fixed in choices:
+            first = share[root] * per_channel[root] + counts[root] * costs.reference_ns
+            first = lines.channels * first + fixed
+            if first >= best[0]:
+                continue
+            if cycles is None:
+                # While a subimage of size i is seen, of phases that turn as for size j.
+                cycles = view.cycles_in_root(tuple(sides[root]), seen[within]) @ sides[within].T
+            density = 2 * choice.density
+            nodes = density * (np.diag(cycles) + for_beam[within])
+            nodes += 1 if view.beam else choice.aperture_taps
             # Channels of a parent of size j that a child of size i uses.
             used = density * cycles + 2 * choice.aperture_taps
-            step = np.where(divides.T, used * per_channel[:, None], np.inf)
-            last = pixels * nodes * leaf_ns * interpolation.COST[choice.final_taps]
-            last = last + counts * nodes * costs.channel_ns
-            last[leaf_error > 0.1 * 10 ** (tolerance_db / 10)] = np.inf
+            step = np.where(divides[np.ix_(within, within)].T, used, np.inf)
+            step *= per_channel[within, None]
+            last = pixels[within] * leaf_ns * interpolation.COST[choice.final_taps]
+            last = nodes * (last + counts[within] * costs.channel_ns)
+            last[too_curved[within]] = np.inf
+            total = np.where(within == root, first, np.inf)
             path = []
             for _ in range(stages - 1):
                 through = total + step
                 path.append(through.argmin(axis=1))
                 total = through.min(axis=1)
             leaf = int((total + last).argmin())
-            upsampling = costs.upsampled_sample_ns * lines.channels * lines.length * ratio
-            seconds = 1e-9 * (total[leaf] + last[leaf] + upsampling + stages * costs.batch_ns)
-            if math.isfinite(seconds) and (best is None or seconds < best[0]):
+            if (total + last)[leaf] < best[0]:
                 chain = [leaf]
                 for parents in reversed(path):
                     chain.append(int(parents[chain[-1]]))
-                best = seconds, choice, chain[::-1]
-    if best is None:
-        return None
+                best = (total + last)[leaf], choice, within[chain[::-1]]
     _, choice, chain = best
+    if choice is None:
+        return None
     filters = _Filters(
         interpolation.design(choice.align_taps, choice.rate, view.spectrum),
         interpolation.design(choice.aperture_taps, choice.density, _FLAT),
@@ -644,6 +649,7 @@ def _root_error(view: View, side: tuple[int, int]) -> float:
     lines, track = view.lines, view.track
     index = np.arange(0, lines.channels, -(-lines.channels // _CHANNELS))
     part = replace(track, place=track.place[index])
+    middle_m = phase_centres_m(lines)
     side = np.minimum(side, view.grid.shape)
     seen = view.seen(*side)
     random = np.random.default_rng(0)
@@ -652,20 +658,19 @@ def _root_error(view: View, side: tuple[int, int]) -> float:
         some = np.interp(part.place, track.samples, seen[spot]) > 0
         if not some.any():
             continue
-        channels = lines.select(index[some])
+        near_index = index[some]
+        velocity = lines.rx_velocity_m_s
         near = replace(track, place=part.place[some])
         offset_m = random.uniform(-0.5, 0.5, (_PIXELS, 2)) * side @ view.steps_m
         points_m = view.spots_m[spot] + np.concatenate([np.zeros((1, 3)), offset_m])
         range_m = pairwise_range_m(
             points_m,
-            channels.tx_m,
-            channels.rx_m,
-            channels.rx_velocity_m_s,
-            channels.sound_speed_m_s,
+            lines.tx_m[near_index],
+            lines.rx_m[near_index],
+            velocity if velocity is None else velocity[near_index],
+            lines.sound_speed_m_s,
         )
-        virtual_m = track.positions_m(
-            near.places_seen_from(points_m[:1], phase_centres_m(channels))[0]
-        )
+        virtual_m = track.positions_m(near.places_seen_from(points_m[:1], middle_m[near_index])[0])
         on_track_m = pairwise_range_m(points_m, virtual_m, virtual_m)
         on_track_m -= (points_m @ drift(lines))[:, None]
         away_m = (range_m - range_m[0]) - (on_track_m - on_track_m[0])
