@@ -48,7 +48,8 @@ _SPOTS = (0.02, 0.25, 0.5, 0.75, 0.98)  # of rows and columns, where the geometr
 _COARSER = 4  # of the track's samples: where roots are compared
 _ROOTS_SHARE, _BEAM_SHARE = 0.25, 0.2  # of the error allowed
 _LEAST_BEAM_CYCLES, _MOST_BEAM_CYCLES = 0.5, 64.0
-_CHANNELS, _PIXELS = 256, 24  # at which the motion error is evaluated
+_CHANNELS, _PLACES, _PIXELS = 256, 300, 24  # at which errors are evaluated
+_SOME_SPOTS = 6  # one in so many of the spots, there
 
 
 def plan(
@@ -135,31 +136,38 @@ def plan(
     most = _root_limits(view, _ROOTS_SHARE * allowed)
     beam_cycles = 0.0 if beam is None else _LEAST_BEAM_CYCLES
     needed, spared = 0, 0.0 if most is None else _root_error(view, most) + 0.05 * allowed
+    tree: _Tree | None = None
     while most is not None and beam_cycles <= _MOST_BEAM_CYCLES and spared < 0.9 * allowed:
         filters_db = _decibel(allowed - spared) - _MARGIN_DB
-        found = _search(
-            view, tolerance_db, filters_db, most, beam_cycles, device, costs, memory_bytes
-        )
-        if found is None and needed:
+        if tree is None:
+            tree = _search(view, filters_db, most, beam_cycles, device, costs)
+        filters = None if tree is None else _filters(view, tree, filters_db)
+        if filters is None and needed:
             raise ValueError(
                 f"memory_bytes must be at least {needed / 2**20:.1f} MiB to factorize, "
                 f"got {memory_bytes / 2**20:.1f} MiB; clsas.backproject needs less"
             )
-        if found is None or found.predicted_seconds >= exact.predicted_seconds:
+        if filters is None:
+            break
+        found = _plan(
+            view, tolerance_db, filters, tree.sides, device, costs, memory_bytes, (), beam_cycles
+        )
+        if found.predicted_seconds >= exact.predicted_seconds:
             break
         if found.memory_bytes > memory_bytes:
-            needed = found.memory_bytes
+            needed, tree = found.memory_bytes, None
             rows, columns = found.sides[0]
             most = (rows // 2, columns) if rows > columns else (rows, columns // 2)
         elif found.predicted_error_db <= tolerance_db:
             return found
         else:
             # What a beam adds falls with the density of nodes; filters must make up for the rest.
-            others = _other_errors(view, found.sides, found.aperture, beam_cycles, device)
-            if others.beam > _BEAM_SHARE * allowed:
+            within = view.within(found.sides[0])
+            others = _other_errors(within, found.sides, found.aperture, beam_cycles, device)
+            if beam is not None and others.last > _BEAM_SHARE * allowed:
                 beam_cycles *= 2
             else:
-                spared += max(others.total - spared, 0.05 * allowed)
+                spared += max(others.total - spared, 0.1 * allowed)
     return exact
 
 
@@ -220,6 +228,7 @@ class View:
         cell_m = np.linalg.norm(self.steps_m, axis=1) @ (np.array(grid.shape) - 1) / 128
         nearest_m = KDTree(phase_centres_m(lines)).query(dense_m)[0].min() - cell_m
         self.nearest_m = max(float(nearest_m), 1e-9)
+        self._cycles_in_root: dict[tuple[int, int], NDArray[np.float64]] = {}
         self.along = None
         if beam is not None:
             self.along = beam_directions(beam, lines, self.track, self.track.samples)
@@ -272,11 +281,15 @@ class View:
 
         `seen` is [n, spots, samples]: while which of some subimages are seen.
         """
+        if root in self._cycles_in_root:
+            return self._cycles_in_root[root]
         middle = np.arange(len(_SPOTS) ** 2).reshape(len(_SPOTS), -1)[1:-1, 1:-1].ravel()
         rates = self._rates(root, self.spots_m[middle], _COARSER)
         steps = np.gradient(self.track.samples[::_COARSER])
         while_seen = seen[:, middle, ::_COARSER] * steps
-        return np.einsum("nps,kps->nk", while_seen, rates) / len(middle)
+        cycles = np.einsum("nps,kps->nk", while_seen, rates) / len(middle)
+        self._cycles_in_root[root] = cycles
+        return cycles
 
     def _rates(
         self, root: tuple[int, int], centres_m: NDArray[np.float64], every: int = 1
@@ -343,17 +356,24 @@ class _Choice:
     final_taps: int
 
 
+@dataclass(frozen=True)
+class _Tree:
+    """Sizes of subimages, and taps of the filters between them."""
+
+    sides: list[tuple[int, int]]
+    align_taps: int
+    aperture_taps: int
+
+
 def _search(
     view: View,
-    tolerance_db: float,
     filters_db: float,
     most: tuple[int, int],
     beam_cycles: float,
     device: Device,
     costs: Costs,
-    memory_bytes: int,
-) -> Plan | None:
-    """Return the fastest plan whose filters err by no more than `filters_db` together.
+) -> _Tree | None:
+    """Return the fastest tree whose filters err by no more than `filters_db` together.
 
     None where there is none with roots of `most` rows and columns.
 
@@ -371,7 +391,7 @@ def _search(
     seen = np.array([view.seen(*side) for side in sides])
     share = seen[..., view.on_track].mean(axis=(1, 2))
     divides = (sides[:, None] % sides == 0).all(axis=-1) & (sides[:, None] != sides).any(axis=-1)
-    too_curved = _leaf_error(view, sides, device) > 0.1 * 10 ** (tolerance_db / 10)
+    too_curved = _leaf_error(view, sides, device) > 0.1 * 10 ** (filters_db / 10)
     reach_m = np.array([view.reach_m(side) for side in sides])
 
     leaf_ns = costs.leaf_ns * (1.0 if view.beam is None else WITH_BEAM)
@@ -381,10 +401,12 @@ def _search(
 
     choices = []
     for stages in range(1, _MOST_STAGES + 1):
-        for choice in _choices(view.spectrum, filters_db - 10 * math.log10(2 * stages + 1)):
+        for taps in product(_ALIGN_TAPS, _APERTURE_TAPS):
+            choice = _choice(view.spectrum, *taps, _each(filters_db, stages))
+            if choice is None:
+                continue
             samples = 2 * reach_m * choice.rate / lines.range_step_m + choice.final_taps + 16
-            taps = choice.align_taps + choice.aperture_taps
-            sample_ns = costs.sample_ns + costs.sample_tap_ns * taps
+            sample_ns = costs.sample_ns + costs.sample_tap_ns * sum(taps)
             per_channel = counts * (samples * sample_ns + costs.channel_ns)
             fixed = costs.upsampled_sample_ns * lines.samples.size * choice.rate
             choices.append((stages, choice, per_channel, fixed + stages * costs.batch_ns))
@@ -425,29 +447,40 @@ def _search(
     _, choice, chain = best
     if choice is None:
         return None
-    filters = _Filters(
+    chosen = [tuple(map(int, sides[i])) for i in chain]
+    return _Tree(chosen, choice.align_taps, choice.aperture_taps)
+
+
+def _filters(view: View, tree: _Tree, filters_db: float) -> _Filters | None:
+    """Return the filters of a tree whose errors together are no more than `filters_db`."""
+    choice = _choice(
+        view.spectrum, tree.align_taps, tree.aperture_taps, _each(filters_db, len(tree.sides))
+    )
+    if choice is None:
+        return None
+    return _Filters(
         interpolation.design(choice.align_taps, choice.rate, view.spectrum),
         interpolation.design(choice.aperture_taps, choice.density, _FLAT),
         interpolation.design(choice.final_taps, choice.rate, view.spectrum),
     )
-    chosen = [tuple(map(int, sides[i])) for i in chain]
-    return _plan(
-        view, tolerance_db, filters, chosen, device, costs, memory_bytes, beam_cycles=beam_cycles
-    )
 
 
-def _choices(spectrum: Spectrum, each_db: float) -> list[_Choice]:
-    """Return taps with the least rates at which every interpolation errs by no more."""
-    result = []
-    for align_taps, aperture_taps in product(_ALIGN_TAPS, _APERTURE_TAPS):
-        rate = _least(align_taps, each_db, spectrum, "scatter_db")
-        density = _least(aperture_taps, each_db, _FLAT, "error_db")
-        if rate is None or density is None:
-            continue
-        needed = {taps: _least(taps, each_db, spectrum, "scatter_db") for taps in _FINAL_TAPS}
-        final_taps = next(t for t in _FINAL_TAPS if needed[t] is not None and needed[t] <= rate)
-        result.append(_Choice(align_taps, rate, aperture_taps, density, final_taps))
-    return result
+def _each(filters_db: float, stages: int) -> float:
+    """Return the error that every interpolation may have: two of a stage, and the last."""
+    return filters_db - 10 * math.log10(2 * stages + 1)
+
+
+def _choice(
+    spectrum: Spectrum, align_taps: int, aperture_taps: int, each_db: float
+) -> _Choice | None:
+    """Return the least rates at which every interpolation errs by no more; None without any."""
+    rate = _least(align_taps, each_db, spectrum, "scatter_db")
+    density = _least(aperture_taps, each_db, _FLAT, "error_db")
+    if rate is None or density is None:
+        return None
+    needed = {taps: _least(taps, each_db, spectrum, "scatter_db") for taps in _FINAL_TAPS}
+    final_taps = next(t for t in _FINAL_TAPS if needed[t] is not None and needed[t] <= rate)
+    return _Choice(align_taps, rate, aperture_taps, density, final_taps)
 
 
 def _least(taps: int, wanted_db: float, spectrum: Spectrum, error: str) -> float | None:
@@ -616,12 +649,13 @@ class _Errors:
     """Powers of the errors that filters do not account for."""
 
     roots: float
+    nodes: float
+    last: float
     leaves: float
-    beam: float
 
     @property
     def total(self) -> float:
-        return self.roots + self.leaves + self.beam
+        return self.roots + self.nodes + self.last + self.leaves
 
 
 def _other_errors(
@@ -633,8 +667,9 @@ def _other_errors(
 ) -> _Errors:
     return _Errors(
         roots=_root_error(view, sides[0]),
+        nodes=sum(_excess_error(view, side, aperture, None) for side in sides[:-1]),
+        last=_excess_error(view, sides[-1], aperture, beam_cycles),
         leaves=float(_leaf_error(view, np.array([sides[-1]]), device)[0]),
-        beam=_beam_error(view, sides[-1], aperture, beam_cycles),
     )
 
 
@@ -654,7 +689,7 @@ def _root_error(view: View, side: tuple[int, int]) -> float:
     seen = view.seen(*side)
     random = np.random.default_rng(0)
     powers, total = [], 0
-    for spot in range(0, len(view.spots_m), 3):
+    for spot in range(0, len(view.spots_m), _SOME_SPOTS):
         some = np.interp(part.place, track.samples, seen[spot]) > 0
         if not some.any():
             continue
@@ -682,25 +717,26 @@ def _root_error(view: View, side: tuple[int, int]) -> float:
     return float(off_track + rounding)
 
 
-def _beam_error(
-    view: View, side: tuple[int, int], aperture: Interpolator, beam_cycles: float
+def _excess_error(
+    view: View, side: tuple[int, int], aperture: Interpolator, beam_cycles: float | None
 ) -> float:
-    """Return the power of the error that a beam's weights add to those of the last stage's nodes.
+    """Return the power of the error that a stage's nodes add to that of the aperture's filter.
 
-    Evaluated as it is, for leaves and pixels of them at random: weighted steering functions
-    between nodes against what interpolation makes of them.
+    The filter takes nodes as equally spaced and weights as constant. Evaluated as it is, for
+    subimages and pixels of them at random: steering functions between nodes against what
+    interpolation makes of them; in the last stage, where `beam_cycles` is given, weighted.
     """
-    if view.beam is None:
-        return 0.0
     track, random = view.track, np.random.default_rng(0)
-    wavelength = view.lines.sound_speed_m_s / max(view.lines.carrier_hz, 1e-3)
+    wavelength_m = view.lines.sound_speed_m_s / max(view.lines.carrier_hz, 1e-3)
+    weighted = view.beam is not None and beam_cycles is not None
     seen = view.seen(*side)
     wrong = total = 0.0
-    for spot in np.flatnonzero(seen.any(axis=1))[::3]:
+    for spot in np.flatnonzero(seen.any(axis=1))[::_SOME_SPOTS]:
         places = track.samples[seen[spot]]
-        place = np.linspace(places[0], places[-1], 1000)
+        place = np.linspace(places[0], places[-1], _PLACES)
         rate = side[0] * view.rates[0, spot] + side[1] * view.rates[1, spot]
-        rate = rate + beam_cycles * view.beam_rates[spot]
+        if weighted:
+            rate = rate + beam_cycles * view.beam_rates[spot]
         nodes = interpolated_nodes(track, rate[None], place[None], aperture)
         offset_m = random.uniform(-0.5, 0.5, (_PIXELS, 2)) * side @ view.steps_m
         points_m = view.spots_m[spot] + np.concatenate([np.zeros((1, 3)), offset_m])
@@ -708,10 +744,13 @@ def _beam_error(
         def steering(at: NDArray[np.float64], points_m: NDArray[np.float64] = points_m) -> NDArray:
             sight = points_m[:, None] - track.positions_m(at)
             range_m = np.linalg.norm(sight, axis=-1)
-            along = np.stack([np.interp(at, track.samples, axis) for axis in view.along.T], axis=-1)
-            sine = np.einsum("psi,si->ps", sight, along) / range_m
-            turns = view.highest_cycles_per_m * (range_m - range_m[0])
-            return view.beam.weights(sine[1:], wavelength) * np.exp(2j * np.pi * turns[1:])
+            turns = view.highest_cycles_per_m * (range_m[1:] - range_m[0])
+            result = np.exp(2j * np.pi * turns)
+            if weighted:
+                along = [np.interp(at, track.samples, axis) for axis in view.along.T]
+                sine = np.einsum("psi,is->ps", sight[1:], along) / range_m[1:]
+                result *= view.beam.weights(sine, wavelength_m)
+            return result
 
         of_nodes = steering(nodes.place[0])
         index = nodes.base[0][:, None] + np.arange(nodes.taps)
