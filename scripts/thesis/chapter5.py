@@ -13,7 +13,7 @@ import statistics
 import time
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
 from pathlib import Path
@@ -48,11 +48,14 @@ class Scene:
     bistatic : bool
         Whether every receiver stands where it is, half an array from the transmitter; else
         transmitter and receiver stand at their phase centre (THESIS [32]).
+    points : int
+        How many reflectors; if more than one, scattered over the image.
     """
 
     device: Device
     pixels: int = PIXELS
     bistatic: bool = False
+    points: int = 1
 
     @property
     def side_m(self) -> float:
@@ -87,8 +90,16 @@ class Scene:
         track = clsas.Track.straight(
             ((1 - pings) / 2 * spacing_m, 0, 0), (spacing_m, 0, 0), pings, ping_interval_s=1.0
         )
-        point = clsas.PointTargets([[*self.point_m, 0.0]])
-        return clsas.compress(clsas.simulate(sonar, track, point), oversampling=1.25)
+        positions_m = np.array([[*self.point_m, 0.0]])
+        if self.points > 1:
+            random = np.random.default_rng(1)
+            away_m = random.uniform(-0.5, 0.5, (self.points, 2)) * self.side_m
+            positions_m = np.pad(away_m, ((0, 0), (0, 1))) + positions_m
+        # The whole scene from every channel, with room for side lobes in range.
+        far_m = math.hypot(NEAREST_M + self.side_m, self.side_m / 2 + 320 * SPACING_M)
+        window_m = NEAREST_M - 1, far_m + 1
+        echoes = clsas.simulate(sonar, track, clsas.PointTargets(positions_m), range_m=window_m)
+        return clsas.compress(echoes, oversampling=1.25)
 
     @cached_property
     def exact(self) -> clsas.Image:
@@ -107,50 +118,60 @@ class Scene:
         """Form the image by a plan."""
         return clsas.factorize(self.lines, self.grid, plan, device=self.device)
 
+    @cached_property
+    def scattered(self) -> Scene:
+        """The same with many reflectors: for errors that hold for no one place."""
+        return replace(self, points=300)
+
+    def error_db(self, **wish: object) -> float:
+        """Return the relative rms error of the image by a plan, dB."""
+        return clsas.relative_error_db(self.form(self.plan(**wish)), self.exact)
+
     def error_m(self, stages: Stages) -> float:
         """Return the error of all stages by [45]."""
         return sum(nearest.stage_errors_m(stages, SPACING_M, self.side_m, NEAREST_M))
 
-    def largest_error_m(self, plan: clsas.Plan) -> float:
-        """Return the largest range error that a nearest-beam plan makes, over 2000 pixels."""
+    def range_errors_m(self, plan: clsas.Plan) -> np.ndarray:
+        """Return the range errors of a nearest-beam plan at 1016 pixels, [pixels, channels]."""
         random = np.random.default_rng(1)
-        pixels = random.integers(0, self.pixels, (2000, 2))
+        pixels = random.integers(0, self.pixels, (1000, 2))
         ends = [0, self.pixels // 2 - 1, self.pixels // 2, self.pixels - 1]
         pixels = np.concatenate([pixels, list(product(ends, ends))])
-        return float(np.abs(nearest.plan_errors_m(plan, self.lines, self.grid, pixels)).max())
+        return nearest.plan_errors_m(plan, self.lines, self.grid, pixels)
+
+    def largest_error_m(self, plan: clsas.Plan) -> float:
+        """Return the largest of them."""
+        return float(np.abs(self.range_errors_m(plan)).max())
 
     @cached_property
     def exact_quality(self) -> Quality:
         """What is measured on the exact image."""
         return self.measure(self.exact)
 
+    @cached_property
+    def exact_peak(self) -> float:
+        """Amplitude of the point in the exact image."""
+        return clsas.measure_point(self.exact, self.point_m, search_m=GUARD_M).amplitude
+
     def measure(self, image: clsas.Image) -> Quality:
         """Measure the point in an image."""
         x_m, _ = image.grid.axes_m
-        level = profile(image)
-        peak = np.abs(self.exact.pixels).max()
-        far = np.abs(x_m - self.point_m[0]) > GUARD_M
-        error_db = -math.inf
-        if image is not self.exact:
-            error_db = clsas.relative_error_db(image, self.exact)
-        nothing = Quality(math.nan, math.nan, math.nan, math.nan, error_db)
+        beyond = profile(image)[np.abs(x_m - self.point_m[0]) > GUARD_M]
         try:
             with warnings.catch_warnings():
                 # A side lobe above the peak is what a broken image has.
                 warnings.simplefilter("ignore", clsas.ClsasWarning)
                 found = clsas.measure_point(image, self.point_m, search_m=GUARD_M)
-        except ValueError:
-            return nothing  # no point response is left
-        highest = level[far].max(initial=1e-30) / found.amplitude
-        cut = found.azimuth
-        return Quality(
-            cut.resolution_m,
-            max(*cut.pslr_db, 20 * math.log10(highest)),
-            cut.islr_db,
-            20
-            * math.log10(peak / np.abs(image.pixels).max(initial=1e-30, where=near(self, image))),
-            error_db,
-        )
+        except ValueError:  # no point response is left
+            resolution_m = pslr_db = islr_db = loss_db = math.nan
+        else:
+            far_db = decibels(beyond, found.amplitude).max(initial=-math.inf)
+            resolution_m = found.azimuth.resolution_m
+            pslr_db = float(max(*found.azimuth.pslr_db, far_db))
+            islr_db = found.azimuth.islr_db
+            loss_db = 20 * math.log10(self.exact_peak / found.amplitude)
+        error_db = clsas.relative_error_db(image, self.exact)
+        return Quality(resolution_m, pslr_db, islr_db, loss_db, error_db)
 
 
 @dataclass(frozen=True)
@@ -195,13 +216,6 @@ class Quality:
             "loss dB": f"{self.loss_db:.2f}",
             "image error dB": f"{self.error_db:.1f}",
         }
-
-
-def near(scene: Scene, image: clsas.Image) -> np.ndarray:
-    """Return which pixels lie within `GUARD_M` of the point."""
-    x_m, y_m = image.grid.axes_m
-    x, y = scene.point_m
-    return (np.abs(y_m - y) <= GUARD_M)[:, None] & (np.abs(x_m - x) <= GUARD_M)
 
 
 def profile(image: clsas.Image) -> np.ndarray:

@@ -22,7 +22,8 @@ def main() -> None:
         stages = equal_stages(number)
         plan = scene.plan(stages=stages)
         by_formula.append(scene.error_m(stages))
-        largest.append(scene.largest_error_m(plan))
+        errors_m = scene.range_errors_m(plan)
+        largest.append(np.abs(errors_m).max())
         quality = scene.measure(scene.form(plan))
         rows.append(
             {
@@ -32,6 +33,7 @@ def main() -> None:
                 "measured mm": f"{1e3 * largest[-1]:.4f}",
                 "measured": chapter5.fraction(largest[-1]),
                 "measured/[45]": f"{largest[-1] / by_formula[-1]:.3f}",
+                "rms/[45]": f"{np.sqrt(np.mean(errors_m**2)) / by_formula[-1]:.3f}",
                 **quality.cells(),
             }
         )

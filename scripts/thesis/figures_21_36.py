@@ -30,11 +30,12 @@ def main() -> None:
     rows = [
         {
             "image": "backprojection", "QR x QI": "", "[45]": "", "measured": "",
-            **scene.exact_quality.cells(), "usable": "yes",
+            **scene.exact_quality.cells(), "scene error dB": "-inf", "usable": "yes",
         }
     ]  # fmt: skip
 
-    def add(title: str, plan, stages=None, kept: bool = True) -> None:
+    def add(title: str, kept: bool = True, **wish: object) -> None:
+        plan, stages = scene.plan(**wish), wish.get("stages")
         image = scene.form(plan)
         quality = scene.measure(image)
         rows.append(
@@ -44,6 +45,7 @@ def main() -> None:
                 "[45]": chapter5.fraction(scene.error_m(stages)) if stages else "",
                 "measured": chapter5.fraction(scene.largest_error_m(plan)) if stages else "",
                 **quality.cells(),
+                "scene error dB": f"{scene.scattered.error_db(**wish):.1f}",
                 "usable": "yes" if quality.usable(scene.exact_quality) else "no",
             }
         )
@@ -51,11 +53,11 @@ def main() -> None:
             images[title] = image
 
     for label, pair in ERRORS.items():
-        add(f"nearest, λ/{label}", scene.plan(stages=[pair]), [pair])
+        add(f"nearest, λ/{label}", stages=[pair])
     for db in TOLERANCES_DB:
-        add(f"interpolated, {db} dB", scene.plan(tolerance_db=db))
+        add(f"interpolated, {db} dB", tolerance_db=db)
     for label, pair in HALVINGS.items():
-        add(f"nearest, thesis's λ/{label}?", scene.plan(stages=[pair]), [pair], kept=False)
+        add(f"nearest, thesis's λ/{label}?", kept=False, stages=[pair])
     chapter5.report(given.out, "figures_21_36", rows)
 
     x_m, y_m = scene.grid.axes_m
