@@ -23,9 +23,9 @@ from clsas.planner import plan
 from clsas.scene import PointTargets
 from clsas.simulate import simulate_lines
 
-_TOLERANCES_DB = (-20.0, -35.0, -50.0, -65.0)
-# Plans differ with what they are told that things cost: shallow trees, deep ones, many channels.
-_TOLD = (Costs(pixel_ns=100.0), Costs(pixel_ns=1e3, channel_ns=1.0), Costs(pixel_ns=3.0))
+_TOLERANCES_DB = (-25.0, -45.0, -60.0)
+# Plans differ with what they are told that things cost: these have shallow trees and deep ones.
+_TOLD = (Costs(pixel_ns=1e3), Costs(pixel_ns=1e3, leaf_ns=10.0))
 _REPEATS = 3
 
 

@@ -613,7 +613,7 @@ def bench(
     repeats: int,
     as_json: bool,
 ) -> None:
-    """Time a benchmark case and measure its error; without CASE, all of them run.
+    """Time a benchmark case and measure its error; without CASE, all of them run for minutes.
 
     Cases bp-... are exact imaging; cases ffbp-... are factorized imaging, compared with exact
     imaging. With --json every case is one line.

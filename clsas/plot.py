@@ -19,7 +19,7 @@ from clsas.image import Image
 from clsas.io import replacing
 from clsas.lines import RangeLines
 from clsas.quality import Cut, PointResponse
-from clsas.tradeoff import Tradeoff
+from clsas.tradeoff import Row, Tradeoff
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -210,21 +210,15 @@ def tradeoff(measured: Tradeoff, *, title: str = "") -> Figure:
         ("stages", "tab:orange", "s", "thesis's method: stages of QR x QI"),
         ("exact", "black", "D", "exact"),
     ):
-        for row in (row for row in measured.rows if row.method == method):
+        rows = [row for row in measured.rows if row.method == method]
+        for row in rows:
             errors_db = row.error_db, row.predicted_error_db
             seconds = row.seconds, row.predicted_seconds
             axes.plot(errors_db, seconds, ":", color=color, linewidth=0.8, alpha=0.5)
             axes.plot(errors_db[1:], seconds[1:], marker, color=color, fillstyle="none")
             axes.plot(errors_db[:1], seconds[:1], marker, color=color, label=label)
             label = ""  # one entry in the legend
-            axes.annotate(
-                row.label,
-                (row.error_db, row.seconds),
-                xytext=(6, -9),
-                textcoords="offset points",
-                fontsize="x-small",
-                color=color,
-            )
+        _label_beside(axes, rows, color)
     axes.plot([], [], "o", color="0.5", fillstyle="none", label="predicted (hollow)")
     axes.set(
         yscale="log",
@@ -261,6 +255,22 @@ def save_png(figure: Figure, path: str | os.PathLike, *, dpi: float = 150.0) -> 
     validate.positive("dpi", dpi, "pixels per inch")
     with replacing(path) as temporary:
         figure.savefig(temporary, format="png", dpi=dpi)
+
+
+def _label_beside(axes: Axes, rows: list[Row], color: str) -> None:
+    """Label points: to their lower right, those of stages, which lie close, in a column."""
+    column_db, lowest_s = min((row.error_db for row in rows), default=0.0) - 5, 0.0
+    for row in sorted(rows, key=lambda row: row.seconds):
+        style = {"fontsize": "x-small", "color": color}
+        place = row.error_db, row.seconds
+        if row.method != "stages":
+            axes.annotate(row.label, place, (6, -9), textcoords="offset points", **style)
+            continue
+        lowest_s = max(row.seconds, 1.1 * lowest_s)
+        line = {"arrowstyle": "-", "color": color, "linewidth": 0.5, "alpha": 0.6}
+        axes.annotate(
+            row.label, place, (column_db, lowest_s), va="center", arrowprops=line, **style
+        )
 
 
 def _figure_class() -> type[Figure]:

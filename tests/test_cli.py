@@ -1,3 +1,4 @@
+import dataclasses
 import json
 import os
 import pty
@@ -15,7 +16,7 @@ import pytest
 from click.testing import CliRunner
 
 import clsas
-from clsas import bench, cli, demo
+from clsas import bench, cli, costs, demo
 from clsas.config import built_in_scene, read_scene
 
 pytest.importorskip("matplotlib")
@@ -25,6 +26,7 @@ README = (ROOT / "README.md").read_text()
 (EXAMPLE,) = re.findall(
     r"```toml\n(.*?)```", (ROOT / "docs" / "scene-files.md").read_text(), re.DOTALL
 )
+SMALL = bench.Case(48, 8.25e-3, 1e6, 100e3, (-0.2, 0.2), (40.0, 40.4), 64)
 
 
 def run(*args, code=0):
@@ -117,6 +119,140 @@ def test_options_go_before_the_scene_file(made, tmp_path):
     assert result["upsampling"] == pytest.approx(2, rel=0.02)
     positions = clsas.load(image).grid.positions_m()
     np.testing.assert_allclose(positions[[0, -1], [0, -1]], [[-1, 20, 0.5], [1, 21, 0.5]])
+
+
+def image_of(made, tmp_path, *args):
+    """What `clsas image` says, and the image, on the documented scene's grid."""
+    described = read_scene(made[0] / "scene.toml").grid.axes_m
+    x, y = (f"{axis[0]}:{axis[-1]}:{len(axis)}" for axis in described)
+    output = tmp_path / "image.h5"
+    result = run_json("image", made[0] / "lines.h5", "--x", x, "--y", y, *args, "-o", output)
+    return result, clsas.load(output)
+
+
+def test_the_dial(made, tmp_path):
+    """Images to a tolerance, in wavelengths, in the thesis's stages and exactly."""
+    exact = clsas.load(made[0] / "image.h5")
+    for args, worst_db in (
+        ([], -48),
+        (["--tolerance-db", -30], -28),
+        (["--tolerance-wavelengths", "1/40"], -13),
+        (["--tolerance-wavelengths", "0.001"], -41),
+    ):
+        result, image = image_of(made, tmp_path, *args)
+        assert clsas.relative_error_db(image, exact) < worst_db, args
+        assert result["method"] in ("exact", "factorized")
+        assert result["plan_seconds"] > 0
+    result, image = image_of(made, tmp_path, "--stages", "2x2,2X2")
+    assert result["method"] == "stages"
+    assert result["predicted_seconds"] > 0
+    lines = clsas.load(made[0] / "lines.h5")
+    plan = clsas.plan(lines, exact.grid, stages=[(2, 2), (2, 2)])
+    assert result["predicted_error_db"] == pytest.approx(plan.predicted_error_db)
+    by_library = clsas.factorize(lines, exact.grid, plan)
+    assert clsas.relative_error_db(image, by_library) < -100
+    for args in (["--exact"], ["--accuracy-db", -60], ["--exact", "--accuracy-db", -60]):
+        result, image = image_of(made, tmp_path, *args)
+        assert (result["method"], "plan_seconds" in result) == ("exact", False)
+        assert clsas.relative_error_db(image, exact) < -100
+
+
+def test_a_plan_that_is_exact_is_as_accurate_as_asked_for(made, tmp_path):
+    few = ("--x", "-0.02:0.02:3", "--y", "19.9:20.1:4", "--tolerance-db", -70)
+    output = tmp_path / "image.h5"
+    result = run_json("image", made[0] / "lines.h5", *few, "-o", output)
+    assert result["method"] == "exact"
+    assert result["interpolation_error_db"] < -70
+    assert "planned in " in run("image", made[0] / "lines.h5", *few, "-o", output)[0]
+
+
+def test_a_beam_from_the_command_line(made, tmp_path):
+    exact = clsas.load(made[0] / "image.h5")
+    lines = clsas.load(made[0] / "lines.h5")
+    beam = clsas.BeamWindow(5.0, "hann", squint_deg=1.0)
+    options = ("--beam-deg", 5, "--beam-shape", "hann", "--squint-deg", 1)
+    _, image = image_of(made, tmp_path, "--exact", *options)
+    expected = clsas.backproject(lines, exact.grid, beam=beam)
+    assert clsas.relative_error_db(image, expected) < -100
+    _, image = image_of(made, tmp_path, "--tolerance-db", -40, *options)
+    assert clsas.relative_error_db(image, expected) < -38
+
+
+def test_dial_and_beam_of_a_scene_file(made, tmp_path):
+    """The scene's are used, and give way to options."""
+    grid = EXAMPLE[EXAMPLE.index("[grid]") : EXAMPLE.index("[image]")]
+    scene = tmp_path / "scene.toml"
+    scene.write_text(f"{grid}[image]\nstages = [[2, 2]]\nbeam = {{ width_deg = 5.0 }}\n")
+    image = "image", made[0] / "lines.h5", "--scene", scene, "-o", tmp_path / "image.h5"
+    assert run_json(*image)["method"] == "stages"
+    result = run_json(*image, "--exact", "--squint-deg", 1)
+    assert result["method"] == "exact"
+    lines, formed = clsas.load(made[0] / "lines.h5"), clsas.load(tmp_path / "image.h5")
+    beam = clsas.BeamWindow(5.0, squint_deg=1.0)
+    expected = clsas.backproject(lines, formed.grid, beam=beam)
+    assert clsas.relative_error_db(formed, expected) < -100
+    assert run("plan", *image[1:4])[0].startswith("Plan: stages as given")
+    assert run("plan", *image[1:4], "--tolerance-db", -30)[0].startswith("Plan: tolerance -30 dB")
+
+
+def test_plan(made):
+    lines, scene = made[0] / "lines.h5", made[0] / "scene.toml"
+    # The scene asks for an exact image.
+    assert run("plan", lines, "--scene", scene)[0].startswith("Plan: tolerance -50 dB; predicted")
+    args = "plan", lines, "--scene", scene, "--stages", "2x2"
+    text, stderr = run(*args, "--json")
+    assert stderr == ""
+    plan = clsas.Plan.from_json(text)
+    assert plan.describe() + "\n" == run(*args)[0]
+    assert plan.nearest == (2,)
+    assert not (made[0] / "plan.json").exists()
+
+
+def test_tradeoff(made, tmp_path):
+    table, png = tmp_path / "t.csv", tmp_path / "t.png"
+    ways = ("--tolerance-db", -30, "--stages", "2x2,2x2", "--repeats", 1)
+    grid = ("--x", "-0.3:0.3:64", "--y", "19.7:20.3:64")
+    args = ("tradeoff", made[0] / "lines.h5", *grid, *ways)
+    result = run_json(*args, "--csv", table, "--png", png)
+    assert [row["label"] for row in result["rows"]] == ["-30 dB", "2 of 2x2", "exact"]
+    assert result["rows"][0]["error_db"] < -28
+    assert (result["channels"], result["pixels"]) == (320, [64, 64])
+    assert table.read_text().count("\n") == 4
+    assert png.read_bytes().startswith(b"\x89PNG")
+    text, _ = run(*args)
+    assert text.startswith("320 lines, 64 x 64 pixels on ")
+    assert "2 of 2x2" in text
+
+
+def test_tradeoff_of_a_built_in_case(monkeypatch):
+    beam = clsas.BeamWindow(1.0)
+    monkeypatch.setattr(bench, "FACTORIZED", {"small": dataclasses.replace(SMALL, beam=beam)})
+    seen = []
+
+    def measured(lines, grid, **options):
+        seen.append((lines.channels, grid.shape, options))
+        return clsas.Tradeoff("abacus", "1.0", 48, grid.shape, 3, ())
+
+    monkeypatch.setattr(clsas, "tradeoff", measured)
+    run("tradeoff", "--case", "small")
+    run("tradeoff", "--case", "small", "--beam-shape", "hann")
+    assert [(channels, shape) for channels, shape, _ in seen] == [(48, (64, 64))] * 2
+    options = seen[0][2]
+    assert options["beam"].width_deg == 1.0
+    assert (options["stages"], options["repeats"]) == (None, 3)
+    assert (seen[1][2]["beam"].width_deg, seen[1][2]["beam"].shape) == (1.0, "hann")
+
+
+def test_calibrate(monkeypatch):
+    measured = costs.Costs(pixel_ns=0.7)
+    monkeypatch.setattr("clsas.calibrate.calibrate", lambda device, progress: measured)
+    result = run_json("calibrate", "--device", 0)
+    assert result["costs"]["pixel_ns"] == 0.7
+    assert result["file"] == str(costs.path())
+    text, _ = run("calibrate", "--device", 0)
+    assert result["device"] in text
+    assert str(costs.path()) in text
+    assert re.search(r"^ +0\.7  pixel_ns$", text, re.MULTILINE)
 
 
 def test_an_image_tells_its_kernels_times(made, tmp_path):
@@ -229,6 +365,33 @@ FIXED = ["--taps", "4", "--upsampling", "2"]
             2,
             "--accuracy-db plays no part",
         ),
+        (
+            ["image", "lines.h5", *GRID, "-o", "new.h5", "--tolerance-db", "-30", "--exact"],
+            2,
+            "--stages and --exact exclude each other",
+        ),
+        (
+            ["plan", "lines.h5", *GRID, "--tolerance-db", "-30", "--stages", "2x2"],
+            2,
+            "--stages and --exact exclude each other",
+        ),
+        (
+            ["image", "lines.h5", *GRID, "-o", "new.h5", "--stages", "2x2", "--taps", "4"],
+            2,
+            "--taps and --upsampling are of the exact image, and play no part with --stages",
+        ),
+        (["plan", "lines.h5", *GRID, "--stages", "2x2,2"], 2, "'2x2,2' must be QRxQI for every"),
+        (["plan", "lines.h5", *GRID, "--stages", "1x9"], 1, "stages must leave a line and a pixel"),
+        (["plan", "lines.h5", *GRID, "--tolerance-wavelengths", "1/0"], 2, "a fraction such as"),
+        (["plan", "lines.h5", *GRID, "--tolerance-db", "-100"], 1, "tolerance_db must be finite"),
+        (["plan", "lines.h5", *GRID, "--squint-deg", "3"], 2, "go with --beam-deg"),
+        (["plan", "lines.h5", *GRID, "--beam-deg", "-3"], 1, "width_deg must be finite"),
+        (["plan", "lines.h5"], 2, "a grid is needed: --scene, or --x and --y"),
+        (["tradeoff", *GRID], 2, "either LINES.H5 or --case is needed"),
+        (["tradeoff", "lines.h5", "--case", "bp-thesis"], 2, "either LINES.H5 or --case is needed"),
+        (["tradeoff", "--case", "bp-nothing"], 2, "'bp-nothing' is not one of bp-thesis, "),
+        (["tradeoff", "--case", "bp-thesis", *GRID], 2, "--case has its own grid"),
+        (["tradeoff", "lines.h5", *GRID, "--csv", "new", "--png", "new"], 2, "must be two files"),
         (["image", "lines.h5", "-o", "new.h5"], 2, "a grid is needed: --scene, or --x and --y"),
         (["image", "lines.h5", *GRID[:2], "-o", "new.h5"], 2, "--x and --y go together"),
         (["image", "lines.h5", "--x", "0:1", *GRID[2:], "-o", "new.h5"], 2, "START:STOP:N"),
@@ -304,8 +467,8 @@ def test_help_shows_an_example_that_parses(monkeypatch):
 
 
 def test_bench(monkeypatch):
-    small = bench.Case(48, 8.25e-3, 1e6, 100e3, (-0.2, 0.2), (40.0, 40.4), 64)
-    monkeypatch.setattr(bench, "CASES", {"one": small, "two": small})
+    monkeypatch.setattr(bench, "CASES", {"one": SMALL, "two": SMALL})
+    monkeypatch.setattr(bench, "FACTORIZED", {"fast": SMALL})
     result = run_json("bench", "one", "--repeats", 2)
     assert result["case"] == "one"
     assert result.keys() >= {"device", "driver", "gbp_per_s", "rounding_error_db"}
@@ -313,7 +476,12 @@ def test_bench(monkeypatch):
     assert 0 < seconds["min"] <= seconds["median"] <= seconds["max"]
     assert result["true_error_db"] < -50
     stdout, _ = run("bench", "--repeats", 1, "--json")
-    assert [json.loads(line)["case"] for line in stdout.splitlines()] == ["one", "two"]
+    assert [json.loads(line)["case"] for line in stdout.splitlines()] == ["one", "two", "fast"]
+    result = run_json("bench", "fast", "--repeats", 1, "--tolerance-db", -30)
+    assert (result["case"], result["tolerance_db"]) == ("fast", -30)
+    assert result["error_db"] < -28
+    for args in (["fast", "--accuracy-db", "-30"], ["one", "--tolerance-db", "-30"]):
+        assert "--tolerance-db with ffbp-..." in run("bench", *args, code=2)[1]
     text, _ = run("bench", "one", "--repeats", 1)
     assert re.search(r"^ +gbp_per_s  \d", text, re.MULTILINE)
     assert "'one' or 'two'" not in text
@@ -389,8 +557,9 @@ def test_readme_tour(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     tour = README[README.index("## Five minutes") :]
     commands, program = (
-        re.search(rf"```{kind}\n(.*?)```", tour, re.DOTALL)[1] for kind in ("sh", "python")
+        "\n".join(re.findall(rf"```{kind}\n(.*?)```", tour, re.DOTALL)) for kind in ("sh", "python")
     )
+    monkeypatch.setattr(bench, "FACTORIZED", {"ffbp-thesis": SMALL})
     shown = {}
     for line in filter(None, commands.splitlines()):
         name, *args = shlex.split(line)
@@ -398,17 +567,22 @@ def test_readme_tour(tmp_path, monkeypatch):
             monkeypatch.chdir(*args)
         else:
             assert name == "clsas"
-            shown[args[0]], _ = run(*args)
+            shown[args[0]] = shown.get(args[0], "") + run(*args)[0]
     assert re.search(
         r"azimuth 6\.58 mm wide at -3 dB \(theory 6\.58 mm; L/2 = 7\.50 mm\)", shown["demo"]
     )
     assert re.search(r"range +6\.86 mm wide at -3 dB \(theory 6\.86 mm", shown["demo"])
     assert "point at x = " in shown["quality"]
-    assert {path.name for path in Path().glob("*.png")} > {"geometry.png", "lines.png"}
+    error_db = float(re.search(r"error relative to exact.h5: (.*) dB", shown["quality"])[1])
+    assert error_db < -38
+    assert shown["plan"].startswith("Plan: tolerance -40 dB")
+    pictures = {path.name for path in Path().glob("*.png")}
+    assert pictures > {"geometry.png", "lines.png", "cuts.png", "tradeoff.png"}
 
     done = subprocess.run(
         [sys.executable, "-c", program], capture_output=True, text=True, check=True, cwd=tmp_path
     )
+    assert "Plan: tolerance -50 dB; predicted error" in done.stdout
     azimuth, range_ = map(float, re.findall(r"([\d.]+) mm", done.stdout))
     assert azimuth == pytest.approx(6.6, abs=0.3)
     assert range_ == pytest.approx(1.3 * 7.5, rel=0.1)

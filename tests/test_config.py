@@ -67,6 +67,15 @@ def test_documented_example_is_read_as_written():
     assert scene.image == {"accuracy_db": -60}
 
 
+def test_dial_and_beam():
+    text = "[image]\nstages = [[2, 4], [2, 2]]\n[image.beam]\nwidth_deg = 20\nshape = 'hann'"
+    image = parse(text).image
+    assert image["stages"] == [(2, 4), (2, 2)]
+    assert (image["beam"].width_deg, image["beam"].shape) == (20, "hann")
+    assert image.keys() == {"stages", "beam"}
+    assert parse("[image]\ntolerance_db = -30").image == {"tolerance_db": -30}
+
+
 def documented_keys():
     """Key and default of every row of every table of docs/scene-files.md, by TOML table."""
     tables = {}
@@ -297,6 +306,22 @@ def test_bad_track_files(tmp_path, text, message):
         ("[image]\ntaps = 3", "[image] taps must be one of (2, 4, 6, 8), got 3"),
         ("[image]\naccuracy_db = 5", "[image] accuracy_db must be finite and < 0 and >= -85 dB"),
         ("[image]\nupsampling = nan", "[image] upsampling must be finite and >= 1 and <= 64"),
+        (
+            "[image]\ntolerance_db = -50\ntaps = 4\nstages = [[2, 2]]",
+            "[image] tolerance_db must stand alone, got also stages, taps",
+        ),
+        (
+            "[image]\ntolerance_db = -90",
+            "[image] tolerance_db must be finite and >= -75 and <= -10",
+        ),
+        (
+            "[image]\ntolerance_wavelengths = 0",
+            "[image] tolerance_wavelengths must be finite and >",
+        ),
+        ("[image]\nstages = [[2, 0]]", "[image] QI of stages must be at least 1, got 0"),
+        ("[image]\nstages = [[2]]", "[image] stages[0] must be a list of 2, got [2]"),
+        ("[image.beam]\nshape = 'hann'", "missing key 'width_deg' in [image.beam]"),
+        ("[image.beam]\nwidth_deg = 0", "[image.beam] width_deg must be finite"),
     ],
 )
 def test_mistakes_are_named_with_their_place(text, message):

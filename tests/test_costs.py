@@ -1,0 +1,92 @@
+import dataclasses
+import json
+
+import pytest
+
+from clsas import costs
+from clsas.costs import Costs
+from clsas.device import open_device
+from clsas.lines import RangeLines
+from clsas.planner import plan
+
+
+@pytest.fixture
+def cache(tmp_path, monkeypatch):
+    """An empty cache of the user's."""
+    monkeypatch.setattr(costs, "user_cache_path", lambda _: tmp_path / "cache")
+    return costs.path()
+
+
+OTHER = Costs(*(float(n + 1) for n in range(len(dataclasses.fields(Costs)))))
+
+
+def test_what_was_stored_is_loaded(cache, platform):
+    assert costs.save(platform, OTHER) == cache
+    assert costs.load(platform) == OTHER
+
+
+def test_without_a_file_there_are_defaults(cache, platform):
+    assert costs.load(platform) == Costs()
+    assert not cache.exists()
+
+
+def test_devices_have_costs_of_their_own(cache, platform):
+    info = dataclasses.replace(platform.info, driver="another driver")
+    other = dataclasses.replace(platform, info=info, _kernels={})
+    costs.save(platform, OTHER)
+    assert costs.load(other) == Costs()
+    costs.save(other, dataclasses.replace(OTHER, pixel_ns=9.0))
+    assert costs.load(other).pixel_ns == 9
+    assert costs.load(platform) == OTHER
+
+
+@pytest.mark.parametrize(
+    "content", ["", "{", "[]", "null", "5", '{"x": 5}', "\x00", '"text"'], ids=repr
+)
+def test_a_broken_file_is_as_good_as_none_and_is_replaced(cache, platform, content):
+    cache.parent.mkdir()
+    cache.write_text(content)
+    assert costs.load(platform) == Costs()
+    costs.save(platform, OTHER)
+    assert costs.load(platform) == OTHER
+
+
+@pytest.mark.parametrize("value", ["x", None, [], "nan", -1.0, "inf"])
+def test_a_broken_number_is_as_good_as_none(cache, platform, value):
+    costs.save(platform, OTHER)
+    stored = json.loads(cache.read_text())
+    next(iter(stored.values()))["pixel_ns"] = value
+    cache.write_text(json.dumps(stored))
+    assert costs.load(platform) == Costs()
+
+
+def test_a_number_too_few_is_as_good_as_none(cache, platform):
+    costs.save(platform, OTHER)
+    stored = json.loads(cache.read_text())
+    del next(iter(stored.values()))["sample_ns"]
+    cache.write_text(json.dumps(stored))
+    assert costs.load(platform) == Costs()
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), -1.0])
+def test_costs_are_finite_and_not_negative(value):
+    for field in dataclasses.fields(Costs):
+        with pytest.raises(ValueError, match=f"{field.name} must be finite.*>= 0"):
+            Costs(**{field.name: value})
+
+
+def test_costs_are_immutable():
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        Costs().pixel_ns = 1.0
+
+
+def test_a_plan_asks_for_what_is_stored(cache):
+    """With an expensive exact image stored, the plan is another."""
+    from test_factorize import EXACT_IS_SLOW, made, straight
+
+    lines, grid = made(straight)
+    assert isinstance(lines, RangeLines)
+    costs.save(open_device(), EXACT_IS_SLOW)
+    stored = plan(lines, grid, tolerance_db=-40)
+    given = plan(lines, grid, tolerance_db=-40, costs=EXACT_IS_SLOW)
+    assert stored.to_json() == given.to_json()

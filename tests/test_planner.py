@@ -1,0 +1,210 @@
+import dataclasses
+
+import numpy as np
+import pytest
+from cases import along_x
+from test_factorize import (
+    BEAMS,
+    EXACT_IS_SLOW,
+    around,
+    bistatic_array,
+    made,
+    moving_array,
+    over,
+    planned,
+    straight,
+    swaying,
+)
+
+from clsas.costs import Costs
+from clsas.grid import Grid
+from clsas.planner import plan
+
+# What is chosen
+
+
+def test_a_small_image_is_backprojected():
+    grid = around(0, 40, shape=(20, 20))
+    lines, _ = over(grid, along_x(30, 0.02))
+    chosen = plan(lines, grid, tolerance_db=-50, costs=Costs())
+    assert chosen.is_exact
+    assert chosen.predicted_seconds == chosen.exact_seconds
+    assert chosen.predicted_error_db <= -50
+
+
+@pytest.mark.parametrize("tolerance_db", [-10, -50, -75])
+def test_a_large_image_is_factorized(tolerance_db):
+    """A million pixels from 2000 channels."""
+    grid = around(0, 40, shape=(1000, 1000))
+    lines, _ = over(grid, along_x(2000, 0.004))
+    chosen = plan(lines, grid, tolerance_db=tolerance_db, costs=Costs())
+    assert not chosen.is_exact
+    assert chosen.predicted_seconds < 0.5 * chosen.exact_seconds
+
+
+@pytest.mark.parametrize("case", [straight, swaying], ids=lambda case: case.__name__)
+def test_a_looser_tolerance_never_takes_longer(case):
+    plans = [planned(case, tolerance_db) for tolerance_db in (-10, -25, -40, -60)]
+    seconds = np.array([each.predicted_seconds for each in plans])
+    assert (np.diff(seconds) >= -0.05 * seconds[1:]).all()
+
+
+@pytest.mark.parametrize("case", [bistatic_array, moving_array], ids=lambda case: case.__name__)
+def test_arrays_are_factorized_at_60_db(case):
+    """What vernier arrays and motion in flight leave is no reason to give up."""
+    assert not planned(case, -60).is_exact
+
+
+def test_expensive_parts_are_avoided():
+    leaves, stages = (
+        plan(*made(straight), tolerance_db=-30, costs=dataclasses.replace(EXACT_IS_SLOW, **dear))
+        for dear in ({"leaf_ns": 30.0}, {"sample_ns": 30.0})
+    )
+    assert not leaves.is_exact
+    assert not stages.is_exact
+    assert leaves.stages[-1].operations < stages.stages[-1].operations
+
+
+def test_a_beam_saves_time():
+    lines, grid = made(straight)
+    grid = around(0, 40, shape=(150, 160), pixel_m=(0.015, 0.03))
+    lines, _ = over(grid)
+    whole = plan(lines, grid, tolerance_db=-30, costs=EXACT_IS_SLOW)
+    beam = plan(
+        lines, grid, tolerance_db=-30, beam=dataclasses.replace(BEAMS[0], width_deg=3.0),
+        costs=EXACT_IS_SLOW,
+    )  # fmt: skip
+    assert beam.exact_seconds < whole.exact_seconds
+
+
+@pytest.mark.parametrize("kind", ["heights", "points"])
+def test_off_a_plane_it_is_plain_backprojection(kind):
+    grid = around(0, 40, shape=(40, 30))
+    grid = (
+        grid.with_height(np.ones(grid.shape))
+        if kind == "heights"
+        else Grid.points(grid.positions_m())
+    )
+    lines, _ = over(grid)
+    assert plan(lines, grid, tolerance_db=-40, costs=EXACT_IS_SLOW).is_exact
+
+
+@pytest.mark.parametrize("change", ["one channel", "one place", "one pixel"])
+def test_without_an_aperture_or_an_image_it_is_plain_backprojection(change):
+    grid = around(0, 40, shape=(1, 1) if change == "one pixel" else (40, 30))
+    track = {"one channel": along_x(1, 1.0), "one place": np.zeros((30, 3))}
+    lines, _ = over(grid, track.get(change, along_x(30, 0.02)))
+    assert plan(lines, grid, tolerance_db=-40, costs=EXACT_IS_SLOW).is_exact
+
+
+def test_normalised_beams_are_backprojected():
+    beam = dataclasses.replace(BEAMS[0], normalise=True)
+    chosen = plan(*made(straight), tolerance_db=-40, beam=beam, costs=EXACT_IS_SLOW)
+    assert chosen.is_exact
+    assert chosen.beam.normalise
+
+
+def test_wavelengths_are_a_range_error():
+    """Errors of range, spread evenly between minus and plus so many wavelengths."""
+    turn = 4 * np.pi * np.random.default_rng(0).uniform(-0.01, 0.01, 100_000)
+    error_db = 20 * np.log10(np.sqrt(np.mean(np.abs(np.exp(1j * turn) - 1) ** 2)))
+    chosen = plan(*made(straight), tolerance_wavelengths=0.01, costs=EXACT_IS_SLOW)
+    assert chosen.tolerance_db == pytest.approx(error_db, abs=0.05)
+
+
+def test_the_same_question_gets_the_same_answer():
+    one, other = (plan(*made(swaying), tolerance_db=-45, costs=EXACT_IS_SLOW) for _ in range(2))
+    assert one.to_json() == other.to_json()
+
+
+def test_given_stages_are_those_given():
+    lines, grid = made(straight)
+    chosen = plan(lines, grid, stages=[(4, 2), (3, 3)])
+    assert chosen.nearest == (4, 3)
+    (rows, columns), (fewer_rows, fewer_columns) = chosen.sides
+    assert rows == 3 * fewer_rows
+    assert columns == 3 * fewer_columns
+    assert [stage.channels for stage in chosen.stages] == [150, 50, 50]
+
+
+# Bad input
+
+
+@pytest.fixture(scope="module")
+def good():
+    grid = around(0, 40, shape=(9, 8))
+    lines, _ = over(grid, along_x(20, 0.01))
+    return {"lines": lines, "grid": grid}
+
+
+@pytest.mark.parametrize(
+    "wishes",
+    [
+        {},
+        {"tolerance_db": -40, "tolerance_wavelengths": 0.1},
+        {"tolerance_db": -40, "stages": []},
+        {"tolerance_wavelengths": 0.1, "stages": [(2, 2)]},
+        {"tolerance_db": -40, "tolerance_wavelengths": 0.1, "stages": [(2, 2)]},
+    ],
+)
+def test_exactly_one_wish_is_needed(good, wishes):
+    with pytest.raises(
+        ValueError, match="exactly one of tolerance_db, tolerance_wavelengths and stages"
+    ):
+        plan(**good, **wishes)
+
+
+@pytest.mark.parametrize(
+    ("argument", "value", "error", "says"),
+    [
+        ("tolerance_db", -75.1, ValueError, r"tolerance_db must be .*>= -75 .*got -75\.1"),
+        ("tolerance_db", -9, ValueError, "tolerance_db must be .*<= -10 dB, got -9"),
+        ("tolerance_db", 0.001, ValueError, r"tolerance_db must be .*dB, got 0\.001"),
+        ("tolerance_db", np.nan, ValueError, "tolerance_db must be finite.*nan"),
+        ("tolerance_db", -np.inf, ValueError, "tolerance_db must be finite.*inf"),
+        ("tolerance_db", "-40", TypeError, "tolerance_db must be .*'-40'"),
+        ("tolerance_db", True, TypeError, "tolerance_db must be .*True"),
+        ("tolerance_db", [-40], TypeError, r"tolerance_db must be .*\[-40\]"),
+        ("tolerance_wavelengths", 0, ValueError, "tolerance_wavelengths must be .*> 0.*got 0"),
+        ("tolerance_wavelengths", -0.1, ValueError, "tolerance_wavelengths must be .*> 0"),
+        ("tolerance_wavelengths", np.nan, ValueError, "tolerance_wavelengths must be finite"),
+        ("tolerance_wavelengths", 10, ValueError, "tolerance_wavelengths must be .*got 10"),
+        ("tolerance_wavelengths", 1e-9, ValueError, "tolerance_wavelengths must be .*got 1e-09"),
+        ("tolerance_wavelengths", "x", TypeError, "tolerance_wavelengths must be .*'x'"),
+        ("stages", [(0, 2)], ValueError, "QR of stages must be at least 1, got 0"),
+        ("stages", [(2, -1)], ValueError, "QI of stages must be at least 1, got -1"),
+        ("stages", [(21, 1)], ValueError, "stages must .* sum 21 of 20 lines"),
+        ("stages", [(5, 1), (5, 1)], ValueError, "stages must .* sum 25 of 20 lines"),
+        ("stages", [(1, 9)], ValueError, "stages must .* divide 9 x 8 pixels by 9"),
+        ("stages", [(2.0, 2)], TypeError, r"QR of stages must be a whole number, got 2\.0"),
+        ("stages", [(2, True)], TypeError, "QI of stages must be a whole number, got True"),
+        ("stages", [(2, 2, 2)], TypeError, r"stages must be a sequence of \(QR, QI\)"),
+        ("stages", (2, 2), TypeError, r"stages must be a sequence of \(QR, QI\)"),
+        ("stages", "ab", TypeError, r"stages must be a sequence of \(QR, QI\)"),
+        ("stages", 5, TypeError, r"stages must be a sequence of \(QR, QI\)"),
+    ],
+)
+def test_bad_wishes_are_named(good, argument, value, error, says):
+    with pytest.raises(error, match=says):
+        plan(**good, **{argument: value})
+
+
+@pytest.mark.parametrize(
+    ("argument", "value", "error", "says"),
+    [
+        ("lines", np.zeros((2, 3), complex), TypeError, "lines must be .*RangeLines.*ndarray"),
+        ("grid", (5, 5), TypeError, "grid must be .*Grid.*tuple"),
+        ("beam", 20.0, TypeError, "beam must be .*BeamWindow.*float"),
+        ("device", 1.5, TypeError, "device must be .*1.5"),
+        ("costs", 5, TypeError, "costs must be .*Costs.*int"),
+    ],
+)
+def test_bad_arguments_are_named(good, argument, value, error, says):
+    with pytest.raises(error, match=says):
+        plan(**(good | {argument: value}), tolerance_db=-40)
+
+
+def test_stages_off_a_plane_are_refused(good):
+    grid = Grid.points(good["grid"].positions_m())
+    with pytest.raises(ValueError, match="grid must be a plane for stages"):
+        plan(good["lines"], grid, stages=[(2, 2)])

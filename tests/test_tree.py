@@ -1,0 +1,214 @@
+import importlib
+
+import numpy as np
+import pytest
+from cases import along_x
+from test_factorize import BEAMS, EXACT_IS_SLOW, arc, around, made, near, over, straight, swaying
+
+from clsas import interpolation, tree
+from clsas.aperture import cycles_per_pixel, mean_track, phase_centres_m
+from clsas.backproject import backproject
+from clsas.factorize import factorize
+from clsas.interpolation import Spectrum
+from clsas.planner import plan
+from clsas.quality import relative_error_db
+from clsas.tree import Division, interpolated_nodes, nearest_nodes
+
+FLAT = Spectrum(0.0, (np.arange(64) + 0.5) / 128, np.full(64, 1 / 64))
+
+
+# Division
+
+
+SIDES = ((64, 48), (32, 16), (16, 4))
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (64, 48), (65, 49), (200, 100)])
+def test_roots_hold_every_pixel_once(shape):
+    division = Division(around(0, 40, shape=shape), SIDES)
+    count = np.zeros((384, 384), int)
+    for row, column in division.roots:
+        count[row : row + 64, column : column + 48] += 1
+    assert (count[: shape[0], : shape[1]] == 1).all()
+    assert all(row < shape[0] and column < shape[1] for row, column in division.roots)
+
+
+@pytest.mark.parametrize("level", [1, 2])
+def test_subimages_fill_their_parents(level):
+    division = Division(around(0, 40, shape=(150, 100)), SIDES)
+    parents = division.corners(level - 1, division.roots)
+    children = division.corners(level, division.roots)
+    inside = children - parents[:, division.parents(level)]
+    assert (inside >= 0).all()
+    assert (inside + SIDES[level] <= SIDES[level - 1]).all()
+    for root in children:
+        assert len({tuple(corner) for corner in root}) == division.per_root(level)
+
+
+def test_a_centre_is_the_mean_of_pixels():
+    grid = around(3, 40, shape=(150, 100))
+    division = Division(grid, SIDES)
+    corners = division.corners(1, division.roots[:1])
+    positions_m = grid.positions_m()
+    for (row, column), centre_m in zip(corners[0], division.centres_m(1, corners)[0], strict=True):
+        pixels_m = positions_m[row : row + 32, column : column + 16].reshape(-1, 3)
+        np.testing.assert_allclose(centre_m, pixels_m.mean(axis=0), atol=1e-12)
+        assert np.linalg.norm(pixels_m - centre_m, axis=1).max() <= division.radius_m(1)
+
+
+# Nodes
+
+
+def interpolation_error_db(case, side, aperture, root=(128, 128)):
+    """Of steering functions of pixels in subimages of a size, anywhere in a root; float64."""
+    lines, grid = made(case)
+    rng = np.random.default_rng(0)
+    track, centres_m = mean_track(lines), phase_centres_m(lines)
+    division = Division(grid, (root, side))
+    cycles_per_m = lines.carrier_cycles_per_m
+    wrong = total = 0.0
+    for corner in division.roots[:2]:
+        middle_m = division.centres_m(0, corner[None])
+        place = track.places_seen_from(middle_m, centres_m)
+        rates = cycles_per_pixel(track, grid, middle_m, root, cycles_per_m, division.radius_m(1))
+        rate = side[0] * rates[0] + side[1] * rates[1]
+        nodes = interpolated_nodes(track, rate, place, aperture)
+        between = nodes.base[0][:, None] + np.arange(nodes.taps)
+        of_channels = track.positions_m(place[0][nodes.order[0]])
+        leaves_m = division.centres_m(1, division.corners(1, corner[None]))[0]
+        for centre_m in leaves_m[rng.integers(0, len(leaves_m), 6)]:
+            offset = rng.integers(0, side, (40, 2)) - (np.array(side) - 1) / 2
+            pixels_m = centre_m + offset @ np.stack([grid.row_step_m, grid.column_step_m])
+
+            def steering(position_m, pixels_m=pixels_m, centre_m=centre_m):
+                range_m = np.linalg.norm(pixels_m[:, None] - position_m, axis=-1)
+                range_m -= np.linalg.norm(centre_m - position_m, axis=-1)
+                return np.exp(2j * np.pi * cycles_per_m * range_m)
+
+            wanted = steering(of_channels)
+            got = np.einsum(
+                "pct,ct->pc", steering(nodes.position_m[0])[:, between], nodes.weights[0]
+            )
+            wrong += np.sum(np.abs(got - wanted) ** 2)
+            total += np.sum(np.abs(wanted) ** 2)
+    return 10 * np.log10(wrong / total)
+
+
+@pytest.mark.parametrize(("taps", "density"), [(4, 1.48), (6, 2.07), (8, 2.16)])
+@pytest.mark.parametrize("side", [(64, 64), (16, 16), (64, 8)])
+@pytest.mark.parametrize("case", [straight, near, swaying, arc], ids=lambda case: case.__name__)
+def test_steering_functions_are_interpolated_as_well_as_designed(case, side, taps, density):
+    """The design is for all frequencies alike; pixels have the highest ones rarely."""
+    aperture = interpolation.design(taps, density, FLAT)
+    assert interpolation_error_db(case, side, aperture) <= aperture.error_db + 1
+
+
+def any_nodes():
+    lines, grid = made(swaying)
+    track = mean_track(lines)
+    middle_m = Division(grid, ((64, 64),)).centres_m(0, np.array([[0, 0], [64, 64]]))
+    rates = cycles_per_pixel(track, grid, middle_m, (64, 64), lines.carrier_cycles_per_m, 0.1)
+    place = track.places_seen_from(middle_m, phase_centres_m(lines))
+    aperture = interpolation.design(6, 2.0, FLAT)
+    return place, interpolated_nodes(track, 64 * rates.sum(axis=0), place, aperture)
+
+
+def test_every_channel_lies_between_its_middle_nodes():
+    place, nodes = any_nodes()
+    place = np.take_along_axis(place, nodes.order, axis=1)
+    rows = np.arange(2)[:, None]
+    assert (np.diff(nodes.place, axis=1) > 0).all()
+    assert (nodes.place[rows, nodes.base + 2] <= place + 1e-9).all()
+    assert (place <= nodes.place[rows, nodes.base + 3] + 1e-9).all()
+
+
+def test_channels_come_in_the_order_of_their_nodes():
+    _, nodes = any_nodes()
+    assert (np.diff(nodes.base, axis=1) >= 0).all()
+    assert (nodes.base >= 0).all()
+    assert (nodes.base + nodes.taps <= nodes.place.shape[1]).all()
+    assert (np.sort(nodes.order, axis=1) == np.arange(nodes.order.shape[1])).all()
+
+
+def test_a_constant_is_interpolated_exactly_enough():
+    _, nodes = any_nodes()
+    np.testing.assert_allclose(nodes.weights.sum(axis=-1), 1, atol=0.01)
+
+
+@pytest.mark.parametrize(("channels", "factor"), [(12, 3), (13, 3), (5, 5), (4, 9), (7, 1)])
+def test_nearest_nodes_are_means_of_neighbours(channels, factor):
+    place = np.random.default_rng(0).permutation(channels)[None] / channels
+    position_m = place[..., None] * [3.0, 1, 0]
+    nodes = nearest_nodes(place, position_m, factor)
+    assert nodes.place.shape == (1, -(-channels // factor))
+    for node in range(nodes.place.shape[1]):
+        mine = nodes.order[0, nodes.base[0] == node]
+        assert nodes.place[0, node] == pytest.approx(place[0, mine].mean())
+        np.testing.assert_allclose(nodes.position_m[0, node], position_m[0, mine].mean(axis=0))
+    assert (nodes.weights == 1).all()
+
+
+# What subimages need
+
+
+@pytest.fixture
+def everything(monkeypatch):
+    """Images whose subimages get all nodes and channels there are."""
+
+    def widened(division, nodes, seen, inside):
+        everywhere = np.full_like(seen[0], -np.inf), np.full_like(seen[1], np.inf)
+        return ranges(division, nodes, everywhere, np.ones_like(inside))
+
+    ranges = tree.ranges
+    monkeypatch.setattr(importlib.import_module("clsas.factorize").tree, "ranges", widened)
+
+
+@pytest.mark.parametrize("beam", BEAMS, ids=["hann", "tukey", "squint"])
+def test_leaves_have_all_the_nodes_they_need(beam, everything, monkeypatch):
+    """What lies outside a beam weighs nothing: leaving it out changes nothing."""
+    grid = around(0, 12, pixel_m=(0.015, 0.05), shape=(130, 150))
+    lines, _ = over(grid, along_x(700, 0.012))
+    chosen = plan(lines, grid, tolerance_db=-45, beam=beam, costs=EXACT_IS_SLOW)
+    assert not chosen.is_exact
+    whole = factorize(lines, grid, chosen)
+    monkeypatch.undo()
+    assert relative_error_db(factorize(lines, grid, chosen), whole) <= -100
+    assert relative_error_db(whole, backproject(lines, grid, accuracy_db=-85, beam=beam)) <= -45
+
+
+@pytest.mark.parametrize("shape", [(33, 65), (70, 129)])
+def test_subimages_beyond_the_grid_are_not_missed(shape, everything, monkeypatch):
+    grid = around(0, 40, shape=shape)
+    lines, _ = over(grid)
+    chosen = plan(lines, grid, tolerance_db=-45, costs=EXACT_IS_SLOW)
+    assert not chosen.is_exact
+    whole = factorize(lines, grid, chosen)
+    monkeypatch.undo()
+    assert relative_error_db(factorize(lines, grid, chosen), whole) <= -110
+
+
+def test_places_from_where_leaves_are_seen_hold_all_that_weigh():
+    lines, grid = made(near)
+    beam, track = BEAMS[0], mean_track(lines)
+    along = tree.beam_directions(beam, lines, track, track.samples)
+    division = Division(grid, ((16, 16),))
+    corners = division.roots[:, None]
+    half_m = 8 * np.stack([grid.row_step_m, grid.column_step_m])
+    begin, end = tree.seen_from(beam, track, along, division.centres_m(0, corners), half_m)
+    place = np.linspace(0, 1, 2001)
+    position_m = track.positions_m(place)
+    direction = tree.beam_directions(beam, lines, track, place)
+    for (corner,), (first,), (last,) in zip(corners, begin, end, strict=True):
+        for pixel in corner + np.array([[0, 0], [0, 15], [15, 0], [15, 15], [7, 8]]):
+            pixel_m = grid.origin_m + pixel @ np.stack([grid.row_step_m, grid.column_step_m])
+            sight = pixel_m - position_m
+            sine = np.einsum("pi,pi->p", sight, direction) / np.linalg.norm(sight, axis=1)
+            weighs = place[beam.weights(sine) > 0]
+            assert ((weighs >= first) & (weighs <= last)).all()
+
+
+def test_directions_between_channels_are_of_length_one():
+    lines, _ = made(arc)
+    track = mean_track(lines)
+    along = tree.beam_directions(BEAMS[0], lines, track, np.linspace(-1, 2, 50))
+    np.testing.assert_allclose(np.linalg.norm(along, axis=1), 1)
