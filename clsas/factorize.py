@@ -266,7 +266,7 @@ class _Run:
                 self.along,
             )
             for level, (rows, columns) in enumerate(chosen.sides):
-                rate = rows * rates[0] + columns * rates[1]
+                rate = chosen.crowding[level] * (rows * rates[0] + columns * rates[1])
                 if chosen.beam is not None and level == len(self.levels) - 1:
                     rate += chosen.beam_cycles * tree.beam_rate(
                         chosen.beam, track, self.along, root_m

@@ -93,6 +93,9 @@ class Plan:
     lines_digest, grid_digest : str
         Of the geometry that this plan was made for.
     beam : BeamWindow or None
+    crowding : tuple of float
+        By how much virtual channels are denser than band-limited steering functions need, stage by
+        stage: where their spacing changes along the track filters err.
     beam_cycles : float
         For how many cycles per edge of the beam the last stage's virtual channels are dense enough.
     """
@@ -117,6 +120,7 @@ class Plan:
     lines_digest: str
     grid_digest: str
     beam: BeamWindow | None = None
+    crowding: tuple[float, ...] = ()
     beam_cycles: float = 0.0
 
     @property
@@ -206,6 +210,7 @@ class Plan:
             values["sides"] = tuple(map(tuple, values["sides"]))
             values["tile"] = tuple(values["tile"])
             values["nearest"] = tuple(values["nearest"])
+            values["crowding"] = tuple(values["crowding"])
             values["stages"] = tuple(Stage(**stage) for stage in values["stages"])
             return cls(**values)
         except (TypeError, KeyError, AttributeError, json.JSONDecodeError) as error:

@@ -42,11 +42,12 @@ NEAREST_UPSAMPLING = 8.0
 """By how much lines are upsampled before the linear interpolation of given stages."""
 
 _MARGIN_DB = 1.0  # between prediction and tolerance, for what measured errors scatter
-_FLOAT32 = 1.2e-7  # rms error of a phase in the stages over the phase across a root: measured
+_FLOAT32 = 4.5e-8  # rms error of a phase in the stages over the phase across a root: measured
 _MOST_BATCH_BYTES = 256 << 20
 _SPOTS = (0.02, 0.25, 0.5, 0.75, 0.98)  # of rows and columns, where the geometry is looked at
 _COARSER = 4  # of the track's samples: where roots are compared
-_ROOTS_SHARE, _BEAM_SHARE = 0.25, 0.2  # of the error allowed
+_ROOTS_SHARE, _NODES_SHARE = 0.25, 0.2  # of the error allowed
+_MOST_CROWDING = 2.0
 _LEAST_BEAM_CYCLES, _MOST_BEAM_CYCLES = 0.5, 64.0
 _CHANNELS, _PLACES, _PIXELS = 256, 300, 24  # at which errors are evaluated
 _SOME_SPOTS = 6  # one in so many of the spots, there
@@ -141,6 +142,7 @@ def plan(
         filters_db = _decibel(allowed - spared) - _MARGIN_DB
         if tree is None:
             tree = _search(view, filters_db, most, beam_cycles, device, costs)
+            crowding = () if tree is None else (1.0,) * len(tree.sides)
         filters = None if tree is None else _filters(view, tree, filters_db)
         if filters is None and needed:
             raise ValueError(
@@ -150,7 +152,15 @@ def plan(
         if filters is None:
             break
         found = _plan(
-            view, tolerance_db, filters, tree.sides, device, costs, memory_bytes, (), beam_cycles
+            view,
+            tolerance_db,
+            filters,
+            tree.sides,
+            device,
+            costs,
+            memory_bytes,
+            crowding=crowding,
+            beam_cycles=beam_cycles,
         )
         if found.predicted_seconds >= exact.predicted_seconds:
             break
@@ -161,11 +171,21 @@ def plan(
         elif found.predicted_error_db <= tolerance_db:
             return found
         else:
-            # What a beam adds falls with the density of nodes; filters must make up for the rest.
+            # What uneven spacing and a beam add falls with the density of nodes; filters must
+            # make up for the rest.
             within = view.within(found.sides[0])
-            others = _other_errors(within, found.sides, found.aperture, beam_cycles, device)
-            if beam is not None and others.last > _BEAM_SHARE * allowed:
+            others = _other_errors(
+                within, found.sides, found.aperture, crowding, beam_cycles, device
+            )
+            share = _NODES_SHARE * allowed / len(found.sides)
+            uneven = _excess_error(within, found.sides[-1], found.aperture, crowding[-1], None)
+            if others.nodes[-1] > share and uneven < others.nodes[-1] / 2:
                 beam_cycles *= 2
+            elif max(others.nodes) > share and max(crowding) < _MOST_CROWDING:
+                crowding = tuple(
+                    1.1 * c if excess > share else c
+                    for c, excess in zip(crowding, others.nodes, strict=True)
+                )
             else:
                 spared += max(others.total - spared, 0.1 * allowed)
     return exact
@@ -525,6 +545,7 @@ def _plan(
     costs: Costs,
     memory_bytes: int,
     nearest: Sequence[tuple[int, int]] = (),
+    crowding: tuple[float, ...] = (),
     beam_cycles: float = 0.0,
 ) -> Plan:
     """Return a plan with all that is expected of it."""
@@ -544,12 +565,14 @@ def _plan(
         samples = -(-(2 * halves[level] + 1) // width) * width
         seen = view.seen(*side)
         turns = view.turns(side, seen)
-        if level:
-            used = min(channels, density * view.turns(sides[level - 1], seen) + 2 * aperture.taps)
+        if level and not nearest:
+            used = crowding[level - 1] * density * view.turns(sides[level - 1], seen)
+            used = min(channels, used + 2 * aperture.taps)
         if nearest:
             used = channels
             channels = math.ceil(channels / nearest[level][0])
         else:
+            turns *= crowding[level]
             if view.beam is not None and level == len(sides) - 1:
                 turns += beam_cycles * view.cycles(view.beam_rates, seen)
             channels = density * turns + (1 if view.beam else aperture.taps)
@@ -571,14 +594,14 @@ def _plan(
         Stage(*side, count, round(channels), samples, operations, final.scatter_db, seconds)
     )
     line_bytes = 8 * lines.channels * padded_length(resampling, halves[0])
-    root_bytes = _root_bytes(view, sides, tile, stages, filters, beam_cycles, bool(nearest))
+    root_bytes = _root_bytes(view, sides, tile, stages, filters, crowding, beam_cycles)
     room = min(memory_bytes - line_bytes, _MOST_BATCH_BYTES)
     at_once = min(max(int(room // root_bytes), 1), stages[0].subimages)
     error = sum(10 ** (stage.error_db / 10) for stage in stages)
     if nearest:
         error += _nearest_error(view, nearest)
     else:
-        error += _other_errors(view, sides, aperture, beam_cycles, device).total
+        error += _other_errors(view, sides, aperture, crowding, beam_cycles, device).total
     return Plan(
         tolerance_db=tolerance_db,
         sides=tuple(sides),
@@ -600,6 +623,7 @@ def _plan(
         lines_digest=lines_digest(lines),
         grid_digest=grid_digest(grid),
         beam=view.beam,
+        crowding=crowding,
         beam_cycles=beam_cycles,
     )
 
@@ -610,26 +634,23 @@ def _root_bytes(
     tile: tuple[int, int],
     stages: Sequence[Stage],
     filters: _Filters,
+    crowding: tuple[float, ...],
     beam_cycles: float,
-    nearest: bool,
 ) -> float:
     """Return the device memory that a root takes while it is worked on: see `factorize`."""
     taps, channels, result = filters.aperture.taps, view.lines.channels, 0.0
+    density = 2 * filters.aperture.upsampling
     for level, side in enumerate(sides):
         seen = view.seen(*side)
+        crowd = crowding[level] if crowding else 1.0
         # Virtual channels of the whole aperture, and those of the subimage that sees most.
         everywhere, most = (
-            2 * filters.aperture.upsampling * view.turns(side, where, np.max) + taps + 2
+            density * crowd * view.turns(side, where, np.max) + taps + 2
             for where in (np.ones_like(seen), seen)
         )
         if view.beam is not None and level == len(sides) - 1:
-            most += (
-                2
-                * filters.aperture.upsampling
-                * beam_cycles
-                * view.cycles(view.beam_rates, seen, np.max)
-            )
-        if nearest:
+            most += density * beam_cycles * view.cycles(view.beam_rates, seen, np.max)
+        if not crowding:  # nearest beams
             everywhere = most = stages[level].channels
         subimages = _subimages(sides[0], side)
         result += 8 * subimages * most * (stages[level].samples + 2 * GUARD)
@@ -649,26 +670,28 @@ class _Errors:
     """Powers of the errors that filters do not account for."""
 
     roots: float
-    nodes: float
-    last: float
+    nodes: tuple[float, ...]
     leaves: float
 
     @property
     def total(self) -> float:
-        return self.roots + self.nodes + self.last + self.leaves
+        return self.roots + sum(self.nodes) + self.leaves
 
 
 def _other_errors(
     view: View,
     sides: Sequence[tuple[int, int]],
     aperture: Interpolator,
+    crowding: tuple[float, ...],
     beam_cycles: float,
     device: Device,
 ) -> _Errors:
     return _Errors(
         roots=_root_error(view, sides[0]),
-        nodes=sum(_excess_error(view, side, aperture, None) for side in sides[:-1]),
-        last=_excess_error(view, sides[-1], aperture, beam_cycles),
+        nodes=tuple(
+            _excess_error(view, side, aperture, crowd, beam_cycles if side is sides[-1] else None)
+            for side, crowd in zip(sides, crowding, strict=True)
+        ),
         leaves=float(_leaf_error(view, np.array([sides[-1]]), device)[0]),
     )
 
@@ -718,7 +741,11 @@ def _root_error(view: View, side: tuple[int, int]) -> float:
 
 
 def _excess_error(
-    view: View, side: tuple[int, int], aperture: Interpolator, beam_cycles: float | None
+    view: View,
+    side: tuple[int, int],
+    aperture: Interpolator,
+    crowding: float,
+    beam_cycles: float | None,
 ) -> float:
     """Return the power of the error that a stage's nodes add to that of the aperture's filter.
 
@@ -734,7 +761,7 @@ def _excess_error(
     for spot in np.flatnonzero(seen.any(axis=1))[::_SOME_SPOTS]:
         places = track.samples[seen[spot]]
         place = np.linspace(places[0], places[-1], _PLACES)
-        rate = side[0] * view.rates[0, spot] + side[1] * view.rates[1, spot]
+        rate = crowding * (side[0] * view.rates[0, spot] + side[1] * view.rates[1, spot])
         if weighted:
             rate = rate + beam_cycles * view.beam_rates[spot]
         nodes = interpolated_nodes(track, rate[None], place[None], aperture)

@@ -10,6 +10,7 @@ from clsas.backproject import backproject
 from clsas.costs import Costs
 from clsas.factorize import factorize
 from clsas.grid import Grid
+from clsas.image import Image
 from clsas.plan import Plan
 from clsas.quality import relative_error_db
 from clsas.scene import PointTargets
@@ -150,7 +151,12 @@ def made(case):
 
 @cache
 def exact(case, beam=None):
-    return backproject(*made(case), accuracy_db=-85, beam=beam)
+    lines, grid = made(case)
+    if beam is None:
+        return backproject(lines, grid, accuracy_db=-85)
+    # Point by point, a window is evaluated for every pixel.
+    points = Grid.points(grid.positions_m())
+    return Image(backproject(lines, points, accuracy_db=-85, beam=beam).pixels, grid)
 
 
 @cache
