@@ -199,21 +199,16 @@ def cycles_per_pixel(
     return cycles_per_m / 2 * np.moveaxis(rates, -1, 0)
 
 
-def turned(
-    track: MeanTrack, rate: NDArray[np.float64], *, floor: float = 1e-3
-) -> NDArray[np.float64]:
-    """Return the integral of rates [..., samples] along the track: cycles at `track.samples`.
-
-    No rate counts as less than `floor` times the largest: where the track leads straight towards
-    a subimage nothing turns, and yet nodes must have places.
-    """
-    rate = np.maximum(rate, floor * rate.max(axis=-1, keepdims=True))
+def turned(track: MeanTrack, rate: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the integral of rates [..., samples] along the track: cycles at `track.samples`."""
     steps = np.diff(track.samples) * (rate[..., 1:] + rate[..., :-1]) / 2
     return np.concatenate([np.zeros((*rate.shape[:-1], 1)), np.cumsum(steps, axis=-1)], axis=-1)
 
 
 def _order(centres_m: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Return the order of phase centres along the track, and how far along it each lies, metres."""
+    if len(centres_m) == 1:
+        return np.zeros(1, np.int64), np.zeros(1)
     away = centres_m - centres_m.mean(axis=0)
     first, second = np.linalg.svd(away, full_matrices=False)[2][:2] @ away.T
     candidates = (

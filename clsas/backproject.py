@@ -169,13 +169,12 @@ def prepare(
     accuracy_db = validate.number(
         "accuracy_db", accuracy_db, "dB", least=BEST_ACCURACY_DB, below=0.0
     )
-    along, window_sine, heaviest = None, math.inf, 1.0
+    along, heaviest = None, 1.0
     if beam is not None:
         validate.instance("beam", beam, BeamWindow)
         if beam.shape == "inverse" and not lines.carrier_hz:
             raise ValueError("carrier_hz must be above 0 for a beam of the shape 'inverse'")
         along = beam.directions(lines)
-        window_sine = float(np.diff(np.clip(beam.limits, -1, 1))[0])
         heaviest = max(float(beam.table(wavelength_m(lines)).max()), 1.0)
     _check_numbers(lines, heaviest)
     device = open_device(device)
@@ -194,7 +193,7 @@ def prepare(
         cycles_per_m,
         device.info.width,
         speed_ratio=_fastest(lines),
-        window_sine=window_sine,
+        beam=beam,
     )
     _check_distances(antennas_m, layout)
     interpolator = interpolation.choose(
@@ -204,7 +203,7 @@ def prepare(
         upsampling=upsampling,
         other_error=GEOMETRY_ERROR,
         pixels_per_sample=grid.size / lines.length,
-        most_upsampling=_room(max(interpolation.TAPS))
+        most_upsampling=lookup_room(max(interpolation.TAPS))
         * lines.range_step_m
         / max(layout.block_radius_m, 1e-30),
     )
@@ -242,7 +241,7 @@ def execute(
         device.finish()  # an interrupted run leaves nothing in use
     image = Image(layout.collect(pixels), p.grid)
     if not image.pixels.any() and p.lines.samples.any():
-        _warn_unseen(p)
+        warn_unseen(p.lines, layout.centres_m(slice(None)), p.beam, p.along)
     return image
 
 
@@ -290,7 +289,7 @@ class _Run:
         if self.pitch % 256 == 0:  # lines at equal places in cache sets would evict each other
             self.pitch += 16
 
-        fits = layout.block_radius_m * p.samples_per_m <= _room(p.interpolator.taps)
+        fits = layout.block_radius_m * p.samples_per_m <= lookup_room(p.interpolator.taps)
         options = {
             "WIDTH": device.info.width,
             "TAPS": p.interpolator.taps,
@@ -573,7 +572,7 @@ def float_pairs(positions_m: NDArray[np.float64]) -> NDArray[np.float32]:
     return np.concatenate([nearest, (positions_m - nearest).astype(np.float32)], axis=1)
 
 
-def _room(taps: int) -> float:
+def lookup_room(taps: int) -> float:
     """Return how many samples a block may reach from its middle within the lookup window."""
     return _WINDOW / 2 - 2 - taps / 2
 
@@ -654,9 +653,13 @@ def _check_distances(antennas_m: NDArray[np.float64], layout: Tiles | Groups) ->
         )
 
 
-def _warn_unseen(p: Preparation) -> None:
-    lines = p.lines
-    centres_m = p.layout.centres_m(slice(None))
+def warn_unseen(
+    lines: RangeLines,
+    centres_m: NDArray[np.float64],
+    beam: BeamWindow | None,
+    along: NDArray[np.float64] | None,
+) -> None:
+    """Warn that lines add nothing to parts of a grid with centres [parts, 3]."""
     some = lines.select(slice(None, None, max(lines.channels // 64, 1)))
     range_m = pairwise_range_m(
         centres_m[:: max(len(centres_m) // 1024, 1)],
@@ -669,7 +672,7 @@ def _warn_unseen(p: Preparation) -> None:
         f"the lines span {lines.first_range_m.min():.6g} to {lines.last_range_m.max():.6g} m, the "
         f"grid lies at {range_m.min():.6g} to {range_m.max():.6g} m"
     )
-    if p.beam is None:
+    if beam is None:
         validate.warn(
             f"no pixel of the grid lies within any line's range, so the image is zero: {spans}"
         )
@@ -677,10 +680,10 @@ def _warn_unseen(p: Preparation) -> None:
     sine = sines(
         centres_m[:: max(len(centres_m) // 1024, 1)],
         some,
-        p.along[:: max(lines.channels // 64, 1)],
+        along[:: max(lines.channels // 64, 1)],
     )
     low, high = np.degrees(np.arcsin(np.clip([sine.min(), sine.max()], -1, 1)))
-    first, last = np.degrees(p.beam.limits_rad)
+    first, last = np.degrees(beam.limits_rad)
     validate.warn(
         f"no pixel of the grid lies within the beam and the range of any line, so the image is "
         f"zero: the beam spans {first:.4g} to {last:.4g} degrees, the grid lies at {low:.4g} to "

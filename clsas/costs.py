@@ -8,6 +8,7 @@ from pathlib import Path
 
 from platformdirs import user_cache_path
 
+from clsas import validate
 from clsas.device import Device
 
 
@@ -42,6 +43,11 @@ class Costs:
     leaf_ns: float = 0.6
     pixel_ns: float = 0.6
 
+    def __post_init__(self) -> None:
+        """Check every cost."""
+        for field in fields(self):
+            validate.number(field.name, getattr(self, field.name), "ns", least=0.0)
+
 
 WITH_BEAM = 1.3
 """What a beam multiplies the cost of a pixel and channel by."""
@@ -66,9 +72,9 @@ def save(device: Device, costs: Costs) -> Path:
     """Store what was measured for a device; return where."""
     file = path()
     try:
-        stored = json.loads(file.read_text())
-    except (OSError, ValueError):
-        stored = {}
+        stored = dict(json.loads(file.read_text()))
+    except (OSError, ValueError, TypeError):
+        stored = {}  # none yet, or not ours
     stored[_key(device)] = asdict(costs)
     file.parent.mkdir(parents=True, exist_ok=True)
     file.write_text(json.dumps(stored, indent=1))

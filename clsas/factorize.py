@@ -11,15 +11,22 @@ from numpy.typing import NDArray
 
 from clsas import tree, validate
 from clsas.aperture import cycles_per_pixel, drift, mean_track, phase_centres_m
-from clsas.backproject import backproject, beam_arguments, float_pairs, padded_lines
+from clsas.backproject import (
+    backproject,
+    beam_arguments,
+    float_pairs,
+    lookup_room,
+    padded_lines,
+    warn_unseen,
+)
 from clsas.device import Device, Slot, open_device
 from clsas.geometry import pairwise_range_m
 from clsas.grid import Grid
 from clsas.image import Image
-from clsas.layout import STACK
+from clsas.layout import STACK, Tiles
 from clsas.lines import RangeLines
 from clsas.plan import GUARD, Plan, margin, padded_length
-from clsas.planner import plan
+from clsas.planner import BEST_TOLERANCE_DB, WORST_TOLERANCE_DB, plan
 from clsas.tree import Division, Nodes, Ranges
 from clsas.window import INTERVALS, BeamWindow
 
@@ -80,6 +87,13 @@ def factorize(
     validate.progress(progress)
     device = open_device(device)
     if not isinstance(plan_or_tolerance, Plan):
+        validate.number(
+            "plan_or_tolerance",
+            plan_or_tolerance,
+            "dB",
+            least=BEST_TOLERANCE_DB,
+            most=WORST_TOLERANCE_DB,
+        )
         chosen = plan(lines, grid, tolerance_db=plan_or_tolerance, beam=beam, device=device)
     elif beam is not None:
         raise ValueError("beam must be left out with a plan, which holds its own")
@@ -109,7 +123,12 @@ def factorize(
                 progress(done, grid.size)
     finally:
         device.finish()  # an interrupted run leaves nothing in use
-    return Image(pixels, grid)
+    image = Image(pixels, grid)
+    if not pixels.any() and lines.samples.any():
+        corners_m = run.division.centres_m(0, run.division.roots)
+        along = None if chosen.beam is None else chosen.beam.directions(lines)
+        warn_unseen(lines, corners_m, chosen.beam, along)
+    return image
 
 
 @dataclass(frozen=True)
@@ -185,12 +204,14 @@ class _Run:
         options["APERTURE_TAPS"] = chosen.aperture.taps
         self.first_stage = device.kernel("stage", "stage", GIVEN=1, **options)
         self.later_stage = device.kernel("stage", "stage", GIVEN=0, **options)
+        block_m = Tiles(grid, chosen.tile[0], self.width).block_radius_m
+        fits = block_m * self.samples_per_m <= lookup_room(chosen.final.taps)
         last = {
             "WIDTH": self.width,
             "TAPS": chosen.final.taps,
             "TILE_ROWS": chosen.tile[0],
             "TILE_COLUMNS": chosen.tile[1],
-            "PERMUTE": int(device.info.permute),
+            "PERMUTE": int(device.info.permute and fits),
             "BISTATIC": 0,
             "MOVING": 0,
             "BEAM": 0 if chosen.beam is None else INTERVALS,

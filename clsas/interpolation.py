@@ -71,6 +71,10 @@ class Interpolator:
     error_db: float
     scatter_db: float
 
+    def __post_init__(self) -> None:
+        """Keep the coefficients from being changed."""
+        self.coefficients.flags.writeable = False
+
     def weights(self, nu: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the taps' weights at positions `nu` from the middle, shape [..., taps]."""
         even, odd = (

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from clsas.grid import Grid
+from clsas.window import BeamWindow
 
 STACK = 4
 """Blocks per work-item, one below the other (cl/backproject.cl)."""
@@ -157,7 +158,7 @@ def lay_out(
     width: int,
     *,
     speed_ratio: float = 0.0,
-    window_sine: float = np.inf,
+    beam: BeamWindow | None = None,
 ) -> Tiles | Groups:
     """Return how to divide a grid so that the geometry's share of the error stays below -90 dB.
 
@@ -173,8 +174,8 @@ def lay_out(
         Float lanes per work-item.
     speed_ratio : float
         Speed of the fastest receiver over that of sound.
-    window_sine : float
-        Width of a beam's window in the sine of the aspect angle; infinite for none.
+    beam : BeamWindow, optional
+        Weights of the channels.
 
     Notes
     -----
@@ -190,6 +191,7 @@ def lay_out(
     """
     if grid.is_planar:
         tree = KDTree(antennas_m)
+        window_sine = np.inf if beam is None else np.ptp(np.clip(beam.limits, -1, 1))
         for side in _SIDES:
             tiles = Tiles(grid, side, width)
             nearest = tree.query(tiles.centres_m(slice(None)))[0].min()
@@ -199,11 +201,14 @@ def lay_out(
             remainder_m += 0.2 * speed_ratio * tiles.radius_m**3 / nearest**2
             rounding = _FLOAT32_ERROR * cycles_per_m * tiles.radius_m
             error = np.hypot(2 * np.pi * cycles_per_m * remainder_m, rounding)
+            block_error = 0.0
+            if beam is not None:
+                block_error = beam.block_error(tiles.block_radius_m / nearest)
             sine_error = 0.1 * (tiles.radius_m / nearest) ** 4
             if (
                 error <= GEOMETRY_ERROR
                 and sine_error <= max(1e-6 * window_sine, 1e-7)
-                and tiles.block_radius_m / nearest <= 0.05 * window_sine
+                and block_error <= GEOMETRY_ERROR
             ):
                 return tiles
     with np.errstate(divide="ignore"):

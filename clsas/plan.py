@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from dataclasses import asdict, dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -123,6 +124,63 @@ class Plan:
     crowding: tuple[float, ...] = ()
     beam_cycles: float = 0.0
 
+    def __post_init__(self) -> None:
+        """Check what sizes buffers and indices."""
+
+        def check(good: bool, name: str, wanted: str) -> None:
+            if not good:
+                raise ValueError(f"{name} must be {wanted}, got {getattr(self, name)!r}")
+
+        def whole(value: object, least: int) -> bool:
+            return type(value) is int and least <= value < 2**31
+
+        def numbers(values: object, count: int, least: float) -> bool:
+            return (
+                isinstance(values, tuple)
+                and len(values) == count
+                and all(isinstance(v, (int, float)) and least <= v < np.inf for v in values)
+            )
+
+        levels = len(self.sides)
+        pairs = (*self.sides, self.tile) if levels else self.sides
+        nested = all(numbers(p, 2, 1) and all(whole(n, 1) for n in p) for p in pairs) and all(
+            a % b == 0
+            for large, small in pairwise(pairs)
+            for a, b in zip(large, small, strict=True)
+        )
+        check(nested, "sides", "pairs of rows and columns that divide each other")
+        for name in ("predicted_error_db", "predicted_seconds", "exact_seconds"):
+            check(numbers((getattr(self, name),), 1, -np.inf), name, "a number")
+        check(whole(self.roots_at_once, 1), "roots_at_once", "a whole number from 1")
+        check(type(self.memory_bytes) is int and self.memory_bytes >= 0, "memory_bytes", "bytes")
+        if not levels:
+            return
+        whole_items = self.tile[0] % 16 == 0 and self.tile[1] % 4 == 0
+        check(whole_items, "tile", "a multiple of 16 rows and 4 columns")
+        fits = isinstance(self.half_lengths, tuple) and len(self.half_lengths) == levels
+        fits = fits and all(whole(n, 0) for n in self.half_lengths)
+        check(fits, "half_lengths", "a whole number for every stage")
+        check(
+            numbers((self.highest_cycles_per_m, self.beam_cycles), 2, 0), "beam_cycles", "positive"
+        )
+        if self.nearest:
+            fits = numbers(self.nearest, levels, 1) and all(whole(n, 1) for n in self.nearest)
+            check(fits, "nearest", "a whole number for every stage")
+        else:
+            check(numbers(self.crowding, levels, 1), "crowding", "a number from 1 for every stage")
+        for name, allowed in (("align", (2, 4, 6, 8)), ("final", (2, 4, 6, 8)), ("aperture", ())):
+            filter_ = getattr(self, name)
+            allowed = allowed or ((1,) if self.nearest else (2, 4, 6, 8))
+            good = isinstance(filter_, Interpolator) and filter_.taps in allowed
+            good = good and filter_.coefficients.shape == (filter_.taps // 2, 2, filter_.taps // 2)
+            good = good and bool(np.isfinite(filter_.coefficients).all())
+            check(good and numbers((filter_.upsampling,), 1, 1), name, f"of {allowed} taps")
+        good = isinstance(self.resampling, Resampling) and all(
+            type(n) is int for n in asdict(self.resampling).values()
+        )
+        good = good and self.resampling.length > 0 and self.resampling.fft_length > 0
+        check(good, "resampling", "made of whole numbers")
+
     @property
     def is_exact(self) -> bool:
         """Whether this is plain backprojection."""
@@ -131,7 +189,7 @@ class Plan:
     def describe(self) -> str:
         """Return a table of what is expected, stage by stage."""
         if self.tolerance_db is None:
-            wish = "stages as given, nearest beam"
+            wish = "stages as given, nearest beam" if self.sides else "no stage, as given"
         else:
             wish = f"tolerance {self.tolerance_db:g} dB"
         lines = [
@@ -140,7 +198,8 @@ class Plan:
             f"(exact: {_seconds(self.exact_seconds)}), {self.memory_bytes / 2**20:.0f} MiB"
         ]
         if self.is_exact:
-            return lines[0] + "\nPlain backprojection: no factorization is faster within it."
+            reason = "" if self.tolerance_db is None else ": no factorization is faster within it"
+            return f"{lines[0]}\nPlain backprojection{reason}."
         taps = f"{self.align.taps} taps in range at {self.resampling.ratio:.2f} x the lines' rate"
         if self.nearest:
             beams = f"sums of {', '.join(map(str, self.nearest))} neighbours"
@@ -201,7 +260,9 @@ class Plan:
             values = json.loads(text)
             for name in ("align", "aperture", "final"):
                 if values[name] is not None:
-                    coefficients = np.array(values[name].pop("coefficients"))
+                    half = values[name]["taps"] // 2
+                    coefficients = np.array(values[name].pop("coefficients"), np.float64)
+                    coefficients = coefficients.reshape(half, 2, half)
                     values[name] = Interpolator(coefficients=coefficients, **values[name])
             if values["resampling"] is not None:
                 values["resampling"] = Resampling(**values["resampling"])
@@ -209,6 +270,7 @@ class Plan:
                 values["beam"] = BeamWindow(**values["beam"])
             values["sides"] = tuple(map(tuple, values["sides"]))
             values["tile"] = tuple(values["tile"])
+            values["half_lengths"] = tuple(values["half_lengths"])
             values["nearest"] = tuple(values["nearest"])
             values["crowding"] = tuple(values["crowding"])
             values["stages"] = tuple(Stage(**stage) for stage in values["stages"])

@@ -117,11 +117,21 @@ def plan(
             f"got {tolerance_db}, {tolerance_wavelengths}, {stages}"
         )
     if tolerance_wavelengths is not None:
+        limits = [wavelengths(each) for each in (BEST_TOLERANCE_DB, WORST_TOLERANCE_DB)]
+        tolerance_wavelengths = validate.number(
+            "tolerance_wavelengths",
+            tolerance_wavelengths,
+            "wavelengths",
+            least=limits[0],
+            most=limits[1],
+        )
         tolerance_db = decibels(tolerance_wavelengths)
-    if tolerance_db is not None:
+    elif tolerance_db is not None:
         tolerance_db = validate.number(
             "tolerance_db", tolerance_db, "dB", least=BEST_TOLERANCE_DB, most=WORST_TOLERANCE_DB
         )
+    if costs is not None:
+        validate.instance("costs", costs, Costs)
     device = open_device(device)
     costs = costs or load_costs(device)
     if memory_bytes is None:
@@ -211,8 +221,12 @@ def _root_limits(view: View, allowed: float) -> tuple[int, int] | None:
 
 def decibels(wavelengths: float) -> float:
     """Return the relative rms error of range errors spread evenly up to some wavelengths, dB."""
-    wavelengths = validate.positive("tolerance_wavelengths", wavelengths, "wavelengths")
     return 20 * math.log10(4 * math.pi * wavelengths / math.sqrt(3))
+
+
+def wavelengths(decibels: float) -> float:
+    """Return what `decibels` made an error of."""
+    return 10 ** (decibels / 20) * math.sqrt(3) / (4 * math.pi)
 
 
 class View:
@@ -279,7 +293,7 @@ class View:
         over: Callable[[NDArray[np.float64]], float] = np.mean,
     ) -> float:
         """Return how far a phase turns while it is seen, on average over the spots."""
-        return float(over(turned(self.track, np.where(seen, rates, 0.0), floor=0.0)[:, -1]))
+        return float(over(turned(self.track, np.where(seen, rates, 0.0))[:, -1]))
 
     def turns(
         self,
@@ -411,7 +425,7 @@ def _search(
     seen = np.array([view.seen(*side) for side in sides])
     share = seen[..., view.on_track].mean(axis=(1, 2))
     divides = (sides[:, None] % sides == 0).all(axis=-1) & (sides[:, None] != sides).any(axis=-1)
-    too_curved = _leaf_error(view, sides, device) > 0.1 * 10 ** (filters_db / 10)
+    too_curved = _leaf_error(view, sides, device) > 0.25 * 10 ** (filters_db / 10)
     reach_m = np.array([view.reach_m(side) for side in sides])
 
     leaf_ns = costs.leaf_ns * (1.0 if view.beam is None else WITH_BEAM)
@@ -526,14 +540,20 @@ def _errors_db(taps: int, error: str, frequency: bytes, power: bytes) -> NDArray
 def _leaf_error(view: View, sides: NDArray[np.int64], device: Device) -> NDArray[np.float64]:
     """Return the power of the error that expanding leaves of some sizes adds.
 
-    See `layout.lay_out`: the fourth order of a tile, and the third within a block.
+    See `layout.lay_out`: the fourth order of a tile, and the third within a block. In long leaves
+    the former is 0.35 of the largest rms.
     """
     steps_m = np.linalg.norm(view.steps_m, axis=1)
     radius_m = np.hypot(*(sides * steps_m).T) / 2
     block_m = np.hypot(*(np.array(BLOCKS[device.info.width]) * steps_m)) / 2
     nearest_m = np.maximum(view.nearest_m, 1e-6)
-    remainder_m = 0.15 * radius_m**4 / (8 * nearest_m**3) + 0.04 * block_m**3 / nearest_m**2
-    return (2 * np.pi * view.highest_cycles_per_m * remainder_m) ** 2
+    remainder_m = 0.35 * radius_m**4 / (8 * nearest_m**3) + 0.04 * block_m**3 / nearest_m**2
+    power = (2 * np.pi * view.highest_cycles_per_m * remainder_m) ** 2
+    if view.beam is not None:
+        power += view.beam.block_error(block_m / nearest_m) ** 2
+        window_sine = np.ptp(np.clip(view.beam.limits, -1, 1))
+        power += (0.1 * (radius_m / nearest_m) ** 4 / window_sine) ** 2
+    return power
 
 
 def _plan(

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter1d
 
 from clsas.aperture import MeanTrack, turned
 from clsas.grid import Grid
@@ -14,6 +15,9 @@ from clsas.interpolation import Interpolator
 from clsas.lines import RangeLines
 from clsas.window import BeamWindow, touches_rectangles
 
+_EVEN_NODES = 2.5  # over how many nodes their spacing is smoothed, rms
+_LEAST_RATE = 0.3  # of the mean over the track
+_LEAST_NODES = 2.0  # between the track's ends
 _COARSER = 2  # of the track's samples those at which it is decided what they see
 
 
@@ -67,7 +71,7 @@ def interpolated_nodes(
         Its `upsampling` is the density of nodes over the least.
     """
     taps, density = aperture.taps, 2 * aperture.upsampling
-    cycles = density * turned(track, rate)
+    cycles = density * turned(track, _even(track, rate, density))
     turns = np.stack([np.interp(p, track.samples, c) for p, c in zip(place, cycles, strict=True)])
     turns -= (origin := np.floor(turns.min(axis=1, keepdims=True)) - (taps // 2 - 1))
     order = np.argsort(turns, axis=1, kind="stable")
@@ -78,6 +82,28 @@ def interpolated_nodes(
     wanted = origin + np.arange(base.max() + taps)
     nodes = np.stack([np.interp(w, c, track.samples) for w, c in zip(wanted, cycles, strict=True)])
     return Nodes(nodes, track.positions_m(nodes), order, base, weights)
+
+
+def _even(track: MeanTrack, rate: NDArray[np.float64], density: float) -> NDArray[np.float64]:
+    """Return rates that change little over the taps of a filter, [roots, samples].
+
+    Steering functions are band-limited between nodes only where their spacing hardly changes:
+    the rates' logarithms are smoothed over some nodes. Where nothing is seen (a rate of 0), beyond
+    the track's ends and where nearly nothing turns, nodes go on much as they are beside.
+    """
+    on_track = np.flatnonzero(np.abs(track.samples - 0.5) <= 0.5)
+    result = np.empty_like(rate)
+    for root, each in enumerate(rate):
+        seen = on_track[each[on_track] > 0]
+        if not seen.size:
+            result[root] = 1.0
+            continue
+        inside = np.interp(on_track, seen, each[seen])
+        inside = np.maximum(inside, max(_LEAST_RATE * inside.mean(), _LEAST_NODES / density))
+        nodes_per_sample = density * inside.mean() / (len(on_track) - 1)
+        smooth = gaussian_filter1d(np.log(inside), _EVEN_NODES / nodes_per_sample, mode="nearest")
+        result[root] = np.exp(np.interp(np.arange(len(each)), on_track, smooth))
+    return result
 
 
 def nearest_nodes(

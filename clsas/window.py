@@ -159,6 +159,18 @@ class BeamWindow:
         low, high = np.clip(self.limits, -1, 1)
         return (high - low) / 2 * (max(self.taper, 0.02) if self.shape == "tukey" else 1.0)
 
+    def block_error(self, reach: float) -> float:
+        """Return the relative rms error of taking the weights over a block as one cubic.
+
+        `reach` is by how much the sine may change from the block's middle. The edges of "tukey"
+        begin with a kink, which no cubic follows; the other shapes are smooth between the limits.
+        """
+        x = math.pi * reach / self.edge
+        if self.shape != "tukey" or not self.taper:
+            return 0.01 * x**4
+        low, high = np.clip(self.limits, -1, 1)
+        return 0.03 * x**2 * math.sqrt(min(8 * reach / (high - low), 1.0))
+
     def weights(self, q: ArrayLike, wavelength_m: float = math.inf) -> NDArray[np.float64]:
         """Return the weights at sines `q` of the aspect angle; `wavelength_m` is for "inverse"."""
         q = np.asarray(q, np.float64)

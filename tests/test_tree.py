@@ -98,9 +98,10 @@ def interpolation_error_db(case, side, aperture, root=(128, 128)):
 @pytest.mark.parametrize("side", [(64, 64), (16, 16), (64, 8)])
 @pytest.mark.parametrize("case", [straight, near, swaying, arc], ids=lambda case: case.__name__)
 def test_steering_functions_are_interpolated_as_well_as_designed(case, side, taps, density):
-    """The design is for all frequencies alike; pixels have the highest ones rarely."""
+    """But for what nodes at slowly changing distances add, which plans account for."""
     aperture = interpolation.design(taps, density, FLAT)
-    assert interpolation_error_db(case, side, aperture) <= aperture.error_db + 1
+    designed, uneven = 10 ** (aperture.error_db / 10), 10**-6.3
+    assert interpolation_error_db(case, side, aperture) <= 10 * np.log10(1.26 * designed + uneven)
 
 
 def any_nodes():
@@ -163,7 +164,7 @@ def everything(monkeypatch):
     monkeypatch.setattr(importlib.import_module("clsas.factorize").tree, "ranges", widened)
 
 
-@pytest.mark.parametrize("beam", BEAMS, ids=["hann", "tukey", "squint"])
+@pytest.mark.parametrize("beam", BEAMS, ids=["hann", "wide", "squint"])
 def test_leaves_have_all_the_nodes_they_need(beam, everything, monkeypatch):
     """What lies outside a beam weighs nothing: leaving it out changes nothing."""
     grid = around(0, 12, pixel_m=(0.015, 0.05), shape=(130, 150))
