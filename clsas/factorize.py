@@ -251,17 +251,36 @@ class _Run:
         return buffer
 
     def batches(self) -> Iterator[tuple[NDArray[np.int64], NDArray[np.complex64]]]:
-        """Yield roots, [n, 2], with their pixels, [n, rows, columns]."""
+        """Yield roots, [n, 2], with their pixels, [n, rows, columns].
+
+        The geometry of a batch is prepared while the device works on the one before.
+        """
         roots = self.division.roots
+        before: tuple[NDArray[np.int64], NDArray[np.complex64], cl.Event | None] | None = None
         for start in range(0, len(roots), self.plan.roots_at_once):
             some = roots[start : start + self.plan.roots_at_once]
             batch = self._batch(some)
-            if not batch.stride(0):
-                yield some, np.zeros((len(some), *self.plan.sides[0]), np.complex64)
-                continue
-            for level in range(len(self.levels)):
-                self._stage(batch, level)
-            yield some, self._backproject(batch)
+            if before is not None:
+                yield self._done(*before)
+            before = some, *self._start(batch)
+        if before is not None:
+            yield self._done(*before)
+
+    def _start(self, batch: _Batch) -> tuple[NDArray[np.complex64], cl.Event | None]:
+        """Start a batch; return where its pixels will be, and when."""
+        pixels = np.zeros((len(batch.root_m), *self.plan.sides[0]), np.complex64)
+        if not batch.stride(0):
+            return pixels, None
+        for level in range(len(self.levels)):
+            self._stage(batch, level)
+        return pixels, self._backproject(batch, pixels)
+
+    def _done(
+        self, roots: NDArray[np.int64], pixels: NDArray[np.complex64], ready: cl.Event | None
+    ) -> tuple[NDArray[np.int64], NDArray[np.complex64]]:
+        if ready is not None:
+            ready.wait()
+        return roots, pixels
 
     def _batch(self, roots: NDArray[np.int64]) -> _Batch:
         division, chosen, track = self.division, self.plan, self.track
@@ -388,8 +407,8 @@ class _Run:
             "cycles": ordered(cycles - np.rint(cycles), np.float32),
         }
 
-    def _backproject(self, batch: _Batch) -> NDArray[np.complex64]:
-        """Return the pixels of roots from their last stage."""
+    def _backproject(self, batch: _Batch, image: NDArray[np.complex64]) -> cl.Event:
+        """Form the pixels of roots from their last stage, and start reading them."""
         device, slot, chosen, level = self.device, self.last_slot, self.plan, self.levels[-1]
         nodes, need, stride = batch.nodes[-1], batch.needs[-1], batch.stride(len(self.levels) - 1)
         roots = len(batch.root_m)
@@ -408,7 +427,7 @@ class _Run:
         position_m = nodes.position_m - batch.root_m[:, None]
         rows = [float_pairs(position_m.reshape(-1, 3))]
         if chosen.beam is not None:
-            along = tree.beam_directions(chosen.beam, self.lines, self.track, nodes.place)
+            along = tree.interpolated_directions(self.track, self.along, nodes.place)
             rows.append((along * self.per_sine).astype(np.float32).reshape(-1, 3))
         geometry = np.pad(np.concatenate(rows, axis=1).T, ((0, 0), (0, 16)), mode="edge")
         slot.wait()
@@ -436,9 +455,9 @@ class _Run:
             *self.beam[1:2],
             wait_for=slot.filled,
         )
-        height, width = chosen.sides[0]
-        pixels = device.zeros(8 * roots * height * width)
-        device.run(
+        pixels = slot.buffer("pixels", image.nbytes)
+        cl.enqueue_fill_buffer(device.queue, pixels, np.uint32(0), 0, image.nbytes)
+        slot.busy = device.run(
             self.backproject,
             (chosen.tile[0] * chosen.tile[1] // (self.width * STACK), roots * per_root),
             self.slots[-1]["lines"],
@@ -452,13 +471,13 @@ class _Run:
             self.cycles_per_m / self.samples_per_m,
             self.filters["final"],
             pixels,
-            width,
+            chosen.sides[0][1],
             0,
             *self.beam,
         )
-        image = np.empty((roots, height, width), np.complex64)
-        cl.enqueue_copy(device.queue, image, pixels)
-        return image
+        ready = cl.enqueue_copy(device.queue, image, pixels, is_blocking=False)
+        device.queue.flush()
+        return ready
 
     def _leaf_references(
         self, batch: _Batch, leaf_of: NDArray[np.int64], centres_m: NDArray[np.float64], pitch: int

@@ -206,6 +206,14 @@ def beam_directions(
     return along / np.linalg.norm(along, axis=-1, keepdims=True)
 
 
+def interpolated_directions(
+    track: MeanTrack, along: NDArray[np.float64], place: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return unit directions at some parameters, [..., 3], from those at `track.samples`."""
+    between = np.stack([np.interp(place, track.samples, axis) for axis in along.T], axis=-1)
+    return between / np.linalg.norm(between, axis=-1, keepdims=True)
+
+
 def beam_rate(
     beam: BeamWindow, track: MeanTrack, along: NDArray[np.float64], points_m: NDArray[np.float64]
 ) -> NDArray[np.float64]:
