@@ -34,14 +34,14 @@ class Costs:
         Per pixel and channel of an exact image, with 4 taps.
     """
 
-    upsampled_sample_ns: float = 12.0
-    reference_ns: float = 300.0
+    upsampled_sample_ns: float = 20.0
+    reference_ns: float = 600.0
     batch_ns: float = 2e6
     channel_ns: float = 30.0
     sample_ns: float = 0.35
-    sample_tap_ns: float = 0.02
-    leaf_ns: float = 0.6
-    pixel_ns: float = 0.6
+    sample_tap_ns: float = 0.045
+    leaf_ns: float = 0.75
+    pixel_ns: float = 0.65
 
     def __post_init__(self) -> None:
         """Check every cost."""

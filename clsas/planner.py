@@ -597,7 +597,7 @@ def _plan(
                 turns += beam_cycles * view.cycles(view.beam_rates, seen)
             channels = density * turns + (1 if view.beam else aperture.taps)
         operations = count * used * samples
-        seconds = 1e-9 * (operations * sample_ns + count * used * costs.channel_ns + costs.batch_ns)
+        seconds = 1e-9 * (operations * sample_ns + count * used * costs.channel_ns)
         if not level:
             seconds += 1e-9 * count * lines.channels * costs.reference_ns
             seconds += 1e-9 * costs.upsampled_sample_ns * lines.channels * resampling.length
@@ -617,6 +617,8 @@ def _plan(
     root_bytes = _root_bytes(view, sides, tile, stages, filters, crowding, beam_cycles)
     room = min(memory_bytes - line_bytes, _MOST_BATCH_BYTES)
     at_once = min(max(int(room // root_bytes), 1), stages[0].subimages)
+    batches = -(-stages[0].subimages // at_once)
+    in_batches = 1e-9 * costs.batch_ns * batches * len(sides)
     error = sum(10 ** (stage.error_db / 10) for stage in stages)
     if nearest:
         error += _nearest_error(view, nearest)
@@ -636,7 +638,7 @@ def _plan(
         roots_at_once=at_once,
         stages=tuple(stages),
         predicted_error_db=_decibel(error) + (_MARGIN_DB if not nearest else 0.0),
-        predicted_seconds=sum(stage.seconds for stage in stages),
+        predicted_seconds=sum(stage.seconds for stage in stages) + in_batches,
         exact_seconds=_exact_seconds(view, costs),
         memory_bytes=int(line_bytes + at_once * root_bytes),
         device=device.info.label,
