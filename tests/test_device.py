@@ -18,7 +18,15 @@ from clsas.device import (
 
 FOLDERS = (Path(module.__file__).parent / "cl", Path(module.__file__).parents[1] / "cl")
 SOURCES = sorted(path.name for folder in FOLDERS for path in folder.glob("*.*"))
-OPTIONS = {"WIDTH": 1, "TAPS": 4, "TILE": 16, "PERMUTE": 0, "BISTATIC": 0, "MOVING": 0}
+OPTIONS = {
+    "WIDTH": 1,
+    "TAPS": 4,
+    "TILE_ROWS": 16,
+    "TILE_COLUMNS": 16,
+    "PERMUTE": 0,
+    "BISTATIC": 0,
+    "MOVING": 0,
+}
 
 
 @pytest.fixture(autouse=True)

@@ -1,13 +1,16 @@
 import dataclasses
+import weakref
 from functools import cache
 
 import numpy as np
+import pyopencl as cl
 import pytest
 from cases import along_x, beside, lines_over, noise, patch, thesis_lines
 
 from clsas import plan
 from clsas.backproject import backproject
 from clsas.costs import Costs
+from clsas.device import open_device
 from clsas.factorize import factorize
 from clsas.grid import Grid
 from clsas.image import Image
@@ -544,3 +547,53 @@ def test_samples_whose_sum_overflows_are_refused(good):
     chosen = plan(huge, good["grid"], tolerance_db=-40, costs=EXACT_IS_SLOW)
     with pytest.raises(ValueError, match="samples must be at most"):
         factorize(huge, good["grid"], chosen)
+
+
+# Memory
+
+
+def peak_device_bytes(monkeypatch, run):
+    """Return the most bytes that buffers of the default device hold at once during a run."""
+    device = open_device()
+    held, peak = [0], [0]
+
+    class Buffer(cl.Buffer):
+        pass
+
+    def counted(flags, size, hostbuf=None):
+        buffer = Buffer(device.context, flags, size, hostbuf)
+        held[0] += buffer.size
+        peak[0] = max(peak[0], held[0])
+        weakref.finalize(buffer, lambda size: held.__setitem__(0, held[0] - size), buffer.size)
+        return buffer
+
+    flags = cl.mem_flags.READ_WRITE
+    monkeypatch.setattr(device, "buffer", lambda size: counted(flags, max(int(size), 4)))
+    monkeypatch.setattr(
+        device,
+        "upload",
+        lambda array: counted(flags | cl.mem_flags.COPY_HOST_PTR, 0, np.ascontiguousarray(array)),
+    )
+    run()
+    return peak[0]
+
+
+@pytest.mark.parametrize("beam", [None, BeamWindow(20, "hann")], ids=["all", "beam"])
+@pytest.mark.parametrize("tolerance_db", [-20, -50])
+def test_device_memory_is_as_planned(monkeypatch, beam, tolerance_db):
+    lines, grid = over(around(0, 40, shape=(600, 700)))
+    chosen = plan(lines, grid, tolerance_db=tolerance_db, beam=beam, costs=EXACT_IS_SLOW)
+    peak = peak_device_bytes(monkeypatch, lambda: factorize(lines, grid, chosen))
+    assert peak <= 1.1 * chosen.memory_bytes
+
+
+def test_little_memory_makes_small_roots_or_is_refused():
+    lines, grid = over(around(0, 40, shape=(600, 700)))
+    wish = {"tolerance_db": -40, "costs": EXACT_IS_SLOW}
+    plenty = plan(lines, grid, **wish)
+    little_bytes = int(0.7 * plenty.memory_bytes)
+    little = plan(lines, grid, memory_bytes=little_bytes, **wish)
+    assert not little.is_exact
+    assert little.memory_bytes <= little_bytes
+    with pytest.raises(ValueError, match=r"memory_bytes must be at least [\d.]+ MiB"):
+        plan(lines, grid, memory_bytes=1 << 20, **wish)
