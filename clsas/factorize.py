@@ -20,7 +20,7 @@ from clsas.backproject import (
     warn_unseen,
 )
 from clsas.device import Device, Slot, open_device
-from clsas.geometry import pairwise_range_m
+from clsas.geometry import bistatic_range_m, pairwise_range_m
 from clsas.grid import Grid
 from clsas.image import Image
 from clsas.layout import STACK, Tiles
@@ -492,17 +492,17 @@ class _Run:
         if self.plan.tile != self.plan.sides[-1]:
             nodes, need = batch.nodes[-1], batch.needs[-1]
             for root, position_m in enumerate(nodes.position_m - batch.root_m[:, None]):
-                first, last = need.first[root].min(), need.last[root].max()
-                node_m = position_m[first:last]
+                first = need.first[root, leaf_of]
+                index = np.minimum(first[:, None] + np.arange(pitch), len(position_m) - 1)
                 leaf_m = batch.relative_m[-1][root, leaf_of]
-                range_m = pairwise_range_m(centres_m[root], node_m, node_m)
-                range_m -= pairwise_range_m(leaf_m, node_m, node_m)
-                range_m -= (centres_m[root] - leaf_m) @ self.drift[:, None]
+                tile_m, node_m = centres_m[root], position_m[index]
+                range_m = bistatic_range_m(tile_m[:, None], node_m, node_m)
+                range_m -= bistatic_range_m(leaf_m[:, None], node_m, node_m)
+                range_m -= (tile_m - leaf_m) @ self.drift[:, None]
                 place = range_m * self.samples_per_m
-                used = np.s_[root, :, : last - first]
-                sample[used] += np.rint(place).astype(np.int32)
-                fraction[used] = place - np.rint(place)
-                phase[used] = np.remainder(self.cycles_per_m * range_m + 0.5, 1) - 0.5
+                sample[root] += np.rint(place).astype(np.int32)
+                fraction[root] = place - np.rint(place)
+                phase[root] = np.remainder(self.cycles_per_m * range_m + 0.5, 1) - 0.5
         return {"sample": sample, "fraction": fraction, "phase": phase}
 
 

@@ -139,7 +139,12 @@ def plan(
     memory_bytes = validate.count("memory_bytes", memory_bytes)
     view = View(lines, grid, beam)
     if stages is not None:
-        return _nearest(view, _checked_stages(stages, lines, grid), device, costs, memory_bytes)
+        checked = _checked_stages(stages, lines, grid)
+        if checked and view.track is None:
+            raise ValueError("lines must have channels at more than one place for stages")
+        if checked and beam is not None and beam.normalise:
+            raise ValueError("beam must not normalise with stages; clsas.backproject does")
+        return _nearest(view, checked, device, costs, memory_bytes)
     exact = _exact(view, tolerance_db, device, costs)
     if view.track is None or grid.size == 1 or (beam is not None and beam.normalise):
         return exact
@@ -689,7 +694,11 @@ def _subimages(root: tuple[int, int], side: tuple[int, int]) -> int:
 
 @dataclass(frozen=True)
 class _Errors:
-    """Powers of the errors that filters do not account for."""
+    """Powers of the errors that filters do not account for.
+
+    Of rounding and of putting channels on the track, of uneven nodes and weights stage by stage,
+    and of expanding leaves.
+    """
 
     roots: float
     nodes: tuple[float, ...]
@@ -708,11 +717,12 @@ def _other_errors(
     beam_cycles: float,
     device: Device,
 ) -> _Errors:
+    last = len(sides) - 1
     return _Errors(
         roots=_root_error(view, sides[0]),
         nodes=tuple(
-            _excess_error(view, side, aperture, crowd, beam_cycles if side is sides[-1] else None)
-            for side, crowd in zip(sides, crowding, strict=True)
+            _excess_error(view, side, aperture, crowd, beam_cycles if level == last else None)
+            for level, (side, crowd) in enumerate(zip(sides, crowding, strict=True))
         ),
         leaves=float(_leaf_error(view, np.array([sides[-1]]), device)[0]),
     )
@@ -903,7 +913,7 @@ def _exact(view: View, tolerance_db: float | None, device: Device, costs: Costs)
         highest_cycles_per_m=view.highest_cycles_per_m,
         roots_at_once=1,
         stages=(),
-        predicted_error_db=-60.0 if tolerance_db is None else tolerance_db,
+        predicted_error_db=-60.0 if tolerance_db is None else tolerance_db - _MARGIN_DB,
         predicted_seconds=seconds,
         exact_seconds=seconds,
         memory_bytes=0,

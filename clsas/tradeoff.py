@@ -32,7 +32,7 @@ STAGES = (*(((2, 2),) * count for count in range(1, 6)), ((2, 4),) * 2)
 
 EXACT_DB = -60.0
 """Accuracy of the exact image that is timed, unless a tolerance is tighter."""
-REFERENCE_DB = -80.0
+REFERENCE_DB = -85.0
 """Accuracy of the exact image that errors are against."""
 
 _HEADER = ("label", "method", "plan", "plan_s", "time_s", "predicted_time_s", "error_db")
@@ -241,7 +241,7 @@ def tradeoff(
     -------
     Tradeoff
         The exact image that is timed has an accuracy of -60 dB, or the tightest tolerance; errors
-        are against one of -80 dB.
+        are against one of -85 dB.
 
     Raises
     ------
@@ -258,7 +258,7 @@ def tradeoff(
     tolerances_db = np.atleast_1d(tolerances_db).tolist()
     wishes: list[dict] = [{"tolerance_db": tolerance_db} for tolerance_db in tolerances_db]
     wishes += [
-        {"stages": given} for given in (_feasible(lines, grid) if stages is None else stages)
+        {"stages": given} for given in (_feasible(lines, grid, beam) if stages is None else stages)
     ]
     ways: list[tuple[Row, Callable[[], Image]]] = []
     for wish in wishes:
@@ -320,9 +320,12 @@ def summary(chosen: Plan) -> str:
     return f"{sides}; {chosen.align.taps} taps in range, {chosen.final.taps} at the end, {along}"
 
 
-def _feasible(lines: RangeLines, grid: Grid) -> list[tuple[tuple[int, int], ...]]:
+def _feasible(
+    lines: RangeLines, grid: Grid, beam: BeamWindow | None
+) -> list[tuple[tuple[int, int], ...]]:
     """Return those of `STAGES` that leave a line, and a pixel of a plane."""
-    if not grid.is_planar:
+    one_place = not np.ptp(lines.tx_m + lines.rx_m, axis=0).any()
+    if not grid.is_planar or one_place or (beam is not None and beam.normalise):
         return []
     return [
         stages

@@ -597,3 +597,25 @@ def test_little_memory_makes_small_roots_or_is_refused():
     assert little.memory_bytes <= little_bytes
     with pytest.raises(ValueError, match=r"memory_bytes must be at least [\d.]+ MiB"):
         plan(lines, grid, memory_bytes=1 << 20, **wish)
+
+
+# The thesis's method
+
+
+@pytest.mark.parametrize("width_deg", [3, 8, 30])
+def test_given_stages_with_a_beam(width_deg):
+    """Leaves of many tiles, each of which sees other channels."""
+    lines, grid = over(around(0, 20, shape=(128, 256)), along_x(400, 0.015))
+    beam = BeamWindow(width_deg, "hann")
+    chosen = plan(lines, grid, stages=[(1, 1), (1, 2)], beam=beam)
+    assert chosen.tile != chosen.sides[-1]
+    reference = backproject(lines, grid, accuracy_db=-80, beam=beam)
+    assert relative_error_db(factorize(lines, grid, chosen), reference) <= -35
+
+
+def test_given_stages_refuse_what_they_cannot_do():
+    lines, grid = made(straight)
+    with pytest.raises(ValueError, match="beam must not normalise"):
+        plan(lines, grid, stages=[(1, 2)], beam=BeamWindow(20, "hann", normalise=True))
+    with pytest.raises(ValueError, match="lines must have channels at more than one place"):
+        plan(lines.select([0]), grid, stages=[(1, 2)])
