@@ -160,9 +160,8 @@ class Plan:
         fits = isinstance(self.half_lengths, tuple) and len(self.half_lengths) == levels
         fits = fits and all(whole(n, 0) for n in self.half_lengths)
         check(fits, "half_lengths", "a whole number for every stage")
-        check(
-            numbers((self.highest_cycles_per_m, self.beam_cycles), 2, 0), "beam_cycles", "positive"
-        )
+        for name in ("highest_cycles_per_m", "beam_cycles"):
+            check(numbers((getattr(self, name),), 1, 0), name, "a number from 0")
         if self.nearest:
             fits = numbers(self.nearest, levels, 1) and all(whole(n, 1) for n in self.nearest)
             check(fits, "nearest", "a whole number for every stage")

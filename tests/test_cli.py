@@ -522,7 +522,14 @@ def test_ctrl_c_ends_with_130_and_leaves_no_file(tmp_path):
     )
     (tmp_path / "scene.toml").write_text(points + text.replace("snr_db = 20", ""))
     command = [sys.executable, "-m", "clsas", "simulate", "scene.toml", "-o", "echoes.h5"]
-    with subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE, text=True) as process:
+
+    def heed() -> None:
+        """A shell's background jobs, and so what they start, ignore Ctrl-C."""
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+    with subprocess.Popen(
+        command, cwd=tmp_path, stderr=subprocess.PIPE, text=True, preexec_fn=heed
+    ) as process:
         assert process.stderr.readline().startswith("Warning: phase centres")
         time.sleep(0.5)
         process.send_signal(signal.SIGINT)
