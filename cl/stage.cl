@@ -39,7 +39,7 @@
  * Samples outside the parent's line are never read: the place is moved inside, where the host has put zeros.
  */
 
-/* Calls that are not inlined would spill every open sum. */
+/* clamp() in the inner loops: as a call that is not inlined it would spill every open sum. */
 #define KEEP(x, low, high) ((x) < (low) ? (low) : (x) > (high) ? (high) : (x))
 
 #define CHUNK 32 /* channels whose weights are kept at a time */
@@ -231,45 +231,45 @@ __kernel void stage(__global const float *parent, int parent_pitch, __global con
                 }
             }
             for (int k = block; k < block_end; k += WIDTH) {
-            vfloat re[APERTURE_TAPS], im[APERTURE_TAPS];
-            node = chunk_node;
-#pragma unroll
-            for (int t = 0; t < APERTURE_TAPS; t++) {
-                re[t] = im[t] = 0.0f;
-                if (chunk > begin && HAS(node + t)) {
-                    re[t] = LOAD_RE(NODE_LINE(node + t), k, pitch);
-                    im[t] = LOAD_IM(NODE_LINE(node + t), k, pitch);
-                }
-            }
-            for (int c = 0; c < count; c++) {
-                const int channel = chunk + c;
-                for (; node < base[channel]; node++) {
-                    /* No later channel reaches this virtual channel. */
-                    if (HAS(node)) {
-                        STORE_RE(re[0], NODE_LINE(node), k, pitch);
-                        STORE_IM(im[0], NODE_LINE(node), k, pitch);
-                    }
-#pragma unroll
-                    for (int t = 0; t + 1 < APERTURE_TAPS; t++) {
-                        re[t] = re[t + 1];
-                        im[t] = im[t + 1];
-                    }
-                    re[APERTURE_TAPS - 1] = im[APERTURE_TAPS - 1] = 0.0f;
-                }
-                const vfloat a = aligned_re[(k - block) / WIDTH][c], b = aligned_im[(k - block) / WIDTH][c];
-                __global const float *weight = aperture + channel * APERTURE_TAPS;
+                vfloat re[APERTURE_TAPS], im[APERTURE_TAPS];
+                node = chunk_node;
 #pragma unroll
                 for (int t = 0; t < APERTURE_TAPS; t++) {
-                    re[t] += weight[t] * a;
-                    im[t] += weight[t] * b;
+                    re[t] = im[t] = 0.0f;
+                    if (chunk > begin && HAS(node + t)) {
+                        re[t] = LOAD_RE(NODE_LINE(node + t), k, pitch);
+                        im[t] = LOAD_IM(NODE_LINE(node + t), k, pitch);
+                    }
                 }
-            }
+                for (int c = 0; c < count; c++) {
+                    const int channel = chunk + c;
+                    for (; node < base[channel]; node++) {
+                        /* No later channel reaches this virtual channel. */
+                        if (HAS(node)) {
+                            STORE_RE(re[0], NODE_LINE(node), k, pitch);
+                            STORE_IM(im[0], NODE_LINE(node), k, pitch);
+                        }
 #pragma unroll
-            for (int t = 0; t < APERTURE_TAPS; t++)
-                if (HAS(node + t)) {
-                    STORE_RE(re[t], NODE_LINE(node + t), k, pitch);
-                    STORE_IM(im[t], NODE_LINE(node + t), k, pitch);
+                        for (int t = 0; t + 1 < APERTURE_TAPS; t++) {
+                            re[t] = re[t + 1];
+                            im[t] = im[t + 1];
+                        }
+                        re[APERTURE_TAPS - 1] = im[APERTURE_TAPS - 1] = 0.0f;
+                    }
+                    const vfloat a = aligned_re[(k - block) / WIDTH][c], b = aligned_im[(k - block) / WIDTH][c];
+                    __global const float *weight = aperture + channel * APERTURE_TAPS;
+#pragma unroll
+                    for (int t = 0; t < APERTURE_TAPS; t++) {
+                        re[t] += weight[t] * a;
+                        im[t] += weight[t] * b;
+                    }
                 }
+#pragma unroll
+                for (int t = 0; t < APERTURE_TAPS; t++)
+                    if (HAS(node + t)) {
+                        STORE_RE(re[t], NODE_LINE(node + t), k, pitch);
+                        STORE_IM(im[t], NODE_LINE(node + t), k, pitch);
+                    }
             }
         }
         /* Where this work-item had no samples it passed no channel. */

@@ -256,15 +256,14 @@ class _Run:
         The geometry of a batch is prepared while the device works on the one before.
         """
         roots = self.division.roots
-        before: tuple[NDArray[np.int64], NDArray[np.complex64], cl.Event | None] | None = None
+        before = None
         for start in range(0, len(roots), self.plan.roots_at_once):
             some = roots[start : start + self.plan.roots_at_once]
             batch = self._batch(some)
             if before is not None:
-                yield self._done(*before)
+                yield before[0], self._finished(*before[1:])
             before = some, *self._start(batch)
-        if before is not None:
-            yield self._done(*before)
+        yield before[0], self._finished(*before[1:])
 
     def _start(self, batch: _Batch) -> tuple[NDArray[np.complex64], cl.Event | None]:
         """Start a batch; return where its pixels will be, and when."""
@@ -275,12 +274,12 @@ class _Run:
             self._stage(batch, level)
         return pixels, self._backproject(batch, pixels)
 
-    def _done(
-        self, roots: NDArray[np.int64], pixels: NDArray[np.complex64], ready: cl.Event | None
-    ) -> tuple[NDArray[np.int64], NDArray[np.complex64]]:
+    @staticmethod
+    def _finished(pixels: NDArray[np.complex64], ready: cl.Event | None) -> NDArray[np.complex64]:
+        """Wait for the pixels of a batch that was started."""
         if ready is not None:
             ready.wait()
-        return roots, pixels
+        return pixels
 
     def _batch(self, roots: NDArray[np.int64]) -> _Batch:
         division, chosen, track = self.division, self.plan, self.track
@@ -427,7 +426,7 @@ class _Run:
         position_m = nodes.position_m - batch.root_m[:, None]
         rows = [float_pairs(position_m.reshape(-1, 3))]
         if chosen.beam is not None:
-            along = tree.interpolated_directions(self.track, self.along, nodes.place)
+            along = tree.interpolated_directions(self.track.samples, self.along, nodes.place)
             rows.append((along * self.per_sine).astype(np.float32).reshape(-1, 3))
         geometry = np.pad(np.concatenate(rows, axis=1).T, ((0, 0), (0, 16)), mode="edge")
         slot.wait()

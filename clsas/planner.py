@@ -25,7 +25,13 @@ from clsas.layout import BLOCKS
 from clsas.lines import RangeLines
 from clsas.nearest import stage_errors_m
 from clsas.plan import GUARD, Plan, Stage, grid_digest, lines_digest, padded_length
-from clsas.tree import Division, beam_directions, beam_rate, interpolated_nodes
+from clsas.tree import (
+    Division,
+    beam_directions,
+    beam_rate,
+    interpolated_directions,
+    interpolated_nodes,
+)
 from clsas.window import BeamWindow, touches_rectangles
 
 BEST_TOLERANCE_DB = -75.0
@@ -166,11 +172,14 @@ def plan(
             )
         if filters is None:
             break
+        within = view.within(tree.sides[0])
+        others = _other_errors(within, tree.sides, filters.aperture, crowding, beam_cycles, device)
         found = _plan(
-            view,
+            within,
             tolerance_db,
             filters,
             tree.sides,
+            others.total,
             device,
             costs,
             memory_bytes,
@@ -188,10 +197,6 @@ def plan(
         else:
             # What uneven spacing and a beam add falls with the density of nodes; filters must
             # make up for the rest.
-            within = view.within(found.sides[0])
-            others = _other_errors(
-                within, found.sides, found.aperture, crowding, beam_cycles, device
-            )
             share = _NODES_SHARE * allowed / len(found.sides)
             uneven = _excess_error(within, found.sides[-1], found.aperture, crowding[-1], None)
             if others.nodes[-1] > share and uneven < others.nodes[-1] / 2:
@@ -566,6 +571,7 @@ def _plan(
     tolerance_db: float | None,
     filters: _Filters,
     sides: list[tuple[int, int]],
+    other_error: float,
     device: Device,
     costs: Costs,
     memory_bytes: int,
@@ -573,9 +579,12 @@ def _plan(
     crowding: tuple[float, ...] = (),
     beam_cycles: float = 0.0,
 ) -> Plan:
-    """Return a plan with all that is expected of it."""
+    """Return a plan with all that is expected of it.
+
+    `view` is that within its roots where the aperture is interpolated; `other_error` the power of
+    the errors that the filters do not account for.
+    """
     lines, grid = view.lines, view.grid
-    view = view if nearest else view.within(sides[0])
     align, aperture, final = filters.align, filters.aperture, filters.final
     resampling = interpolation.resampling(lines.length, align, view.spectrum)
     halves = view.half_lengths(sides, align, final, resampling.ratio)
@@ -624,11 +633,7 @@ def _plan(
     at_once = min(max(int(room // root_bytes), 1), stages[0].subimages)
     batches = -(-stages[0].subimages // at_once)
     in_batches = 1e-9 * costs.batch_ns * batches * len(sides)
-    error = sum(10 ** (stage.error_db / 10) for stage in stages)
-    if nearest:
-        error += _nearest_error(view, nearest)
-    else:
-        error += _other_errors(view, sides, aperture, crowding, beam_cycles, device).total
+    error = other_error + sum(10 ** (stage.error_db / 10) for stage in stages)
     return Plan(
         tolerance_db=tolerance_db,
         sides=tuple(sides),
@@ -806,8 +811,8 @@ def _excess_error(
             turns = view.highest_cycles_per_m * (range_m[1:] - range_m[0])
             result = np.exp(2j * np.pi * turns)
             if weighted:
-                along = [np.interp(at, track.samples, axis) for axis in view.along.T]
-                sine = np.einsum("psi,is->ps", sight[1:], along) / range_m[1:]
+                along = interpolated_directions(track.samples, view.along, at)
+                sine = np.einsum("psi,si->ps", sight[1:], along) / range_m[1:]
                 result *= view.beam.weights(sine, wavelength_m)
             return result
 
@@ -840,7 +845,8 @@ def _nearest(
         leaf = leaf[0] * divisions, leaf[1] * divisions
     linear = interpolation.design(2, NEAREST_UPSAMPLING, view.spectrum)
     filters = _Filters(linear, Interpolator(1, 1.0, np.zeros((0, 2, 0)), 0.0, 0.0), linear)
-    chosen = _plan(view, None, filters, sides[::-1], device, costs, memory_bytes, stages)
+    error = _nearest_error(view, stages)
+    chosen = _plan(view, None, filters, sides[::-1], error, device, costs, memory_bytes, stages)
     if chosen.memory_bytes > memory_bytes:
         raise ValueError(
             f"memory_bytes must be at least {chosen.memory_bytes / 2**20:.1f} MiB for these "

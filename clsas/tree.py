@@ -201,16 +201,14 @@ def beam_directions(
 ) -> NDArray[np.float64]:
     """Return the unit direction of the track, as the beam has it, at some parameters, [..., 3]."""
     order = np.argsort(track.place, kind="stable")
-    given = beam.directions(lines)[order]
-    along = np.stack([np.interp(place, track.place[order], axis) for axis in given.T], axis=-1)
-    return along / np.linalg.norm(along, axis=-1, keepdims=True)
+    return interpolated_directions(track.place[order], beam.directions(lines)[order], place)
 
 
 def interpolated_directions(
-    track: MeanTrack, along: NDArray[np.float64], place: NDArray[np.float64]
+    given: NDArray[np.float64], along: NDArray[np.float64], place: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return unit directions at some parameters, [..., 3], from those at `track.samples`."""
-    between = np.stack([np.interp(place, track.samples, axis) for axis in along.T], axis=-1)
+    """Return unit directions at some parameters, [..., 3], from `along` at ascending `given`."""
+    between = np.stack([np.interp(place, given, axis) for axis in along.T], axis=-1)
     return between / np.linalg.norm(between, axis=-1, keepdims=True)
 
 
