@@ -104,6 +104,49 @@ def load(path: str | os.PathLike) -> Saved:
     OSError
         If it does not exist (FileNotFoundError) or cannot be read.
     """
+    with _opened(path) as file:
+        obj = _read(file)
+        if not isinstance(obj, _SAVED):
+            raise FileFormatError(f"holds only a {type(obj).__name__}")
+        return obj
+
+
+def read_geometry(path: str | os.PathLike) -> tuple[RangeLines, int]:
+    """Read everything of range lines but their samples.
+
+    Returns
+    -------
+    lines : RangeLines
+        With one sample per channel, zero.
+    length : int
+        Samples per channel in the file.
+
+    Raises
+    ------
+    FileFormatError, OSError
+        As `load` does, and if the file holds something else.
+    """
+    with _opened(path) as file:
+        dataset = _samples_of(file)
+        nothing = np.zeros((dataset.shape[0], 1), np.complex64)
+        return _read(file, samples=nothing), dataset.shape[1]
+
+
+def read_samples(path: str | os.PathLike, rows: slice, columns: slice) -> np.ndarray:
+    """Read some samples of range lines, [channels, samples], and nothing else.
+
+    Raises
+    ------
+    FileFormatError, OSError
+        As `read_geometry` does.
+    """
+    with _opened(path) as file:
+        return _samples_of(file)[rows, columns]
+
+
+@contextmanager
+def _opened(path: str | os.PathLike) -> Iterator[h5py.File]:
+    """Open a file of clsas to read; whatever is wrong with it is said by one exception."""
     path = Path(path)
     with path.open("rb"):
         pass  # Whatever keeps it from being opened is said by Python, better than by HDF5.
@@ -112,10 +155,7 @@ def load(path: str | os.PathLike) -> Saved:
     try:
         with h5py.File(path, "r") as file:
             _check_header(file)
-            obj = _read(file)
-            if not isinstance(obj, _SAVED):
-                raise FileFormatError(f"holds only a {type(obj).__name__}")
-            return obj
+            yield file
     except FileFormatError as error:
         raise FileFormatError(f"{path} {error}") from None
     # HDF5 reports damage by any of these, depending on what it met first.
@@ -192,14 +232,24 @@ def _write(group: h5py.Group, obj: Any) -> None:
             _set(group, field.name, value)
 
 
-def _read(group: h5py.Group) -> Any:
+def _samples_of(file: h5py.File) -> h5py.Dataset:
+    kind = _attribute(file, "kind")
+    if kind != "range_lines":
+        raise FileFormatError(f"must hold range lines, got {kind}")
+    return file["samples"]
+
+
+def _read(group: h5py.Group, **instead: Any) -> Any:
+    """Return the object in a group, some of whose fields may be given `instead` of being read."""
     name = _attribute(group, "kind")
     if name not in _KINDS:
         raise FileFormatError(f"holds an object of unknown kind {name!r} at {group.name}")
     kind = _KINDS[name]
     values = {}
     for field in fields(kind):
-        if field.name in group.attrs:
+        if field.name in instead:
+            values[field.name] = instead[field.name]
+        elif field.name in group.attrs:
             values[field.name] = _attribute(group, field.name)
         elif field.name in group:
             item = group[field.name]

@@ -19,12 +19,15 @@ SHAPES = ("rectangular", "hann", "hamming", "taylor", "tukey", "inverse")
 INTERVALS = 1024
 """Cubics of a table: enough for the kinks of a Tukey window."""
 
+MOST_TRACK_PINGS = 101
+"""Pings over which a track's direction is smoothed at most, unless told otherwise."""
+
 _NARROWEST = 1e-3  # degrees: float32 holds a hundredth of it
 _BEYOND = 2.0  # for a limit at end-fire: a sine that rounding does not reach
 _HALF_POWER = 0.442946  # sinc^2 is 1/2 here
 _MOST_WEIGHT = 100.0
 _TAYLOR_TERMS, _TAYLOR_SIDE_LOBES_DB = 4, 30.0  # SciPy's choice
-_TRACK_SHARE = 4  # the track's direction is that of a cubic through this part of the pings
+_TRACK_SHARE = 4  # the track's direction is that of cubics through this part of the pings
 _ROUNDING = 1e-5  # of sines on the device, amply
 _CHANNELS_TOGETHER = 16
 
@@ -57,6 +60,9 @@ class BeamWindow:
     along : array_like, [3] or [channels, 3], optional
         Direction of the track, of any length. Unless given it is that of a smooth curve through
         the lines' phase centres, see `directions`.
+    track_pings : int, optional
+        Over how many pings the direction of the track is smoothed, from 5; a quarter of them, 101
+        at most, unless given.
     normalise : bool
         Multiply every pixel by channels / sum_i w_i(x), w_i the weights: a point has the amplitude
         it has without a window, also near the ends of the aperture, where fewer channels see it.
@@ -76,6 +82,7 @@ class BeamWindow:
     element_length_m: float | None = None
     along: NDArray[np.float64] | None = None
     normalise: bool = False
+    track_pings: int | None = None
 
     def __post_init__(self) -> None:  # noqa: D105
         width = validate.number(
@@ -102,6 +109,8 @@ class BeamWindow:
             if not length.all():
                 raise ValueError("along must hold directions of some length, got zeros")
             fields["along"] = along / length
+        if self.track_pings is not None:
+            fields["track_pings"] = validate.count("track_pings", self.track_pings, least=5)
         if not isinstance(self.normalise, (bool, np.bool_)):
             raise TypeError(f"normalise must be True or False, got {self.normalise!r}")
         for name, value in fields.items():
@@ -205,8 +214,8 @@ class BeamWindow:
         """Return the unit direction of the track for every channel, float64 [channels, 3].
 
         That is `along`, or from the lines the tangent of local cubics, least-squares fits to the
-        phase centres of a quarter of the pings each. Successive channels of one transmitter
-        position are a ping.
+        phase centres of `track_pings` pings each. Successive channels of one transmitter position
+        are a ping.
 
         Raises
         ------
@@ -232,7 +241,8 @@ class BeamWindow:
         sums = np.add.reduceat((lines.tx_m + lines.rx_m) / 2, first, axis=0)
         centres_m = sums / np.diff(np.append(first, lines.channels))[:, None]
         # Odd, and four pings at least where there are as many.
-        window = min(max(2 * (pings // (2 * _TRACK_SHARE)) + 1, 5), pings - 1 + pings % 2)
+        wanted = self.track_pings or min(max(pings // _TRACK_SHARE, 5), MOST_TRACK_PINGS)
+        window = min(2 * (wanted // 2) + 1, pings - 1 + pings % 2)
         if window < 2:
             tangent = np.diff(centres_m, axis=0).repeat(2, axis=0)
         else:

@@ -1,0 +1,672 @@
+"""Mosaics: an image of any size, patch by patch, resumable and on many devices or machines.
+
+Every patch is planned and formed by itself, from the channels and samples that it needs. In a store
+(clsas.store) it is finished once its record is there, which is written after its pixels.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+import os
+import queue
+import tempfile
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Executor, Future, ThreadPoolExecutor, wait
+from dataclasses import asdict, dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsas import validate
+from clsas.backproject import BEST_ACCURACY_DB, backproject
+from clsas.device import Device, list_devices, open_device
+from clsas.factorize import factorize
+from clsas.geometry import bistatic_range_m
+from clsas.grid import Grid
+from clsas.image import Image
+from clsas.lines import RangeLines
+from clsas.plan import Plan, grid_digest
+from clsas.planner import plan
+from clsas.store import Record, Store
+from clsas.survey import Survey, files_of, has_ended, largest_gap_m, open_files, open_survey
+from clsas.window import MOST_TRACK_PINGS, BeamWindow, touches_rectangles
+
+if TYPE_CHECKING:
+    from distributed import Client
+
+MEMORY_BYTES = 1 << 30
+"""What one patch may take unless told otherwise."""
+
+WISHES = ("tolerance_db", "tolerance_wavelengths", "stages", "accuracy_db")
+"""How a mosaic may be wished for: at most one of these."""
+
+_TOLERANCE_DB = -50.0
+_LARGEST_SIDE = 2048  # pixels of a patch, where memory allows more: a second of work
+_SMALLEST_SIDE = 128
+_POLL_S = 0.5
+_MOST_WORKERS = 1024  # of one machine
+
+
+@dataclass(frozen=True, eq=False)
+class Patch:
+    """One patch of a mosaic, formed.
+
+    Attributes
+    ----------
+    row, column : int
+        Which patch.
+    rows, columns : slice
+        Which pixels of the mosaic's grid it has.
+    grid : Grid
+        These pixels' grid.
+    record : Record
+        What is known about it: error, seconds, plan, gaps.
+    """
+
+    row: int
+    column: int
+    rows: slice
+    columns: slice
+    grid: Grid
+    record: Record
+    _pixels: NDArray[np.complex64] | None
+    _store: Store | None
+
+    @property
+    def image(self) -> Image:
+        """The pixels; read from the store where another process formed them."""
+        if self._pixels is not None:
+            return Image(self._pixels, self.grid)
+        return Image(self._store.pixels[self.rows, self.columns], self.grid)
+
+
+@dataclass(frozen=True, eq=False)
+class Mosaic:
+    """A mosaic to be formed by iterating over it, which yields a `Patch` as each is finished.
+
+    Attributes
+    ----------
+    grid : Grid
+        All of its pixels.
+    patch_shape : (rows, columns)
+        Pixels of a patch; those at the end may have fewer.
+    shape : (rows, columns)
+        Patches.
+    finished : dict of (row, column) to Record
+        Patches that the store had when the mosaic was opened.
+    """
+
+    grid: Grid
+    patch_shape: tuple[int, int]
+    finished: dict[tuple[int, int], Record]
+    _job: _Job
+    _survey: Survey
+    _source: RangeLines | Path
+    _devices: tuple[Device, ...]
+    _client: Client | None
+    _idle_s: float | None
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Number of patches along rows and columns."""
+        rows, columns = (
+            math.ceil(n / m) for n, m in zip(self.grid.shape, self.patch_shape, strict=True)
+        )
+        return rows, columns
+
+    def __len__(self) -> int:
+        """Return the number of all patches."""
+        return self.shape[0] * self.shape[1]
+
+    def __iter__(self) -> Iterator[Patch]:
+        """Form what is not finished and yield it, patch by patch.
+
+        Raises
+        ------
+        OSError
+            If the store cannot be written (a full disk); what is finished stays.
+        ValueError
+            What imaging one patch raises, with its place.
+        """
+        todo = [place for place in np.ndindex(self.shape) if place not in self.finished]
+        survey, formed_from = self._survey, {}
+        ended = self._idle_s is None or has_ended(self._source)
+        last_news = time.monotonic()
+        executor = self._executor(min(len(self._devices), max(len(todo), 1)))
+        running: dict[Future, tuple[int, int]] = {}
+        try:
+            sight = _Sight.of(survey, self._job.beam)
+            ready = self._ready(todo, sight, ended)
+            while True:
+                for place in ready:
+                    todo.remove(place)
+                    job = replace(self._job, paths=_paths(survey), lines=_in_memory(survey))
+                    running[executor.submit(_form, job, *self._window(*place))] = place
+                    formed_from[place] = survey.channels
+                if not running and ended:
+                    return
+                done, _ = wait(
+                    running or [Future()],
+                    timeout=None if ended else _POLL_S,
+                    return_when=FIRST_COMPLETED,
+                )
+                for future in done:
+                    place = running.pop(future)
+                    yield self._finished(place, *future.result())
+                ready = []
+                if ended:
+                    continue
+                last = has_ended(self._source)  # asked before looking: nothing comes after it
+                paths = files_of(self._source)
+                if len(paths) > len(survey.parts):
+                    survey = open_files(paths, survey)
+                    sight, last_news = _Sight.of(survey, self._job.beam), time.monotonic()
+                    # Patches that channels saw which came later than they were formed.
+                    todo += [
+                        place
+                        for place, channels in formed_from.items()
+                        if place not in todo
+                        and place not in running.values()
+                        and sight.sees(self._window(*place)[0])[channels:].any()
+                    ]
+                ended = last or time.monotonic() - last_news > self._idle_s
+                ready = self._ready(todo, sight, ended)
+        finally:
+            for future in running:
+                future.cancel()
+            executor.shutdown(wait=True)
+
+    def _window(self, row: int, column: int) -> tuple[Grid, int, int, slice, slice]:
+        parts = []
+        for index, side, most in zip((row, column), self.patch_shape, self.grid.shape, strict=True):
+            parts.append(slice(index * side, min((index + 1) * side, most)))
+        return self.grid.window(*parts), row, column, *parts
+
+    def _finished(
+        self, place: tuple[int, int], record: Record, pixels: NDArray[np.complex64] | None
+    ) -> Patch:
+        grid, *where = self._window(*place)
+        return Patch(*where, grid, record, pixels, self._job.opened_store())
+
+    def _ready(
+        self, todo: Sequence[tuple[int, int]], sight: _Sight, ended: bool
+    ) -> list[tuple[int, int]]:
+        """Return patches that every channel which can see them has seen."""
+        if ended:
+            return list(todo)
+        settled = sight.settled
+        if settled < 1:
+            return []
+        return [p for p in todo if sight.has_passed(self._window(*p)[0], settled)]
+
+    def _executor(self, workers: int) -> Executor:
+        if self._client is not None:
+            return self._client.get_executor(pure=False, retries=2)
+        # Every thread takes a device of its own.
+        free: queue.SimpleQueue[Device] = queue.SimpleQueue()
+        for device in self._devices:
+            free.put(device)
+        return ThreadPoolExecutor(
+            workers, initializer=lambda: setattr(_LOCAL, "device", free.get())
+        )
+
+
+def mosaic(
+    source: RangeLines | str | os.PathLike,
+    grid: Grid,
+    store: str | os.PathLike | None = None,
+    *,
+    tolerance_db: float | None = None,
+    tolerance_wavelengths: float | None = None,
+    stages: Sequence[tuple[int, int]] | None = None,
+    accuracy_db: float | None = None,
+    beam: BeamWindow | None = None,
+    patches: tuple[int, int] | None = None,
+    memory_bytes: int | None = None,
+    device: Device | str | int | Sequence[Device | str | int] | None = None,
+    client: Client | None = None,
+    follow_s: float | None = None,
+) -> Mosaic:
+    """Form an image of any size patch by patch.
+
+    Nothing is formed until the result is iterated over::
+
+        for patch in clsas.mosaic("lines.h5", grid, "image.zarr", tolerance_db=-40):
+            print(patch.row, patch.column, patch.record.predicted_error_db)
+
+    Parameters
+    ----------
+    source : RangeLines or path
+        Lines, a file of them, or a folder of such files (*.h5, in the order of their names), read
+        by slices. Channels whose samples are not finite or all zero count as missing.
+    grid : Grid
+        A plane, a height map, or points with two axes.
+    store : path, optional
+        Zarr store to write, or to go on with: patches that it holds are not formed again. Needed
+        with a `client`. See docs/mosaic.md for its layout.
+    tolerance_db, tolerance_wavelengths, stages
+        See `clsas.plan`. -50 dB unless anything is given.
+    accuracy_db : float, optional
+        Backproject every patch exactly, see `clsas.backproject`.
+    beam : BeamWindow, optional
+        Weights of the channels. Where its direction follows the track, all of the track counts,
+        not only what a patch sees; in a folder, which may grow, `track_pings` is 101 unless given.
+    patches : (rows, columns), optional
+        Patches along either axis; those at the end may be smaller. Unless given they are as large
+        as memory allows, up to 2048 x 2048 pixels.
+    memory_bytes : int, optional
+        What one patch may take on host and device together; 1 GiB unless given.
+    device : Device, str or int, or a sequence of them, optional
+        Devices that work side by side. Unless given, every GPU if there are several, else the one
+        that `clsas.device.choose` chooses. Not with a `client`, whose workers each take one.
+    client : distributed.Client, optional
+        Let the workers of a Dask cluster form the patches. They must see `source` and `store`
+        under the same paths.
+    follow_s : float, optional
+        Wait for files to be added to the folder `source`, until it holds a file named `end` or
+        nothing was added for so many seconds. A patch is formed once the latest channels have
+        it behind their beam, and again should later channels see it.
+
+    Returns
+    -------
+    Mosaic
+        To be iterated over.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If an argument is not what is allowed, files of a folder do not belong together, the memory
+        holds not even the smallest patch, or `store` was made with other inputs (the
+        message names what differs).
+    FileFormatError, OSError
+        If a file cannot be read or the store not written.
+    ImportError
+        If a store is wanted and Zarr is not installed.
+    DeviceError
+        If there is no such device.
+
+    Notes
+    -----
+    Patches are formed independently; each differs from the exact image by no more than
+    the tolerance, and so do neighbours along their border.
+    """
+    validate.instance("grid", grid, Grid)
+    if len(grid.shape) != 2:
+        raise ValueError(f"grid must have two axes for a mosaic, got shape {grid.shape}")
+    given = (tolerance_db, tolerance_wavelengths, stages, accuracy_db)
+    wish = {name: value for name, value in zip(WISHES, given, strict=True) if value is not None}
+    if len(wish) > 1:
+        raise ValueError(f"at most one of {', '.join(WISHES)} must be given, got {wish}")
+    wish = wish or {"tolerance_db": _TOLERANCE_DB}
+    if accuracy_db is not None:
+        validate.number("accuracy_db", accuracy_db, "dB", least=BEST_ACCURACY_DB, below=0.0)
+    if beam is not None:
+        validate.instance("beam", beam, BeamWindow)
+    if patches is not None:
+        patch_shape = _shape_of(patches, grid)
+    memory_bytes = validate.count("memory_bytes", memory_bytes or MEMORY_BYTES)
+    if client is not None and store is None:
+        raise ValueError("store must be given with a client")
+    if client is not None and isinstance(source, RangeLines):
+        raise ValueError("source must be a path with a client, whose workers read it")
+    if client is not None and device is not None:
+        raise ValueError("device must be left out with a client: every worker takes one")
+    follows = follow_s is not None
+    if follows:
+        follow_s = validate.positive("follow_s", follow_s, "s")
+    folder = not isinstance(source, RangeLines) and Path(source).is_dir()
+    if follows and not folder:
+        raise ValueError(f"source must be a folder to follow, got {source!r}")
+    if not isinstance(source, RangeLines):
+        source = Path(source).resolve()
+    devices = _devices(device)
+    if follows:
+        _wait_for_first(source, follow_s)
+    survey = open_survey(source)
+    if folder and beam is not None and beam.along is None and beam.track_pings is None:
+        beam = replace(beam, track_pings=MOST_TRACK_PINGS)
+    sight = _Sight.of(survey, beam)
+    inputs = _inputs(survey, grid, wish, beam)
+    opened = None if store is None else Store.at(store)
+    if patches is None:
+        stored = None if opened is None else opened.patch_shape
+        patch_shape = stored or _choose_shape(sight, grid, wish, memory_bytes, devices[0])
+    job = _Job(
+        paths=(),
+        lines=None,
+        wish=wish,
+        beam=beam,
+        memory_bytes=memory_bytes,
+        store=None if opened is None else opened.path,
+        local=client is None,
+    )
+    finished: dict[tuple[int, int], Record] = {}
+    if opened is not None:
+        opened.begin(inputs, grid, patch_shape)
+        finished = opened.records()
+    found = Mosaic(grid, patch_shape, finished, job, survey, source, devices, client, follow_s)
+    for place, record in list(finished.items()):
+        # Files that were added since may hold channels that see it.
+        if record.survey_channels < survey.channels:
+            seen = sight.sees(found._window(*place)[0])
+            if seen[record.survey_channels :].any():
+                del finished[place]
+    return found
+
+
+@dataclass(frozen=True, eq=False)
+class _Job:
+    """What every patch of a mosaic has in common; small, it travels with each."""
+
+    paths: tuple[Path, ...]
+    lines: Survey | None
+    wish: dict[str, Any]
+    beam: BeamWindow | None
+    memory_bytes: int
+    store: Path | None
+    local: bool
+
+    def sight(self) -> _Sight:
+        """Return the survey, opened once per process and number of files."""
+        if self.lines is not None:
+            return _Sight.of(self.lines, self.beam)
+        return _opened(self.paths, _beam_json(self.beam))
+
+    def opened_store(self) -> Store | None:
+        return None if self.store is None else Store.at(self.store)
+
+
+@dataclass(frozen=True, eq=False)
+class _Sight:
+    """A survey, and what its channels see through a beam."""
+
+    survey: Survey
+    beam: BeamWindow | None
+    along: NDArray[np.float64] | None
+    phase_centres_m: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, survey: Survey, beam: BeamWindow | None) -> _Sight:
+        geometry = survey.geometry
+        along = None if beam is None else beam.directions(geometry)
+        return cls(survey, beam, along, (geometry.tx_m + geometry.rx_m) / 2)
+
+    @property
+    def settled(self) -> int:
+        """How many channels, from the first, will keep their direction when others come."""
+        if self.beam is None:
+            return 0  # any channel may see any patch
+        if self.beam.along is not None:
+            return self.survey.channels
+        tx_m = self.survey.geometry.tx_m
+        pings = np.flatnonzero(np.append(True, (np.diff(tx_m, axis=0) != 0).any(axis=1)))
+        later = self.beam.track_pings // 2 + 1
+        return int(pings[-later]) if len(pings) > 2 * later else 0
+
+    def ranges_m(self, grid: Grid) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the nearest and farthest range of a grid from every channel, at most."""
+        centre_m, half_m = _box(grid)
+        geometry = self.survey.geometry
+        middle_m = bistatic_range_m(centre_m, geometry.tx_m, geometry.rx_m)
+        radius_m = np.linalg.norm(np.abs(half_m).sum(axis=0))
+        reach_m = np.full(len(middle_m), radius_m + 2 * geometry.range_step_m)
+        if geometry.rx_velocity_m_s is not None:
+            speed = np.linalg.norm(geometry.rx_velocity_m_s, axis=1) / geometry.sound_speed_m_s
+            reach_m += 1.1 * speed * (middle_m + radius_m)
+        return middle_m - reach_m, middle_m + reach_m
+
+    def sees(self, grid: Grid) -> NDArray[np.bool_]:
+        """Return which channels may contribute to a grid, [channels]."""
+        seen = self.survey.within(*self.ranges_m(grid))
+        if self.beam is not None:
+            centre_m, half_m = _box(grid)
+            seen &= touches_rectangles(
+                self.beam, centre_m[None], half_m, self.phase_centres_m, self.along
+            )[0]
+        return seen
+
+    def has_passed(self, grid: Grid, settled: int) -> bool:
+        """Return whether the latest settled channels have a grid behind their beam."""
+        if self.sees(grid)[settled:].any():
+            return False
+        centre_m, half_m = _box(grid)
+        offset_m = centre_m - self.phase_centres_m[settled - 1]
+        direction = self.along[settled - 1]
+        extent_m = np.abs(half_m @ direction).sum()
+        low = self.beam.limits[0]
+        distance_m = np.linalg.norm(offset_m) + np.linalg.norm(np.abs(half_m).sum(axis=0))
+        return bool(direction @ offset_m + extent_m < max(low, -1.0) * distance_m)
+
+
+@lru_cache(maxsize=2)
+def _opened(paths: tuple[Path, ...], beam: str | None) -> _Sight:
+    return _Sight.of(open_files(paths), None if beam is None else BeamWindow(**json.loads(beam)))
+
+
+def _form(
+    job: _Job, grid: Grid, row: int, column: int, rows: slice, columns: slice
+) -> tuple[Record, NDArray[np.complex64] | None]:
+    """Form one patch, on whichever worker this is; return its pixels where no store has them."""
+    try:
+        record, pixels = _image(job, job.sight(), grid, _this_device(job))
+    except ValueError as error:
+        raise ValueError(f"patch {row},{column}: {error}") from error
+    store = job.opened_store()
+    if store is not None:
+        store.write(row, column, rows, columns, pixels, record)
+    return record, pixels if job.local else None
+
+
+def _image(
+    job: _Job, sight: _Sight, grid: Grid, device: Device
+) -> tuple[Record, NDArray[np.complex64]]:
+    start = time.perf_counter()
+    seen = sight.sees(grid)
+    known = {"survey_channels": sight.survey.channels, "device": device.info.label}
+    known |= {"driver": device.info.driver, "channels": int(np.count_nonzero(seen))}
+    empty = np.zeros(grid.shape, np.complex64)
+    if not seen.any():
+        return Record(**known, seconds=time.perf_counter() - start), empty
+    lines, missing = sight.survey.read(seen, *sight.ranges_m(grid))
+    known |= {"missing_channels": int(np.count_nonzero(missing))}
+    known |= {"gap_m": largest_gap_m(lines, missing), "read_seconds": time.perf_counter() - start}
+    if missing.all():
+        return Record(**known, seconds=time.perf_counter() - start), empty
+    beam = None if job.beam is None else replace(job.beam, along=sight.along[seen])
+    if "accuracy_db" in job.wish:
+        image = backproject(lines, grid, **job.wish, beam=beam, device=device)
+        known |= {"predicted_error_db": job.wish["accuracy_db"]}
+    else:
+        before = time.perf_counter()
+        chosen = _planned(lines, grid, job, beam, device)
+        known |= {
+            "plan_seconds": time.perf_counter() - before,
+            "predicted_error_db": chosen.predicted_error_db,
+            "predicted_seconds": chosen.predicted_seconds,
+            "memory_bytes": _bytes(lines, grid, chosen),
+            "plan": json.loads(_without_directions(chosen).to_json()),
+        }
+        image = factorize(lines, grid, chosen, device=device)
+    return Record(**known, seconds=time.perf_counter() - start), image.pixels
+
+
+def _planned(
+    lines: RangeLines, grid: Grid, job: _Job, beam: BeamWindow | None, device: Device
+) -> Plan:
+    room = job.memory_bytes - _host_bytes(lines.channels, lines.length, grid.size)
+    if room <= 0:
+        raise ValueError(
+            f"memory_bytes must be more than {(job.memory_bytes - room) / 2**20:.0f} MiB for "
+            f"{grid.shape[0]} x {grid.shape[1]} pixels from {lines.channels} lines of "
+            f"{lines.length} samples, got {job.memory_bytes / 2**20:.0f} MiB: use smaller patches"
+        )
+    most = min(room, device.info.memory_bytes // 2)
+    return plan(lines, grid, **job.wish, beam=beam, device=device, memory_bytes=most)
+
+
+def _host_bytes(channels: int, length: int, pixels: int) -> int:
+    """Return what lines and pixels of a patch take, with the copy of either that work makes."""
+    return 2 * 8 * (channels * length + pixels)
+
+
+def _bytes(lines: RangeLines, grid: Grid, chosen: Plan) -> int:
+    return _host_bytes(lines.channels, lines.length, grid.size) + int(chosen.memory_bytes)
+
+
+def _choose_shape(
+    sight: _Sight, grid: Grid, wish: dict[str, Any], memory_bytes: int, device: Device
+) -> tuple[int, int]:
+    """Return the largest patches whose middle one fits the memory, with its plan."""
+    side = _LARGEST_SIDE
+    needed = 0
+    while side >= _SMALLEST_SIDE or side == _LARGEST_SIDE:
+        # As even as they can be.
+        shape = tuple(math.ceil(n / math.ceil(n / side)) for n in grid.shape)
+        most = 0
+        for row in (0, grid.shape[0] - 1):
+            start = [row // shape[0] * shape[0], grid.shape[1] // 2 // shape[1] * shape[1]]
+            window = grid.window(*(slice(a, a + n) for a, n in zip(start, shape, strict=True)))
+            seen = sight.sees(window)
+            if seen.any():
+                count, length = sight.survey.extent(seen, *sight.ranges_m(window))
+                most = max(most, count * length)
+        # Lines are upsampled and stages held on the device: about as much again, and half.
+        needed = _host_bytes(1, most, shape[0] * shape[1]) + 12 * most + (64 << 20)
+        if needed <= memory_bytes:
+            return shape
+        side //= 2
+    raise ValueError(
+        f"memory_bytes must be at least {needed / 2**20:.0f} MiB for patches of "
+        f"{shape[0]} x {shape[1]} pixels, got {memory_bytes / 2**20:.0f} MiB"
+    )
+
+
+def _shape_of(patches: tuple[int, int], grid: Grid) -> tuple[int, int]:
+    """Return the pixels of a patch where a grid is divided into so many."""
+    try:
+        counts = tuple(validate.count("every entry of patches", n) for n in patches)
+    except TypeError:
+        raise TypeError(f"patches must be (rows, columns) of patches, got {patches!r}") from None
+    if len(counts) != 2:
+        raise ValueError(f"patches must be (rows, columns) of patches, got {patches!r}")
+    shape = []
+    for count, pixels in zip(counts, grid.shape, strict=True):
+        side = math.ceil(pixels / count)
+        if math.ceil(pixels / side) != count:
+            less = math.ceil(pixels / side)
+            raise ValueError(
+                f"patches must leave each some of {pixels} pixels: {count} patches of {side} are "
+                f"too many, {less} are enough"
+            )
+        shape.append(side)
+    return shape[0], shape[1]
+
+
+def _box(grid: Grid) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the middle of a box around a grid, and halves of its sides as vectors [n, 3]."""
+    if grid.points_m is not None:
+        low, high = (edge(grid.points_m, axis=(0, 1)) for edge in (np.min, np.max))
+        return (low + high) / 2, np.diag((high - low) / 2)
+    rows, columns = grid.shape
+    half_m = np.array([grid.row_step_m * (rows - 1), grid.column_step_m * (columns - 1)]) / 2
+    centre_m = grid.origin_m + half_m.sum(axis=0)
+    if grid.height_m is None:
+        return centre_m, half_m
+    low, high = grid.height_m.min(), grid.height_m.max()
+    up = np.array([0.0, 0.0, 1.0])
+    return centre_m + up * (low + high) / 2, np.concatenate([half_m, [up * (high - low) / 2]])
+
+
+def _inputs(
+    survey: Survey, grid: Grid, wish: dict[str, Any], beam: BeamWindow | None
+) -> dict[str, Any]:
+    """Return what a store must have been made with, as JSON has it."""
+    inputs = {
+        "parts": survey.digests(),
+        "grid": grid_digest(grid),
+        "pixels": list(grid.shape),
+        "beam": None if beam is None else json.loads(_beam_json(beam)),
+        **{name: wish.get(name) for name in WISHES},
+    }
+    return json.loads(json.dumps(inputs))
+
+
+def _beam_json(beam: BeamWindow | None) -> str | None:
+    return None if beam is None else json.dumps(asdict(beam), default=lambda value: value.tolist())
+
+
+def _without_directions(chosen: Plan) -> Plan:
+    """Return a plan whose beam follows the track: directions of all channels are long."""
+    if chosen.beam is None:
+        return chosen
+    return replace(chosen, beam=replace(chosen.beam, along=None))
+
+
+def _paths(survey: Survey) -> tuple[Path, ...]:
+    return tuple(part for part in survey.parts if isinstance(part, Path))
+
+
+def _in_memory(survey: Survey) -> Survey | None:
+    return survey if isinstance(survey.parts[0], RangeLines) else None
+
+
+def _wait_for_first(source: Path, follow_s: float) -> None:
+    start = time.monotonic()
+    while not files_of(source):
+        if has_ended(source) or time.monotonic() - start > follow_s:
+            raise ValueError(f"source must hold range lines: {source} has no file *.h5")
+        time.sleep(_POLL_S)
+
+
+_LOCAL = threading.local()
+
+
+def _devices(wish: Any) -> tuple[Device, ...]:
+    """Return the devices to work on side by side."""
+    if isinstance(wish, Sequence) and not isinstance(wish, str):
+        if not wish:
+            raise ValueError("device must name at least one device, got an empty sequence")
+        found = tuple(open_device(each) for each in wish)
+    elif wish is not None:
+        found = (open_device(wish),)
+    else:
+        first = open_device(None)
+        alike = [info for info in list_devices() if info.kind == first.info.kind == "gpu"]
+        found = tuple(open_device(info.index) for info in alike)
+        if len(found) < 2 or "CLSAS_DEVICE" in os.environ:
+            found = (first,)
+    names = {device.info.index for device in found}
+    if len(names) < len(found):
+        raise ValueError("device must name each device once")
+    return found
+
+
+def _this_device(job: _Job) -> Device:
+    """Return the device of this thread, or of this worker's process."""
+    return _LOCAL.device if job.local else _claimed()[0]
+
+
+@lru_cache(maxsize=1)
+def _claimed() -> tuple[Device, object]:
+    """Return a device for this process, and the lock that tells others on this machine.
+
+    Of several devices each worker takes the next; where there are more workers, they share.
+    """
+    import fcntl
+
+    devices = _devices(None)
+    folder = Path(tempfile.gettempdir())
+    for slot in range(_MOST_WORKERS):
+        lock = (folder / f"clsas-{os.getuid()}-worker-{slot}").open("w")
+        with contextlib.suppress(BlockingIOError):
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            return devices[slot % len(devices)], lock
+        lock.close()
+    return devices[0], None

@@ -1,0 +1,333 @@
+"""The Zarr store of a mosaic: its pixels in one array, one chunk and one record per patch.
+
+docs/mosaic.md describes the layout. A patch is finished once its record is there, which is written
+after its pixels; both are renamed into place, so that neither is ever half there.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import re
+import tempfile
+from dataclasses import asdict, dataclass, fields
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsas import validate
+from clsas.grid import Grid
+from clsas.image import Image
+
+if TYPE_CHECKING:
+    import zarr
+
+FORMAT = "clsas mosaic"
+VERSION = 1
+
+_OVERVIEW = 1024  # pixels along the longer side, at most
+
+
+@dataclass(frozen=True)
+class Record:
+    """What is known about a finished patch.
+
+    Attributes
+    ----------
+    channels : int
+        Channels that may see it; with 0 the patch is empty: all zero.
+    survey_channels : int
+        Channels that the survey had when it was formed.
+    missing_channels : int
+        Those of `channels` without samples.
+    gap_m : float
+        Longest way between pings that see it where that is a gap (three usual steps), else 0.
+    predicted_error_db : float or None
+        Relative rms error expected against the exact image; None for an empty patch.
+    predicted_seconds, plan_seconds, read_seconds, seconds : float
+        Expected for imaging; taken by planning and by reading; and by all of it.
+    memory_bytes : int
+        What it was planned to take.
+    device, driver : str
+        Where it was formed.
+    plan : dict or None
+        The plan, as `clsas.Plan.from_json` reads it, its beam without directions; None for an exact
+        image or an empty patch.
+    """
+
+    channels: int
+    survey_channels: int
+    missing_channels: int = 0
+    gap_m: float = 0.0
+    predicted_error_db: float | None = None
+    predicted_seconds: float = 0.0
+    plan_seconds: float = 0.0
+    read_seconds: float = 0.0
+    seconds: float = 0.0
+    memory_bytes: int = 0
+    device: str = ""
+    driver: str = ""
+    plan: dict[str, Any] | None = None
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether no channel contributes, so that all pixels are zero."""
+        return self.channels == self.missing_channels
+
+    @property
+    def flags(self) -> tuple[str, ...]:
+        """What a user should know, in words; nothing if all is well."""
+        found = []
+        if not self.channels:
+            found.append("empty: no channel sees it")
+        elif self.missing_channels:
+            found.append(f"{self.missing_channels} of {self.channels} channels have no samples")
+        if self.gap_m:
+            found.append(f"a gap of {self.gap_m:.3g} m between pings")
+        return tuple(found)
+
+
+@dataclass(frozen=True)
+class Store:
+    """A mosaic on disk.
+
+    Attributes
+    ----------
+    path : Path
+    """
+
+    path: Path
+
+    @classmethod
+    def at(cls, path: str | os.PathLike) -> Store:
+        """Return the store at a path, which need not exist yet.
+
+        Raises
+        ------
+        ImportError
+            If Zarr is not installed.
+        """
+        _zarr()
+        return cls(Path(path).resolve())
+
+    @classmethod
+    def opened(cls, path: str | os.PathLike) -> Store:
+        """Return the store at a path.
+
+        Raises
+        ------
+        OSError
+            If there is none.
+        ValueError
+            If it is not of this library, or of another version.
+        """
+        store = cls.at(path)
+        if not store.path.exists():
+            raise FileNotFoundError(2, "there is no mosaic", str(path))
+        if "inputs" not in store._attributes():
+            raise ValueError(f"{path} holds a mosaic that was never begun; form it anew")
+        return store
+
+    @property
+    def patch_shape(self) -> tuple[int, int] | None:
+        """Pixels of a patch, or None where there is no mosaic yet."""
+        shape = self._attributes().get("patch_shape")
+        return None if shape is None else (shape[0], shape[1])
+
+    @cached_property
+    def pixels(self) -> zarr.Array:
+        """The pixels, complex64 [rows, columns], on disk."""
+        return _zarr().open_array(self.path / "pixels", mode="r+")
+
+    @property
+    def grid(self) -> Grid:
+        """Where the pixels lie.
+
+        Raises
+        ------
+        ValueError
+            If the mosaic is not of a plane or height map, whose grid alone is stored.
+        """
+        stored = self._attributes()["grid"]
+        if stored is None:
+            raise ValueError(f"{self.path} is a mosaic of points, whose grid it does not hold")
+        shape = tuple(self.pixels.shape)
+        grid = Grid.oriented(**stored, shape=shape)
+        height = self.path / "height"
+        if not height.exists():
+            return grid
+        return grid.with_height(_zarr().open_array(height, mode="r")[:])
+
+    def begin(self, inputs: dict[str, Any], grid: Grid, patch_shape: tuple[int, int]) -> None:
+        """Create the store, or check that it was made with these inputs.
+
+        Raises
+        ------
+        ValueError
+            If the path holds something else, or a mosaic of other inputs; the message names them.
+        OSError
+            If it cannot be written.
+        """
+        stored = self._attributes()
+        if "inputs" in stored:
+            self._check(stored["inputs"], inputs)
+            if stored["patch_shape"] != list(patch_shape):
+                mine, given = ("{} x {}".format(*s) for s in (stored["patch_shape"], patch_shape))
+                raise ValueError(
+                    f"{self.path} was made with other inputs: patches of {mine} pixels there, "
+                    f"of {given} given; give it another path or the same inputs"
+                )
+            with tempfile.TemporaryFile(dir=self.path):
+                pass  # raises where it cannot be written
+            if stored["inputs"]["parts"] != inputs["parts"]:
+                self._root("r+").attrs["inputs"] = inputs
+            return
+        if not self.path.parent.is_dir():
+            raise FileNotFoundError(2, "there is no such folder", str(self.path.parent))
+        zarr = _zarr()
+        # Whole only once it has its inputs; until then it is begun anew.
+        root = zarr.create_group(
+            self.path, attributes={"format": FORMAT}, overwrite=self.path.exists()
+        )
+        names = ("y", "x") if grid.has_axes else ("row", "column")
+        root.create_array(
+            "pixels",
+            shape=grid.shape,
+            dtype=np.complex64,
+            chunks=patch_shape,
+            compressors=None,  # noise does not compress
+            fill_value=0,
+            dimension_names=names,
+        )
+        plane = None
+        if grid.points_m is None:
+            steps = ("origin_m", "row_step_m", "column_step_m")
+            plane = {name: getattr(grid, name).tolist() for name in steps}
+        if grid.has_axes:
+            for name, axis in zip(("x", "y"), grid.axes_m, strict=True):
+                root.create_array(
+                    name, data=axis, dimension_names=(name,), attributes={"units": "m"}
+                )
+        if grid.height_m is not None:
+            root.create_array("height", data=grid.height_m, dimension_names=names)
+        root.create_group("patches")
+        root.attrs.update(version=VERSION, patch_shape=list(patch_shape), grid=plane, inputs=inputs)
+
+    def records(self) -> dict[tuple[int, int], Record]:
+        """Return the records of all finished patches, by row and column."""
+        found = {}
+        known = {field.name for field in fields(Record)}
+        for folder in (self.path / "patches").iterdir():
+            if not (name := re.fullmatch(r"(\d+)\.(\d+)", folder.name)):
+                continue
+            try:
+                stored = json.loads((folder / "zarr.json").read_text())["attributes"]
+                record = Record(**{k: v for k, v in stored.items() if k in known})
+            except (OSError, ValueError, KeyError, TypeError):
+                continue  # cut off while it was written
+            found[int(name[1]), int(name[2])] = record
+        return dict(sorted(found.items()))
+
+    def write(
+        self,
+        row: int,
+        column: int,
+        rows: slice,
+        columns: slice,
+        pixels: NDArray[np.complex64],
+        record: Record,
+    ) -> None:
+        """Write a patch and then its record.
+
+        Raises
+        ------
+        OSError
+            If the disk is full or the store not writable.
+        """
+        self.pixels[rows, columns] = pixels
+        _zarr().create_group(
+            self.path / "patches" / f"{row}.{column}", attributes=asdict(record), overwrite=True
+        )
+
+    def image(self, rows: slice = slice(None), columns: slice = slice(None)) -> Image:
+        """Return some of the pixels, all unless told otherwise, as an image."""
+        window = self.grid.window(rows, columns)
+        validate.memory("the mosaic", 8 * window.size)
+        return Image(self.pixels[rows, columns], window)
+
+    def overview(self, most: int = _OVERVIEW) -> Image:
+        """Return the mosaic at fewer pixels, each the root of the mean power of those it covers."""
+        grid, (height, width) = self.grid, self.patch_shape
+        step = math.ceil(max(grid.shape) / most)
+        shape = tuple(n // step or 1 for n in grid.shape)
+        step = [min(step, n) for n in grid.shape]
+        power = np.zeros(shape)
+        # Bands of whole patches and whole pixels of the overview.
+        band = max(height // step[0], 1)
+        for first in range(0, shape[0], band):
+            last = min(first + band, shape[0])
+            for start in range(0, shape[1], max(width // step[1], 1)):
+                stop = min(start + max(width // step[1], 1), shape[1])
+                part = self.pixels[
+                    first * step[0] : last * step[0], start * step[1] : stop * step[1]
+                ]
+                blocks = (np.abs(part) ** 2).reshape(last - first, step[0], stop - start, step[1])
+                power[first:last, start:stop] = blocks.mean(axis=(1, 3))
+        middle = sum(
+            (n - 1) / 2 * each
+            for n, each in zip(step, (grid.row_step_m, grid.column_step_m), strict=True)
+        )
+        coarse = Grid.oriented(
+            grid.origin_m + middle, grid.row_step_m * step[0], grid.column_step_m * step[1], shape
+        )
+        return Image(np.sqrt(power).astype(np.complex64), coarse)
+
+    def _root(self, mode: str) -> zarr.Group:
+        return _zarr().open_group(self.path, mode=mode)
+
+    def _attributes(self) -> dict[str, Any]:
+        """Return what is known about the mosaic as a whole; nothing where there is none."""
+        if not self.path.exists() or (self.path.is_dir() and not any(self.path.iterdir())):
+            return {}
+        try:
+            attributes = dict(self._root("r").attrs)
+        except (OSError, ValueError, KeyError) as error:
+            raise ValueError(f"{self.path} exists and is not a mosaic of clsas") from error
+        if attributes.get("format") != FORMAT:
+            raise ValueError(f"{self.path} exists and is not a mosaic of clsas")
+        if "inputs" in attributes and attributes.get("version") != VERSION:
+            raise ValueError(
+                f"{self.path} is a mosaic of version {attributes.get('version')}, this clsas works "
+                f"with version {VERSION}: give it another path"
+            )
+        return attributes
+
+    def _check(self, stored: dict[str, Any], given: dict[str, Any]) -> None:
+        differences = []
+        for name in given:
+            mine, theirs = stored.get(name), given[name]
+            if name == "parts":
+                if theirs[: len(mine)] != mine:
+                    differences.append("the range lines are others")
+            elif name == "grid" and mine != theirs:
+                if stored.get("pixels") == given["pixels"]:
+                    differences.append("the grid lies elsewhere")
+            elif mine != theirs:
+                differences.append(f"{name} is {mine} there, {theirs} given")
+        if differences:
+            raise ValueError(
+                f"{self.path} was made with other inputs: {'; '.join(differences)}; give it "
+                f"another path or the same inputs"
+            )
+
+
+def _zarr() -> Any:
+    try:
+        import zarr
+    except ImportError:
+        raise ImportError("stores of mosaics need Zarr: pip install 'clsas[mosaic]'") from None
+    return zarr

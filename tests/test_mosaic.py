@@ -1,0 +1,511 @@
+"""Mosaics: as exact as asked for, seamless, resumable, distributed, growing."""
+
+import dataclasses
+import json
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+import threading
+import time
+from types import MappingProxyType
+
+import h5py
+import numpy as np
+import pytest
+from cases import along_x, lines_over
+
+import clsas
+from clsas.device import list_devices
+from clsas.grid import Grid
+from clsas.quality import relative_error_db
+from clsas.store import Store
+from clsas.survey import END
+from clsas.window import BeamWindow
+
+GRID = Grid.plane((-4, 4, 80), (30, 40, 60))
+LINES = lines_over(GRID, along_x(160, 0.05), carrier_hz=100e3, step_m=0.03)
+BEAM = BeamWindow(8.0, "hann")
+WISH = {"accuracy_db": -70, "beam": BEAM, "patches": (2, 4)}
+
+
+@pytest.fixture(scope="module")
+def exact():
+    return clsas.backproject(LINES, GRID, beam=BEAM, accuracy_db=-80)
+
+
+@pytest.fixture
+def file(tmp_path):
+    clsas.save(tmp_path / "lines.h5", LINES)
+    return tmp_path / "lines.h5"
+
+
+def whole(patches, grid=GRID):
+    pixels = np.full(grid.shape, np.nan, np.complex64)
+    for patch in patches:
+        assert np.isnan(pixels[patch.rows, patch.columns]).all()
+        pixels[patch.rows, patch.columns] = patch.image.pixels
+    return clsas.Image(pixels, grid)
+
+
+def test_patches_make_the_image(platform, exact):
+    image = whole(clsas.mosaic(LINES, GRID, **WISH, device=platform))
+    assert relative_error_db(image, exact) < -65
+
+
+def test_every_patch_has_its_own_pixels(exact):
+    seen = set()
+    for patch in clsas.mosaic(LINES, GRID, **WISH):
+        seen.add((patch.row, patch.column))
+        expected = GRID.positions_m(patch.rows, patch.columns)
+        np.testing.assert_allclose(patch.grid.positions_m(), expected, atol=1e-9)
+        assert 0 < patch.record.channels < 160  # the beam's
+        assert not patch.record.flags
+    assert seen == set(np.ndindex(2, 4))
+
+
+def test_a_store_holds_pixels_and_records(file, tmp_path, exact):
+    mosaic = clsas.mosaic(file, GRID, tmp_path / "image.zarr", **WISH)
+    assert len(mosaic) == 8
+    assert not mosaic.finished
+    for patch in mosaic:
+        assert Store.opened(tmp_path / "image.zarr").records()[patch.row, patch.column] == (
+            patch.record
+        )
+    store = Store.opened(tmp_path / "image.zarr")
+    assert relative_error_db(store.image(), exact) < -65
+    np.testing.assert_allclose(store.grid.positions_m(), GRID.positions_m(), atol=1e-12)
+    for record in store.records().values():
+        assert record.predicted_error_db == -70
+        assert record.seconds > 0
+
+
+def test_a_store_opens_in_xarray(file, tmp_path, exact):
+    xarray = pytest.importorskip("xarray")
+    for _ in clsas.mosaic(file, GRID, tmp_path / "image.zarr", **WISH):
+        pass
+    data = xarray.open_zarr(tmp_path / "image.zarr", consolidated=False)
+    assert data.pixels.dims == ("y", "x")
+    np.testing.assert_allclose(data.x, GRID.axes_m[0])
+    assert np.abs(data.pixels.values).max() == pytest.approx(np.abs(exact.pixels).max(), rel=1e-3)
+
+
+def test_the_overview_keeps_power_and_place(file, tmp_path, exact):
+    for _ in clsas.mosaic(file, GRID, tmp_path / "image.zarr", **WISH):
+        pass
+    overview = Store.opened(tmp_path / "image.zarr").overview(20)
+    assert overview.grid.shape == (15, 20)
+    blocks = np.abs(exact.pixels).reshape(15, 4, 20, 4) ** 2
+    np.testing.assert_allclose(np.abs(overview.pixels) ** 2, blocks.mean(axis=(1, 3)), rtol=1e-2)
+    expected = GRID.positions_m().reshape(15, 4, 20, 4, 3).mean(axis=(1, 3))
+    np.testing.assert_allclose(overview.grid.positions_m(), expected, atol=1e-9)
+
+
+def test_the_directions_are_those_of_the_whole_track():
+    """A swaying track's, which the channels that see a patch would tell otherwise."""
+    track = LINES.tx_m.copy()
+    track[:, 1] += 0.2 * np.sin(track[:, 0])
+    lines = lines_over(GRID, track, carrier_hz=100e3, step_m=0.03)
+    beam = BeamWindow(8.0, "rectangular")
+    reference = clsas.backproject(lines, GRID, beam=beam, accuracy_db=-80)
+    image = whole(clsas.mosaic(lines, GRID, **(WISH | {"beam": beam})))
+    assert relative_error_db(image, reference) < -65
+
+
+class TestFactorized:
+    """A larger scene, of which every patch is worth factorizing."""
+
+    GRID = Grid.plane((-5.1, 5.1, 512), (40, 50.2, 512))
+    BEAM = BeamWindow(20.0, "hann")
+    TOLERANCE_DB = -40.0
+
+    @pytest.fixture(scope="class")
+    @classmethod
+    def scene(cls):
+        lines = lines_over(cls.GRID, along_x(1200, 0.025), carrier_hz=120e3, step_m=0.02)
+        return lines, clsas.backproject(lines, cls.GRID, beam=cls.BEAM, accuracy_db=-80)
+
+    @pytest.fixture(scope="class")
+    @classmethod
+    def patches(cls, scene):
+        return list(
+            clsas.mosaic(
+                scene[0], cls.GRID, tolerance_db=cls.TOLERANCE_DB, beam=cls.BEAM, patches=(2, 2)
+            )
+        )
+
+    def test_every_patch_is_as_good_as_predicted(self, scene, patches):
+        for patch in patches:
+            assert patch.record.plan["sides"]  # not plain backprojection
+            exact = clsas.Image(scene[1].pixels[patch.rows, patch.columns], patch.grid)
+            measured = relative_error_db(patch.image, exact)
+            assert measured <= patch.record.predicted_error_db <= self.TOLERANCE_DB
+
+    def test_there_are_no_seams(self, scene, patches):
+        """Along borders the error is what it is elsewhere, and neighbours agree."""
+        image, exact = whole(patches, self.GRID).pixels, scene[1].pixels
+        level = np.sqrt(np.mean(np.abs(exact) ** 2))
+        error = np.abs(image - exact) / level
+        for border in (error[254:258], error[:, 254:258]):
+            assert 20 * np.log10(np.sqrt(np.mean(border**2))) <= self.TOLERANCE_DB + 1
+        # The step across the border, beyond the exact image's own.
+        for a, b in ((np.s_[255], np.s_[256]), (np.s_[:, 255], np.s_[:, 256])):
+            step = (image[a] - image[b]) - (exact[a] - exact[b])
+            step_db = 20 * np.log10(np.sqrt(np.mean(np.abs(step) ** 2)) / level)
+            assert step_db <= self.TOLERANCE_DB + 4
+
+    def test_a_record_holds_its_plan(self, patches):
+        plan = clsas.Plan.from_json(json.dumps(patches[0].record.plan))
+        assert plan.tolerance_db == self.TOLERANCE_DB
+        assert plan.predicted_error_db == patches[0].record.predicted_error_db
+
+
+def test_height_maps_and_points():
+    x, y = GRID.axes_m
+    hill = 0.3 * np.exp(-(np.add.outer((y - 35) ** 2, x**2)))
+    for grid in (GRID.with_height(hill), Grid.points(GRID.with_height(hill).positions_m())):
+        exact = clsas.backproject(LINES, grid, beam=BEAM, accuracy_db=-80)
+        image = whole(clsas.mosaic(LINES, grid, **WISH), grid)
+        assert relative_error_db(image, exact) < -65
+
+
+def test_the_thesis_stages_work_in_patches():
+    patches = list(clsas.mosaic(LINES, GRID, stages=[(2, 2), (2, 2)], beam=BEAM, patches=(2, 2)))
+    assert [len(patch.record.plan["nearest"]) for patch in patches] == [2] * 4
+
+
+def test_patches_that_do_not_divide_the_grid(exact):
+    patches = list(clsas.mosaic(LINES, GRID, **(WISH | {"patches": (7, 3)})))
+    assert {patch.image.grid.shape for patch in patches} == {(9, 27), (9, 26), (6, 27), (6, 26)}
+    assert relative_error_db(whole(patches), exact) < -65
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"patches": (50, 4)}, "patches must leave each some of 60 pixels: 50 patches of 2"),
+        ({"patches": (61, 4)}, "patches must leave each some of 60 pixels"),
+        ({"patches": (0, 4)}, "every entry of patches must be .* got 0"),
+        ({"patches": 4}, r"patches must be \(rows, columns\) of patches, got 4"),
+        ({"patches": (1, 2, 3)}, r"patches must be \(rows, columns\) of patches"),
+        ({"tolerance_db": -40}, "at most one of tolerance_db, .* must be given"),
+        ({"accuracy_db": 3}, "accuracy_db must be .* dB, got 3"),
+        ({"memory_bytes": -1}, "memory_bytes must be"),
+        ({"patches": None, "memory_bytes": 1000}, "memory_bytes must be at least .* MiB"),
+        ({"beam": 8.0}, "beam must be"),
+        ({"device": []}, "device must name at least one device"),
+        ({"follow_s": 1.0}, "source must be a folder to follow"),
+    ],
+)
+def test_bad_arguments(wrong, message):
+    with pytest.raises((TypeError, ValueError), match=message):
+        clsas.mosaic(LINES, GRID, **(WISH | wrong))
+
+
+def test_bad_grids():
+    with pytest.raises(ValueError, match="grid must have two axes"):
+        clsas.mosaic(LINES, Grid.points([[0.0, 30.0, 0.0]]))
+    with pytest.raises(TypeError, match="grid must be"):
+        clsas.mosaic(LINES, (3, 4))
+
+
+def test_a_wish_is_checked_before_any_patch():
+    with pytest.raises(ValueError, match=r"tolerance_db must be .* got -200"):
+        clsas.mosaic(LINES, GRID, tolerance_db=-200)
+    with pytest.raises(ValueError, match="tolerance_wavelengths must be"):
+        clsas.mosaic(LINES, GRID, tolerance_wavelengths=-1)
+    with pytest.raises(TypeError, match="stages must be"):
+        clsas.mosaic(LINES, GRID, stages=3)
+
+
+def test_a_patch_that_no_channel_sees_is_empty_and_flagged(tmp_path):
+    """Half of the scene lies behind the beams, and some beyond the lines' end."""
+    grid = Grid.plane((-4, 120, 64), (30, 40, 20))
+    patches = list(clsas.mosaic(LINES, grid, tmp_path / "a.zarr", **(WISH | {"patches": (1, 4)})))
+    assert [patch.record.is_empty for patch in patches] == [False, True, True, True]
+    for patch in patches[1:]:
+        assert not patch.image.pixels.any()
+        assert patch.record.flags == ("empty: no channel sees it",)
+        assert patch.record.predicted_error_db is None
+
+
+def test_missing_samples_are_flagged(file, tmp_path):
+    with h5py.File(file, "r+") as lines:
+        lines["samples"][20:24] = np.nan
+    kept = np.delete(np.arange(160), slice(20, 24))
+    along = BEAM.directions(LINES)
+    reference = clsas.backproject(
+        LINES.select(kept), GRID, beam=dataclasses.replace(BEAM, along=along[kept])
+    )
+    patches = list(clsas.mosaic(file, GRID, tmp_path / "a.zarr", **WISH))
+    assert relative_error_db(whole(patches), reference) < -58
+    flagged = [patch for patch in patches if patch.record.flags]
+    assert 0 < len(flagged) < len(patches)
+    assert flagged[0].record.missing_channels == 4
+    assert flagged[0].record.gap_m == pytest.approx(0.25)
+    assert "4 of" in flagged[0].record.flags[0]
+    assert "a gap of 0.25 m" in flagged[0].record.flags[1]
+
+
+def test_lost_pings_are_flagged():
+    lines = LINES.select(np.delete(np.arange(160), slice(70, 80)))
+    flags = {patch.record.flags for patch in clsas.mosaic(lines, GRID, **WISH)}
+    assert ("a gap of 0.55 m between pings",) in flags
+
+
+class TestResuming:
+    def test_what_is_finished_is_kept(self, file, tmp_path, exact):
+        path = tmp_path / "image.zarr"
+        running = iter(clsas.mosaic(file, GRID, path, **WISH))
+        for _ in range(3):
+            next(running)
+        running.close()
+        kept = {place: (path / "patches" / "{}.{}".format(*place)) for place in np.ndindex(2, 4)}
+        times = {p: f.stat().st_mtime_ns for p, f in kept.items() if f.exists()}
+        assert 3 <= len(times) < 8
+        mosaic = clsas.mosaic(file, GRID, path, **WISH)
+        assert set(mosaic.finished) == set(times)
+        assert {(patch.row, patch.column) for patch in mosaic} == set(kept) - set(times)
+        assert all(kept[place].stat().st_mtime_ns == then for place, then in times.items())
+        assert relative_error_db(Store.opened(path).image(), exact) < -65
+        assert not list(clsas.mosaic(file, GRID, path, **WISH))
+
+    def test_after_kill(self, file, tmp_path, exact):
+        """Kill -9 in the middle, again and again."""
+        program = f"""
+            import clsas, pickle, sys
+            grid, wish = pickle.load(open({str(tmp_path / "wish")!r}, "rb"))
+            for patch in clsas.mosaic({str(file)!r}, grid, {str(tmp_path / "a.zarr")!r}, **wish):
+                print(patch.row, patch.column, flush=True)
+        """
+        import pickle
+
+        wish = WISH | {"patches": (6, 8)}
+        (tmp_path / "wish").write_bytes(pickle.dumps((GRID, wish)))
+        formed = []
+        for kills in range(4):
+            process = subprocess.Popen(
+                [sys.executable, "-c", textwrap.dedent(program)], stdout=subprocess.PIPE, text=True
+            )
+            for line in process.stdout:
+                formed.append(line)
+                if kills < 3 and len(formed) % 9 == 8:
+                    process.send_signal(signal.SIGKILL)
+                    break
+            formed += process.stdout.readlines()
+            assert process.wait() == (-signal.SIGKILL if kills < 3 else 0)
+        assert len(set(formed)) == len(formed)  # none twice
+        # One may have been finished, and not yet told, when the process died.
+        assert 45 <= len(formed) <= 48
+        assert relative_error_db(Store.opened(tmp_path / "a.zarr").image(), exact) < -65
+
+    @pytest.mark.parametrize(
+        ("change", "message"),
+        [
+            ({"accuracy_db": -60}, "accuracy_db is -70 there, -60 given"),
+            ({"accuracy_db": None, "tolerance_db": -40}, "tolerance_db is None there, -40 given"),
+            ({"beam": None}, "beam is .*width_deg.* there, None given"),
+            ({"patches": (2, 2)}, "patches of 30 x 20 pixels there, of 30 x 40 given"),
+            ({"grid": Grid.plane((-4, 4, 80), (30, 41, 60))}, "the grid lies elsewhere"),
+            ({"grid": Grid.plane((-4, 4, 40), (30, 40, 60))}, r"pixels is \[60, 80\] there"),
+            ({"lines": LINES.select(slice(1, None))}, "the range lines are others"),
+        ],
+    )
+    def test_other_inputs_are_refused(self, tmp_path, change, message):
+        next(iter(clsas.mosaic(LINES, GRID, tmp_path / "a.zarr", **WISH)))
+        before = len(Store.opened(tmp_path / "a.zarr").records())
+        change = {"lines": LINES, "grid": GRID} | WISH | change
+        with pytest.raises(ValueError, match=f"made with other inputs: .*{message}"):
+            clsas.mosaic(change.pop("lines"), change.pop("grid"), tmp_path / "a.zarr", **change)
+        assert len(Store.opened(tmp_path / "a.zarr").records()) == before
+
+    def test_a_store_of_an_older_schema_is_refused(self, tmp_path):
+        next(iter(clsas.mosaic(LINES, GRID, tmp_path / "a.zarr", **WISH)))
+        header = tmp_path / "a.zarr" / "zarr.json"
+        text = json.loads(header.read_text())
+        text["attributes"]["version"] = 0
+        header.write_text(json.dumps(text))
+        with pytest.raises(ValueError, match="is a mosaic of version 0, this clsas works with"):
+            clsas.mosaic(LINES, GRID, tmp_path / "a.zarr", **WISH)
+
+    def test_a_folder_of_something_else_is_left_alone(self, tmp_path):
+        (tmp_path / "letter.txt").write_text("dear")
+        with pytest.raises(ValueError, match="exists and is not a mosaic of clsas"):
+            clsas.mosaic(LINES, GRID, tmp_path, **WISH)
+        assert [path.name for path in tmp_path.iterdir()] == ["letter.txt"]
+
+    def test_a_record_cut_off_is_formed_again(self, tmp_path):
+        list(clsas.mosaic(LINES, GRID, tmp_path / "a.zarr", **WISH))
+        record = tmp_path / "a.zarr" / "patches" / "1.2" / "zarr.json"
+        record.write_text(record.read_text()[:50])
+        again = list(clsas.mosaic(LINES, GRID, tmp_path / "a.zarr", **WISH))
+        assert [(patch.row, patch.column) for patch in again] == [(1, 2)]
+
+
+def test_a_full_disk_keeps_what_is_finished(file, tmp_path):
+    program = """
+        import clsas, pickle, resource, signal, sys
+        from clsas.store import Store
+        signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+        grid, wish = pickle.load(open("wish", "rb"))
+        mosaic = clsas.mosaic("lines.h5", grid, "a.zarr", **wish)
+        formed = 0
+        try:
+            for patch in mosaic:
+                formed += 1
+                if formed == 3:
+                    resource.setrlimit(resource.RLIMIT_FSIZE, (2000, 2000))
+        except OSError as error:
+            print(formed, type(error).__name__, error)
+    """
+    import pickle
+
+    (tmp_path / "wish").write_bytes(pickle.dumps((GRID, WISH)))
+    done = subprocess.run(
+        [sys.executable, "-c", textwrap.dedent(program)], cwd=tmp_path, text=True,
+        capture_output=True, check=True,
+    )  # fmt: skip
+    assert "too large" in done.stdout
+    kept = Store.opened(tmp_path / "a.zarr").records()
+    assert 3 <= len(kept) < 8
+    assert len(list(clsas.mosaic(file, GRID, tmp_path / "a.zarr", **WISH))) == 8 - len(kept)
+
+
+def test_a_store_that_cannot_be_made(tmp_path):
+    with pytest.raises(OSError, match="no such folder"):
+        clsas.mosaic(LINES, GRID, tmp_path / "none" / "a.zarr", **WISH)
+    (tmp_path / "file").write_text("")
+    with pytest.raises((OSError, ValueError), match="file"):
+        clsas.mosaic(LINES, GRID, tmp_path / "file", **WISH)
+    if os.geteuid():  # nothing is read-only to root
+        list(clsas.mosaic(LINES, GRID, tmp_path / "a.zarr", **WISH))
+        (tmp_path / "a.zarr").chmod(0o500)
+        with pytest.raises(PermissionError):
+            clsas.mosaic(LINES, GRID, tmp_path / "a.zarr", **WISH)
+
+
+@pytest.mark.skipif(len(list_devices()) < 2, reason="one OpenCL device only")
+def test_devices_side_by_side(exact):
+    infos = list_devices()[:2]
+    mosaic = clsas.mosaic(
+        LINES, GRID, **(WISH | {"patches": (6, 8)}), device=[info.index for info in infos]
+    )
+    patches = list(mosaic)
+    assert {patch.record.device for patch in patches} == {info.label for info in infos}
+    assert relative_error_db(whole(patches), exact) < -65
+
+
+class TestDistributed:
+    def test_a_worker_that_dies_is_made_up_for(self, file, tmp_path):
+        distributed = pytest.importorskip("distributed")
+        for _ in clsas.mosaic(file, GRID, tmp_path / "local.zarr", **WISH):
+            pass
+        with (
+            distributed.LocalCluster(
+                n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None
+            ) as cluster,
+            distributed.Client(cluster) as client,
+        ):
+            first = next(iter(client.run(os.getpid).values()))
+            places = []
+            path = tmp_path / "distributed.zarr"
+            for patch in clsas.mosaic(file, GRID, path, client=client, **WISH):
+                places.append((patch.row, patch.column))
+                if len(places) == 2:
+                    os.kill(first, signal.SIGKILL)
+        assert sorted(places) == sorted(np.ndindex(2, 4))
+        local, other = (
+            Store.opened(tmp_path / f"{n}.zarr").image().pixels for n in ("local", "distributed")
+        )
+        np.testing.assert_array_equal(local, other)
+
+    @pytest.mark.parametrize(
+        ("wrong", "message"),
+        [
+            ({"store": None}, "store must be given with a client"),
+            ({"source": LINES}, "source must be a path with a client"),
+            ({"device": 0}, "device must be left out with a client"),
+        ],
+    )
+    def test_bad_arguments(self, file, tmp_path, wrong, message):
+        arguments = {"source": file, "store": tmp_path / "a.zarr"} | wrong
+        with pytest.raises(ValueError, match=message):
+            clsas.mosaic(grid=GRID, client=object(), **arguments)
+
+
+class TestFollowing:
+    GRID = Grid.plane((-30, 10, 200), (30, 33, 12))
+    TRACK = along_x(1200, 0.05)
+    WISH = MappingProxyType({"accuracy_db": -70, "beam": BEAM, "patches": (1, 10)})
+
+    @pytest.fixture(scope="class")
+    @classmethod
+    def lines(cls):
+        return lines_over(cls.GRID, cls.TRACK, carrier_hz=100e3, step_m=0.03, own_start=True)
+
+    @pytest.fixture
+    def record(self, lines, tmp_path):
+        """Return a function that adds files to a folder, of 200 channels each."""
+        folder = tmp_path / "survey"
+        folder.mkdir()
+
+        def add(parts):
+            for part in parts:
+                clsas.save(folder / f"{part}.h5", lines.select(slice(200 * part, 200 * part + 200)))
+
+        return folder, add
+
+    def test_patches_are_formed_while_files_arrive(self, lines, record, tmp_path):
+        folder, add = record
+        beam = dataclasses.replace(BEAM, track_pings=101)
+        reference = clsas.backproject(lines, self.GRID, beam=beam, accuracy_db=-80)
+        add([0, 1])
+        formed, late = [], threading.Event()
+
+        def more():
+            for part in (2, 3, 4, 5):
+                time.sleep(0.3)
+                add([part])
+                if part == 3:
+                    late.wait(60)  # the rest comes once patches are there
+            (folder / END).touch()
+
+        recorder = threading.Thread(target=more)
+        recorder.start()
+        path = tmp_path / "a.zarr"
+        for patch in clsas.mosaic(folder, self.GRID, path, **self.WISH, follow_s=60):
+            formed.append((patch.column, patch.record.survey_channels))
+            late.set()
+        recorder.join()
+        assert sorted(column for column, _ in formed) == list(range(10))  # none twice
+        assert formed[0][1] <= 800  # of 1200
+        assert relative_error_db(Store.opened(path).image(), reference) < -65
+
+    def test_it_ends_when_nothing_comes(self, record, tmp_path):
+        folder, add = record
+        add(range(3))
+        start = time.monotonic()
+        patches = list(
+            clsas.mosaic(folder, self.GRID, tmp_path / "a.zarr", **self.WISH, follow_s=1)
+        )
+        assert len(patches) == 10
+        assert time.monotonic() - start < 30
+
+    def test_later_channels_make_a_patch_anew(self, lines, record, tmp_path):
+        folder, add = record
+        add(range(4))
+        path = tmp_path / "a.zarr"
+        assert len(list(clsas.mosaic(folder, self.GRID, path, **self.WISH))) == 10
+        add(range(4, 6))
+        again = {patch.column for patch in clsas.mosaic(folder, self.GRID, path, **self.WISH)}
+        assert 9 in again
+        assert 0 not in again
+        beam = dataclasses.replace(BEAM, track_pings=101)
+        reference = clsas.backproject(lines, self.GRID, beam=beam, accuracy_db=-80)
+        assert relative_error_db(Store.opened(path).image(), reference) < -65
+
+    def test_a_folder_that_stays_empty(self, tmp_path):
+        (tmp_path / "none").mkdir()
+        with pytest.raises(ValueError, match="has no file"):
+            clsas.mosaic(tmp_path / "none", self.GRID, **self.WISH, follow_s=0.1)
