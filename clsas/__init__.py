@@ -9,16 +9,19 @@ from clsas.grid import Grid
 from clsas.image import Image
 from clsas.io import FileFormatError, load, save, to_xarray
 from clsas.lines import RangeLines
+from clsas.mosaic import Mosaic, Patch, mosaic
 from clsas.plan import Plan
 from clsas.planner import plan
 from clsas.quality import contrast, entropy, measure_point, relative_error_db
 from clsas.sampling import check_sampling
-from clsas.scene import PointTargets
+from clsas.scene import PointTargets, Seabed
 from clsas.simulate import simulate, simulate_lines
 from clsas.sonar import Pulse, Sonar
+from clsas.store import Store
 from clsas.track import Pointing, Track, channels
 from clsas.tradeoff import Tradeoff, tradeoff
 from clsas.validate import ClsasWarning
+from clsas.wavenumber import wavenumber
 from clsas.window import BeamWindow
 
 __version__ = "0.1.0"
@@ -31,12 +34,16 @@ __all__ = [
     "FileFormatError",
     "Grid",
     "Image",
+    "Mosaic",
+    "Patch",
     "Plan",
     "PointTargets",
     "Pointing",
     "Pulse",
     "RangeLines",
+    "Seabed",
     "Sonar",
+    "Store",
     "Track",
     "Tradeoff",
     "backproject",
@@ -49,6 +56,7 @@ __all__ = [
     "list_devices",
     "load",
     "measure_point",
+    "mosaic",
     "plan",
     "relative_error_db",
     "save",
@@ -56,4 +64,5 @@ __all__ = [
     "simulate_lines",
     "to_xarray",
     "tradeoff",
+    "wavenumber",
 ]

@@ -1,4 +1,4 @@
-"""Scene files: sonar, track, targets, grid and processing from one TOML file.
+"""Scene files: sonar, track, targets, seabed, grid and processing from one TOML file.
 
 docs/scene-files.md lists every key. A file is checked whole before anything is computed, and every
 message names the file, the table and the key.
@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import csv
 import difflib
+import inspect
 import os
 import tomllib
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from importlib.resources import files
@@ -27,13 +28,15 @@ from clsas.compress import check_options as check_compression
 from clsas.grid import Grid
 from clsas.interpolation import TAPS
 from clsas.planner import BEST_TOLERANCE_DB, WORST_TOLERANCE_DB
-from clsas.scene import PointTargets
+from clsas.scene import PointTargets, Seabed, pipeline, rocks, wreck
+from clsas.simulate import Scene
 from clsas.simulate import check_options as check_simulation
 from clsas.sonar import Pulse, Sonar, line_array
 from clsas.track import Motion, Pointing, Track
 from clsas.window import BeamWindow
 
 PRESETS = ("thesis_wide_beam", "edgetech", "sensotek")
+SEABEDS: dict[str, Callable[..., Seabed]] = {"wreck": wreck, "pipeline": pipeline, "rocks": rocks}
 
 DIAL = ("tolerance_db", "tolerance_wavelengths", "stages")
 """Keys of `[image]` of which `clsas.plan` takes one."""
@@ -49,28 +52,33 @@ class SceneFile:
     ----------
     name : str
         Where it came from, for messages.
-    sonar, track, targets, grid
+    sonar, track, grid
         The tables of these names.
+    targets : PointTargets, Seabed, or a tuple of both
+        What the tables `targets` and `seabed` describe.
     simulate, compress, image : dict
         Keyword arguments for `clsas.simulate` and `clsas.compress`, and for `clsas.plan` (one of
         `DIAL`) or `clsas.backproject` (some of `EXACT`), either with a `beam`.
+    mosaic : dict
+        What `clsas mosaic` reads (`lines`), writes (`store`), and its `patches` and `memory_mib`.
     """
 
     name: str
     sonar: Sonar | None = None
     track: Track | None = None
-    targets: PointTargets | None = None
+    targets: Scene | None = None
     grid: Grid | None = None
     simulate: dict[str, Any] = field(default_factory=dict)
     compress: dict[str, Any] = field(default_factory=dict)
     image: dict[str, Any] = field(default_factory=dict)
+    mosaic: dict[str, Any] = field(default_factory=dict)
 
     def need(self, *tables: str) -> tuple[Any, ...]:
         """Return the parts of these names; raises ValueError naming one that is missing."""
         for table in tables:
             if getattr(self, table) is None:
-                brackets = "[[{}]]" if table == "targets" else "[{}]"
-                raise ValueError(f"{self.name}: missing table {brackets.format(table)}")
+                missing = "[[targets]] or [seabed]" if table == "targets" else f"[{table}]"
+                raise ValueError(f"{self.name}: missing table {missing}")
         return tuple(getattr(self, table) for table in tables)
 
 
@@ -269,6 +277,31 @@ class _Target(_Table):
     amplitude: float = 1.0
 
 
+class _Seabed(_Table):
+    scene: str
+    x_m: Annotated[list[float], Field(min_length=2, max_length=2)] | None = None
+    y_m: Annotated[list[float], Field(min_length=2, max_length=2)] | None = None
+    position_m: Annotated[list[float], Field(min_length=2, max_length=2)] | None = None
+    heading_deg: float | None = None
+    mast_m: float | None = None
+    count: int | None = None
+    cell_m: float = 0.1
+    density_m2: float = 600.0
+    seed: int = 0
+    floor_db: float = -50.0
+
+    def build(self) -> Seabed:
+        with _in("[seabed]"):
+            make = SEABEDS[validate.one_of("scene", self.scene, tuple(SEABEDS))]
+            options = self.given()
+            del options["scene"]
+            known = inspect.signature(make).parameters
+            for name in options:
+                if name not in known:
+                    raise ValueError(f"{name} must be left out with the scene {self.scene!r}")
+            return make(**options)
+
+
 class _Axis(_Table):
     start_m: float
     stop_m: float
@@ -392,32 +425,61 @@ class _Image(_Table):
         return options
 
 
+class _Mosaic(_Table):
+    lines: str | None = None
+    store: str | None = None
+    patches: Annotated[list[int], Field(min_length=2, max_length=2)] | None = None
+    memory_mib: int | None = None
+
+    def build(self, folder: Path) -> dict[str, Any]:
+        options = self.given()
+        with _in("[mosaic]"):
+            for name in ("lines", "store"):
+                if name in options:
+                    options[name] = folder / options[name]
+            if "lines" in options and not options["lines"].exists():
+                raise ValueError(f"lines must be a file or folder, there is no {options['lines']}")
+            if self.patches is not None:
+                rows, columns = (validate.count("every entry of patches", n) for n in self.patches)
+                options["patches"] = rows, columns
+            if self.memory_mib is not None:
+                validate.count("memory_mib", self.memory_mib)
+        return options
+
+
 class _Scene(_Table):
     sonar: _Sonar | None = None
     track: _Track | None = None
     targets: list[_Target] | None = None
+    seabed: _Seabed | None = None
     grid: _Grid | None = None
     simulate: _Simulate = _Simulate()
     compress: _Compress = _Compress()
     image: _Image = _Image()
+    mosaic: _Mosaic = _Mosaic()
 
     def build(self, name: str, folder: Path) -> SceneFile:
-        targets = None
+        parts: list[PointTargets | Seabed] = []
         if self.targets is not None:
             with _in("[[targets]]"):
-                targets = PointTargets(
-                    np.reshape([target.position_m for target in self.targets], (-1, 3)),
-                    np.array([target.amplitude for target in self.targets], complex),
+                parts.append(
+                    PointTargets(
+                        np.reshape([target.position_m for target in self.targets], (-1, 3)),
+                        np.array([target.amplitude for target in self.targets], complex),
+                    )
                 )
+        if self.seabed is not None:
+            parts.append(self.seabed.build())
         return SceneFile(
             name=name,
             sonar=self.sonar.build() if self.sonar else None,
             track=self.track.build(folder) if self.track else None,
-            targets=targets,
+            targets=tuple(parts) if len(parts) > 1 else parts[0] if parts else None,
             grid=self.grid.build() if self.grid else None,
             simulate=self.simulate.build(),
             compress=self.compress.build(),
             image=self.image.build(),
+            mosaic=self.mosaic.build(folder),
         )
 
 

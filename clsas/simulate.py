@@ -13,16 +13,21 @@ and a receive window that cuts it holds exactly the part inside. A pulse with no
 The sum is a type-1 non-uniform FFT per channel (finufft). An element pattern depends on point and
 frequency together; it is interpolated through Chebyshev nodes in frequency, whose number
 follows from a bound on the remainder.
+
+What a scene's points are is asked anew for every few channels of a ping (`_Paths.look`): all of
+some point targets, of a seabed only what is lit and within the beam. A scene that allows its
+echoes an error is summed only as exactly as that, in single precision where it suffices.
 """
 
 from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import lru_cache, reduce
+from typing import Any, NamedTuple
 
 import finufft
 import numpy as np
@@ -36,11 +41,12 @@ from clsas.compress import check_options as check_compression
 from clsas.echoes import Echoes
 from clsas.geometry import legs_m
 from clsas.lines import RangeLines
-from clsas.scene import PointTargets
+from clsas.scene import PointTargets, Seabed, View
 from clsas.sonar import PASSBAND, Sonar, element_pattern
 from clsas.spectral import EDGE_PRODUCT, smooth_edge
 from clsas.track import Channels, Pointing, Track, channels
 
+Scene = PointTargets | Seabed | tuple[PointTargets | Seabed, ...]
 Progress = Callable[[int, int], None] | None
 
 # Samples for which the receiver's filter rings before and after an echo.
@@ -48,16 +54,20 @@ _RINGING = math.ceil(EDGE_PRODUCT / ((1 - PASSBAND) / 2))
 # Relative errors of the sum over points and of the patterns' expansion.
 _SUM_ERROR = 1e-9
 _PATTERN_ERROR = 1e-6
-# Points worked on at once, and of these with all terms of their patterns: few enough for caches,
-# so many that their sum costs more than its FFT.
+# Points worked on at once without and with all terms of their patterns: few enough for caches, so
+# many that their sum costs more than its FFT.
 _BLOCK = 1 << 17
-_BEAM_BLOCK = 1 << 14
+_BEAM_BLOCK = 1 << 15
+# Channels of a ping that share one look at the scene; the Notes of `simulate` say what that costs.
+_LOOK = 8
+# Nearer to an element than this a point has no direction.
+_TOUCHING_M = 1e-9
 
 
 def simulate(
     sonar: Sonar,
     track: Track,
-    scene: PointTargets,
+    scene: Scene,
     *,
     pointing: Pointing | None = None,
     spreading: bool = False,
@@ -72,10 +82,12 @@ def simulate(
 
     Parameters
     ----------
-    sonar, track, scene
-        What transmits, where it goes, what reflects. Element patterns (THESIS [9]-[12]) apply
-        where the sonar's elements have sizes; such elements are baffled: nothing is transmitted to
-        or received from behind the plane of their face.
+    sonar, track
+        What transmits and where it goes. Element patterns (THESIS [9]-[12]) apply where the
+        sonar's elements have sizes; such elements are baffled: nothing is transmitted to or
+        received from behind the plane of their face.
+    scene : PointTargets, Seabed, or tuple of them
+        What reflects; the echoes of several add. Point targets are neither shadowed nor left out.
     pointing : Pointing, optional
         Where the elements look; broadside unless given. Only for a sonar with element sizes.
     spreading : bool
@@ -86,8 +98,8 @@ def simulate(
     range_m : (near, far), optional
         Receive window: from the delay of range `near` to that of `far` plus the pulse's duration
         (THESIS [22], [23]), the same for every channel. What falls outside is cut. Unless given,
-        each channel's window starts just before its first echo and all are long enough for
-        every echo.
+        each channel's window starts just before its first echo (of a seabed: before the nearest
+        part of it within the beam) and all are long enough for every echo.
     snr_db : float, optional
         Add complex white Gaussian noise: the power of the strongest noise-free sample of all
         channels over the noise's mean power per sample, before compression; -200 to 300 dB.
@@ -114,15 +126,21 @@ def simulate(
     -----
     ClsasWarning
         If no echo at all falls into the receive window.
+
+    Notes
+    -----
+    What a seabed shows is found once per eight channels of a ping, as seen from the middle between
+    their transmitter and their receivers' mean. For an element that lies e beside that middle, the
+    edge of a shadow at distance d behind what casts it, that at distance r, is out by e d/r.
     """
     validate.instance("sonar", sonar, Sonar)
     validate.instance("track", track, Track)
-    validate.instance("scene", scene, PointTargets)
     validate.progress(progress)
     check_options(
         pointing=pointing, spreading=spreading, motion_in_flight=motion_in_flight,
         range_m=range_m, snr_db=snr_db, seed=seed,
     )  # fmt: skip
+    parts = _parts(scene)
     beams = None
     if not sonar.is_omnidirectional:
         beams = _Beams(sonar, (pointing or Pointing.broadside()).axes(track))
@@ -130,7 +148,7 @@ def simulate(
         raise ValueError("pointing has nothing to act on: the sonar's elements have no sizes")
     pulse, rate, sound = sonar.pulse, sonar.sample_rate_hz, sonar.sound_speed_m_s
     geometry = channels(sonar, track, motion_in_flight=motion_in_flight)
-    paths = _Paths(scene, geometry, sound, spreading, beams)
+    paths = _Paths(parts, geometry, sound, spreading, beams, sonar.receivers)
     ringing = _RINGING / rate
     if range_m is None:
         nearest, farthest = paths.delay_limits_s(workers)
@@ -192,7 +210,7 @@ def check_options(
 def simulate_lines(
     tx_m: ArrayLike,
     rx_m: ArrayLike,
-    scene: PointTargets,
+    scene: Scene,
     *,
     carrier_hz: float,
     bandwidth_hz: float,
@@ -218,8 +236,8 @@ def simulate_lines(
     ----------
     tx_m, rx_m : array_like, [channels, 3] or [3]
         Transmitter and receiver position of each channel.
-    scene : PointTargets
-        The points.
+    scene : PointTargets, Seabed, or tuple of them
+        The points, as for `simulate`; a seabed's visibility is found for every channel.
     carrier_hz, bandwidth_hz : float
         Centre and width of the band.
     window, oversampling
@@ -253,10 +271,10 @@ def simulate_lines(
     carrier = validate.number("carrier_hz", carrier_hz, "Hz", least=0.0)
     band = validate.positive("bandwidth_hz", bandwidth_hz, "Hz")
     check_compression(window=window, oversampling=oversampling)
-    validate.instance("scene", scene, PointTargets)
     validate.progress(progress)
+    parts = _parts(scene)
     sound = validate.positive("sound_speed_m_s", sound_speed_m_s, "m/s")
-    paths = _Paths(scene, _channels(tx_m, rx_m, rx_velocity_m_s), sound)
+    paths = _Paths(parts, _channels(tx_m, rx_m, rx_velocity_m_s), sound)
     if (first_range_m is None) != (length is None):
         raise ValueError("first_range_m and length must be given together or not at all")
     # The receiver's filter needs room outside the band.
@@ -311,53 +329,86 @@ class _Beams:
     sonar: Sonar
     axes: NDArray[np.float64]
 
+    @property
+    def elements(self) -> list[tuple[float, int, int]]:
+        """Of every pattern the element's size, its end of the path, and its axis."""
+        sonar = self.sonar
+        sizes = (
+            (sonar.tx_length_m, 0, 0),
+            (sonar.rx_length_m, 1, 0),
+            (sonar.tx_height_m, 0, 2),
+            (sonar.rx_height_m, 1, 2),
+        )
+        return [(size, end, axis) for size, end, axis in sizes if size is not None]
+
+    def bound(self, ping: int, directions: NDArray, slack: NDArray | float) -> NDArray:
+        """Return an upper bound of the two-way pattern; see `clsas.scene.View`."""
+        pulse = self.sonar.pulse
+        lowest = max(pulse.carrier_hz - pulse.bandwidth_hz / 2, 0.0) / self.sonar.sound_speed_m_s
+        components = directions @ self.axes[ping].T
+        gain = np.where(components[:, 1] > -slack, 1.0, 0.0)
+        for size, _, axis in self.elements:
+            sine = np.maximum(np.abs(components[:, axis]) - slack, 0.0)
+            gain /= np.maximum(np.pi * size * lowest * sine, 1.0)
+        return gain
+
+    def sines(
+        self, points: NDArray, elements: Channels, out: NDArray, back: NDArray
+    ) -> tuple[NDArray[np.bool_], list[NDArray]]:
+        """Return which points are before the elements' faces, and the sines for `elements`.
+
+        All positions are in the elements' axes: from tx at transmission, and from rx at reception.
+        """
+        tx, rx, velocity = elements
+        heard = rx[:, None]
+        if velocity is not None:
+            heard = heard + velocity[:, None] * ((out + back) / self.sonar.sound_speed_m_s)
+        ends = ((tx[:, None], out), (heard, back))
+        faced = (points[:, 1] > tx[1]) & (points[:, 1] > heard[1])
+        return faced, [
+            (points[:, axis] - ends[end][0][axis]) / ends[end][1] for _, end, axis in self.elements
+        ]
+
     def gains(
-        self,
-        channel: int,
-        tx_way: NDArray[np.float64],
-        rx_way: NDArray[np.float64],
-    ) -> Iterator[tuple[NDArray[np.intp], NDArray[np.float32]]]:
-        """Yield indices of points and their two-way pattern [terms, points] at `_nodes(terms)`.
+        self, sines: list[NDArray], error: float, dtype: type[np.floating]
+    ) -> NDArray[np.float32]:
+        """Return the two-way pattern [terms, points] at `_nodes(terms)` of the sampled band.
 
-        The nodes are those of the sampled band. Points behind an element's face are left out; the
-        others come in order of how much their pattern varies, so that most need few terms.
+        `sines` are those of `elements`. Interpolated, the pattern is right to `error` at every
+        frequency, half of which is left for rounding to single precision. With a_i = pi L_i
+        sine_i/c, sinc(a_i f) has derivatives of order k below a_i^k min(1/(k + 1), 2/(a_i f)), and
+        the product of the patterns those of order Q below
 
-        Interpolated, a pattern is right to `_PATTERN_ERROR` at every frequency, half of which is
-        left for rounding to single precision: with b the sum of sizes times their sines over the
-        sound speed, the product of sincs has derivatives of order Q below (pi b)^Q / (Q + 1), so
-        that over a band of +-h hertz Q nodes leave at most 2 (pi b h/2)^Q / (Q + 1)!.
+            (sum_i a_i)^Q min(1/(Q + 1), prod_i min(1, 2/(a_i f_least))),
+
+        so that over a band of +-h hertz Q nodes leave at most 2 (h/2)^Q/Q! times that.
         """
         sonar = self.sonar
-        along, axis, up = self.axes[channel // sonar.receivers]
-        factors = (
-            (sonar.tx_length_m, tx_way, along),
-            (sonar.rx_length_m, rx_way, along),
-            (sonar.tx_height_m, tx_way, up),
-            (sonar.rx_height_m, rx_way, up),
+        half_band = sonar.sample_rate_hz / 2
+        slopes = [
+            np.abs(sine) * (np.pi * size / sonar.sound_speed_m_s)
+            for (size, _, _), sine in zip(self.elements, sines, strict=True)
+        ]
+        reach = reduce(np.add, slopes) * (half_band / 2)
+        lowest = max(sonar.pulse.carrier_hz - half_band, 0.0)
+        level: NDArray | float = 2.0
+        for slope in slopes:
+            level = level / np.maximum(slope * (lowest / 2), 1.0)
+        terms = _terms(reach, level, error / 2)
+        frequency = (sonar.pulse.carrier_hz + _nodes(terms) * half_band)[:, None].astype(dtype)
+        patterns = (
+            element_pattern(size, sine, frequency, sonar.sound_speed_m_s, np.float32)
+            for (size, _, _), sine in zip(self.elements, sines, strict=True)
         )
-        sizes = [(size, way @ vector) for size, way, vector in factors if size is not None]
-        faced = np.flatnonzero((tx_way @ axis > 0) & (rx_way @ axis > 0))
-        extent = sum(size * np.abs(sine[faced]) for size, sine in sizes)
-        order = np.argsort(extent)
-        for first in range(0, len(order), _BEAM_BLOCK):
-            chosen = order[first : first + _BEAM_BLOCK]
-            some = faced[chosen]
-            nodes = _nodes(_terms(sonar, extent[chosen[-1]])) * sonar.sample_rate_hz / 2
-            frequency = sonar.pulse.carrier_hz + nodes[:, None]
-            patterns = (
-                element_pattern(size, sine[some], frequency, sonar.sound_speed_m_s, np.float32)
-                for size, sine in sizes
-            )
-            yield some, reduce(np.multiply, patterns)
+        return reduce(np.multiply, patterns)
 
 
-def _terms(sonar: Sonar, extent_m: float) -> int:
-    """Return the least Q with 2 (pi b h/2)^Q / (Q + 1)! <= `_PATTERN_ERROR`/2; see `gains`."""
-    reach = np.pi * extent_m / sonar.sound_speed_m_s * sonar.sample_rate_hz / 4
-    terms, remainder = 1, reach
-    while remainder > _PATTERN_ERROR / 2:
+def _terms(reach: NDArray, level: NDArray | float, error: float) -> int:
+    """Return the least Q with reach^Q/Q! min(2/(Q + 1), level) <= `error` everywhere."""
+    terms, power = 1, reach
+    while np.max(power * np.minimum(level, 2 / (terms + 1))) > error:
         terms += 1
-        remainder *= reach / (terms + 1)
+        power = power * (reach / terms)
     return terms
 
 
@@ -374,50 +425,128 @@ def _interpolation(terms: int, modes: int) -> NDArray:
     return to_coefficients @ chebvander(2 * fft.fftfreq(modes), terms - 1).T
 
 
+class _Look(NamedTuple):
+    """Some of the points that some channels of one ping see.
+
+    Positions are relative to the view's and turned into the elements' axes, float64 [points, 3],
+    each coordinate contiguous.
+    """
+
+    points_m: NDArray[np.float64]
+    amplitudes: NDArray
+    error: float
+
+
 @dataclass(frozen=True)
 class _Paths:
     """The scene as every channel sees it."""
 
-    scene: PointTargets
+    parts: tuple[PointTargets | Seabed, ...]
     geometry: Channels
     sound_speed_m_s: float
     spreading: bool = False
     beams: _Beams | None = None
+    receivers: int = 1
 
     @property
     def channels(self) -> int:
         return len(self.geometry.tx_m)
 
+    @property
+    def together(self) -> list[range]:
+        """The channels that look together."""
+        return [
+            range(first, min(first + _LOOK, ping + self.receivers))
+            for ping in range(0, self.channels, self.receivers)
+            for first in range(ping, ping + self.receivers, _LOOK)
+        ]
+
     def elements(self, channel: int) -> Channels:
         tx, rx, velocity = self.geometry
         return Channels(tx[channel], rx[channel], None if velocity is None else velocity[channel])
 
-    def legs(self, channel: int) -> Iterator[tuple[NDArray, ...]]:
-        """Yield positions, amplitudes, outward and inward legs, some points at a time."""
-        elements = self.elements(channel)
-        for first in range(0, self.scene.points, _BLOCK):
-            points = self.scene.positions_m[first : first + _BLOCK]
-            amplitudes = self.scene.amplitudes[first : first + _BLOCK]
-            yield points, amplitudes, *legs_m(points, *elements, self.sound_speed_m_s)
+    def view(self, some: range) -> View:
+        """Return where channels of one ping look from."""
+        tx, rx, velocity = self.geometry
+        tx, rx = tx[some], rx[some]
+        middle = (tx[0] + rx.mean(axis=0)) / 2
+        if self.beams is None:
+            return View(middle)
+        reach = max(np.linalg.norm(end - middle, axis=1).max() for end in (tx, rx))
+        ping = some[0] // self.receivers
+        # How far the receivers' motion while the sound travels turns the way back.
+        turn = 0.0
+        if velocity is not None:
+            turn = 2 * float(np.linalg.norm(velocity[some[0]])) / self.sound_speed_m_s
+        beams = self.beams
+
+        def gain(directions: NDArray, slack: NDArray | float) -> NDArray:
+            return beams.bound(ping, directions, slack + turn)
+
+        return View(middle, reach, gain)
+
+    def look(self, some: range) -> tuple[list[Channels], Iterator[_Look]]:
+        """Return channels of one ping, and block by block what they see, in the same axes."""
+        view, beams = self.view(some), self.beams
+        axes = np.eye(3) if beams is None else beams.axes[some[0] // self.receivers]
+        size = _BLOCK if beams is None else _BEAM_BLOCK
+
+        def local(channel: int) -> Channels:
+            tx, rx, velocity = self.elements(channel)
+            velocity = None if velocity is None else axes @ velocity
+            return Channels(axes @ (tx - view.position_m), axes @ (rx - view.position_m), velocity)
+
+        def looks() -> Iterator[_Look]:
+            for part in self.parts:
+                positions, amplitudes = part.seen(view)
+                for first in range(0, len(positions), size):
+                    block = slice(first, first + size)
+                    offsets = np.ascontiguousarray((positions[block] - view.position_m).T)
+                    yield _Look((axes @ offsets).T, amplitudes[block], part.error)
+
+        return [local(channel) for channel in some], looks()
 
     def delay_limits_s(self, workers: int | None) -> NDArray:
         """Return the shortest and the longest delay of every channel, [2, channels]."""
+        velocity = self.geometry.rx_velocity_m_s
+        speed = 0.0 if velocity is None else float(np.linalg.norm(velocity, axis=1).max())
+        # What one metre adds to a path at most: twice that, and what the receiver moves meanwhile.
+        per_metre = 2 / max(1 - speed / self.sound_speed_m_s, 1e-3)
 
-        def limits(channel: int) -> tuple[float, float]:
-            lengths = [out + back for _, _, out, back in self.legs(channel)]
-            return min(map(np.min, lengths)), max(map(np.max, lengths))
+        def limits(some: range) -> list[tuple[float, float]]:
+            view = self.view(some)
+            spheres = [part.spheres(view) for part in self.parts]
 
-        found = np.array(list(_in_threads(limits, self.channels, workers)))
-        return found.T / self.sound_speed_m_s
+            def lengths(channel: int) -> Iterator[tuple[float, float]]:
+                for centres, radii in spheres:
+                    out, back = legs_m(centres, *self.elements(channel), self.sound_speed_m_s)
+                    margin = per_metre * radii
+                    yield np.min(out + back - margin), np.max(out + back + margin)
 
-    def directions(
-        self, channel: int, points: NDArray, out: NDArray, back: NDArray
-    ) -> tuple[NDArray, NDArray]:
-        """Return unit vectors to the points, from tx at transmission and rx at reception."""
-        tx, rx, velocity = self.elements(channel)
-        if velocity is not None:
-            rx = rx + velocity * ((out + back) / self.sound_speed_m_s)[:, None]
-        return (points - tx) / out[:, None], (points - rx) / back[:, None]
+            both = [zip(*lengths(channel), strict=True) for channel in some]
+            return [(min(nearest), max(farthest)) for nearest, farthest in both]
+
+        found = np.array(
+            [ends for some in _in_threads(limits, self.together, workers) for ends in some]
+        )
+        return np.maximum(found.T, 0.0) / self.sound_speed_m_s
+
+
+def _parts(scene: Scene) -> tuple[PointTargets | Seabed, ...]:
+    """Return what the scene is made of, points in such numbers as are worked on at once."""
+    given: Any = scene if isinstance(scene, tuple) and scene else (scene,)
+    parts: list[PointTargets | Seabed] = []
+    for part in given:
+        validate.instance("scene", part, PointTargets, Seabed)
+    for part in given:
+        # Asking for its points makes a seabed draw them, here once rather than in every thread.
+        if part.points <= _BLOCK or isinstance(part, Seabed):
+            parts.append(part)
+            continue
+        for first in range(0, part.points, _BLOCK):
+            block = slice(first, first + _BLOCK)
+            parts.append(PointTargets(part.positions_m[block], part.amplitudes[block]))
+    return tuple(parts)
 
 
 def _record(
@@ -443,60 +572,88 @@ def _record(
     # The FFT's sum stands for an integral over frequency, hence the rate.
     transfer = rate_hz * spectrum(frequency) * smooth_edge(beyond)
 
-    def echo(channel: int) -> NDArray[np.complex64]:
-        total = np.zeros(modes, np.complex128)
-        for block in paths.legs(channel):
-            delay = (block[2] + block[3]) / paths.sound_speed_m_s
-            kept = (delay >= kept_s[0][channel]) & (delay <= kept_s[1][channel])
-            if not kept.any():
-                continue
-            if not kept.all():
-                block, delay = tuple(part[kept] for part in block), delay[kept]
-            points, amplitudes, out, back = block
-            cycles = carrier_hz * delay
-            strengths = amplitudes * np.exp(-2j * np.pi * (cycles - np.rint(cycles)))
-            if (paths.spreading or paths.beams) and not (out.all() and back.all()):
-                raise ValueError(
-                    f"scene must have no point on an element with spreading or element patterns, "
-                    f"got one on an element of channel {channel}"
+    def add(total: NDArray, channel: int, elements: Channels, look: _Look) -> None:
+        """Add the transfer functions of some points."""
+        points, amplitudes = look.points_m, look.amplitudes
+        out, back = legs_m(points, *elements, paths.sound_speed_m_s)
+        delay = (out + back) / paths.sound_speed_m_s
+        kept = (delay >= kept_s[0][channel]) & (delay <= kept_s[1][channel])
+        if not kept.any():
+            return
+        if not kept.all():
+            points, amplitudes, out, back, delay = (
+                part[kept] for part in (points, amplitudes, out, back, delay)
+            )
+        if (paths.spreading or paths.beams) and min(out.min(), back.min()) < _TOUCHING_M:
+            raise ValueError(
+                f"scene must have no point on an element with spreading or element patterns, "
+                f"got one on an element of channel {channel}"
+            )
+        sines: list[NDArray] = []
+        if paths.beams is not None:
+            faced, sines = paths.beams.sines(points, elements, out, back)
+            if not faced.any():
+                return
+            if not faced.all():
+                amplitudes, out, back, delay, *sines = (
+                    part[faced] for part in (amplitudes, out, back, delay, *sines)
                 )
-            if paths.spreading:
-                strengths /= out * back
-            angles = 2 * np.pi * rate_hz / modes * (delay - start_s[channel])
-            if paths.beams is None:
-                total += _sum(angles, strengths, modes)
-                continue
-            ways = paths.directions(channel, points, out, back)
-            for some, gains in paths.beams.gains(channel, *ways):
-                sums = _sum(angles[some], strengths[some] * gains, modes)
-                sums = sums.reshape(len(gains), modes)
-                total += np.sum(_interpolation(len(gains), modes) * sums, axis=0)
-        return fft.ifft(total * transfer)[:length].astype(np.complex64)
+        # Rounding of an angle a to float32, a/2^25 at most, is phase at `modes`/2.
+        single = look.error >= 1e-7 * modes
+        real = np.float32 if single else np.float64
+        cycles = carrier_hz * delay
+        phase = (-2 * np.pi * (cycles - np.rint(cycles))).astype(real)
+        strengths: NDArray = np.empty(len(phase), np.complex64 if single else np.complex128)
+        strengths.real, strengths.imag = np.cos(phase), np.sin(phase)
+        strengths *= amplitudes
+        if paths.spreading:
+            strengths /= out * back
+        turns = rate_hz / modes * (delay - start_s[channel])
+        angles = (2 * np.pi * (turns - np.rint(turns))).astype(real)
+        accuracy = max(_SUM_ERROR, look.error / 10)
+        if paths.beams is None:
+            total += _sum(angles, strengths, modes, accuracy)
+            return
+        sines = [sine.astype(real) for sine in sines]
+        gains = paths.beams.gains(sines, max(_PATTERN_ERROR, look.error), real)
+        sums = _sum(angles, strengths * gains, modes, accuracy).reshape(len(gains), modes)
+        total += np.sum(_interpolation(len(gains), modes) * sums, axis=0)
+
+    def echoes(some: range) -> list[NDArray[np.complex64]]:
+        totals = np.zeros((len(some), modes), np.complex128)
+        elements, looks = paths.look(some)
+        for look in looks:
+            for total, channel, ends in zip(totals, some, elements, strict=True):
+                add(total, channel, ends, look)
+        return [fft.ifft(total * transfer)[:length].astype(np.complex64) for total in totals]
 
     samples = np.empty((paths.channels, length), np.complex64)
-    for channel, line in enumerate(_in_threads(echo, paths.channels, workers)):
-        samples[channel] = line
-        if progress is not None:
-            progress(channel + 1, paths.channels)
+    together = paths.together
+    for some, lines in zip(together, _in_threads(echoes, together, workers), strict=True):
+        for channel, line in zip(some, lines, strict=True):
+            samples[channel] = line
+            if progress is not None:
+                progress(channel + 1, paths.channels)
     if not samples.any():
         validate.warn("no echo falls within the receive window: every sample is zero")
     return samples
 
 
-def _sum(angles: NDArray, strengths: NDArray, modes: int) -> NDArray[np.complex128]:
+def _sum(angles: NDArray, strengths: NDArray, modes: int, error: float) -> NDArray:
     """Return sum_s strengths_s exp(-j k angle_s) for the FFT's frequencies k."""
+    # The frequencies' grid fits into caches, so sorting the points would only cost.
     return finufft.nufft1d1(
-        angles, strengths, modes, eps=_SUM_ERROR, isign=-1, modeord=1, nthreads=1
+        angles, strengths, modes, eps=error, isign=-1, modeord=1, nthreads=1, spread_sort=0
     )
 
 
-def _in_threads(function: Callable, count: int, workers: int | None) -> Iterator:
-    """Yield function(0), ..., function(count - 1), computed by threads; stop early if closed."""
+def _in_threads(function: Callable, items: Iterable, workers: int | None) -> Iterator:
+    """Yield the function of every item, computed by threads; stop early if closed."""
     if workers is not None:
         workers = validate.count("workers", workers)
     pool = ThreadPoolExecutor(workers or os.cpu_count())
     try:
-        yield from pool.map(function, range(count))
+        yield from pool.map(function, items)
     finally:
         pool.shutdown(cancel_futures=True)
 

@@ -8,7 +8,9 @@ from pydantic_core import PydanticUndefined
 
 from clsas import config
 from clsas.sampling import check_sampling
+from clsas.scene import PointTargets, Seabed, rocks
 from clsas.sonar import BARKER_13
+from clsas.window import BeamWindow
 
 DOCS = Path(__file__).parents[1] / "docs" / "scene-files.md"
 (EXAMPLE,) = re.findall(r"```toml\n(.*?)```", DOCS.read_text(), re.DOTALL)
@@ -133,6 +135,48 @@ def test_presets_and_built_in_scenes():
         config.built_in_scene("other")
 
 
+def test_the_wreck_comes_with_clsas():
+    """THESIS chapter 6: 6 receivers, 200 pings over 80 m, 0.2 m of sway, a wreck at 60 m."""
+    scene = config.parse_scene(config.built_in_scene("wreck"), name="built in", folder=Path())
+    sonar, track, seabed, grid = scene.need("sonar", "track", "targets", "grid")
+    assert (sonar.receivers, track.pings) == (6, 200)
+    assert 200 * np.diff(track.positions_m[:, 0]) == pytest.approx(80)
+    assert np.ptp(track.positions_m[:, 1]) == pytest.approx(0.4, abs=0.01)
+    # It heads where it goes: the beams look square to the course made good, as windows assume.
+    course = np.gradient(track.positions_m[:, 1], track.positions_m[:, 0])
+    np.testing.assert_allclose(track.yaw_rad[1:-1], course[1:-1], atol=1e-4)
+    assert isinstance(seabed, Seabed)
+    assert seabed.heights_m.max() == 6.5
+    assert grid.shape == (1024, 1024)
+    assert grid.axes_m[0][[0, -1]] == pytest.approx(seabed.x_m)
+    assert grid.axes_m[1][[0, -1]] == pytest.approx(seabed.y_m)
+    assert scene.image["tolerance_db"] == -40
+    # The window ends where the two-way pattern is at -6 dB.
+    window = BeamWindow.of_element(sonar.rx_length_m, sonar.wavelength_m)
+    assert scene.image["beam"].width_deg == pytest.approx(window.width_deg, rel=0.02)
+    assert not check_sampling(sonar, track, grid)
+
+
+def test_seabeds():
+    table = "[seabed]\nx_m = [-3, 3]\ny_m = [20, 30]\nposition_m = [0, 25]\ncell_m = 0.25\n"
+    seabed = parse(f"{table}scene = 'rocks'\ncount = 3\nseed = 4\nfloor_db = -40").targets
+    assert isinstance(seabed, Seabed)
+    assert (seabed.x_m, seabed.y_m, seabed.steps_m) == ((-3, 3), (20, 30), (0.25, 0.25))
+    assert (seabed.seed, seabed.floor_db, seabed.density_m2) == (4, -40, 600)
+    again = rocks((-3, 3), (20, 30), position_m=(0, 25), cell_m=0.25, count=3, seed=4)
+    np.testing.assert_array_equal(seabed.heights_m, again.heights_m)
+    pipe = parse(f"{table}scene = 'pipeline'\nheading_deg = 90\ndensity_m2 = 50").targets
+    assert (pipe.heights_m[:, 12] > 0.5).all()
+    assert pipe.density_m2 == 50
+
+
+def test_targets_beside_a_seabed():
+    table = "[[targets]]\nposition_m = [0, 1, 2]\n[seabed]\nscene = 'pipeline'\ncell_m = 1"
+    targets, seabed = parse(table).need("targets")[0]
+    assert isinstance(targets, PointTargets)
+    assert isinstance(seabed, Seabed)
+
+
 def test_phase_codes():
     code = parse(f"{SONAR}code = {list(BARKER_13)}").sonar.pulse
     assert code.code == BARKER_13
@@ -219,7 +263,7 @@ def test_bad_track_files(tmp_path, text, message):
     [
         ("sonar = [", "is not TOML: "),
         ("[sonr]", "unknown table [sonr]: did you mean 'sonar'?"),
-        ("[lake]", "unknown table [lake]; allowed are sonar, track, targets, grid, "),
+        ("[lake]", "unknown table [lake]; allowed are sonar, track, targets, seabed, grid, "),
         (
             "[sonar.pulse]\ncarier_hz = 1e6\nduration_s = 1e-3",
             "unknown key 'carier_hz' in [sonar.pulse]: did you mean 'carrier_hz'?",
@@ -275,6 +319,22 @@ def test_bad_track_files(tmp_path, text, message):
         (
             "[[targets]]\nposition_m = [0, 1, 2]\n[[targets]]\nposition = [0, 1, 2]",
             "unknown key 'position' in [[targets]] number 2: did you mean 'position_m'?",
+        ),
+        ("[seabed]", "missing key 'scene' in [seabed]"),
+        (
+            "[seabed]\nscene = 'lake'",
+            "[seabed] scene must be one of 'wreck', 'pipeline', 'rocks', got 'lake'",
+        ),
+        (
+            "[seabed]\nscene = 'rocks'\nmast_m = 3.0",
+            "[seabed] mast_m must be left out with the scene 'rocks'",
+        ),
+        ("[seabed]\nscene = 'wreck'\nx_m = [1]", "[seabed] x_m must be a list of 2, got [1]"),
+        ("[seabed]\nscene = 'wreck'\nx_m = [3, 1]", "[seabed] x_m must be first < last in m"),
+        ("[seabed]\nscene = 'wreck'\nfloor_db = 3", "[seabed] floor_db must be finite and >="),
+        (
+            "[seabed]\nscene = 'wreck'\ndensity = 3",
+            "unknown key 'density' in [seabed]: did you mean 'density_m2'?",
         ),
         ("[targets]\nposition_m = [0, 1, 2]", "targets must be one or more tables [[targets]]"),
         ("targets = []", "[[targets]] positions_m must have shape (any, 3) and no empty axis"),
@@ -339,7 +399,9 @@ def test_a_mistyped_key_is_one_mistake_and_every_mistake_is_told():
 def test_missing_tables_are_named():
     scene = parse(GRID)
     assert scene.need("grid") == (scene.grid,)
-    with pytest.raises(ValueError, match=r"^scene\.toml: missing table \[\[targets\]\]$"):
+    with pytest.raises(
+        ValueError, match=r"^scene\.toml: missing table \[\[targets\]\] or \[seabed\]$"
+    ):
         scene.need("grid", "targets")
 
 

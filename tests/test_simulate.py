@@ -7,7 +7,7 @@ from scipy.special import erfc, fresnel
 
 from clsas.echoes import Echoes
 from clsas.geometry import bistatic_range_m
-from clsas.scene import PointTargets
+from clsas.scene import PointTargets, Seabed, View
 from clsas.simulate import simulate, simulate_lines
 from clsas.sonar import Pulse, Sonar, line_array
 from clsas.track import Pointing, Track, channels
@@ -305,6 +305,140 @@ def test_large_coordinates_change_nothing():
     assert db(near.samples - far.samples) < -90
 
 
+# Seabed
+
+NARROW = Sonar(
+    Pulse(100e3, 15e3, 1e-3),
+    line_array(3, 0.2),
+    sample_rate_hz=30e3,
+    tx_length_m=0.2,
+    rx_length_m=0.2,
+)
+SWATH = Track.straight([-0.6, 0, 10], [1.5, 0, 0], 4, 0.2, sway_m=[0.0, 0.1, -0.1, 0.05])
+
+
+def box_on_sand(**others):
+    x, y = np.meshgrid(np.linspace(-6, 6, 121), np.linspace(30, 42, 121))
+    box = (np.abs(x) <= 1.5) & (np.abs(y - 33) <= 0.5)
+    return Seabed((-6, 6), (30, 42), np.where(box, 1.5, 0.0), **{"density_m2": 40, **others})
+
+
+@pytest.mark.parametrize(
+    ("sonar", "options"),
+    [
+        (NARROW, {}),
+        (NARROW, {"pointing": Pointing.broadside(depression_rad=0.3), "spreading": True}),
+        (replace(NARROW, tx_length_m=None, rx_length_m=None), {"motion_in_flight": True}),
+        (replace(NARROW, rx_height_m=0.05), {"motion_in_flight": True, "range_m": (30, 40)}),
+    ],
+)
+def test_a_seabed_sounds_like_its_points_that_are_seen(sonar, options):
+    """Ping by ping they are the point targets, and right to a third of the floor."""
+    seabed = box_on_sand(floor_db=-60)
+    echoes = simulate(sonar, SWATH, seabed, **options)
+    for ping in range(SWATH.pings):
+        alone = Track(SWATH.positions_m[[ping]], [0.0], velocity_m_s=SWATH.velocity_m_s[[ping]])
+        tx, rx, _ = channels(sonar, alone)
+        positions, amplitudes = seabed.seen(View((tx[0] + rx.mean(axis=0)) / 2))
+        points = PointTargets(positions, amplitudes.astype(complex))
+        exact = simulate(sonar, alone, points, **{**options, "range_m": (25, 48)})
+        for channel in range(3):
+            compare(echoes, 3 * ping + channel, exact, channel)
+
+
+def compare(echoes, channel, exact, of):
+    """Assert that two channels agree, whose windows begin at different times."""
+    f = np.fft.fftfreq(4096, 1 / echoes.sample_rate_hz)
+    shift = exact.start_time_s[of] - echoes.start_time_s[channel]
+    spectrum = np.fft.fft(exact.samples[of], 4096) * np.exp(-2j * np.pi * f * shift)
+    moved = np.fft.ifft(spectrum)
+    # Away from where one of the two windows cuts.
+    inner = slice(100, echoes.length - 100)
+    apart = echoes.samples[channel, inner] - moved[inner.start : inner.stop]
+    assert np.linalg.norm(apart) < 10 ** (-55 / 20) * np.linalg.norm(moved[inner])
+
+
+def test_the_floor_is_what_is_left_out():
+    track = Track([[0, 0, 10.0]], [0.0])
+    x_m, y_m = (-40, 40), (30, 34)
+    levels = {
+        floor: simulate(
+            NARROW, track, Seabed(x_m, y_m, np.zeros((5, 81)), density_m2=20, floor_db=floor),
+            range_m=(30, 60),
+        ).samples
+        for floor in (-130, -50, -30)
+    }  # fmt: skip
+    energy = np.linalg.norm(levels[-130])
+    lost = {floor: 20 * np.log10(np.linalg.norm(levels[floor] - levels[-130]) / energy)
+            for floor in (-50, -30)}  # fmt: skip
+    # The Notes of Seabed: 0.0038/u^3 of the energy beyond u = 1/(pi sqrt(floor)).
+    for floor, level in lost.items():
+        u = 10 ** (-floor / 40) / np.pi
+        stated = 10 * np.log10(0.0038 / u**3)
+        # Whole tiles are kept, so that less is lost; the part that is cut has 40 m on either side.
+        assert stated - 12 < level < stated + 1.5
+
+
+def test_echoes_of_several_parts_add():
+    seabed, targets = box_on_sand(), PointTargets([[0, 33, 2], [1, 35, 0]], [3, 2j])
+    limits = {"range_m": (25, 48)}
+    both, one, other = (
+        simulate(NARROW, SWATH, part, **limits).samples
+        for part in ((seabed, targets), seabed, targets)
+    )
+    assert db(both - one - other, both) < -120
+    noisy = simulate(NARROW, SWATH, (seabed, targets), **limits, snr_db=20.0).samples
+    ratio = np.abs(both).max() ** 2 / np.mean(np.abs(noisy - both) ** 2)
+    assert 10 * np.log10(ratio) == pytest.approx(20, abs=0.3)
+    # In single precision or not, a part is summed by its own error only.
+    alone = simulate(NARROW, SWATH, targets, **limits).samples
+    np.testing.assert_array_equal(alone, simulate(NARROW, SWATH, (targets,), **limits).samples)
+
+
+def test_window_of_a_seabed_holds_its_echoes():
+    seabed = box_on_sand()
+    tight = simulate(NARROW, SWATH, seabed, motion_in_flight=True)
+    wide = simulate(NARROW, SWATH, seabed, motion_in_flight=True, range_m=(10, 100))
+    np.testing.assert_allclose(
+        np.linalg.norm(tight.samples, axis=1), np.linalg.norm(wide.samples, axis=1), rtol=1e-3
+    )
+    assert tight.length < 0.3 * wide.length
+
+
+def test_result_does_not_depend_on_threads_or_looks(monkeypatch):
+    seabed = box_on_sand()
+    one = simulate(NARROW, SWATH, seabed, workers=1).samples
+    np.testing.assert_array_equal(one, simulate(NARROW, SWATH, seabed, workers=3).samples)
+    module = importlib.import_module("clsas.simulate")
+    monkeypatch.setattr(module, "_LOOK", 1)
+    # Each channel looks for itself: only edges of shadows and of the beam change.
+    apart = simulate(NARROW, SWATH, seabed, range_m=(30, 46)).samples
+    monkeypatch.setattr(module, "_LOOK", 8)
+    together = simulate(NARROW, SWATH, seabed, range_m=(30, 46)).samples
+    assert 0 < np.linalg.norm(apart - together) < 0.15 * np.linalg.norm(together)
+
+
+def test_a_seabed_behind_the_sonar_is_silent():
+    track = Track([[0, 80, 10.0]], [0.0])
+    with pytest.warns(ClsasWarning, match="no echo falls within the receive window"):
+        assert not simulate(NARROW, track, box_on_sand()).samples.any()
+
+
+def test_lines_of_a_seabed_hold_a_shadow():
+    """One ping from above: no echo between the box's top and the end of its shadow."""
+    y = np.broadcast_to(np.linspace(30, 42, 241)[:, None], (241, 11))
+    wall = np.where(np.abs(y - 33) <= 0.5, 1.5, 0.0)
+    seabed = Seabed((-0.5, 0.5), (30, 42), wall, density_m2=300)
+    lines = simulate_lines([0, 0, 10], [0, 0, 10], seabed, carrier_hz=CARRIER, bandwidth_hz=BAND)
+    r = lines.first_range_m[0] + lines.range_step_m * np.arange(lines.length)
+    y = np.sqrt(np.clip(r**2 - 100, 0, None))  # on the ground
+    level = np.abs(lines.samples[0]) ** 2
+    end = 33.5 * 10 / 8.5
+    lit = level[(y > end + 0.3) & (y < 41.8)].mean()
+    dark = level[(y > 34) & (y < end - 0.3)].mean()
+    assert 10 * np.log10(dark / lit) < -25
+
+
 # Range lines directly
 
 
@@ -425,7 +559,11 @@ def test_points_outside_a_line_give_it_nothing():
         ({"progress": 1}, TypeError, "progress must be a function or None, got 1"),
         ({"sonar": None}, TypeError, "sonar must be of type Sonar, got NoneType"),
         ({"track": SMOOTH}, TypeError, "track must be of type Track, got Sonar"),
-        ({"scene": [[0, 40, 0]]}, TypeError, "scene must be of type PointTargets, got list"),
+        (
+            {"scene": [[0, 40, 0]]},
+            TypeError,
+            "scene must be of type PointTargets or Seabed, got list",
+        ),
         ({"range_m": (0, 1e12)}, ValueError, r"range_m must ask for at most .* GiB, .* got .* GiB"),
         ({"range_m": (0, 1e308)}, ValueError, "range_m must ask for at most .* got inf GiB"),
         ({"workers": 0}, ValueError, "workers must be at least 1, got 0"),
