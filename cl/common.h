@@ -23,10 +23,18 @@ typedef int vint;
 #define AS_VINT as_int
 #define LOAD(p) (*(p))
 #define STORE(value, p) (*(p) = (value))
+#define LANES 0.0f
 #else
 typedef JOIN(float, WIDTH) vfloat;
 typedef JOIN(int, WIDTH) vint;
 #define AS_VINT JOIN(as_int, WIDTH)
+#if WIDTH == 16
+#define LANES ((vfloat)(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15))
+#elif WIDTH == 8
+#define LANES ((vfloat)(0, 1, 2, 3, 4, 5, 6, 7))
+#else
+#define LANES ((vfloat)(0, 1, 2, 3))
+#endif
 #ifdef __clang__
 typedef float vfloat_anywhere __attribute__((ext_vector_type(WIDTH), aligned(4)));
 #define LOAD(p) (*(__global const vfloat_anywhere *)(p))

@@ -1,10 +1,11 @@
 /* A stage of factorized backprojection: the lines of a parent subimage become fewer, virtual lines of each
  * child,
  *
- *     v_m(k) = sum_n a_nm exp(j 2 pi cycles_n) sum_t h_t(nu_n) s_n(start_n + k + t),
+ *     v_m(k) = sum_n a_nm exp(j 2 pi (cycles_n + ramp_n (k - half))) sum_t h_t(nu_n) s_n(start_n + k + t),
  *
  * that is, every line is brought to the child's centre (a constant shift: a short filter h over contiguous
- * samples, and a phase), and summed with weights a that interpolate the aperture. Channels come in the order
+ * samples, and a phase), and summed with weights a that interpolate the aperture. The ramp makes up for
+ * channels whose ranges grow a little faster or slower across the child than those on the track do. Channels come in the order
  * of the virtual channels they contribute to: channel n adds to APERTURE_TAPS consecutive ones from
  * base[n] on, so that as many sums are open at a time.
  *
@@ -14,6 +15,7 @@
  *   APERTURE_TAPS  of the aperture interpolation a.
  *   GIVEN          1: shifts and phases come from the host (the first stage, whose channels may be
  *                  anything); 0: from the positions of virtual channels.
+ *   RAMP           1: phases vary along the lines (with GIVEN only); 0: every ramp is 0.
  *
  * Buffers
  *   parent      lines of float, `parent_pitch` samples each: [...][2][parent_pitch], real parts and
@@ -24,14 +26,15 @@
  *   Per root and channel, [roots][channel_pitch]:
  *   base        int: the first virtual channel it contributes to, never decreasing.
  *   aperture    float [APERTURE_TAPS]: its weights a.
- *   GIVEN only  order (int: its line), start (int: parent sample of tap 0 for k = 0), nu and cycles (float).
+ *   GIVEN only  order (int: its line), start (int: parent sample of tap 0 for k = 0), nu, cycles and ramp
+ *               (float; cycles per sample).
  *   otherwise   positions  float [roots][3][channel_pitch]: of channels, m from the root's centre.
  *               offsets    float [children][6]: the parent's centre from the root's, the child's from
  *                          its parent's, m.
  *               drift      velocity of receivers over the sound speed: what motion in flight adds to the
  *                          range to x is -drift.(x - channel), to first order.
  *               parent_centre: sample of a parent line that is its subimage's centre.
- *               half: samples of a line before the one of the child's centre.
+ *   half_length: samples of a line before the one of the child's centre.
  *   lines       [children][lines_per_child][2][pitch], samples `guard` to guard + length - 1 written,
  *               `length` a multiple of WIDTH.
  *
@@ -113,15 +116,19 @@ __kernel void stage(__global const float *parent, int parent_pitch, __global con
                     __global const int *base, __global const float *aperture, int channel_pitch,
 #if GIVEN
                     __global const int *order, __global const int *start, __global const float *nu,
-                    __global const float *cycles,
+                    __global const float *cycles, __global const float *ramp,
 #else
                     __global const float *positions, __global const float *offsets, float4 drift,
-                    float samples_per_m, float cycles_per_m, int parent_centre, int half_length,
+                    float samples_per_m, float cycles_per_m, int parent_centre,
 #endif
+                    int half_length,
                     __global const float *filter, __global float *lines, int lines_per_child, int pitch,
                     int length, int guard)
 {
     __local float taps[TAPS][CHUNK], cosine[CHUNK], sine[CHUNK];
+#if RAMP
+    __local float phase[CHUNK]; /* at the child's centre; cosine and sine are of the turn per WIDTH samples */
+#endif
     __local int first[CHUNK];
 #if WIDTH > 1
     vfloat aligned_re[BLOCK / WIDTH][CHUNK], aligned_im[BLOCK / WIDTH][CHUNK];
@@ -142,6 +149,7 @@ __kernel void stage(__global const float *parent, int parent_pitch, __global con
     start += root * channel_pitch;
     nu += root * channel_pitch;
     cycles += root * channel_pitch;
+    ramp += root * channel_pitch;
 #else
     positions += root * 3 * channel_pitch;
     offsets += 6 * child;
@@ -178,7 +186,12 @@ __kernel void stage(__global const float *parent, int parent_pitch, __global con
 #endif
             vfloat weight[TAPS], s, co;
             filter_weights(filter, between, weight);
+#if RAMP
+            STORE_LOCAL(turns, phase + c);
+            sincos_cycles(WIDTH * LOAD(ramp + chunk + c), &s, &co);
+#else
             sincos_cycles(turns, &s, &co);
+#endif
 #pragma unroll
             for (int t = 0; t < TAPS; t++)
                 STORE_LOCAL(weight[t], taps[t] + c);
@@ -200,7 +213,13 @@ __kernel void stage(__global const float *parent, int parent_pitch, __global con
 #pragma unroll
                 for (int t = 0; t < TAPS; t++)
                     weight[t] = taps[t][c];
+#if RAMP
+                const float step_re = cosine[c], step_im = sine[c];
+                vfloat turn_re, turn_im;
+                sincos_cycles(phase[c] + ramp[chunk + c] * (LANES + (float)(block - half_length)), &turn_im, &turn_re);
+#else
                 const float turn_re = cosine[c], turn_im = sine[c];
+#endif
                 const int start = first[c];
 #ifdef SLIDING
                 const int before = KEEP(start + block, 0, parent_pitch - TAPS - WIDTH);
@@ -228,6 +247,11 @@ __kernel void stage(__global const float *parent, int parent_pitch, __global con
 #endif
                     aligned_re[(k - block) / WIDTH][c] = a * turn_re - b * turn_im;
                     aligned_im[(k - block) / WIDTH][c] = a * turn_im + b * turn_re;
+#if RAMP
+                    const vfloat turned = turn_re * step_re - turn_im * step_im;
+                    turn_im = turn_re * step_im + turn_im * step_re;
+                    turn_re = turned;
+#endif
                 }
             }
             for (int k = block; k < block_end; k += WIDTH) {

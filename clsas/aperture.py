@@ -126,6 +126,44 @@ def phase_centres_m(lines: RangeLines) -> NDArray[np.float64]:
     return (lines.tx_m + lines.rx_m) / 2
 
 
+def stretches(
+    lines: RangeLines,
+    grid: Grid,
+    points_m: NDArray[np.float64],
+    virtual_m: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """Return by how much faster channels' ranges grow than those of places that stand for them.
+
+    Across the grid's plane the range of a channel grows along its gradient there, the mean of the
+    unit vectors from transmitter and receiver. Of what that differs from the gradient g of the
+    place on the track, the part along g is a stretch of the range line about the point, and can be
+    made up for; places_seen_from leaves little across it. Drift is common to both.
+
+    Parameters
+    ----------
+    points_m : float64 [points, 3]
+    virtual_m : float64 [points, channels, 3]
+        For every channel of lines a place on the track.
+
+    Returns
+    -------
+    float64 [points, channels]
+    """
+    normal = np.cross(grid.row_step_m, grid.column_step_m)
+    normal = normal / max(np.linalg.norm(normal), 1e-300)
+
+    def sight(from_m: NDArray[np.float64]) -> NDArray[np.float64]:
+        way = points_m[:, None] - from_m
+        return way / np.maximum(np.linalg.norm(way, axis=-1, keepdims=True), 1e-30)
+
+    along = sight(virtual_m)
+    more = (sight(lines.tx_m) + sight(lines.rx_m)) / 2 - along
+    along = along - (along @ normal)[..., None] * normal
+    square = np.einsum("pci,pci->pc", along, along)
+    # Right below the track ranges do not grow at all.
+    return np.einsum("pci,pci->pc", more, along) / np.maximum(square, 1e-3)
+
+
 def drift(lines: RangeLines) -> NDArray[np.float64]:
     """Return the mean velocity of the receivers over the sound speed, [3].
 

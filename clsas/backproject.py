@@ -17,8 +17,8 @@ from clsas.device import Device, Slot, open_device
 from clsas.geometry import bistatic_range_m, pairwise_range_m
 from clsas.grid import Grid
 from clsas.image import Image
-from clsas.interpolation import Interpolator, Resampling
-from clsas.layout import GEOMETRY_ERROR, STACK, Groups, Tiles, lay_out
+from clsas.interpolation import Interpolator, Resampling, Spectrum
+from clsas.layout import GEOMETRY_ERROR, STACK, Groups, Tiles, allowed, lay_out
 from clsas.lines import RangeLines
 from clsas.window import INTERVALS, BeamWindow, channel_ranges, sines
 
@@ -55,14 +55,12 @@ class Preparation:
     @property
     def samples_per_m(self) -> float:
         """Upsampled samples per metre of range."""
-        return self.resampling.ratio / self.lines.range_step_m
+        return self.resampling.samples_per_m(self.lines)
 
     @property
     def cycles_per_m(self) -> float:
         """Phase to restore per metre of range, cycles: of the lines' spectral centre."""
-        return self.lines.carrier_cycles_per_m + (
-            self.resampling.centre_cycles_per_sample / self.lines.range_step_m
-        )
+        return self.resampling.cycles_per_m(self.lines)
 
 
 def backproject(
@@ -169,30 +167,22 @@ def prepare(
     accuracy_db = validate.number(
         "accuracy_db", accuracy_db, "dB", least=BEST_ACCURACY_DB, below=0.0
     )
-    along, heaviest = None, 1.0
     if beam is not None:
         validate.instance("beam", beam, BeamWindow)
-        if beam.shape == "inverse" and not lines.carrier_hz:
-            raise ValueError("carrier_hz must be above 0 for a beam of the shape 'inverse'")
-        along = beam.directions(lines)
-        heaviest = max(float(beam.table(wavelength_m(lines)).max()), 1.0)
-    _check_numbers(lines, heaviest)
+    check_numbers(lines, beam)
+    along = None if beam is None else beam.directions(lines)
     device = open_device(device)
     spectrum = interpolation.measure_spectrum(lines)
-    # What rounding a range costs: phase, and place within the lines' band, 0.3 Nyquist rms.
-    cycles_per_m = math.hypot(
-        lines.carrier_cycles_per_m + spectrum.centre / lines.range_step_m,
-        0.3 / lines.range_step_m,
-    )
-    antennas_m = np.unique(np.concatenate([lines.tx_m, lines.rx_m]), axis=0)
-    if beam is not None:
-        antennas_m = np.concatenate([antennas_m, (lines.tx_m + lines.rx_m) / 2])
+    antennas_m, cycles_per_m = antennas_and_phase(lines, spectrum, beam)
+    fixed = taps is not None and upsampling is not None  # then accuracy_db plays no part
+    geometry_error = GEOMETRY_ERROR if fixed else allowed(accuracy_db)
     layout = lay_out(
         grid,
         antennas_m,
         cycles_per_m,
         device.info.width,
-        speed_ratio=_fastest(lines),
+        error=geometry_error,
+        speed_ratio=fastest(lines),
         beam=beam,
     )
     _check_distances(antennas_m, layout)
@@ -201,14 +191,34 @@ def prepare(
         accuracy_db,
         taps=taps,
         upsampling=upsampling,
-        other_error=GEOMETRY_ERROR,
+        other_error=geometry_error,
         pixels_per_sample=grid.size / lines.length,
-        most_upsampling=lookup_room(max(interpolation.TAPS))
-        * lines.range_step_m
-        / max(layout.block_radius_m, 1e-30),
+        most_upsampling=most_upsampling(lines, layout.block_radius_m),
     )
     resampling = interpolation.resampling(lines.length, interpolator, spectrum)
     return Preparation(device, lines, grid, layout, interpolator, resampling, beam, along)
+
+
+def antennas_and_phase(
+    lines: RangeLines, spectrum: Spectrum, beam: BeamWindow | None
+) -> tuple[NDArray[np.float64], float]:
+    """Return all places that ranges and aspects are from, [n, 3], and cycles per metre of range.
+
+    The latter are what rounding a range costs: phase, and place within the lines' band, 0.3 Nyquist
+    rms.
+    """
+    antennas_m = lines.tx_m
+    if not np.array_equal(lines.tx_m, lines.rx_m):
+        antennas_m = np.unique(np.concatenate([lines.tx_m, lines.rx_m]), axis=0)
+    if beam is not None:
+        antennas_m = np.concatenate([antennas_m, (lines.tx_m + lines.rx_m) / 2])
+    of_phase = interpolation.cycles_per_m(lines, spectrum.centre)
+    return antennas_m, math.hypot(of_phase, 0.3 / lines.range_step_m)
+
+
+def most_upsampling(lines: RangeLines, block_radius_m: float) -> float:
+    """Return the upsampling beyond which a block does not fit the lookup's window."""
+    return lookup_room(max(interpolation.TAPS)) * lines.range_step_m / max(block_radius_m, 1e-30)
 
 
 def execute(
@@ -227,7 +237,8 @@ def execute(
     normalise = p.beam is not None and p.beam.normalise
     try:
         run = _Run(p, progress)
-        for band in _slices(slice(0, layout.parts), _band_parts(p)):
+        at_once = band_parts(device, layout.part_pixels, layout.across, normalise)
+        for band in _slices(slice(0, layout.parts), at_once):
             part = slice(band.start * layout.part_pixels, band.stop * layout.part_pixels)
             on_device = [device.zeros(pixels[part].nbytes) for _ in range(1 + normalise)]
             for channels in _slices(slice(0, p.lines.channels), run.channels_at_once):
@@ -268,6 +279,70 @@ def beam_arguments(
     return per_sine, (device.upload(beam.table(wavelength_m(lines))), *places)
 
 
+@dataclass(frozen=True)
+class Blocks:
+    """What is on a device at once.
+
+    Attributes
+    ----------
+    reach, margin : int
+        Samples by which a part may reach beyond a line's end, and zeros around lines.
+    pitch : int
+        Samples of a line with these.
+    terms : int
+        Coefficients per (tile, channel); none off a plane.
+    channels_at_once, parts_at_once : int
+    """
+
+    reach: int
+    margin: int
+    pitch: int
+    terms: int
+    channels_at_once: int
+    parts_at_once: int
+
+
+def blocks_of(
+    device: Device,
+    lines: RangeLines,
+    resampling: Resampling,
+    taps: int,
+    *,
+    radius_m: float,
+    part_pixels: int,
+    tiled: bool,
+    beam: BeamWindow | None,
+) -> Blocks:
+    """Return how much of an image's data is on a device at once.
+
+    That is an eighth of its memory for either set of lines, a sixteenth for either of references.
+    """
+    # Zeros around a line on the device: a part may reach beyond its end by a radius.
+    reach = math.ceil(radius_m * resampling.samples_per_m(lines) * 1.1) + taps
+    margin = 2 * reach + _WINDOW
+    pitch = _round_up(resampling.length + 2 * margin, 16)
+    if pitch % 256 == 0:  # lines at equal places in cache sets would evict each other
+        pitch += 16
+    terms = _EXPANSION_TERMS + (0 if beam is None else _BEAM_TERMS) if tiled else 0
+    line_bytes = 8 * pitch
+    part_bytes = _CHANNELS_AT_ONCE * (16 + 4 * terms) + 12 * part_pixels
+    most = device.info.max_buffer_bytes
+    room = min(most, device.info.memory_bytes // 8)
+    if line_bytes > most:
+        raise ValueError(
+            f"lines of {lines.length} samples need {line_bytes / 2**10:.0f} KiB each when "
+            f"upsampled, more than a buffer of {device.info.label}, {most / 2**10:.0f} KiB"
+        )
+    return Blocks(
+        reach,
+        margin,
+        pitch,
+        terms,
+        channels_at_once=min(_CHANNELS_AT_ONCE, max(room // line_bytes, 1)),
+        parts_at_once=max(min(_PART_BYTES, room // 2) // part_bytes, 1),
+    )
+
+
 class _Run:
     """A preparation at work: its kernels, its buffers, and how much it has done."""
 
@@ -282,12 +357,19 @@ class _Run:
         self.radius_m = layout.radius_m
         self.origin_m = layout.centres_m(slice(0, 1))[0]
 
-        # Zeros around a line on the device: a part may reach beyond its end by a radius.
-        self.reach = math.ceil(self.radius_m * p.samples_per_m * 1.1) + p.interpolator.taps
-        self.margin = 2 * self.reach + _WINDOW
-        self.pitch = _round_up(p.resampling.length + 2 * self.margin, 16)
-        if self.pitch % 256 == 0:  # lines at equal places in cache sets would evict each other
-            self.pitch += 16
+        blocks = blocks_of(
+            device,
+            p.lines,
+            p.resampling,
+            p.interpolator.taps,
+            radius_m=self.radius_m,
+            part_pixels=layout.part_pixels,
+            tiled=self.tiled,
+            beam=p.beam,
+        )
+        self.reach, self.margin, self.pitch = blocks.reach, blocks.margin, blocks.pitch
+        self.terms, self.channels_at_once = blocks.terms, blocks.channels_at_once
+        self.parts_at_once = blocks.parts_at_once
 
         fits = layout.block_radius_m * p.samples_per_m <= lookup_room(p.interpolator.taps)
         options = {
@@ -304,21 +386,6 @@ class _Run:
         name = "backproject_tiles" if self.tiled else "backproject_points"
         self.kernel = device.kernel("backproject", name, **options)
         self.expand = device.kernel("backproject", "expand_tiles", **options)
-
-        # Device memory: an eighth for either set of lines, a sixteenth for either of references.
-        line_bytes = 8 * self.pitch
-        self.terms = _EXPANSION_TERMS + (0 if p.beam is None else _BEAM_TERMS)
-        part_bytes = _CHANNELS_AT_ONCE * (16 + 4 * self.terms if self.tiled else 16)
-        part_bytes += 12 * layout.part_pixels
-        most = device.info.max_buffer_bytes
-        room = min(most, device.info.memory_bytes // 8)
-        if line_bytes > most:
-            raise ValueError(
-                f"lines of {p.lines.length} samples need {line_bytes / 2**10:.0f} KiB each when "
-                f"upsampled, more than a buffer of {device.info.label}, {most / 2**10:.0f} KiB"
-            )
-        self.channels_at_once = min(_CHANNELS_AT_ONCE, max(room // line_bytes, 1))
-        self.parts_at_once = max(min(_PART_BYTES, room // 2) // part_bytes, 1)
 
         # While one set of buffers is in use on the device, the other is filled.
         self.line_slots = itertools.cycle([Slot(device), Slot(device)])
@@ -457,7 +524,7 @@ class _Run:
             rows.append((lines.rx_velocity_m_s / lines.sound_speed_m_s).astype(np.float32))
         if self.p.beam is not None:
             rows.append((self.p.along[channels] * self.per_sine).astype(np.float32))
-        pitch = _channel_pitch(lines.channels) + 16
+        pitch = channel_pitch(lines.channels) + 16
         geometry = np.concatenate(rows, axis=1).T
         return np.pad(geometry, ((0, 0), (0, pitch - lines.channels)), mode="edge")
 
@@ -499,7 +566,7 @@ class _Run:
             self.margin - self.reach,
             self.margin + resampling.length + self.reach,
         )
-        shape = (len(centres_m), _channel_pitch(count))
+        shape = (len(centres_m), channel_pitch(count))
         references = {
             "sample": np.zeros(shape, np.int32),
             "fraction": np.zeros(shape, np.float32),
@@ -577,7 +644,7 @@ def lookup_room(taps: int) -> float:
     return _WINDOW / 2 - 2 - taps / 2
 
 
-def _channel_pitch(channels: int) -> int:
+def channel_pitch(channels: int) -> int:
     """Channels with padding to whole vectors of any width."""
     return _round_up(channels, 16)
 
@@ -592,14 +659,10 @@ def _slices(whole: slice, most: int) -> Iterator[slice]:
         yield slice(start, min(start + most, whole.stop))
 
 
-def _band_parts(p: Preparation) -> int:
-    """Return how many parts' pixels may be on the device at once: whole rows of tiles."""
-    info = p.device.info
-    pixel_bytes = 8 * (1 + (p.beam is not None and p.beam.normalise))
-    most = min(info.max_buffer_bytes, info.memory_bytes // 4) // (
-        pixel_bytes * p.layout.part_pixels
-    )
-    return max(most // p.layout.across, 1) * p.layout.across
+def band_parts(device: Device, part_pixels: int, across: int, normalise: bool) -> int:
+    """Return how many parts' pixels may be on a device at once: whole rows of tiles."""
+    most = min(device.info.max_buffer_bytes, device.info.memory_bytes // 4)
+    return max(most // (8 * (1 + normalise) * part_pixels) // across, 1) * across
 
 
 def _check_same_grid(image: Image, grid: Grid) -> None:
@@ -608,11 +671,13 @@ def _check_same_grid(image: Image, grid: Grid) -> None:
         raise ValueError("accumulate must be an image on the same grid")
 
 
-def _check_numbers(lines: RangeLines, heaviest: float) -> None:
-    """Refuse lines whose numbers would leave what float32 sums or float64 phases can hold.
-
-    `heaviest` is the largest weight of a channel.
-    """
+def check_numbers(lines: RangeLines, beam: BeamWindow | None) -> None:
+    """Refuse lines whose numbers would leave what float32 sums or float64 phases can hold."""
+    heaviest = 1.0
+    if beam is not None:
+        if beam.shape == "inverse" and not lines.carrier_hz:
+            raise ValueError("carrier_hz must be above 0 for a beam of the shape 'inverse'")
+        heaviest = max(float(beam.table(wavelength_m(lines)).max()), 1.0)
     validate.number(
         "range_step_m", lines.range_step_m, "m", least=_SMALLEST_STEP_M, most=_LARGEST_DISTANCE_M
     )
@@ -624,18 +689,20 @@ def _check_numbers(lines: RangeLines, heaviest: float) -> None:
             f"carrier_hz = {lines.carrier_hz:g} Hz makes {cycles:.3g} cycles over {farthest_m:g} m "
             f"at {lines.sound_speed_m_s:g} m/s; float64 holds the phase of {_MOST_CYCLES:g}"
         )
-    largest, most = float(np.abs(lines.samples).max()), _LARGEST_SUM / heaviest / lines.channels
+    parts = lines.samples.real, lines.samples.imag
+    largest = max(float(max(part.max(), -part.min())) for part in parts)
+    most = _LARGEST_SUM / heaviest / lines.channels
     if largest > most:
         raise ValueError(
             f"samples must be at most {most:.3g} for the sum of {lines.channels} channels to stay "
             f"within float32, got {largest:.3g}"
         )
-    speed_m_s = _fastest(lines) * lines.sound_speed_m_s
+    speed_m_s = fastest(lines) * lines.sound_speed_m_s
     most_m_s = _FASTEST * lines.sound_speed_m_s
     validate.number("the speed of rx_velocity_m_s", speed_m_s, "m/s", most=most_m_s * (1 + 1e-9))
 
 
-def _fastest(lines: RangeLines) -> float:
+def fastest(lines: RangeLines) -> float:
     """Return the speed of the fastest receiver over that of sound."""
     if lines.rx_velocity_m_s is None:
         return 0.0

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
+from dataclasses import dataclass, field
 from functools import partial
 from itertools import product
 
@@ -12,21 +13,105 @@ import numpy as np
 from scipy.optimize import nnls
 
 from clsas import costs as stored
-from clsas import interpolation, validate
-from clsas.backproject import execute, prepare
+from clsas import validate
+from clsas.backproject import backproject
 from clsas.costs import Costs
 from clsas.device import Device, open_device
+from clsas.exact import Exact, expect
 from clsas.factorize import factorize
 from clsas.grid import Grid
+from clsas.interpolation import COST
 from clsas.lines import RangeLines
+from clsas.plan import Plan
 from clsas.planner import plan
 from clsas.scene import PointTargets
 from clsas.simulate import simulate_lines
+from clsas.view import View
+from clsas.window import BeamWindow
 
+_SIZES = ((500, 768), (1500, 512))
+"""Channels, and pixels along a side, of the images that are formed in every way."""
+_SMALL_SIZES = ((100, 128), (400, 256))
+"""Those of what is backprojected only."""
 _TOLERANCES_DB = (-25.0, -45.0, -60.0)
 # Plans differ with what they are told that things cost: these have shallow trees and deep ones.
 _TOLD = (Costs(pixel_ns=1e3), Costs(pixel_ns=1e3, leaf_ns=10.0))
-_REPEATS = 3
+_EXACT_DB = -50.0
+_WIDE = BeamWindow(120.0, "hann")  # every channel sees every pixel
+_PIXEL_M = 0.02
+
+_ROUNDS = 4
+_MOST_SCATTER = 0.2  # of times between halves of the rounds: rms of the logarithm
+_MOST_MISFIT = 0.35  # of times from those that the costs make
+
+
+@dataclass(frozen=True, eq=False)
+class _Image:
+    """One way to an image, what it should take, and what it took."""
+
+    form: Callable[[], object]
+    channels: int
+    expected: Plan | Exact
+    seconds: list[float] = field(default_factory=list)
+    kernels: list[dict[str, float]] = field(default_factory=list)
+
+    def run(self, device: Device) -> None:
+        """Form the image once more, timed as a whole and kernel by kernel."""
+        with device.profile() as times:
+            start = time.perf_counter()
+            self.form()
+            self.seconds.append(time.perf_counter() - start)
+        self.kernels.append({name: each.total_s for name, each in times.items()})
+
+    @property
+    def in_stages(self) -> float:
+        """Least seconds that the stages' kernels took."""
+        return min(each.get("stage", 0.0) for each in self.kernels)
+
+    @property
+    def in_pixels(self) -> float:
+        """Least seconds that the backprojecting kernels took."""
+        names = ("backproject_tiles", "backproject_points")
+        return min(sum(each.get(name, 0.0) for name in names) for each in self.kernels)
+
+    @property
+    def scatter(self) -> float:
+        """By how much two halves of the runs differ: logarithm of the ratio of least times."""
+        return math.log(min(self.seconds[::2]) / min(self.seconds[1::2]))
+
+    @property
+    def host_work(self) -> list[float]:
+        """How often it takes what `_HOST` costs."""
+        e = self.expected
+        if isinstance(e, Exact):
+            return [1.0, self.channels * e.samples, 0.0, 0.0, e.parts * self.channels]
+        roots = e.stages[0].subimages
+        batches = -(-roots // e.roots_at_once)
+        lines = self.channels * e.resampling.length
+        return [1.0, lines, roots * self.channels, batches * len(e.sides), 0.0]
+
+    @property
+    def stage_work(self) -> list[float]:
+        """How often it takes what `_STAGES` cost."""
+        if isinstance(self.expected, Exact):
+            return [0.0, 0.0, 0.0]
+        stages = self.expected.stages[:-1]
+        operations = sum(s.operations for s in stages)
+        taps = self.expected.align.taps + self.expected.aperture.taps
+        of_channels = sum(s.operations / s.samples for s in stages)
+        return [of_channels, operations, operations * taps]
+
+    @property
+    def pixel_work(self) -> float:
+        """Pixels times channels, as many as with 4 taps take as long."""
+        e = self.expected
+        if isinstance(e, Exact):
+            return self.channels * e.parts * e.part_pixels * COST[e.taps]
+        return e.stages[-1].operations * COST[e.final.taps]
+
+
+_HOST = ("call_ns", "upsampled_sample_ns", "reference_ns", "batch_ns", "part_ns")
+_STAGES = ("channel_ns", "sample_ns", "sample_tap_ns")
 
 
 def calibrate(
@@ -47,7 +132,7 @@ def calibrate(
     -------
     Costs
         None below zero, fitted with least relative squares to the times of some images of a
-        built-in scene, the least of three runs each.
+        built-in scene, the least of some runs of each, which take turns.
 
     Raises
     ------
@@ -55,70 +140,76 @@ def calibrate(
         If there is no such device.
     OSError
         If the user's cache directory cannot be written.
+
+    Warns
+    -----
+    ClsasWarning
+        If times differ much from run to run, or from what the costs make them: then the costs are
+        returned, but not stored, and those of before stay.
     """
     validate.progress(progress)
     device = open_device(device)
-    plans = list(product(_TOLERANCES_DB, _TOLD))
-    sizes = ((500, 768), (1500, 512))
-    total, done = len(sizes) * (len(plans) + 1), 0
-    rows: list[tuple[np.ndarray, float]] = []
-    host: list[tuple[np.ndarray, float]] = []
-    pixel_ns, leaf_ns = [], []
-    for channels, pixels in sizes:
-        lines, grid = _scene(channels, pixels)
-        preparation = prepare(lines, grid, device=device, accuracy_db=-50.0)
-        seconds, _ = _timed(device, partial(execute, preparation))
-        pairs = lines.channels * grid.size * interpolation.COST[preparation.interpolator.taps]
-        pixel_ns.append(1e9 * seconds["backproject_tiles"] / pairs)
-        for tolerance_db, told in plans:
-            chosen = plan(lines, grid, tolerance_db=tolerance_db, device=device, costs=told)
-            done += 1
-            if progress is not None:
-                progress(done, total)
-            if chosen.is_exact:
-                continue
-            image = partial(factorize, lines, grid, chosen, device=device)
-            seconds, wall = _timed(device, image)
-            in_stages, at_end = seconds["stage"], seconds["backproject_tiles"]
-            *stages, last = chosen.stages
-            operations = sum(s.operations for s in stages)
-            taps = chosen.align.taps + chosen.aperture.taps
-            of_channels = sum(s.operations / s.samples for s in stages)
-            rows.append((np.array([of_channels, operations, operations * taps]), in_stages))
-            leaf_ns.append(1e9 * at_end / last.operations / interpolation.COST[chosen.final.taps])
-            batches = -(-stages[0].subimages // chosen.roots_at_once)
-            work = [
-                lines.channels * chosen.resampling.length,
-                stages[0].subimages * lines.channels,
-                batches * len(stages),
-            ]
-            host.append((np.array(work, float), max(wall - in_stages - at_end, 0.0)))
-        done += 1
+    images = _images(device)
+    total = len(images) * (1 + _ROUNDS)
+    for done in range(total):
+        image = images[done % len(images)]
+        if done < len(images):  # this builds the kernels
+            image.form()
+        else:
+            image.run(device)
         if progress is not None:
-            progress(done, total)
-    channel_ns, sample_ns, sample_tap_ns = _fitted(rows)
-    upsampled_sample_ns, reference_ns, batch_ns = _fitted(host)
-    costs = Costs(
-        upsampled_sample_ns=upsampled_sample_ns,
-        reference_ns=reference_ns,
-        batch_ns=batch_ns,
-        channel_ns=channel_ns,
-        sample_ns=sample_ns,
-        sample_tap_ns=sample_tap_ns,
-        leaf_ns=float(np.median(leaf_ns)),
-        pixel_ns=float(np.median(pixel_ns)),
-    )
-    stored.save(device, costs)
+            progress(done + 1, total)
+    costs = _fitted(images)
+    scatter = _rms([image.scatter for image in images])
+    misfit = _rms([math.log(_expected_s(image, costs) / min(image.seconds)) for image in images])
+    wrong = []
+    if not scatter <= _MOST_SCATTER:
+        wrong.append(f"times of the same image differ by {math.expm1(scatter):.0%} between runs")
+    if not misfit <= _MOST_MISFIT:
+        wrong.append(f"the costs miss the times measured by {math.expm1(misfit):.0%}")
+    if wrong:
+        validate.warn(
+            f"what was measured is not stored: {' and '.join(wrong)}; calibrate again when the "
+            f"machine has nothing else to do"
+        )
+    else:
+        stored.save(device, costs)
     return costs
+
+
+def _images(device: Device) -> list[_Image]:
+    """Return the images that are timed."""
+    images = []
+
+    def backprojected(lines: RangeLines, grid: Grid, beam: BeamWindow | None = None) -> None:
+        expected = expect(View(lines, grid, beam), _EXACT_DB, device)
+        form = partial(backproject, lines, grid, device=device, accuracy_db=_EXACT_DB, beam=beam)
+        images.append(_Image(form, lines.channels, expected))
+
+    for channels, pixels in _SIZES:
+        lines, grid = _scene(channels, pixels)
+        backprojected(lines, grid)
+        backprojected(lines, grid, _WIDE)
+        for tolerance_db, told in product(_TOLERANCES_DB, _TOLD):
+            chosen = plan(lines, grid, tolerance_db=tolerance_db, device=device, costs=told)
+            if not chosen.is_exact:
+                form = partial(factorize, lines, grid, chosen, device=device)
+                images.append(_Image(form, channels, chosen))
+    for channels, pixels in _SMALL_SIZES:
+        lines, grid = _scene(channels, pixels)
+        backprojected(lines, grid)
+        backprojected(lines, grid.with_height(np.zeros(grid.shape)))
+    return images
 
 
 def _scene(channels: int, pixels: int) -> tuple[RangeLines, Grid]:
     """Return lines of random points at 120 kHz and a grid over them, from 40 m."""
     random = np.random.default_rng(0)
-    grid = Grid.plane((-8.0, 8.0, pixels), (40.0, 56.0, pixels))
+    half_m = _PIXEL_M * pixels / 2
+    grid = Grid.plane((-half_m, half_m, pixels), (40.0, 40 + 2 * half_m, pixels))
     along = (np.arange(channels) - (channels - 1) / 2) * (20.0 / channels)
     tx_m = np.stack([along, 0 * along, 0 * along], axis=1)
-    positions_m = random.uniform([-8, 40, 0], [8, 56, 0], (100, 3))
+    positions_m = random.uniform([-half_m, 40, 0], [half_m, 40 + 2 * half_m, 0], (100, 3))
     lines = simulate_lines(
         tx_m,
         tx_m,
@@ -130,25 +221,54 @@ def _scene(channels: int, pixels: int) -> tuple[RangeLines, Grid]:
     return lines, grid
 
 
-def _timed(device: Device, run: Callable[[], object]) -> tuple[dict[str, float], float]:
-    """Return the least seconds in every kernel, and of the whole, after a run that builds them."""
-    run()
-    kernels: dict[str, float] = {}
-    wholes = []
-    for _ in range(_REPEATS):
-        with device.profile() as times:
-            start = time.perf_counter()
-            run()
-            wholes.append(time.perf_counter() - start)
-        for name, each in times.items():
-            kernels[name] = min(each.total_s, kernels.get(name, math.inf))
-    return kernels, min(wholes)
+def _fitted(images: list[_Image]) -> Costs:
+    """Return the costs that make the least times of some images."""
+    plans = [image for image in images if isinstance(image.expected, Plan)]
+    exact = [image for image in images if isinstance(image.expected, Exact)]
+
+    def per_pixel(some: list[_Image]) -> float:
+        return float(np.median([1e9 * image.in_pixels / image.pixel_work for image in some]))
+
+    of_host = [
+        max(min(image.seconds) - image.in_stages - image.in_pixels, 1e-6) for image in images
+    ]
+    pixel_ns = per_pixel([i for i in exact if i.expected.tiled and not i.expected.weighted])
+    weighted = [i for i in exact if i.expected.weighted]
+    of_beam = [1e9 * image.in_pixels - pixel_ns * image.pixel_work for image in weighted]
+    pairs = [image.pixel_work / COST[image.expected.taps] for image in weighted]
+    return Costs(
+        **_least_squares(_HOST, [image.host_work for image in images], of_host),
+        **_least_squares(
+            _STAGES,
+            [image.stage_work for image in plans],
+            [image.in_stages for image in plans],
+        ),
+        leaf_ns=per_pixel(plans),
+        pixel_ns=pixel_ns,
+        point_ns=per_pixel([i for i in exact if not i.expected.tiled]),
+        beam_ns=max(float(np.median(np.divide(of_beam, pairs))), 0.0),
+    )
 
 
-def _fitted(rows: list[tuple[np.ndarray, float]]) -> list[float]:
-    """Return the costs, nanoseconds, of least relative error: work times costs is seconds."""
-    work, seconds = (np.array(column, float) for column in zip(*rows, strict=True))
+def _least_squares(
+    names: tuple[str, ...], work: list[list[float]], seconds: list[float]
+) -> dict[str, float]:
+    """Return the costs, ns, of least relative error: work times costs is seconds."""
     weight = 1 / np.maximum(seconds, 1e-6)
-    scale = (work * weight[:, None]).max(axis=0)
-    solution = nnls(work * weight[:, None] / scale, seconds * weight)[0]
-    return [float(x) for x in 1e9 * solution / scale]
+    rows = np.array(work) * weight[:, None]
+    scale = np.maximum(rows.max(axis=0), 1e-30)
+    solution = nnls(rows / scale, seconds * weight)[0]
+    return dict(zip(names, (1e9 * solution / scale).tolist(), strict=True))
+
+
+def _expected_s(image: _Image, costs: Costs) -> float:
+    """Return the time that costs make of an image."""
+    if isinstance(image.expected, Exact):
+        return image.expected.seconds(costs)
+    work = zip((*_HOST, *_STAGES), (*image.host_work, *image.stage_work), strict=True)
+    in_pixels_ns = costs.leaf_ns * image.pixel_work
+    return 1e-9 * (sum(getattr(costs, name) * amount for name, amount in work) + in_pixels_ns)
+
+
+def _rms(values: list[float]) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))

@@ -14,9 +14,10 @@ import tempfile
 import time
 import warnings
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import ExitStack, contextmanager, nullcontext
 from dataclasses import fields, is_dataclass, replace
 from fractions import Fraction
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -29,15 +30,18 @@ from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, T
 import clsas
 from clsas import demo as demonstration
 from clsas import validate
-from clsas.backproject import execute, prepare
+from clsas.backproject import BEST_ACCURACY_DB, execute, prepare
 from clsas.config import DIAL, EXACT, SceneFile, read_scene
 from clsas.device import choose, open_device
+from clsas.interpolation import TAPS
+from clsas.planner import BEST_TOLERANCE_DB, WORST_TOLERANCE_DB, wavelengths
 from clsas.quality import Cut, PointResponse
 from clsas.tradeoff import TOLERANCES_DB, summary
 from clsas.validate import positive
 from clsas.window import SHAPES
 
 _DEFAULT = {"tolerance_db": -50.0}
+_SCHEDULER_S = 10  # to answer
 
 # What users cause, and what machines lack.
 _ERRORS = (
@@ -78,9 +82,12 @@ class _Axis(click.ParamType):
     def convert(self, value: Any, param: Any, ctx: Any) -> tuple[float, float, int]:
         try:
             start, stop, count = value.split(":")
-            return float(start), float(stop), int(count)
+            axis = float(start), float(stop), int(count)
         except ValueError:
+            axis = math.nan, math.nan, 0
+        if not (np.isfinite(axis).all() and axis[2] > 0):
             self.fail(f"{value!r} must be START:STOP:N, metres and a number of pixels", param, ctx)
+        return axis
 
 
 class _Place(click.ParamType):
@@ -110,9 +117,23 @@ class _Stages(click.ParamType):
     def convert(self, value: Any, param: Any, ctx: Any) -> tuple[tuple[int, int], ...]:
         try:
             pairs = [stage.lower().split("x") for stage in value.split(",")]
-            return tuple((int(beams), int(divisions)) for beams, divisions in pairs)
+            stages = tuple((int(beams), int(divisions)) for beams, divisions in pairs)
         except ValueError:
+            stages = ((0, 0),)
+        if np.min(stages) < 1:
             self.fail(f"{value!r} must be QRxQI for every stage, such as 2x2,2x2", param, ctx)
+        return stages
+
+
+class _Counts(click.ParamType):
+    name = "ROWSxCOLUMNS"
+
+    def convert(self, value: Any, param: Any, ctx: Any) -> tuple[int, int]:
+        try:
+            rows, columns = value.lower().split("x")
+            return int(rows), int(columns)
+        except ValueError:
+            self.fail(f"{value!r} must be ROWSxCOLUMNS, such as 8x8", param, ctx)
 
 
 class _Output(click.Path):
@@ -160,6 +181,21 @@ def _need_matplotlib() -> None:
 _INPUT = click.Path(exists=True, dir_okay=False, path_type=Path)
 
 
+def _checked(check: Callable[[Any], object]) -> Callable:
+    """Return an option's callback that makes a usage error of what a check of its value raises."""
+
+    def callback(ctx: click.Context, param: click.Parameter, value: Any) -> Any:
+        try:
+            for each in value if param.multiple else [value]:
+                if each is not None:
+                    check(each)
+        except (TypeError, ValueError) as error:
+            raise click.BadParameter(str(error), ctx, param) from error
+        return value
+
+    return callback
+
+
 def _output(kind: str) -> Callable:
     return click.option("-o", "--output", type=_Output(), required=True, help=f"{kind} to write.")
 
@@ -169,6 +205,10 @@ def _png(what: str) -> Callable:
 
 
 _as_json = click.option("--json", "as_json", is_flag=True, help="Print results as JSON.")
+_dynamic_range = click.option(
+    "--dynamic-range-db", type=float, default=60.0, show_default=True, help="Of the PNG.",
+    callback=_checked(partial(positive, "dynamic_range_db", unit="dB")),
+)  # fmt: skip
 _scene = click.option("--scene", type=_INPUT, help="Scene file for what the options leave out.")
 _device = click.option("--device", help="Index or part of the name, as `clsas devices` shows.")
 
@@ -184,19 +224,36 @@ def _together(*options: Callable) -> Callable:
     return decorate
 
 
-_grid = _together(
-    _scene,
+_axes = _together(
     click.option("--x", type=_Axis(), help="First and last pixel centre along x (m), how many."),
     click.option("--y", type=_Axis(), help="The same along y."),
-    click.option("--z", type=float, help="Height of the plane (m). [default: 0]"),
+    click.option(
+        "--z", type=float, callback=_checked(partial(validate.number, "z", unit="m")),
+        help="Height of the plane (m). [default: 0]",
+    ),
+)  # fmt: skip
+_grid = _together(_scene, _axes)
+_tolerance_db = _checked(
+    partial(
+        validate.number, "tolerance_db", unit="dB", least=BEST_TOLERANCE_DB, most=WORST_TOLERANCE_DB
+    )
+)
+_accuracy_db = _checked(
+    partial(validate.number, "accuracy_db", unit="dB", least=BEST_ACCURACY_DB, below=0.0)
 )
 _dial = _together(
     click.option(
-        "--tolerance-db", type=float,
+        "--tolerance-db", type=float, callback=_tolerance_db,
         help="Relative rms error allowed against the exact image. [default: -50]",
     ),
     click.option(
         "--tolerance-wavelengths", type=_Ratio(),
+        callback=_checked(
+            partial(
+                validate.number, "tolerance_wavelengths", unit="wavelengths",
+                least=wavelengths(BEST_TOLERANCE_DB), most=wavelengths(WORST_TOLERANCE_DB),
+            )
+        ),
         help="The same as a range error in wavelengths, such as 1/30.",
     ),
     click.option(
@@ -207,10 +264,13 @@ _dial = _together(
 _beam = _together(
     click.option("--beam-deg", type=float, help="Use a beam of this full width only."),
     click.option(
-        "--beam-shape", type=click.Choice([shape for shape in SHAPES if shape != "inverse"]),
-        help="Its shape. [default: rectangular]",
+        "--beam-shape", type=click.Choice(SHAPES), help="Its shape. [default: rectangular]"
     ),
     click.option("--squint-deg", type=float, help="Its middle, ahead of broadside. [default: 0]"),
+    click.option(
+        "--element-length-m", type=float,
+        help="For the shape 'inverse', which divides by the two-way pattern of such elements.",
+    ),
 )  # fmt: skip
 
 
@@ -333,16 +393,27 @@ def compress(
 @_grid
 @_dial
 @click.option("--exact", is_flag=True, help="Backproject plainly, as the three options below do.")
-@click.option("--accuracy-db", type=float, help="Relative rms error wanted. [default: -60]")
-@click.option("--taps", type=int, help="Fix the interpolator's taps: 2, 4, 6 or 8.")
-@click.option("--upsampling", type=float, help="Fix how much lines are upsampled.")
+@click.option(
+    "--accuracy-db",
+    type=float,
+    callback=_accuracy_db,
+    help="Relative rms error wanted. [default: -60]",
+)
+@click.option(
+    "--taps",
+    type=int,
+    callback=_checked(partial(validate.one_of, "taps", allowed=TAPS)),
+    help="Fix the interpolator's taps: 2, 4, 6 or 8.",
+)
+@click.option(
+    "--upsampling", type=float,
+    callback=_checked(partial(validate.number, "upsampling", least=1.0, most=64.0)),
+    help="Fix how much lines are upsampled.",
+)  # fmt: skip
 @_beam
 @_device
 @_png("the image in dB")
-@click.option(
-    "--dynamic-range-db", type=float, default=60.0, show_default=True, help="Of the PNG.",
-    callback=lambda ctx, param, value: positive("dynamic_range_db", value, "dB"),
-)  # fmt: skip
+@_dynamic_range
 @click.option("--profile", is_flag=True, help="Also report the time of every kernel.")
 @_as_json
 def image(
@@ -374,13 +445,15 @@ def image(
     lines = _load(lines_file, clsas.RangeLines)
     opened = open_device(device)
     results: dict[str, Any] = {"method": "exact"}
-    chosen = None
+    chosen, why = None, ""
     if wish.keys() & set(DIAL):
         start = time.perf_counter()
         chosen = clsas.plan(lines, grid, **wish, beam=beam, device=opened)
         results["plan_seconds"] = time.perf_counter() - start
+        _warn_of_error(chosen)
         if chosen.is_exact:
-            wish, chosen = {"accuracy_db": chosen.predicted_error_db}, None
+            wish = {"accuracy_db": chosen.predicted_error_db}
+            why, chosen = f"exact: nothing faster within {chosen.tolerance_db:.4g} dB; ", None
     with (
         _progress("imaging") as progress,
         opened.profile() if profile else nullcontext({}) as kernels,
@@ -399,7 +472,7 @@ def image(
             formed = execute(preparation, progress=progress)
             interpolator, ratio = preparation.interpolator, preparation.resampling.ratio
             how = (
-                f"{interpolator.taps} taps on lines upsampled {ratio:.3g} times, "
+                f"{why}{interpolator.taps} taps on lines upsampled {ratio:.3g} times, "
                 f"{interpolator.error_db:.0f} dB"
             )
             results |= {
@@ -454,6 +527,7 @@ def plan(
     if not wish.keys() & set(DIAL):
         wish = _DEFAULT
     chosen = clsas.plan(lines, grid, **wish, beam=beam, device=device)
+    _warn_of_error(chosen)
     click.echo(chosen.to_json() if as_json else chosen.describe())
 
 
@@ -465,6 +539,7 @@ def plan(
     "--tolerance-db",
     type=float,
     multiple=True,
+    callback=_tolerance_db,
     help=f"Once for every tolerance. [default: {' '.join(f'{db:g}' for db in TOLERANCES_DB)}]",
 )
 @click.option(
@@ -474,6 +549,7 @@ def plan(
     multiple=True,
     help="Once for every plan of the thesis's method. [default: 1 to 5 of 2x2, 2 of 2x4]",
 )
+@click.option("--study", is_flag=True, help="Also sweep the taps of filters and the stages.")
 @_beam
 @_device
 @click.option("--repeats", type=click.IntRange(1), default=3, show_default=True, help="Timed runs.")
@@ -486,6 +562,7 @@ def tradeoff(
     scene: Path | None,
     tolerance_db: tuple[float, ...],
     stages: tuple[tuple[tuple[int, int], ...], ...],
+    study: bool,
     device: str | None,
     repeats: int,
     csv: Path | None,
@@ -501,8 +578,10 @@ def tradeoff(
     \b
     Example:  clsas tradeoff --case ffbp-thesis --csv tradeoff.csv --png tradeoff.png
     """  # fmt: skip
-    if (lines_file is None) == (case is None):
+    if lines_file is None and case is None:
         raise click.UsageError("either LINES.H5 or --case is needed")
+    if lines_file is not None and case is not None:
+        raise click.UsageError("--case has its own lines: LINES.H5 goes without")
     if case is None:
         described, grid = _read_grid(scene, given)
         beam = _read_beam(described, given)
@@ -518,7 +597,7 @@ def tradeoff(
             lines, grid,
             tolerances_db=tolerance_db or TOLERANCES_DB,
             stages=stages or None,
-            beam=beam, device=device, repeats=repeats, progress=progress,
+            beam=beam, device=device, repeats=repeats, study=study, progress=progress,
         )  # fmt: skip
     if csv is not None:
         measured.save_csv(csv)
@@ -530,6 +609,118 @@ def tradeoff(
         f"{measured.device}, median of {repeats} runs; resolutions over those of the exact "
         f"image\n{measured.describe()}",
         **_json_able(measured),
+    )  # fmt: skip
+
+
+@main.command()
+@click.argument("scene", metavar="SCENE.TOML", type=_INPUT)
+@click.option(
+    "--lines", "lines_path", type=click.Path(exists=True, path_type=Path),
+    help="Range lines, or a folder of files of them. [default: simulated from the scene]",
+)  # fmt: skip
+@click.option(
+    "-o", "--output", type=click.Path(path_type=Path),
+    help="Zarr store to write or go on with. [default: SCENE.zarr]",
+)  # fmt: skip
+@_axes
+@_dial
+@click.option("--accuracy-db", type=float, help="Backproject exactly, with this rms error.")
+@_beam
+@click.option("--patches", type=_Counts(), help="Patches along y and x, such as 8x8.")
+@click.option("--memory-mib", type=click.IntRange(1), help="What a patch may take. [default: 1024]")
+@click.option("--device", multiple=True, help="Once for every device that is to work.")
+@click.option("--workers", type=click.IntRange(1), help="Work in so many processes (Dask).")
+@click.option("--scheduler", metavar="ADDRESS", help="Work on a Dask cluster: tcp://host:8786.")
+@click.option("--follow", is_flag=True, help="Go on while files are added to the folder --lines.")
+@click.option(
+    "--idle-s", type=float, default=60.0, show_default=True,
+    help="With --follow: until nothing came for so long, or a file `end` did.",
+)  # fmt: skip
+@_png("an overview in dB")
+@_dynamic_range
+@_as_json
+def mosaic(
+    scene: Path,
+    lines_path: Path | None,
+    output: Path | None,
+    patches: tuple[int, int] | None,
+    memory_mib: int | None,
+    device: tuple[str, ...],
+    workers: int | None,
+    scheduler: str | None,
+    follow: bool,
+    idle_s: float,
+    png: Path | None,
+    dynamic_range_db: float,
+    as_json: bool,
+    **given: Any,
+) -> None:
+    """Form an image of any size patch by patch, into a Zarr store.
+
+    Grid, dial and beam as for `clsas image`. The same command goes on where it was interrupted, by
+    Ctrl-C or by anything else. A scene without --lines is simulated first.
+
+    \b
+    Example:  clsas mosaic scene.toml --lines lines.h5 -o image.zarr --png image.png
+    """
+    if workers is not None and scheduler is not None:
+        raise click.UsageError("--workers and --scheduler exclude each other")
+    if device and (workers or scheduler):
+        raise click.UsageError("--device plays no part with --workers and --scheduler")
+    described, grid = _read_grid(scene, given, memory=False)
+    wish = _wish(described, given)
+    if set(wish) - {*DIAL, "accuracy_db"}:
+        raise ValueError(f"{scene}: [image] taps and upsampling play no part in a mosaic")
+    beam = _read_beam(described, given)
+    _warn_of_sampling(described, grid)
+    options = described.mosaic
+    output = output or options.get("store") or scene.with_suffix(".zarr")
+    lines_path = lines_path or options.get("lines")
+    if follow and (lines_path is None or not lines_path.is_dir()):
+        raise click.UsageError("--follow goes with --lines, a folder")
+    patches = patches or options.get("patches")
+    memory_mib = memory_mib or options.get("memory_mib")
+    if lines_path is None:
+        lines_path = _simulated(described, scene, output)
+    start = time.perf_counter()
+    with _cluster(workers, scheduler) as client:
+        formed = clsas.mosaic(
+            lines_path, grid, output, **wish, beam=beam, patches=patches,
+            memory_bytes=memory_mib and memory_mib << 20, device=list(device) or None,
+            client=client, follow_s=idle_s if follow else None,
+        )  # fmt: skip
+        before, pixels = len(formed.finished), 0
+        with _patch_progress(output.name, len(formed), before) as tell:
+            for patch in formed:
+                pixels += patch.grid.size
+                tell(patch)
+    seconds = time.perf_counter() - start
+    store = clsas.Store.opened(output)
+    records = store.records()
+    if png is not None:
+        from clsas import plot
+
+        plot.save_png(plot.image_db(store.overview(), dynamic_range_db=dynamic_range_db), png)
+    errors = [r.predicted_error_db for r in records.values() if r.predicted_error_db is not None]
+    flagged = {place: record.flags for place, record in records.items() if record.flags}
+    worst = max(errors, default=None)
+    rows, columns = formed.patch_shape
+    text = [
+        f"{output}: {' x '.join(map(str, formed.shape))} patches of {rows} x {columns} pixels, "
+        f"{len(records) - before} formed in {seconds:.2f} s "
+        f"({pixels / seconds / 1e6:.3g} Mpixel/s)"
+        + (f", {before} were there" if before else "")
+        + ("" if worst is None else f"; error predicted {worst:.1f} dB at most")
+    ]
+    text += [f"  patch {row},{column}: {'; '.join(f)}" for (row, column), f in flagged.items()]
+    _report(
+        as_json,
+        "\n".join(text),
+        file=output, png=png, shape=grid.shape, patches=formed.shape,
+        patch_shape=formed.patch_shape, finished=len(records), before=before, seconds=seconds,
+        pixels_per_s=pixels / seconds, predicted_error_db=worst,
+        flags={f"{row},{column}": f for (row, column), f in flagged.items()},
+        seconds_of_patches=sum(record.seconds for record in records.values()),
     )  # fmt: skip
 
 
@@ -601,8 +792,16 @@ def demo(out: Path, device: str | None, as_json: bool) -> None:
 @main.command()
 @click.argument("case", required=False)
 @_device
-@click.option("--accuracy-db", type=float, help="Error wanted in exact cases. [default: -50]")
-@click.option("--tolerance-db", type=float, help="And in factorized ones. [default: -50]")
+@click.option(
+    "--accuracy-db",
+    type=float,
+    callback=_accuracy_db,
+    help="Error wanted in exact cases. [default: -50]",
+)
+@click.option(
+    "--tolerance-db", type=float, callback=_tolerance_db,
+    help="And in factorized ones. [default: -50]",
+)  # fmt: skip
 @click.option("--repeats", type=click.IntRange(1), default=5, show_default=True, help="Timed runs.")
 @_as_json
 def bench(
@@ -658,11 +857,13 @@ def calibrate(device: str | None, as_json: bool) -> None:
     opened = open_device(device)
     with _progress("calibrating") as progress:
         found = measure(opened, progress=progress)
+    stored = costs.load(opened) == found
     parts = "".join(f"\n{getattr(found, part.name):>12.4g}  {part.name}" for part in fields(found))
     _report(
         as_json,
-        f"{opened.info.label}, stored in {costs.path()}{parts}",
-        device=opened.info.label, driver=opened.info.driver, file=costs.path(), costs=found,
+        f"{opened.info.label}, {'' if stored else 'not '}stored in {costs.path()}{parts}",
+        device=opened.info.label, driver=opened.info.driver, file=costs.path(), stored=stored,
+        costs=found,
     )  # fmt: skip
 
 
@@ -676,6 +877,80 @@ def _progress(what: str) -> Iterator[Callable[[int, int], None] | None]:
     with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task(what, total=None)
         yield lambda done, total: bar.update(task, completed=done, total=total)
+
+
+def _simulated(described: SceneFile, scene: Path, output: Path) -> Path:
+    """Return the file of a scene's range lines beside the store; made where it is not there."""
+    path = output.with_suffix(".lines.h5")
+    if path.exists() and path.stat().st_mtime >= scene.stat().st_mtime:
+        click.echo(f"Range lines of {path}, simulated before", err=True)
+        return path
+    sonar, track, targets = described.need("sonar", "track", "targets")
+    with _progress("simulating") as progress:
+        echoes = clsas.simulate(sonar, track, targets, **described.simulate, progress=progress)
+    with _progress("compressing") as progress:
+        clsas.save(path, clsas.compress(echoes, **described.compress, progress=progress))
+    click.echo(f"{path}: range lines, simulated from {scene}", err=True)
+    return path
+
+
+@contextmanager
+def _cluster(workers: int | None, scheduler: str | None) -> Iterator[Any]:
+    """Give a client of a Dask cluster, or None where there is none to be used."""
+    if workers is None and scheduler is None:
+        yield None
+        return
+    try:
+        from distributed import Client, LocalCluster
+        from distributed.scheduler import KilledWorker
+    except ImportError:
+        raise ImportError(
+            "--workers and --scheduler need Dask: pip install 'clsas[mosaic]'"
+        ) from None
+    with ExitStack() as opened:
+        if scheduler is not None:
+            try:
+                client = opened.enter_context(Client(scheduler, timeout=_SCHEDULER_S))
+            except (OSError, ValueError) as error:
+                raise click.ClickException(
+                    f"--scheduler {scheduler} cannot be reached: {error}"
+                ) from None
+        else:
+            cluster = opened.enter_context(
+                LocalCluster(n_workers=workers, threads_per_worker=1, dashboard_address=None)
+            )
+            client = opened.enter_context(Client(cluster))
+        try:
+            yield client
+        except KilledWorker as error:
+            raise click.ClickException(
+                f"workers died on one patch, over and over: {error}"
+            ) from None
+
+
+@contextmanager
+def _patch_progress(name: str, total: int, done: int) -> Iterator[Callable[[clsas.Patch], None]]:
+    """Give a function that tells of a patch: a line each and, on a terminal, a moving bar."""
+    columns = (
+        TextColumn(name), BarColumn(), TextColumn("{task.completed}/{task.total}"),
+        TaskProgressColumn(), TimeRemainingColumn(),
+    )  # fmt: skip
+    console = Console(stderr=True, soft_wrap=True, highlight=False)
+    with Progress(
+        *columns, console=console, transient=True, disable=not console.is_terminal
+    ) as bar:
+        task = bar.add_task(name, total=total, completed=done)
+
+        def tell(patch: clsas.Patch) -> None:
+            record = patch.record
+            parts = [f"{record.seconds:.2f} s", f"{record.channels} channels"]
+            if record.predicted_error_db is not None:
+                parts.append(f"error predicted {record.predicted_error_db:.1f} dB")
+            line = f"patch {patch.row},{patch.column}: {', '.join((*parts, *record.flags))}"
+            console.print(line, markup=False)
+            bar.advance(task)
+
+        yield tell
 
 
 def _show_warning(message: Warning | str, *_: Any, **__: Any) -> None:
@@ -713,8 +988,13 @@ def _case(name: str) -> Any:
     return cases[name]
 
 
-def _read_grid(scene: Path | None, given: dict[str, Any]) -> tuple[SceneFile, clsas.Grid]:
-    """Return what a scene file describes, or nothing, and the grid that is wanted."""
+def _read_grid(
+    scene: Path | None, given: dict[str, Any], memory: bool = True
+) -> tuple[SceneFile, clsas.Grid]:
+    """Return what a scene file describes, or nothing, and the grid that is wanted.
+
+    Its image must fit into the `memory`, if so told.
+    """
     x, y, z = (given[name] for name in ("x", "y", "z"))
     if (x is None) != (y is None) or (z is not None and x is None):
         raise click.UsageError("--x and --y go together, and --z with them")
@@ -722,7 +1002,8 @@ def _read_grid(scene: Path | None, given: dict[str, Any]) -> tuple[SceneFile, cl
         raise click.UsageError("a grid is needed: --scene, or --x and --y")
     described = read_scene(scene) if scene is not None else SceneFile(name="")
     grid = clsas.Grid.plane(x, y, z or 0.0) if x and y else described.need("grid")[0]
-    validate.memory("--x and --y" if x else "[grid]", 8 * grid.size)
+    if memory:
+        validate.memory("--x and --y" if x else "[grid]", 8 * grid.size)
     return described, grid
 
 
@@ -758,12 +1039,29 @@ def _read_beam(described: SceneFile, given: dict[str, Any]) -> clsas.BeamWindow 
     """Return a scene file's beam, changed by what is given, or the beam that is."""
     beam = described.image.get("beam")
     options = {"width_deg": "beam_deg", "shape": "beam_shape", "squint_deg": "squint_deg"}
+    options["element_length_m"] = "element_length_m"
     changes = {key: given[name] for key, name in options.items() if given[name] is not None}
-    if beam is not None:
-        return replace(beam, **changes)
-    if changes and "width_deg" not in changes:
-        raise click.UsageError("--beam-shape and --squint-deg go with --beam-deg")
-    return clsas.BeamWindow(**changes) if changes else None
+    if not changes:
+        return beam
+    if beam is None and "width_deg" not in changes:
+        raise click.UsageError(
+            "--beam-shape, --squint-deg and --element-length-m go with --beam-deg"
+        )
+    try:
+        return replace(beam, **changes) if beam is not None else clsas.BeamWindow(**changes)
+    except ValueError as error:  # the scene's own was checked when it was read
+        raise click.UsageError(str(error)) from error
+
+
+def _warn_of_error(chosen: clsas.Plan) -> None:
+    """Warn where the thesis's method may leave no image."""
+    if chosen.nearest and chosen.predicted_error_db > WORST_TOLERANCE_DB:
+        click.echo(
+            f"Warning: with these stages the error may be as large as "
+            f"{chosen.predicted_error_db:.0f} dB, too large for an image to be of use: sum fewer "
+            "lines (QR), or divide more (QI)",
+            err=True,
+        )
 
 
 def _options(described: dict[str, Any], **given: Any) -> dict[str, Any]:

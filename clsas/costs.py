@@ -6,10 +6,12 @@ import json
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 
+from numpy.typing import ArrayLike
 from platformdirs import user_cache_path
 
 from clsas import validate
 from clsas.device import Device
+from clsas.interpolation import COST
 
 
 @dataclass(frozen=True)
@@ -18,6 +20,8 @@ class Costs:
 
     Attributes
     ----------
+    call_ns : float
+        Per image, however it is formed: what is decided first, buffers, launches.
     upsampled_sample_ns : float
         Per sample of the upsampled lines, on the host.
     reference_ns : float
@@ -30,10 +34,15 @@ class Costs:
         Per aligned sample in a stage, and per tap of either filter.
     leaf_ns : float
         Per pixel and virtual channel of the last stage, with 4 taps.
-    pixel_ns : float
-        Per pixel and channel of an exact image, with 4 taps.
+    part_ns : float
+        Per tile, or group, and channel of an exact image: references, on the host.
+    pixel_ns, point_ns : float
+        Per pixel and channel of an exact image, with 4 taps, in tiles and in groups.
+    beam_ns : float
+        Per pixel and channel of either, where a beam weighs it.
     """
 
+    call_ns: float = 1.5e7
     upsampled_sample_ns: float = 20.0
     reference_ns: float = 600.0
     batch_ns: float = 2e6
@@ -41,16 +50,27 @@ class Costs:
     sample_ns: float = 0.35
     sample_tap_ns: float = 0.045
     leaf_ns: float = 0.75
+    part_ns: float = 20.0
     pixel_ns: float = 0.65
+    point_ns: float = 0.8
+    beam_ns: float = 0.25
 
     def __post_init__(self) -> None:
         """Check every cost."""
         for field in fields(self):
             validate.number(field.name, getattr(self, field.name), "ns", least=0.0)
 
+    def line_ns(self, samples: ArrayLike, taps: int) -> ArrayLike:
+        """Return the cost of a channel of a subimage in a stage, by the taps of both filters."""
+        return samples * (self.sample_ns + self.sample_tap_ns * taps) + self.channel_ns
 
-WITH_BEAM = 1.3
-"""What a beam multiplies the cost of a pixel and channel by."""
+    def leaf_line_ns(self, pixels: ArrayLike, taps: int, *, beam: bool) -> ArrayLike:
+        """Return the cost of a virtual channel of a leaf that is backprojected."""
+        return pixels * (self.leaf_ns * COST[taps] + self.beam_ns * beam) + self.channel_ns
+
+    def pair_ns(self, taps: int, *, tiled: bool, beam: bool) -> float:
+        """Return the cost of a pixel and channel of an exact image."""
+        return (self.pixel_ns if tiled else self.point_ns) * COST[taps] + self.beam_ns * beam
 
 
 def path() -> Path:

@@ -10,10 +10,11 @@ import pyopencl as cl
 from numpy.typing import NDArray
 
 from clsas import tree, validate
-from clsas.aperture import cycles_per_pixel, drift, mean_track, phase_centres_m
+from clsas.aperture import cycles_per_pixel, drift, mean_track, phase_centres_m, stretches
 from clsas.backproject import (
     backproject,
     beam_arguments,
+    check_numbers,
     float_pairs,
     lookup_room,
     padded_lines,
@@ -32,6 +33,7 @@ from clsas.window import INTERVALS, BeamWindow
 
 _GROUP = 64  # work-items that share a subimage where each has one lane
 _MOST_GAIN = 3.0  # of frequencies, which are amplified where lines hold next to nothing
+_ON_TRACK = 1e-4  # wavelengths
 _LINES_AT_ONCE = 256  # upsampled together: what stays in a CPU's cache
 
 
@@ -109,6 +111,7 @@ def factorize(
             beam=chosen.beam,
             progress=progress,
         )
+    check_numbers(lines, chosen.beam)
     rows, columns = grid.shape
     pixels = np.empty(grid.shape, np.complex64)
     (height, width), done = chosen.sides[0], 0
@@ -161,12 +164,15 @@ class _Batch:
         Middles of the subimages from those of their roots, stage by stage.
     nodes : list of Nodes
     needs : list of Ranges
+    place : float64 [roots, channels]
+        Where the raw channels appear on the track.
     """
 
     root_m: NDArray[np.float64]
     relative_m: list[NDArray[np.float64]]
     nodes: list[Nodes]
     needs: list[Ranges]
+    place: NDArray[np.float64]
 
     def stride(self, level: int) -> int:
         """Return how many lines a subimage of a stage has at most."""
@@ -192,6 +198,12 @@ class _Run:
             self.along = tree.beam_directions(chosen.beam, lines, self.track, self.track.samples)
         self.phase_centres_m = phase_centres_m(lines)
         self.drift = drift(lines)
+        # The thesis's method has none; on the track itself there is nothing to make up for.
+        self.ramps = not chosen.nearest and (
+            not np.array_equal(lines.tx_m, lines.rx_m)
+            or np.abs(self.phase_centres_m - self.track.positions_m(self.track.place)).max()
+            > _ON_TRACK * lines.sound_speed_m_s / max(lines.carrier_hz, 1.0)
+        )
         self.levels = [
             _Level(half, -(-(2 * half + 1) // self.width) * self.width)
             for half in chosen.half_lengths
@@ -202,8 +214,8 @@ class _Run:
         }
         options = {"WIDTH": self.width, "TAPS": chosen.align.taps}
         options["APERTURE_TAPS"] = chosen.aperture.taps
-        self.first_stage = device.kernel("stage", "stage", GIVEN=1, **options)
-        self.later_stage = device.kernel("stage", "stage", GIVEN=0, **options)
+        self.first_stage = device.kernel("stage", "stage", GIVEN=1, RAMP=int(self.ramps), **options)
+        self.later_stage = device.kernel("stage", "stage", GIVEN=0, RAMP=0, **options)
         block_m = Tiles(grid, chosen.tile[0], self.width).block_radius_m
         fits = block_m * self.samples_per_m <= lookup_room(chosen.final.taps)
         last = {
@@ -286,7 +298,7 @@ class _Run:
         corners = [division.corners(level, roots) for level in range(len(self.levels))]
         centres_m = [division.centres_m(*each) for each in enumerate(corners)]
         root_m = centres_m[0][:, 0]
-        place = track.places_seen_from(root_m, self.phase_centres_m)
+        seen_at = place = track.places_seen_from(root_m, self.phase_centres_m)
         nodes = []
         if chosen.nearest:
             position_m = np.broadcast_to(self.phase_centres_m, (*place.shape, 3))
@@ -317,7 +329,7 @@ class _Run:
         seen = tree.seen_from(chosen.beam, track, self.along, centres_m[-1], half_m)
         inside = np.all(corners[-1] < self.grid.shape, axis=-1)
         needs = tree.ranges(division, nodes, seen, inside)
-        return _Batch(root_m, [each - root_m[:, None] for each in centres_m], nodes, needs)
+        return _Batch(root_m, [each - root_m[:, None] for each in centres_m], nodes, needs, seen_at)
 
     def _stage(self, batch: _Batch, level: int) -> None:
         """Form the lines of a stage from those of the one before, or from the raw ones."""
@@ -333,9 +345,10 @@ class _Run:
         slot.fill("aperture", _padded(nodes.weights, np.float32))
         if level == 0:
             kernel, parent, parent_pitch = self.first_stage, self.samples, self.pitch
-            for name, values in self._references(batch, shape.half).items():
+            references = self._references(batch, shape.half)
+            for name, values in references.items():
                 slot.fill(name, values)
-            geometry = [slot[name] for name in ("order", "start", "nu", "cycles")]
+            geometry = [slot[name] for name in references]
         else:
             kernel, before = self.later_stage, self.levels[level - 1]
             parent, parent_pitch = self.slots[level - 1]["lines"], before.pitch
@@ -354,7 +367,6 @@ class _Run:
                 self.samples_per_m,
                 self.cycles_per_m,
                 before.centre,
-                shape.half,
             ]
         slot.fill("children", children)
         items = _GROUP if self.width == 1 else 1
@@ -368,6 +380,7 @@ class _Run:
             slot["aperture"],
             _pitch(nodes.base.shape[1]),
             *geometry,
+            shape.half,
             self.filters["align"],
             slot.zeros("lines", 8 * roots * subimages * stride * shape.pitch),
             stride,
@@ -381,7 +394,7 @@ class _Run:
     def _references(self, batch: _Batch, half: int) -> dict[str, NDArray]:
         """Return how roots see the raw channels, in the order of their nodes.
 
-        First sample, place between samples, phase in cycles; all from float64.
+        First sample, place between samples, phase in cycles and its ramp; all from float64.
         """
         lines, resampling = self.lines, self.plan.resampling
         range_m = pairwise_range_m(
@@ -404,7 +417,16 @@ class _Run:
             "start": ordered(start, np.int32),
             "nu": ordered(place - lower - 0.5, np.float32),
             "cycles": ordered(cycles - np.rint(cycles), np.float32),
+            "ramp": ordered(self._ramp(batch), np.float32),
         }
+
+    def _ramp(self, batch: _Batch) -> NDArray[np.float64]:
+        """Return by how many cycles per sample the phase of channels grows beyond their place's."""
+        if not self.ramps:
+            return np.zeros_like(batch.place)
+        virtual_m = self.track.positions_m(batch.place)
+        stretch = stretches(self.lines, self.grid, batch.root_m, virtual_m)
+        return stretch * self.cycles_per_m / self.samples_per_m
 
     def _backproject(self, batch: _Batch, image: NDArray[np.complex64]) -> cl.Event:
         """Form the pixels of roots from their last stage, and start reading them."""

@@ -23,6 +23,7 @@ COST = {2: 0.75, 4: 1.0, 6: 1.3, 8: 1.55}
 _UPSAMPLINGCOST = 40.0
 _FREQUENCIES = 128
 _POSITIONS = 17
+_BLOCK_ROWS = 256
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,6 +115,11 @@ def measure_spectrum(lines: RangeLines, most_channels: int = 256) -> Spectrum:
     return Spectrum(centre, (edges[1:] + edges[:-1]) / 2, share)
 
 
+def cycles_per_m(lines: RangeLines, frequency: float) -> float:
+    """Return the phase per metre of range, cycles, at a frequency in cycles per sample."""
+    return lines.carrier_cycles_per_m + frequency / lines.range_step_m
+
+
 def design(taps: int, upsampling: float, spectrum: Spectrum) -> Interpolator:
     """Return the interpolator of least rms error for lines of a given spectrum.
 
@@ -155,7 +161,7 @@ def design(taps: int, upsampling: float, spectrum: Spectrum) -> Interpolator:
             solution = np.array([(0.5, 1.0)[part]])
         else:
             weighted = (matrix * share[..., None]).reshape(-1, matrix.shape[-1])
-            solution = lstsq(weighted, (wanted * share).ravel(), lapack_driver="gelsy")[0]
+            solution = _least_squares(weighted, (wanted * share).ravel())
         coefficients[:, part] = solution.reshape(taps // 2, taps // 2)
         residuals.append(matrix @ solution - wanted)
     # Turned back by the position it is the response less 1; its mean is real.
@@ -167,6 +173,19 @@ def design(taps: int, upsampling: float, spectrum: Spectrum) -> Interpolator:
         for e in (error, scatter)
     )
     return Interpolator(taps, upsampling, coefficients, error_db, scatter_db)
+
+
+def _least_squares(matrix: NDArray[np.float64], wanted: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the least-squares solution of a tall system.
+
+    Rows are condensed in blocks first, so small that LAPACK does not spread them over threads: on
+    a busy machine these wait for each other far longer than they work.
+    """
+    rows = np.column_stack([matrix, wanted])
+    rows = np.pad(rows, ((0, -len(rows) % _BLOCK_ROWS), (0, 0)))
+    blocks = rows.reshape(-1, _BLOCK_ROWS, rows.shape[1])
+    condensed = np.linalg.qr(blocks, mode="r").reshape(-1, rows.shape[1])
+    return lstsq(condensed[:, :-1], condensed[:, -1], lapack_driver="gelsy")[0]
 
 
 def choose(
@@ -259,6 +278,14 @@ class Resampling:
     def centre_cycles_per_sample(self) -> float:
         """Frequency made zero, cycles per (given) sample."""
         return self.shift_bins / self.fft_length
+
+    def samples_per_m(self, lines: RangeLines) -> float:
+        """Return the upsampled samples per metre of range."""
+        return self.ratio / lines.range_step_m
+
+    def cycles_per_m(self, lines: RangeLines) -> float:
+        """Return the phase per metre of range at the spectral centre, cycles."""
+        return cycles_per_m(lines, self.centre_cycles_per_sample)
 
     @property
     def frequency(self) -> NDArray[np.float64]:

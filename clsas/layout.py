@@ -151,16 +151,24 @@ class Groups:
         return image.reshape(self.grid.shape)
 
 
+def allowed(accuracy_db: float) -> float:
+    """Return what the geometry may add to an image's error: 6 % of its power, -90 dB at least."""
+    return max(GEOMETRY_ERROR, 10 ** ((accuracy_db - 12) / 20))
+
+
 def lay_out(
     grid: Grid,
     antennas_m: NDArray[np.float64],
     cycles_per_m: float,
     width: int,
     *,
+    error: float = GEOMETRY_ERROR,
     speed_ratio: float = 0.0,
     beam: BeamWindow | None = None,
 ) -> Tiles | Groups:
-    """Return how to divide a grid so that the geometry's share of the error stays below -90 dB.
+    """Return how to divide a grid so that the geometry's share of the error stays small.
+
+    That is below -90 dB in tiles, if there are such; else in tiles within `error`; else in groups.
 
     Parameters
     ----------
@@ -172,6 +180,8 @@ def lay_out(
         Phase per metre of range, cycles: two over the wavelength.
     width : int
         Float lanes per work-item.
+    error : float
+        Relative rms error that the geometry may add; see `allowed`.
     speed_ratio : float
         Speed of the fastest receiver over that of sound.
     beam : BeamWindow, optional
@@ -189,31 +199,56 @@ def lay_out(
     smallest tile is too large, near the antennas, and off a plane, pixels go into groups, which
     expand nothing.
     """
-    if grid.is_planar:
-        tree = KDTree(antennas_m)
-        window_sine = np.inf if beam is None else np.ptp(np.clip(beam.limits, -1, 1))
-        for side in _SIDES:
-            tiles = Tiles(grid, side, width)
-            nearest = tree.query(tiles.centres_m(slice(None)))[0].min()
-            nearest = max(nearest, 1e-30)
-            remainder_m = 0.15 * tiles.radius_m**4 / (8 * nearest**3)
-            remainder_m += 0.04 * tiles.block_radius_m**3 / nearest**2
-            remainder_m += 0.2 * speed_ratio * tiles.radius_m**3 / nearest**2
-            rounding = _FLOAT32_ERROR * cycles_per_m * tiles.radius_m
-            error = np.hypot(2 * np.pi * cycles_per_m * remainder_m, rounding)
-            block_error = 0.0
-            if beam is not None:
-                block_error = beam.block_error(tiles.block_radius_m / nearest)
-            sine_error = 0.1 * (tiles.radius_m / nearest) ** 4
-            if (
-                error <= GEOMETRY_ERROR
-                and sine_error <= max(1e-6 * window_sine, 1e-7)
-                and block_error <= GEOMETRY_ERROR
-            ):
-                return tiles
+    found = tiles(
+        grid, antennas_m, cycles_per_m, width, error=error, speed_ratio=speed_ratio, beam=beam
+    )
+    if found is not None:
+        return found
+    return _group(grid, largest_radius_m(cycles_per_m), width)
+
+
+def tiles(
+    grid: Grid,
+    antennas_m: NDArray[np.float64],
+    cycles_per_m: float,
+    width: int,
+    *,
+    error: float = GEOMETRY_ERROR,
+    speed_ratio: float = 0.0,
+    beam: BeamWindow | None = None,
+) -> Tiles | None:
+    """Return the tiles that `lay_out` makes, None where it makes groups."""
+    if not grid.is_planar:
+        return None
+    tree = KDTree(antennas_m)
+    window_sine = np.inf if beam is None else np.ptp(np.clip(beam.limits, -1, 1))
+    tried = []
+    for side in _SIDES:
+        shape = Tiles(grid, side, width)
+        nearest = max(tree.query(shape.centres_m(slice(None)))[0].min(), 1e-30)
+        remainder_m = 0.15 * shape.radius_m**4 / (8 * nearest**3)
+        remainder_m += 0.04 * shape.block_radius_m**3 / nearest**2
+        remainder_m += 0.2 * speed_ratio * shape.radius_m**3 / nearest**2
+        rounding = _FLOAT32_ERROR * cycles_per_m * shape.radius_m
+        phase_error = np.hypot(2 * np.pi * cycles_per_m * remainder_m, rounding)
+        block_error = 0.0
+        if beam is not None:
+            block_error = beam.block_error(shape.block_radius_m / nearest)
+        sine_error = 0.1 * (shape.radius_m / nearest) ** 4
+        tried.append((shape, max(phase_error, block_error), sine_error))
+    # Where the finest takes groups, tiles as fine as is wanted are much faster.
+    for most in (GEOMETRY_ERROR, error):
+        most_sine = max(max(1e-6, most**2) * window_sine, 1e-7)
+        for shape, shape_error, sine_error in tried:
+            if shape_error <= most and sine_error <= most_sine:
+                return shape
+    return None
+
+
+def largest_radius_m(cycles_per_m: float) -> float:
+    """Return how far from a group's centre float32 allows its pixels to lie."""
     with np.errstate(divide="ignore"):
-        largest_radius_m = GEOMETRY_ERROR / _FLOAT32_ERROR / np.float64(cycles_per_m)
-    return _group(grid, largest_radius_m, width)
+        return GEOMETRY_ERROR / _FLOAT32_ERROR / np.float64(cycles_per_m)
 
 
 def _group(grid: Grid, largest_radius_m: float, width: int) -> Groups:

@@ -33,7 +33,7 @@ from clsas.grid import Grid
 from clsas.image import Image
 from clsas.lines import RangeLines
 from clsas.plan import Plan, grid_digest
-from clsas.planner import plan
+from clsas.planner import checked_pairs, plan, tolerance_in_db
 from clsas.store import Record, Store
 from clsas.survey import Survey, files_of, has_ended, largest_gap_m, open_files, open_survey
 from clsas.window import MOST_TRACK_PINGS, BeamWindow, touches_rectangles
@@ -135,17 +135,21 @@ class Mosaic:
         ValueError
             What imaging one patch raises, with its place.
         """
+        survey, sight = self._survey, _Sight.of(self._survey, self._job.beam)
         todo = [place for place in np.ndindex(self.shape) if place not in self.finished]
-        survey, formed_from = self._survey, {}
+        formed_from: dict[tuple[int, int], int] = {}  # channels that the survey had
         ended = self._idle_s is None or has_ended(self._source)
         last_news = time.monotonic()
-        executor = self._executor(min(len(self._devices), max(len(todo), 1)))
+        workers = min(len(self._devices), max(len(todo), 1))
+        # One more than can work: what waits to be taken is held in memory. A cluster holds records.
+        most = len(self) if self._client is not None else workers + 1
+        executor = self._executor(workers)
         running: dict[Future, tuple[int, int]] = {}
         try:
-            sight = _Sight.of(survey, self._job.beam)
             ready = self._ready(todo, sight, ended)
             while True:
-                for place in ready:
+                for place in ready[: max(most - len(running), 0)]:
+                    ready.remove(place)
                     todo.remove(place)
                     job = replace(self._job, paths=_paths(survey), lines=_in_memory(survey))
                     running[executor.submit(_form, job, *self._window(*place))] = place
@@ -158,9 +162,7 @@ class Mosaic:
                     return_when=FIRST_COMPLETED,
                 )
                 for future in done:
-                    place = running.pop(future)
-                    yield self._finished(place, *future.result())
-                ready = []
+                    yield self._finished(running.pop(future), *future.result())
                 if ended:
                     continue
                 last = has_ended(self._source)  # asked before looking: nothing comes after it
@@ -168,7 +170,7 @@ class Mosaic:
                 if len(paths) > len(survey.parts):
                     survey = open_files(paths, survey)
                     sight, last_news = _Sight.of(survey, self._job.beam), time.monotonic()
-                    # Patches that channels saw which came later than they were formed.
+                    # Patches that channels see which came after they were formed.
                     todo += [
                         place
                         for place, channels in formed_from.items()
@@ -305,6 +307,9 @@ def mosaic(
     if len(wish) > 1:
         raise ValueError(f"at most one of {', '.join(WISHES)} must be given, got {wish}")
     wish = wish or {"tolerance_db": _TOLERANCE_DB}
+    tolerance_in_db(tolerance_db, tolerance_wavelengths)
+    if stages is not None:
+        checked_pairs(stages)
     if accuracy_db is not None:
         validate.number("accuracy_db", accuracy_db, "dB", least=BEST_ACCURACY_DB, below=0.0)
     if beam is not None:

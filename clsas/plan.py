@@ -190,7 +190,7 @@ class Plan:
         if self.tolerance_db is None:
             wish = "stages as given, nearest beam" if self.sides else "no stage, as given"
         else:
-            wish = f"tolerance {self.tolerance_db:g} dB"
+            wish = f"tolerance {self.tolerance_db:.4g} dB"
         lines = [
             f"Plan: {wish}; predicted error {self.predicted_error_db:.1f} dB, "
             f"{_seconds(self.predicted_seconds)} on {self.device} "

@@ -206,6 +206,7 @@ def tradeoff(measured: Tradeoff, *, title: str = "") -> Figure:
     front = [(row.error_db, row.seconds) for row in measured.front]
     axes.plot(*zip(*front, strict=True), color="0.7", linewidth=1.5, zorder=1, label="Pareto front")
     for method, color, marker, label in (
+        ("study", "0.75", ".", "the same with other taps and stages"),
         ("tolerance", "tab:blue", "o", "to a tolerance"),
         ("stages", "tab:orange", "s", "thesis's method: stages of QR x QI"),
         ("exact", "black", "D", "exact"),
@@ -218,7 +219,8 @@ def tradeoff(measured: Tradeoff, *, title: str = "") -> Figure:
             axes.plot(errors_db[1:], seconds[1:], marker, color=color, fillstyle="none")
             axes.plot(errors_db[:1], seconds[:1], marker, color=color, label=label)
             label = ""  # one entry in the legend
-        _label_beside(axes, rows, color)
+        if method != "study":
+            _label_beside(axes, rows, color)
     axes.plot([], [], "o", color="0.5", fillstyle="none", label="predicted (hollow)")
     axes.set(
         yscale="log",

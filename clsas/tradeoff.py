@@ -10,6 +10,7 @@ import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import product
 
 import numpy as np
 
@@ -17,6 +18,7 @@ from clsas import validate
 from clsas.backproject import backproject
 from clsas.device import Device, open_device
 from clsas.factorize import factorize
+from clsas.filters import ALIGN_TAPS, APERTURE_TAPS
 from clsas.grid import Grid
 from clsas.image import Image
 from clsas.io import replacing
@@ -29,6 +31,10 @@ from clsas.window import BeamWindow
 TOLERANCES_DB = (-20.0, -30.0, -40.0, -50.0, -60.0, -70.0)
 STAGES = (*(((2, 2),) * count for count in range(1, 6)), ((2, 4),) * 2)
 """Plans of THESIS chapter 4 that are shown: 1 to 5 stages of 2 x 2, and 2 of QR = 2, QI = 4."""
+
+STUDIED_TAPS = tuple(product(ALIGN_TAPS, APERTURE_TAPS))
+STUDIED_DEPTHS = (1, 2, 3, 4)
+"""Taps in range and along the aperture, and numbers of stages, of a study."""
 
 EXACT_DB = -60.0
 """Accuracy of the exact image that is timed, unless a tolerance is tighter."""
@@ -70,9 +76,10 @@ class Row:
     Attributes
     ----------
     label : str
-        The tolerance, the stages given ("3 of 2x2"), or "exact".
+        The tolerance, the stages given ("3 of 2x2"), "exact", or of a study tolerance, taps in
+        range and along the aperture, and stages ("-50 dB, 8+6 taps, 3 stages").
     method : str
-        "tolerance", "stages" or "exact".
+        "tolerance", "study", "stages" or "exact".
     plan : str
         How it was divided, and with which filters.
     plan_seconds : float
@@ -113,7 +120,7 @@ class Tradeoff:
     repeats : int
         Runs of which `seconds` are medians.
     rows : tuple of Row
-        By tolerance, by stages, and the exact image last.
+        By tolerance, of a study, by stages, and the exact image last.
     """
 
     device: str
@@ -140,7 +147,7 @@ class Tradeoff:
 
     def describe(self) -> str:
         """Return a table of all rows; resolutions are shown over those of the exact image."""
-        names = ("", "time (s)", "predicted", "speedup", "error (dB)", "predicted")
+        names = ("", "time (s)", "predicted (s)", "speedup", "error (dB)", "predicted (dB)")
         names += ("azimuth", "range", "azimuth PSLR", "range PSLR")
         table = [names]
         for row in self.rows:
@@ -210,6 +217,7 @@ def tradeoff(
     beam: BeamWindow | None = None,
     device: Device | str | int | None = None,
     repeats: int = 3,
+    study: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> Tradeoff:
     """Form one image in many ways; measure how long each takes and how much it errs.
@@ -234,6 +242,9 @@ def tradeoff(
         See `clsas.device.choose`.
     repeats : int
         Timed runs of each.
+    study : bool
+        Also form the image, for every tolerance, with all of `STUDIED_TAPS` and `STUDIED_DEPTHS`
+        that can keep to it: what the planner chooses from. That takes long.
     progress : callable, optional
         Called as progress(images done, images).
 
@@ -257,6 +268,11 @@ def tradeoff(
     device = open_device(device)
     tolerances_db = np.atleast_1d(tolerances_db).tolist()
     wishes: list[dict] = [{"tolerance_db": tolerance_db} for tolerance_db in tolerances_db]
+    if study:
+        wishes += [
+            {"tolerance_db": tolerance_db, "taps": taps, "depth": depth}
+            for tolerance_db, taps, depth in product(tolerances_db, STUDIED_TAPS, STUDIED_DEPTHS)
+        ]
     wishes += [
         {"stages": given} for given in (_feasible(lines, grid, beam) if stages is None else stages)
     ]
@@ -264,6 +280,8 @@ def tradeoff(
     for wish in wishes:
         start = time.perf_counter()
         chosen = plan(lines, grid, **wish, beam=beam, device=device)
+        if "taps" in wish and chosen.is_exact:
+            continue  # these cannot keep to it
         row = _row(*_name(wish), chosen, time.perf_counter() - start)
         ways.append((row, partial(factorize, lines, grid, chosen, device=device)))
     accuracy_db = min([EXACT_DB, *tolerances_db])
@@ -337,6 +355,10 @@ def _feasible(
 
 def _name(wish: dict) -> tuple[str, str]:
     """Return label and method: "-50 dB", "3 of 2x2" for equal stages, "2x2,4x2" for others."""
+    if "taps" in wish:
+        (in_range, along), depth = wish["taps"], wish["depth"]
+        taps = f"{in_range}+{along} taps, {depth} stage{'s' * (depth > 1)}"
+        return f"{wish['tolerance_db']:g} dB, {taps}", "study"
     if "stages" not in wish:
         return f"{wish['tolerance_db']:g} dB", "tolerance"
     each = [f"{beams}x{divisions}" for beams, divisions in wish["stages"]]

@@ -213,9 +213,9 @@ class BeamWindow:
     def directions(self, lines: RangeLines) -> NDArray[np.float64]:
         """Return the unit direction of the track for every channel, float64 [channels, 3].
 
-        That is `along`, or from the lines the tangent of local cubics, least-squares fits to the
-        phase centres of `track_pings` pings each. Successive channels of one transmitter position
-        are a ping.
+        That is `along`, or from the lines the tangent, next to each phase centre, of local cubics:
+        least-squares fits to the phase centres of `track_pings` pings each. Successive channels of
+        one transmitter position are a ping.
 
         Raises
         ------
@@ -252,7 +252,15 @@ class BeamWindow:
         extent_m = np.linalg.norm(np.ptp(centres_m, axis=0))
         if not speed.min() > 1e-3 * extent_m / pings:
             raise ValueError("along must be given: the lines' phase centres stand still")
-        return (tangent / speed[:, None])[np.cumsum(new) - 1]
+        tangent /= speed[:, None]
+        # Of an array, a channel ahead of its ping's middle lies where later pings are.
+        ping = np.cumsum(new) - 1
+        steps_m = np.linalg.norm(np.diff(centres_m, axis=0), axis=1)
+        covered_m = np.concatenate([[0.0], np.cumsum(steps_m)])
+        ahead_m = (lines.tx_m + lines.rx_m) / 2 - centres_m[ping]
+        place_m = covered_m[ping] + np.einsum("ci,ci->c", ahead_m, tangent[ping])
+        found = np.stack([np.interp(place_m, covered_m, each) for each in tangent.T], axis=-1)
+        return found / np.linalg.norm(found, axis=1, keepdims=True)
 
     def _inside(self, q: NDArray[np.float64], wavelength_m: float) -> NDArray[np.float64]:
         """Return the weights as if the window had no end."""

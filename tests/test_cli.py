@@ -143,11 +143,11 @@ def test_the_dial(made, tmp_path):
         assert clsas.relative_error_db(image, exact) < worst_db, args
         assert result["method"] in ("exact", "factorized")
         assert result["plan_seconds"] > 0
-    result, image = image_of(made, tmp_path, "--stages", "2x2,2X2")
+    result, image = image_of(made, tmp_path, "--stages", "2x4,2X4")
     assert result["method"] == "stages"
     assert result["predicted_seconds"] > 0
     lines = clsas.load(made[0] / "lines.h5")
-    plan = clsas.plan(lines, exact.grid, stages=[(2, 2), (2, 2)])
+    plan = clsas.plan(lines, exact.grid, stages=[(2, 4), (2, 4)])
     assert result["predicted_error_db"] == pytest.approx(plan.predicted_error_db)
     by_library = clsas.factorize(lines, exact.grid, plan)
     assert clsas.relative_error_db(image, by_library) < -100
@@ -163,7 +163,30 @@ def test_a_plan_that_is_exact_is_as_accurate_as_asked_for(made, tmp_path):
     result = run_json("image", made[0] / "lines.h5", *few, "-o", output)
     assert result["method"] == "exact"
     assert result["interpolation_error_db"] < -70
-    assert "planned in " in run("image", made[0] / "lines.h5", *few, "-o", output)[0]
+    text, _ = run("image", made[0] / "lines.h5", *few, "-o", output)
+    assert "planned in " in text
+    assert "(exact: nothing faster within -70 dB; " in text
+
+
+def test_stages_that_leave_no_image_are_a_warning(made, tmp_path):
+    scene = ("--scene", made[0] / "scene.toml")
+    for command in (("image", "-o", tmp_path / "image.h5"), ("plan",)):
+        args = (command[0], made[0] / "lines.h5", *scene, *command[1:])
+        _, stderr = run(*args, "--stages", "16x2")
+        assert re.fullmatch(
+            r"Warning: with these stages the error .* -?\d+ dB, too large.*\n", stderr
+        )
+        assert run(*args, "--stages", "2x16")[1] == ""
+
+
+def test_an_element_for_the_inverse_beam(made, tmp_path):
+    """Options make the window that the library makes of them."""
+    exact = clsas.load(made[0] / "image.h5")
+    shape = ("--beam-deg", 5, "--beam-shape", "inverse", "--element-length-m", 0.03)
+    _, image = image_of(made, tmp_path, "--exact", *shape)
+    beam = clsas.BeamWindow(5.0, "inverse", element_length_m=0.03)
+    expected = clsas.backproject(clsas.load(made[0] / "lines.h5"), exact.grid, beam=beam)
+    assert clsas.relative_error_db(image, expected) < -100
 
 
 def test_a_beam_from_the_command_line(made, tmp_path):
@@ -246,7 +269,11 @@ def test_tradeoff_of_a_built_in_case(monkeypatch):
 def test_calibrate(monkeypatch):
     measured = costs.Costs(pixel_ns=0.7)
     monkeypatch.setattr("clsas.calibrate.calibrate", lambda device, progress: measured)
+    assert not run_json("calibrate", "--device", 0)["stored"]
+    assert ", not stored in " in run("calibrate", "--device", 0)[0]
+    monkeypatch.setattr(costs, "load", lambda device: measured)
     result = run_json("calibrate", "--device", 0)
+    assert result["stored"]
     assert result["costs"]["pixel_ns"] == 0.7
     assert result["file"] == str(costs.path())
     text, _ = run("calibrate", "--device", 0)
@@ -336,10 +363,13 @@ FIXED = ["--taps", "4", "--upsampling", "2"]
         (["simulate", "grid.toml", "-o", "new.h5"], 1, "grid.toml: missing table [sonar]"),
         (["compress", "echoes.h5", "-o", "new.h5", "--window", "bay"], 1, "bay"),
         (["compress", "echoes.h5", "-o", "new.h5", "--oversampling", "0.5"], 1, "oversampling"),
-        (["image", "lines.h5", *GRID, "-o", "new.h5", "--taps", "3"], 1, "taps must be one of"),
-        (["image", "lines.h5", *GRID, "-o", "new.h5", "--accuracy-db", "3"], 1, "accuracy_db must"),
+        (["image", "lines.h5", *GRID, "-o", "new.h5", "--taps", "3"], 2, "taps must be one of"),
+        (["image", "lines.h5", *GRID, "-o", "new.h5", "--accuracy-db", "3"], 2, "accuracy_db must"),
+        (["image", "lines.h5", *GRID, "-o", "new.h5", "--upsampling", "0"], 2, "upsampling must"),
         (["image", "lines.h5", *GRID, "-o", "new.h5", "--device", "abacus"], 1, "'abacus'"),
-        (["image", "lines.h5", "--x", "0:1:0", *GRID[2:], "-o", "new.h5"], 1, "x count must be"),
+        (["image", "lines.h5", "--x", "0:1:0", *GRID[2:], "-o", "new.h5"], 2, "START:STOP:N"),
+        (["image", "lines.h5", "--x", "0:nan:9", *GRID[2:], "-o", "new.h5"], 2, "START:STOP:N"),
+        (["plan", "lines.h5", *GRID, "--z", "inf"], 2, "z must be finite m, got inf"),
         (["quality", "image.h5", "--near", "9,9"], 1, "near must be inside the image"),
         (["quality", "image.h5", "--near", "0,20", "--search-m", "-1"], 1, "search_m must be"),
         (["simulate", "none.toml", "-o", "new.h5"], 2, "'none.toml' does not exist"),
@@ -352,7 +382,7 @@ FIXED = ["--taps", "4", "--upsampling", "2"]
         (["compress", "echoes.h5", "--png", "new", "-o", "new"], 2, "must be two files"),
         (
             ["image", "lines.h5", *GRID, "-o", "new.h5", "--png", "a", "--dynamic-range-db", "-5"],
-            1,
+            2,
             "dynamic_range_db must be finite and > 0 dB, got -5",
         ),
         (
@@ -383,12 +413,22 @@ FIXED = ["--taps", "4", "--upsampling", "2"]
         (["plan", "lines.h5", *GRID, "--stages", "2x2,2"], 2, "'2x2,2' must be QRxQI for every"),
         (["plan", "lines.h5", *GRID, "--stages", "1x9"], 1, "stages must leave a line and a pixel"),
         (["plan", "lines.h5", *GRID, "--tolerance-wavelengths", "1/0"], 2, "a fraction such as"),
-        (["plan", "lines.h5", *GRID, "--tolerance-db", "-100"], 1, "tolerance_db must be finite"),
+        (["plan", "lines.h5", *GRID, "--tolerance-db", "-100"], 2, "tolerance_db must be finite"),
+        (["plan", "lines.h5", *GRID, "--tolerance-db", "nan"], 2, "and <= -10 dB, got nan"),
+        (["tradeoff", "lines.h5", *GRID, "--tolerance-db", "-9"], 2, "dB, got -9"),
+        (["plan", "lines.h5", *GRID, "--tolerance-wavelengths", "9"], 2, "wavelengths, got 9"),
+        (["plan", "lines.h5", *GRID, "--stages", "2x0"], 2, "'2x0' must be QRxQI for every"),
         (["plan", "lines.h5", *GRID, "--squint-deg", "3"], 2, "go with --beam-deg"),
-        (["plan", "lines.h5", *GRID, "--beam-deg", "-3"], 1, "width_deg must be finite"),
+        (["plan", "lines.h5", *GRID, "--element-length-m", "1"], 2, "go with --beam-deg"),
+        (
+            ["plan", "lines.h5", *GRID, "--beam-deg", "9", "--beam-shape", "inverse"],
+            2,
+            "element_length_m must be given for the shape 'inverse'",
+        ),
+        (["plan", "lines.h5", *GRID, "--beam-deg", "-3"], 2, "width_deg must be finite"),
         (["plan", "lines.h5"], 2, "a grid is needed: --scene, or --x and --y"),
         (["tradeoff", *GRID], 2, "either LINES.H5 or --case is needed"),
-        (["tradeoff", "lines.h5", "--case", "bp-thesis"], 2, "either LINES.H5 or --case is needed"),
+        (["tradeoff", "lines.h5", "--case", "bp-thesis"], 2, "--case has its own lines: LINES.H5"),
         (["tradeoff", "--case", "bp-nothing"], 2, "'bp-nothing' is not one of bp-thesis, "),
         (["tradeoff", "--case", "bp-thesis", *GRID], 2, "--case has its own grid"),
         (["tradeoff", "lines.h5", *GRID, "--csv", "new", "--png", "new"], 2, "must be two files"),

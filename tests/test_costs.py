@@ -1,13 +1,16 @@
 import dataclasses
 import json
 
+import numpy as np
 import pytest
+from test_factorize import around, over
 
 from clsas import costs
 from clsas.costs import Costs
 from clsas.device import open_device
 from clsas.lines import RangeLines
 from clsas.planner import plan
+from clsas.window import BeamWindow
 
 
 @pytest.fixture
@@ -90,3 +93,30 @@ def test_a_plan_asks_for_what_is_stored(cache):
     stored = plan(lines, grid, tolerance_db=-40)
     given = plan(lines, grid, tolerance_db=-40, costs=EXACT_IS_SLOW)
     assert stored.to_json() == given.to_json()
+
+
+@pytest.mark.parametrize("beam", [None, BeamWindow(30, "hann")], ids=["all", "beam"])
+def test_what_an_exact_image_takes(beam):
+    """Something for the call, and more for more channels and pixels, and off the plane."""
+    lines, grid = over(around(0, 40, shape=(64, 64)))
+
+    def seconds(lines, grid):
+        return plan(lines, grid, stages=[], beam=beam, costs=Costs()).predicted_seconds
+
+    few = seconds(lines.select(slice(290, 310)), grid)
+    assert few > 1e-9 * Costs().call_ns
+    whole = seconds(lines, grid)
+    wide, _ = over(around(0, 40, shape=(256, 256)))
+    assert few < whole < seconds(wide, around(0, 40, shape=(256, 256)))
+    assert whole < seconds(lines, grid.with_height(np.zeros(grid.shape)))
+
+
+def test_a_beam_costs_what_it_is_told_to():
+    lines, grid = over(around(0, 40))
+    sees_all = BeamWindow(150, "hann")
+    dear, free = (
+        plan(lines, grid, stages=[], beam=sees_all, costs=Costs(beam_ns=beam_ns)).predicted_seconds
+        for beam_ns in (1.0, 0.0)
+    )
+    pixels = (dear - free) / 1e-9 / lines.channels
+    assert grid.size <= pixels * (1 + 1e-9) <= 192 * 192 * (1 + 1e-6)  # padded to whole tiles

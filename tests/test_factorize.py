@@ -21,7 +21,7 @@ from clsas.simulate import simulate_lines
 from clsas.validate import ClsasWarning
 from clsas.window import BeamWindow
 
-EXACT_IS_SLOW = Costs(pixel_ns=1e3)
+EXACT_IS_SLOW = Costs(pixel_ns=1e3, point_ns=1e3)
 """Plans for small images divide them only if nothing else is fast."""
 
 SPEED = 1500.0

@@ -3,10 +3,24 @@ import json
 
 import numpy as np
 import pytest
-from test_factorize import BEAMS, EXACT_IS_SLOW, around, made, over, planned, straight, swaying
+from test_factorize import (
+    BEAMS,
+    EXACT_IS_SLOW,
+    around,
+    made,
+    moving_array,
+    over,
+    peak_device_bytes,
+    planned,
+    straight,
+    swaying,
+)
 
+from clsas.backproject import backproject
+from clsas.grid import Grid
 from clsas.plan import Plan, grid_digest, lines_digest
 from clsas.planner import plan
+from clsas.window import BeamWindow
 
 
 @pytest.fixture(scope="module")
@@ -153,6 +167,12 @@ def test_it_describes_itself(chosen):
     assert len({len(line) for line in table}) == 1  # columns that line up
 
 
+@pytest.mark.parametrize(("asked", "told"), [(-12.338089, "-12.34 dB"), (-50.5, "-50.5 dB")])
+def test_a_tolerance_is_told_sensibly(chosen, asked, told):
+    text = dataclasses.replace(chosen, tolerance_db=asked).describe()
+    assert f"tolerance {told};" in text
+
+
 def test_given_stages_describe_themselves(given_stages):
     text = given_stages.describe()
     assert "stages as given" in text
@@ -163,6 +183,23 @@ def test_plain_backprojection_says_so(exact):
     assert "Plain backprojection" in exact.describe()
     # Nobody asked for a tolerance.
     assert "nearest beam" not in exact.describe()
+
+
+@pytest.mark.parametrize("beam", [None, BeamWindow(8, "hann", normalise=True)], ids=str)
+@pytest.mark.parametrize("case", [straight, moving_array, "points", "one pixel", "few channels"])
+def test_device_memory_of_plain_backprojection(monkeypatch, case, beam):
+    if case == "points":
+        lines, grid = over(Grid.points(around(0, 40).positions_m()))
+    elif callable(case):
+        lines, grid = made(case)
+    else:
+        lines, grid = over(around(0, 40, shape=(1, 1) if case == "one pixel" else (150, 160)))
+        lines = lines.select(slice(100, 220)) if case == "few channels" else lines
+    planned = plan(lines, grid, stages=[], beam=beam).memory_bytes
+    peak = peak_device_bytes(
+        monkeypatch, lambda: backproject(lines, grid, accuracy_db=-60, beam=beam)
+    )
+    assert 0.5 * planned <= peak <= 1.01 * planned
 
 
 # Digests

@@ -1,4 +1,5 @@
 import dataclasses
+import re
 
 import numpy as np
 import pytest
@@ -127,6 +128,61 @@ def test_given_stages_are_those_given():
     assert [stage.channels for stage in chosen.stages] == [150, 50, 50]
 
 
+@pytest.mark.parametrize("taps", [(4, 8), (8, 4)])
+@pytest.mark.parametrize("depth", [1, 2])
+def test_taps_and_depth_for_study(taps, depth):
+    """Filters and stages are those told, also where the exact image is faster."""
+    costs = Costs(pixel_ns=1e-3, part_ns=0.0)
+    assert plan(*made(straight), tolerance_db=-30, costs=costs).is_exact
+    chosen = plan(*made(straight), tolerance_db=-30, taps=taps, depth=depth, costs=costs)
+    assert (chosen.align.taps, chosen.aperture.taps) == taps
+    assert len(chosen.sides) == depth
+    assert chosen.predicted_error_db <= -30
+    assert chosen.predicted_seconds > chosen.exact_seconds
+
+
+def test_given_taps_are_no_faster_than_the_planners_choice():
+    best = plan(*made(straight), tolerance_db=-40, costs=EXACT_IS_SLOW)
+    for taps in ((4, 4), (6, 8), (8, 6)):
+        chosen = plan(*made(straight), tolerance_db=-40, taps=taps, costs=EXACT_IS_SLOW)
+        assert chosen.predicted_seconds >= best.predicted_seconds
+
+
+# Memory
+
+
+@pytest.mark.parametrize("costs", [EXACT_IS_SLOW, Costs(pixel_ns=1e-3, part_ns=0.0)])
+@pytest.mark.parametrize("beam", [None, BEAMS[0]], ids=["all", "beam"])
+def test_memory_decides_whatever_things_cost(costs, beam):
+    """What fits is taken, also if it is slower; and else the least that does is named."""
+    lines, grid = over(around(0, 40, shape=(600, 700)))
+    wish = {"tolerance_db": -40, "beam": beam, "costs": costs}
+    plain = plan(lines, grid, stages=[], beam=beam, costs=costs)
+    little = plan(lines, grid, memory_bytes=plain.memory_bytes // 2, **wish)
+    assert not little.is_exact
+    assert little.memory_bytes <= plain.memory_bytes // 2
+    with pytest.raises(ValueError, match=r"memory_bytes must be at least .* MiB") as refused:
+        plan(lines, grid, memory_bytes=1 << 20, **wish)
+    (named,) = re.findall(r"at least ([\d.]+) MiB", str(refused.value))
+    enough = int(float(named) * 2**20)
+    assert plan(lines, grid, memory_bytes=enough, **wish).memory_bytes <= enough
+    with pytest.raises(ValueError, match="memory_bytes must be at least"):
+        plan(lines, grid, memory_bytes=int(0.8 * enough), **wish)
+
+
+@pytest.mark.parametrize("kind", ["stages", "points"])
+def test_plain_backprojection_may_need_too_much_as_well(kind):
+    grid = around(0, 40)
+    lines, _ = over(grid if kind == "stages" else (grid := Grid.points(grid.positions_m())))
+    wish = {"stages": []} if kind == "stages" else {"tolerance_db": -40}
+    needed = plan(lines, grid, **wish).memory_bytes
+    assert plan(lines, grid, memory_bytes=needed, **wish).is_exact
+    with pytest.raises(ValueError, match="memory_bytes must be") as refused:
+        plan(lines, grid, memory_bytes=needed // 2, **wish)
+    (named,) = re.findall(r"at least ([\d.]+) MiB", str(refused.value))
+    assert needed / 2**20 <= float(named) < needed / 2**20 + 0.1
+
+
 # Bad input
 
 
@@ -202,11 +258,23 @@ def test_bad_wishes_are_named(good, argument, value, error, says):
         ("beam", 20.0, TypeError, "beam must be .*BeamWindow.*float"),
         ("device", 1.5, TypeError, "device must be .*1.5"),
         ("costs", 5, TypeError, "costs must be .*Costs.*int"),
+        ("memory_bytes", 0, ValueError, "memory_bytes must be at least 1, got 0"),
+        ("memory_bytes", 1e9, TypeError, "memory_bytes must be a whole number"),
+        ("taps", 6, TypeError, "taps must be two, in range and along the aperture, got 6"),
+        ("taps", (6, 2), ValueError, "taps must be one of 4, 6, 8, got 2"),
+        ("depth", 6, ValueError, "depth must be one of 1, 2, 3, 4, 5, got 6"),
+        ("depth", 2.5, TypeError, "depth must be a whole number"),
     ],
 )
 def test_bad_arguments_are_named(good, argument, value, error, says):
     with pytest.raises(error, match=says):
         plan(**(good | {argument: value}), tolerance_db=-40)
+
+
+@pytest.mark.parametrize("study", [{"taps": (4, 4)}, {"depth": 2}])
+def test_taps_and_depth_go_with_a_tolerance(good, study):
+    with pytest.raises(ValueError, match="taps and depth go with a tolerance"):
+        plan(**good, stages=[(2, 2)], **study)
 
 
 def test_stages_off_a_plane_are_refused(good):

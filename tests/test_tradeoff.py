@@ -67,6 +67,18 @@ def test_every_way_is_measured_against_the_exact_image(lines):
     assert exact.azimuth.resolution_m == pytest.approx(0.443 * 1.5e-3 * 40.3 / 1.65, rel=0.03)
 
 
+def test_a_study_sweeps_what_the_planner_chooses_from(lines):
+    measured = clsas.tradeoff(lines, GRID, tolerances_db=(-40,), stages=(), repeats=1, study=True)
+    studied = [row for row in measured.rows if row.method == "study"]
+    assert measured.rows[0].method == "tolerance"
+    labels = {row.label for row in studied}
+    assert len(labels) == len(studied) > 9
+    assert "-40 dB, 8+6 taps, 2 stages" in labels
+    assert "-40 dB, 4+4 taps, 1 stage" in labels
+    assert all(row.error_db <= -39 for row in studied)
+    assert any("8 taps in range" in row.plan and "6 along" in row.plan for row in studied)
+
+
 def test_a_beam_counts_in_every_image(lines):
     beam = clsas.BeamWindow(1.0, "hann")
     narrow = clsas.tradeoff(lines, GRID, tolerances_db=(-40,), stages=(), beam=beam, repeats=1)
@@ -125,6 +137,8 @@ def test_table():
         *("1.100", "1.000", "-12.0", "-13.2"),
     ]
     assert len(table) == 1 + len(MADE.rows)
+    names = [cell.strip() for cell in table[0] if cell.strip()]
+    assert len(set(names)) == len(names)
     assert len({len(line) for line in MADE.describe().splitlines()}) == 1
 
 

@@ -1,0 +1,207 @@
+"""What a factorized image errs by besides its filters: its roots, nodes and leaves."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsas.aperture import drift, phase_centres_m, stretches
+from clsas.backproject import wavelength_m
+from clsas.device import Device
+from clsas.geometry import pairwise_range_m
+from clsas.interpolation import Interpolator
+from clsas.layout import BLOCKS
+from clsas.nearest import stage_errors_m
+from clsas.tree import interpolated_directions, interpolated_nodes
+from clsas.view import View
+from clsas.window import sines
+
+_FLOAT32 = 4.5e-8  # rms error of a phase in the stages over the phase across a root: measured
+_CHANNELS, _PLACES, _PIXELS = 256, 300, 24  # at which errors are evaluated
+_SOME_SPOTS = 6  # one in so many of the spots, there
+
+
+def power(error_db: float) -> float:
+    """Return the power of a relative rms error."""
+    return 10 ** (error_db / 10)
+
+
+def in_db(power: float) -> float:
+    """Return a relative rms error from its power."""
+    return 10 * math.log10(max(power, 1e-30))
+
+
+def leaf_error(view: View, sides: NDArray[np.int64], device: Device) -> NDArray[np.float64]:
+    """Return the power of the error that expanding leaves of some sizes adds.
+
+    See `layout.lay_out`: the fourth order of a tile, and the third within a block. In long leaves
+    the former is 0.35 of the largest rms.
+    """
+    steps_m = np.linalg.norm(view.steps_m, axis=1)
+    radius_m = np.hypot(*(sides * steps_m).T) / 2
+    block_m = np.hypot(*(np.array(BLOCKS[device.info.width]) * steps_m)) / 2
+    nearest_m = np.maximum(view.nearest_m, 1e-6)
+    remainder_m = 0.35 * radius_m**4 / (8 * nearest_m**3) + 0.04 * block_m**3 / nearest_m**2
+    result = (2 * np.pi * view.highest_cycles_per_m * remainder_m) ** 2
+    if view.beam is not None:
+        result += view.beam.block_error(block_m / nearest_m) ** 2
+        window_sine = np.ptp(np.clip(view.beam.limits, -1, 1))
+        result += (0.1 * (radius_m / nearest_m) ** 4 / window_sine) ** 2
+    return result
+
+
+@dataclass(frozen=True)
+class Errors:
+    """Powers of the errors that filters do not account for.
+
+    Of rounding and of putting channels on the track, of uneven nodes and weights stage by stage,
+    and of expanding leaves.
+    """
+
+    roots: float
+    nodes: tuple[float, ...]
+    leaves: float
+
+    @property
+    def total(self) -> float:
+        """All together."""
+        return self.roots + sum(self.nodes) + self.leaves
+
+
+def other_errors(
+    view: View,
+    sides: Sequence[tuple[int, int]],
+    aperture: Interpolator,
+    crowding: tuple[float, ...],
+    beam_cycles: float,
+    device: Device,
+) -> Errors:
+    """Return the errors of a tree; `view` is that within its roots."""
+    last = len(sides) - 1
+    return Errors(
+        roots=root_error(view, sides[0]),
+        nodes=tuple(
+            excess_error(view, side, aperture, crowd, beam_cycles if level == last else None)
+            for level, (side, crowd) in enumerate(zip(sides, crowding, strict=True))
+        ),
+        leaves=float(leaf_error(view, np.array([sides[-1]]), device)[0]),
+    )
+
+
+def root_error(view: View, side: tuple[int, int]) -> float:
+    """Return the power of the error of roots: of rounding, and of channels put on the mean track.
+
+    The latter is evaluated as it is: over channels, roots and pixels of these at random, how a
+    range changes from a root's centre to a pixel for the channel, less the same for the place on
+    the track that stands for it, stretched as the first stage does. That holds what the track does
+    not follow, transmitters and receivers apart, and motion during flight; and with a beam by how
+    much the weights of the two differ.
+    """
+    lines, track = view.lines, view.track
+    index = np.arange(0, lines.channels, -(-lines.channels // _CHANNELS))
+    part = replace(track, place=track.place[index])
+    middle_m = phase_centres_m(lines)
+    along = None if view.beam is None else view.beam.directions(lines)
+    side = tuple(map(min, side, view.grid.shape))
+    seen = view.seen(side)
+    random = np.random.default_rng(0)
+    powers, total = [], 0.0
+    for spot in range(0, len(view.spots_m), _SOME_SPOTS):
+        some = np.interp(part.place, track.samples, seen[spot]) > 0
+        if not some.any():
+            continue
+        near_index = index[some]
+        velocity = lines.rx_velocity_m_s
+        near = replace(track, place=part.place[some])
+        offset_m = random.uniform(-0.5, 0.5, (_PIXELS, 2)) * side @ view.steps_m
+        points_m = view.spots_m[spot] + np.concatenate([np.zeros((1, 3)), offset_m])
+        range_m = pairwise_range_m(
+            points_m,
+            lines.tx_m[near_index],
+            lines.rx_m[near_index],
+            velocity if velocity is None else velocity[near_index],
+            lines.sound_speed_m_s,
+        )
+        virtual_m = track.positions_m(near.places_seen_from(points_m[:1], middle_m[near_index])[0])
+        on_track_m = pairwise_range_m(points_m, virtual_m, virtual_m)
+        on_track_m -= (points_m @ drift(lines))[:, None]
+        near_lines = lines.select(near_index)
+        stretch = 1 + stretches(near_lines, view.grid, points_m[:1], virtual_m[None])
+        away_m = (range_m - range_m[0]) - (on_track_m - on_track_m[0]) * stretch
+        wrong = 2 * np.pi * view.highest_cycles_per_m * away_m[1:]
+        weights = np.ones_like(wrong)
+        if view.beam is not None:
+            virtual = replace(near_lines, tx_m=virtual_m, rx_m=virtual_m)
+            directions = interpolated_directions(track.samples, view.along, near.place)
+            weights, of_virtual = (
+                view.beam.weights(sines(points_m[1:], *seen_by).T, wavelength_m(lines))
+                for seen_by in ((near_lines, along[near_index]), (virtual, directions))
+            )
+            wrong = np.hypot(weights * wrong, weights - of_virtual)
+        powers.append(np.sum(wrong**2))
+        total += np.sum(weights**2)
+    off_track = sum(powers) / max(total, 1e-30)
+    radius_m = np.linalg.norm(side * np.linalg.norm(view.steps_m, axis=1)) / 2
+    rounding = (2 * np.pi * _FLOAT32 * view.highest_cycles_per_m * radius_m) ** 2
+    return float(off_track + rounding)
+
+
+def excess_error(
+    view: View,
+    side: tuple[int, int],
+    aperture: Interpolator,
+    crowding: float,
+    beam_cycles: float | None,
+) -> float:
+    """Return the power of the error that a stage's nodes add to that of the aperture's filter.
+
+    The filter takes nodes as equally spaced and weights as constant. Evaluated as it is, for
+    subimages and pixels of them at random: steering functions between nodes against what
+    interpolation makes of them; in the last stage, where `beam_cycles` is given, weighted.
+    """
+    track, random = view.track, np.random.default_rng(0)
+    wavelength_m = view.lines.sound_speed_m_s / max(view.lines.carrier_hz, 1e-3)
+    weighted = view.beam is not None and beam_cycles is not None
+    seen = view.seen(side)
+    wrong = total = 0.0
+    for spot in np.flatnonzero(seen.any(axis=1))[::_SOME_SPOTS]:
+        places = track.samples[seen[spot]]
+        place = np.linspace(places[0], places[-1], _PLACES)
+        rate = crowding * (side[0] * view.rates[0, spot] + side[1] * view.rates[1, spot])
+        if weighted:
+            rate = rate + beam_cycles * view.beam_rates[spot]
+        nodes = interpolated_nodes(track, rate[None], place[None], aperture)
+        offset_m = random.uniform(-0.5, 0.5, (_PIXELS, 2)) * side @ view.steps_m
+        points_m = view.spots_m[spot] + np.concatenate([np.zeros((1, 3)), offset_m])
+
+        def steering(at: NDArray[np.float64], points_m: NDArray[np.float64] = points_m) -> NDArray:
+            sight = points_m[:, None] - track.positions_m(at)
+            range_m = np.linalg.norm(sight, axis=-1)
+            turns = view.highest_cycles_per_m * (range_m[1:] - range_m[0])
+            result = np.exp(2j * np.pi * turns)
+            if weighted:
+                along = interpolated_directions(track.samples, view.along, at)
+                sine = np.einsum("psi,si->ps", sight[1:], along) / range_m[1:]
+                result *= view.beam.weights(sine, wavelength_m)
+            return result
+
+        of_nodes = steering(nodes.place[0])
+        index = nodes.base[0][:, None] + np.arange(nodes.taps)
+        between = np.einsum("pct,ct->pc", of_nodes[:, index], nodes.weights[0])
+        exact = steering(place[nodes.order[0]])
+        wrong += np.sum(np.abs(between - exact) ** 2)
+        total += np.sum(np.abs(exact) ** 2)
+    return max(wrong / max(total, 1e-30) - power(aperture.error_db), 0.0)
+
+
+def nearest_error(view: View, stages: Sequence[tuple[int, int]]) -> float:
+    """Return the power of the error of nearest beams: THESIS [45], spread evenly."""
+    centres_m = phase_centres_m(view.lines)[np.argsort(view.track.place)]
+    spacing_m = np.linalg.norm(np.diff(centres_m, axis=0), axis=1).mean()
+    image_m = np.max(np.array(view.grid.shape) * np.linalg.norm(view.steps_m, axis=1))
+    total_m = sum(stage_errors_m(stages, spacing_m, image_m, view.nearest_m))
+    return (2 * math.pi * view.lines.carrier_cycles_per_m * total_m) ** 2 / 3

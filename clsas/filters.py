@@ -1,0 +1,92 @@
+"""The filters between the stages of a factorized image: what they take to err by so little."""
+
+from __future__ import annotations
+
+import functools
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsas import interpolation
+from clsas.interpolation import Interpolator, Spectrum
+
+ALIGN_TAPS = APERTURE_TAPS = (4, 6, 8)
+_FINAL_TAPS = (2, 4, 6, 8)
+_RATES = tuple(np.geomspace(1, 12, 16))  # where errors are looked at
+_FLAT = Spectrum(0.0, (np.arange(64) + 0.5) / 128, np.full(64, 1 / 64))
+
+
+@dataclass(frozen=True)
+class Filters:
+    """Filters in range, along the aperture, and in range for the last stage."""
+
+    align: Interpolator
+    aperture: Interpolator
+    final: Interpolator
+
+
+@dataclass(frozen=True)
+class Choice:
+    """Taps and rates of filters that are not designed yet.
+
+    Attributes
+    ----------
+    align_taps, aperture_taps, final_taps : int
+    rate : float
+        By how much lines are upsampled.
+    density : float
+        Virtual channels over the least: per half a cycle.
+    """
+
+    align_taps: int
+    rate: float
+    aperture_taps: int
+    density: float
+    final_taps: int
+
+    def design(self, spectrum: Spectrum) -> Filters:
+        """Return the filters."""
+        return Filters(
+            interpolation.design(self.align_taps, self.rate, spectrum),
+            interpolation.design(self.aperture_taps, self.density, _FLAT),
+            interpolation.design(self.final_taps, self.rate, spectrum),
+        )
+
+
+def choose(
+    spectrum: Spectrum, align_taps: int, aperture_taps: int, stages: int, most_db: float
+) -> Choice | None:
+    """Return the least rates at which all interpolations together err by no more than `most_db`.
+
+    There are two in each of some stages, and the last. None where no rate is enough.
+    """
+    each_db = most_db - 10 * math.log10(2 * stages + 1)
+    rate = _least(align_taps, each_db, spectrum, "scatter_db")
+    density = _least(aperture_taps, each_db, _FLAT, "error_db")
+    if rate is None or density is None:
+        return None
+    needed = {taps: _least(taps, each_db, spectrum, "scatter_db") for taps in _FINAL_TAPS}
+    final_taps = next(t for t in _FINAL_TAPS if needed[t] is not None and needed[t] <= rate)
+    return Choice(align_taps, rate, aperture_taps, density, final_taps)
+
+
+def _least(taps: int, wanted_db: float, spectrum: Spectrum, error: str) -> float | None:
+    """Return the least rate at which a filter errs by no more, None where no rate is enough."""
+    key = spectrum.frequency.tobytes(), spectrum.power.tobytes()
+    errors = _errors_db(taps, error, *key)
+    if errors[-1] > wanted_db:
+        return None
+    if errors[0] <= wanted_db:
+        return _RATES[0]
+    # Errors fall with the rate; a half per cent of rate and a tenth of a decibel are for rounding.
+    return 1.005 * float(np.exp(np.interp(0.1 - wanted_db, -errors, np.log(_RATES))))
+
+
+@functools.lru_cache(maxsize=64)
+def _errors_db(taps: int, error: str, frequency: bytes, power: bytes) -> NDArray[np.float64]:
+    """Return the errors of filters at all `_RATES`."""
+    spectrum = Spectrum(0.0, np.frombuffer(frequency), np.frombuffer(power))
+    found = [getattr(interpolation.design(taps, rate, spectrum), error) for rate in _RATES]
+    return np.minimum.accumulate(found)

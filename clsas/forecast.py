@@ -1,0 +1,190 @@
+"""Plans with all that is expected of them: time, error and memory."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from clsas import interpolation
+from clsas.costs import Costs
+from clsas.device import Device
+from clsas.errors import in_db, leaf_error, power
+from clsas.exact import Exact
+from clsas.filters import Filters
+from clsas.plan import GUARD, Plan, Stage, grid_digest, lines_digest, padded_length
+from clsas.view import View
+
+MARGIN_DB = 1.0  # between prediction and tolerance, for what measured errors scatter
+_MOST_BATCH_BYTES = 48 << 20  # what stays near a CPU's caches
+
+
+@dataclass(frozen=True)
+class Way:
+    """How an image is factorized; attributes as those of `Plan`."""
+
+    sides: tuple[tuple[int, int], ...]
+    filters: Filters
+    nearest: tuple[int, ...] = ()
+    crowding: tuple[float, ...] = ()
+    beam_cycles: float = 0.0
+
+
+def factorized(
+    view: View,
+    way: Way,
+    other_error: float,
+    tolerance_db: float | None,
+    exact: Exact,
+    device: Device,
+    costs: Costs,
+    memory_bytes: int,
+) -> Plan:
+    """Return a plan with all that is expected of it.
+
+    `view` is that within its roots where the aperture is interpolated; `other_error` the power of
+    the errors that the filters do not account for.
+    """
+    lines, grid, sides, nearest = view.lines, view.grid, way.sides, way.nearest
+    align, aperture, final = way.filters.align, way.filters.aperture, way.filters.final
+    resampling = interpolation.resampling(lines.length, align, view.spectrum)
+    halves = view.half_lengths(sides, align, final, resampling)
+    of_aperture = aperture.taps, 2 * aperture.upsampling
+    stages, channels = [], float(lines.channels)
+    width = device.info.width
+    used = channels * view.share_seen(sides[0])
+    for level, side in enumerate(sides):
+        count = math.prod(-(-n // s) for n, s in zip(grid.shape, side, strict=True))
+        samples = -(-(2 * halves[level] + 1) // width) * width
+        seen = view.seen(side)
+        if nearest:
+            used, channels = channels, math.ceil(channels / nearest[level])
+        else:
+            if level:
+                turns = way.crowding[level - 1] * view.turns(sides[level - 1], seen)
+                used = min(channels, view.channels_used(*of_aperture, turns))
+            turns = way.crowding[level] * view.turns(side, seen)
+            if view.beam is not None and level == len(sides) - 1:
+                turns += way.beam_cycles * view.cycles(view.beam_rates, seen)
+            channels = view.channels(*of_aperture, turns)
+        cost_ns = count * used * costs.line_ns(samples, align.taps + aperture.taps)
+        if not level:
+            cost_ns += count * lines.channels * costs.reference_ns
+            cost_ns += costs.upsampled_sample_ns * lines.channels * resampling.length
+        error = power(align.error_db)
+        if not nearest:
+            error = power(align.scatter_db) + power(aperture.error_db)
+        operations = count * used * samples
+        stages.append(
+            Stage(*side, count, round(channels), samples, operations, in_db(error), 1e-9 * cost_ns)
+        )
+    pixels = math.prod(side)
+    operations = count * pixels * channels
+    cost_ns = count * channels * costs.leaf_line_ns(pixels, final.taps, beam=view.beam is not None)
+    stages.append(
+        Stage(*side, count, round(channels), samples, operations, final.scatter_db, 1e-9 * cost_ns)
+    )
+    tile = _tile(view, sides[-1], device) if nearest else sides[-1]
+    line_bytes = 8 * lines.channels * padded_length(resampling, halves[0])
+    root_bytes = _root_bytes(view, way, tile, stages)
+    room = min(memory_bytes - line_bytes, _MOST_BATCH_BYTES)
+    at_once = min(max(int(room // root_bytes), 1), stages[0].subimages)
+    batches = -(-stages[0].subimages // at_once)
+    besides = 1e-9 * (costs.call_ns + costs.batch_ns * batches * len(sides))
+    error = other_error + sum(power(stage.error_db) for stage in stages)
+    return Plan(
+        tolerance_db=tolerance_db,
+        sides=sides,
+        tile=tile,
+        nearest=nearest,
+        align=align,
+        aperture=aperture,
+        final=final,
+        resampling=resampling,
+        half_lengths=halves,
+        highest_cycles_per_m=view.highest_cycles_per_m,
+        roots_at_once=at_once,
+        stages=tuple(stages),
+        predicted_error_db=in_db(error) + (0.0 if nearest else MARGIN_DB),
+        predicted_seconds=sum(stage.seconds for stage in stages) + besides,
+        exact_seconds=exact.seconds(costs),
+        memory_bytes=int(line_bytes + at_once * root_bytes),
+        device=device.info.label,
+        lines_digest=lines_digest(lines),
+        grid_digest=grid_digest(grid),
+        beam=view.beam,
+        crowding=way.crowding,
+        beam_cycles=way.beam_cycles,
+    )
+
+
+def _root_bytes(view: View, way: Way, tile: tuple[int, int], stages: Sequence[Stage]) -> float:
+    """Return the device memory that a root takes while it is worked on: see `factorize`."""
+    taps, channels, result = way.filters.aperture.taps, view.lines.channels, 0.0
+    density, sides = 2 * way.filters.aperture.upsampling, way.sides
+    for level, side in enumerate(sides):
+        if way.nearest:
+            everywhere = most = stages[level].channels
+        else:
+            # Virtual channels of the whole aperture, and those of the subimage that sees most.
+            seen = view.seen(side)
+            everywhere, most = (
+                density * way.crowding[level] * view.turns(side, where, np.max) + taps + 2
+                for where in (np.ones_like(seen), seen)
+            )
+            if view.beam is not None and level == len(sides) - 1:
+                most += density * way.beam_cycles * view.cycles(view.beam_rates, seen, np.max)
+        subimages = _subimages(sides[0], side)
+        result += 8 * subimages * most * (stages[level].samples + 2 * GUARD)
+        result += subimages * 56 + (channels + 32) * (4 + 4 * taps + (12 if level else 16))
+        channels = everywhere
+    terms = 9 if view.beam is None else 19
+    result += _subimages(sides[0], tile) * ((most + 16) * (12 + 4 * terms) + 36)
+    return result + 36 * channels + 8 * math.prod(sides[0])
+
+
+def _subimages(root: tuple[int, int], side: tuple[int, int]) -> int:
+    return math.prod(a // b for a, b in zip(root, side, strict=True))
+
+
+def _tile(view: View, leaf: tuple[int, int], device: Device) -> tuple[int, int]:
+    """Return the largest parts of a leaf that may be expanded about their centres."""
+    parts = [
+        (rows, columns)
+        for rows in range(16, min(leaf[0], 64) + 1, 16)
+        for columns in range(4, min(leaf[1], 64) + 1, 4)
+        if leaf[0] % rows == 0 and leaf[1] % columns == 0
+    ]
+    fit = [part for part in parts if leaf_error(view, np.array([part]), device)[0] < 1e-8]
+    return max(fit or parts[:1], key=math.prod)
+
+
+def plain(
+    view: View, tolerance_db: float | None, exact: Exact, device: Device, costs: Costs
+) -> Plan:
+    """Return plain backprojection as a plan."""
+    seconds = exact.seconds(costs)
+    return Plan(
+        tolerance_db=tolerance_db,
+        sides=(),
+        tile=(0, 0),
+        nearest=(),
+        align=None,
+        aperture=None,
+        final=None,
+        resampling=None,
+        half_lengths=(),
+        highest_cycles_per_m=view.highest_cycles_per_m,
+        roots_at_once=1,
+        stages=(),
+        predicted_error_db=exact.accuracy_db,
+        predicted_seconds=seconds,
+        exact_seconds=seconds,
+        memory_bytes=exact.memory_bytes,
+        device=device.info.label,
+        lines_digest=lines_digest(view.lines),
+        grid_digest=grid_digest(view.grid),
+        beam=view.beam,
+    )

@@ -1,0 +1,189 @@
+"""How a track sees a grid: what the costs and errors of a factorized image depend on."""
+
+from __future__ import annotations
+
+import copy
+import functools
+import math
+from collections.abc import Callable, Sequence
+from itertools import product
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial import KDTree
+
+from clsas import interpolation
+from clsas.aperture import cycles_per_pixel, mean_track, phase_centres_m, turned
+from clsas.grid import Grid
+from clsas.interpolation import Interpolator, Resampling
+from clsas.lines import RangeLines
+from clsas.tree import Division, beam_directions, beam_rate
+from clsas.window import BeamWindow, touches_rectangles
+
+_SPOTS = (0.02, 0.25, 0.5, 0.75, 0.98)  # of rows and columns, where the geometry is looked at
+_COARSER = 4  # of the track's samples: where roots are compared
+
+
+class View:
+    """How the track sees the grid at some spots: what costs and errors depend on.
+
+    Attributes
+    ----------
+    spots_m : float64 [spots, 3]
+        Over the whole grid, its corners among them.
+    rates : float64 [2, spots, samples]
+        Cycles per pixel row and column and per unit of the track's parameter.
+    """
+
+    def __init__(self, lines: RangeLines, grid: Grid, beam: BeamWindow | None) -> None:
+        self.lines, self.grid, self.beam = lines, grid, beam
+        self.spectrum = interpolation.measure_spectrum(lines)
+        occupied = self.spectrum.frequency[np.cumsum(self.spectrum.power) < 1 - 1e-6]
+        half_band = (occupied[-1] if len(occupied) else 0.5) / lines.range_step_m
+        centre = interpolation.cycles_per_m(lines, self.spectrum.centre)
+        self.highest_cycles_per_m = abs(centre) + half_band
+        self.track = mean_track(lines) if grid.is_planar else None
+        if self.track is None:
+            return
+        self.steps_m = np.stack([grid.row_step_m, grid.column_step_m])
+        self.spots_m = self._pixels_m(_SPOTS)
+        position = self.track.positions_m(self.track.samples)
+        sight = self.spots_m[:, None] - position
+        self.distance_m = np.maximum(np.linalg.norm(sight, axis=-1), 1e-9)
+        self.sight = sight / self.distance_m[..., None]
+        self.on_track = np.abs(self.track.samples - 0.5) <= 0.5
+        # Between the places that are looked at a pixel may come nearer.
+        dense_m = self._pixels_m(np.linspace(0, 1, 65))
+        cell_m = np.linalg.norm(self.steps_m, axis=1) @ (np.array(grid.shape) - 1) / 128
+        nearest_m = KDTree(phase_centres_m(lines)).query(dense_m)[0].min() - cell_m
+        self.nearest_m = max(float(nearest_m), 1e-9)
+        self._seen: dict[tuple[int, int], NDArray[np.bool_]] = {}
+        self._within: dict[tuple[int, int], NDArray[np.float64]] = {}
+        self._in_roots: dict[tuple[int, int], NDArray[np.float64]] = {}
+        self.along = None
+        if beam is not None:
+            self.along = beam_directions(beam, lines, self.track, self.track.samples)
+            self.beam_rates = beam_rate(beam, self.track, self.along, self.spots_m)
+        self.rates = self._rates((0, 0), self.spots_m)
+
+    def _pixels_m(self, places: Sequence[float]) -> NDArray[np.float64]:
+        """Return positions at some parts of the rows and columns, [n, 3]."""
+        index = np.array(list(product(places, places))) * (np.array(self.grid.shape) - 1)
+        return self.grid.origin_m + index @ self.steps_m
+
+    def seen(self, side: tuple[int, int]) -> NDArray[np.bool_]:
+        """Return from where channels see anything of subimages at the spots, [spots, samples]."""
+        on_track = np.broadcast_to(self.on_track, self.distance_m.shape)
+        if self.beam is None:
+            return on_track
+        if side not in self._seen:
+            half_m = np.array(side)[:, None] / 2 * self.steps_m
+            origin_m = self.spots_m[0]
+            track_m = self.track.positions_m(self.track.samples) - origin_m
+            self._seen[side] = on_track & touches_rectangles(
+                self.beam, self.spots_m - origin_m, half_m, track_m, self.along
+            )
+        return self._seen[side]
+
+    def share_seen(
+        self, side: tuple[int, int], over: Callable[[NDArray[np.float64]], float] = np.mean
+    ) -> float:
+        """Return which part of the channels sees anything of a subimage, on average."""
+        return float(over(self.seen(side)[:, self.on_track].mean(axis=1)))
+
+    def cycles(
+        self,
+        rates: NDArray[np.float64],
+        seen: NDArray[np.bool_],
+        over: Callable[[NDArray[np.float64]], float] = np.mean,
+    ) -> float:
+        """Return how far a phase turns while it is seen, on average over the spots."""
+        return float(over(turned(self.track, np.where(seen, rates, 0.0))[:, -1]))
+
+    def turns(
+        self,
+        side: tuple[int, int],
+        seen: NDArray[np.bool_],
+        over: Callable[[NDArray[np.float64]], float] = np.mean,
+    ) -> float:
+        """Return `cycles` of the phases of subimages of a size."""
+        return self.cycles(side[0] * self.rates[0] + side[1] * self.rates[1], seen, over)
+
+    def channels(self, taps: int, density: float, turns: ArrayLike) -> ArrayLike:
+        """Return the virtual channels of a subimage while whose phase turns by some cycles.
+
+        `taps` and `density`, nodes per cycle, are those of the filter along the aperture.
+        """
+        return density * turns + (taps if self.beam is None else 1)
+
+    def channels_used(self, taps: int, density: float, turns: ArrayLike) -> ArrayLike:
+        """Return how many of these a smaller subimage uses, while that is seen."""
+        return density * turns + 2 * taps
+
+    def within(self, root: tuple[int, int]) -> View:
+        """Return this view with the rates of subimages in roots of a size."""
+        if root not in self._within:
+            self._within[root] = self._rates(root, self.spots_m)
+        view = copy.copy(self)
+        view.rates = self._within[root]
+        return view
+
+    def cycles_in_root(
+        self, root: tuple[int, int], sides: Sequence[tuple[int, int]]
+    ) -> NDArray[np.float64]:
+        """Return `cycles` per row and column in a root, while subimages of some sizes are seen.
+
+        Roughly; [sides, 2].
+        """
+        middle = np.arange(len(_SPOTS) ** 2).reshape(len(_SPOTS), -1)[1:-1, 1:-1].ravel()
+        if root not in self._in_roots:
+            self._in_roots[root] = self._rates(root, self.spots_m[middle], _COARSER)
+        seen = np.stack([self.seen(side)[middle, ::_COARSER] for side in sides])
+        while_seen = seen * np.gradient(self.track.samples[::_COARSER])
+        return np.einsum("nps,kps->nk", while_seen, self._in_roots[root]) / len(middle)
+
+    def _rates(
+        self, root: tuple[int, int], centres_m: NDArray[np.float64], every: int = 1
+    ) -> NDArray[np.float64]:
+        return cycles_per_pixel(
+            self.track,
+            self.grid,
+            centres_m,
+            root,
+            self.highest_cycles_per_m,
+            self.nearest_m,
+            self.beam,
+            self.along,
+            every,
+        )
+
+    @functools.cached_property
+    def slopes_m(self) -> tuple[float, float]:
+        """Largest change of range per row and per column."""
+        seen = self.seen((16, 16))
+        slopes = np.abs(self.sight @ self.steps_m.T)
+        slopes = slopes[seen] if seen.any() else slopes.reshape(-1, 2)
+        return tuple(1.02 * slopes.max(axis=0))
+
+    def reach_m(self, side: tuple[int, int]) -> float:
+        """Return by how much a pixel's range may differ from that of its subimage's centre."""
+        radius_m = Division(self.grid, (side,)).radius_m(0)
+        bend_m = radius_m**2 / (2 * max(self.nearest_m, radius_m))
+        return min(float(np.dot(side, self.slopes_m)) / 2 + bend_m, radius_m)
+
+    def half_lengths(
+        self,
+        sides: Sequence[tuple[int, int]],
+        align: Interpolator,
+        final: Interpolator,
+        resampling: Resampling,
+    ) -> tuple[int, ...]:
+        """Return the samples to either side of a centre that the lines of each stage must hold."""
+        samples_per_m = resampling.samples_per_m(self.lines)
+        return tuple(
+            math.ceil(self.reach_m(side) * samples_per_m)
+            + (len(sides) - 1 - level) * (align.taps // 2 + 1)
+            + final.taps // 2
+            + 1
+            for level, side in enumerate(sides)
+        )

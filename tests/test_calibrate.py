@@ -1,0 +1,72 @@
+import sys
+
+import pytest
+
+from clsas import costs
+from clsas.calibrate import calibrate
+from clsas.costs import Costs
+from clsas.device import open_device
+from clsas.validate import ClsasWarning
+
+module = sys.modules["clsas.calibrate"]
+
+
+@pytest.fixture
+def cache(tmp_path, monkeypatch):
+    """An empty cache of the user's."""
+    monkeypatch.setattr(costs, "user_cache_path", lambda _: tmp_path / "cache")
+    return costs.path()
+
+
+@pytest.fixture
+def small(monkeypatch):
+    """Images of a few milliseconds."""
+    monkeypatch.setattr(module, "_SIZES", ((200, 128), (400, 96)))
+    monkeypatch.setattr(module, "_SMALL_SIZES", ((50, 32), (100, 64)))
+
+
+@pytest.fixture
+def disturbed(monkeypatch):
+    """A function that changes the times of images."""
+
+    def disturb(change):
+        run = module._Image.run
+
+        def changed(image, device):
+            run(image, device)
+            image.seconds[-1] = change(image, image.seconds[-1])
+
+        monkeypatch.setattr(module._Image, "run", changed)
+
+    return disturb
+
+
+def test_what_is_measured_is_stored(cache, small, monkeypatch):
+    # Whatever else this machine does.
+    monkeypatch.setattr(module, "_MOST_SCATTER", 100.0)
+    monkeypatch.setattr(module, "_MOST_MISFIT", 100.0)
+    seen = []
+    found = calibrate(progress=lambda *n: seen.append(n))
+    assert costs.load(open_device()) == found != Costs()
+    assert seen == [(done, seen[0][1]) for done in range(1, len(seen) + 1)]
+    assert found.pixel_ns > 0
+    assert found.leaf_ns > 0
+    assert found.sample_ns + found.sample_tap_ns > 0
+
+
+def test_measurements_of_a_busy_machine_are_not_stored(cache, small, disturbed):
+    """What else there is to do comes and goes: every other run takes half a second more."""
+    disturbed(lambda image, seconds: seconds + 0.5 * (len(image.seconds) % 2))
+    before = Costs(pixel_ns=0.123)
+    costs.save(open_device(), before)
+    with pytest.warns(ClsasWarning, match=r"not stored: times of the same image differ by \d+"):
+        found = calibrate()
+    assert costs.load(open_device()) == before != found
+
+
+def test_times_that_no_costs_explain_are_not_stored(cache, small, disturbed):
+    """Small images take a thousand times as long as large ones."""
+    disturbed(lambda image, seconds: 1e6 / image.pixel_work)
+    with pytest.warns(ClsasWarning, match=r"the costs miss the times measured by \d+"):
+        calibrate()
+    assert not cache.exists()
