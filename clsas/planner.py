@@ -153,7 +153,9 @@ def plan(
     return forecast.plain(view, tolerance_db, exact, device, costs)
 
 
-def tolerance_in_db(tolerance_db: float | None, tolerance_wavelengths: float | None) -> float | None:
+def tolerance_in_db(
+    tolerance_db: float | None, tolerance_wavelengths: float | None
+) -> float | None:
     """Return the tolerance asked for, or None, after checking it."""
     if tolerance_db is not None:
         return validate.number(
