@@ -127,7 +127,8 @@ def phase_centres_m(lines: RangeLines) -> NDArray[np.float64]:
 
 
 def stretches(
-    lines: RangeLines,
+    tx_m: NDArray[np.float64],
+    rx_m: NDArray[np.float64],
     grid: Grid,
     points_m: NDArray[np.float64],
     virtual_m: NDArray[np.float64],
@@ -141,9 +142,10 @@ def stretches(
 
     Parameters
     ----------
+    tx_m, rx_m : float64 [channels, 3]
     points_m : float64 [points, 3]
     virtual_m : float64 [points, channels, 3]
-        For every channel of lines a place on the track.
+        For every channel a place on the track.
 
     Returns
     -------
@@ -157,7 +159,7 @@ def stretches(
         return way / np.maximum(np.linalg.norm(way, axis=-1, keepdims=True), 1e-30)
 
     along = sight(virtual_m)
-    more = (sight(lines.tx_m) + sight(lines.rx_m)) / 2 - along
+    more = (sight(tx_m) + sight(rx_m)) / 2 - along
     along = along - (along @ normal)[..., None] * normal
     square = np.einsum("pci,pci->pc", along, along)
     # Right below the track ranges do not grow at all.

@@ -746,7 +746,7 @@ def warn_unseen(
         return
     sine = sines(
         centres_m[:: max(len(centres_m) // 1024, 1)],
-        some,
+        (some.tx_m + some.rx_m) / 2,
         along[:: max(lines.channels // 64, 1)],
     )
     low, high = np.degrees(np.arcsin(np.clip([sine.min(), sine.max()], -1, 1)))

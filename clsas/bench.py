@@ -11,16 +11,19 @@ from typing import Any
 
 import numpy as np
 
-from clsas import reference, validate
+from clsas import reference, validate, wreck
 from clsas.backproject import backproject, execute, prepare
 from clsas.device import Device, open_device
 from clsas.factorize import factorize
 from clsas.grid import Grid
+from clsas.image import Image
 from clsas.lines import RangeLines
+from clsas.mosaic import mosaic
 from clsas.planner import plan
 from clsas.quality import relative_error_db
 from clsas.scene import PointTargets
 from clsas.simulate import simulate_lines
+from clsas.store import Record
 from clsas.tradeoff import REFERENCE_DB
 from clsas.window import BeamWindow
 
@@ -97,6 +100,9 @@ FACTORIZED = {
     "ffbp-8k": Case(8192, 15e-3, 120e3, 30e3, (-40.96, 40.94), (40.0, 121.9), 4096, _BEAM),
 }
 """Cases of factorized imaging."""
+
+MOSAICS = {"mosaic-wreck": (4096, BeamWindow(5.0, "hann"))}
+"""Cases of mosaics: pixels along either side of the wreck's scene, and the beam."""
 
 
 def scaled(size: int) -> Case:
@@ -271,6 +277,95 @@ def run_factorized(
         "predicted_seconds": chosen.predicted_seconds,
         "predicted_exact_seconds": chosen.exact_seconds,
         "plan": chosen.describe(),
+    }
+
+
+def run_mosaic(
+    case: str = "mosaic-wreck",
+    *,
+    device: Device | str | int | None = None,
+    tolerance_db: float = -40.0,
+    repeats: int = 3,
+    progress: Callable[[int, int], None] | None = None,
+) -> dict[str, Any]:
+    """Measure a mosaic against exact imaging with and without the beam's limits; all take turns.
+
+    Parameters
+    ----------
+    case : str
+        One of `MOSAICS`.
+    device : Device, str or int, optional
+        See `clsas.device.choose`.
+    tolerance_db : float
+        As for `clsas.mosaic`; the exact images that are timed are as accurate.
+    repeats : int
+        Timed runs of each.
+    progress : callable, optional
+        Called as progress(done, total), while the lines are simulated and then run by run.
+
+    Returns
+    -------
+    dict
+        What was measured, ready for JSON. `seconds` are of all of `clsas.mosaic`, from lines in
+        memory to patches in memory, with all planning; `exact_seconds` and `unlimited_seconds` of
+        `clsas.backproject` with the beam and without; `speedup` and `speedup_unlimited` are their
+        medians over that of the mosaic. `error_db` is against an exact image of -80 dB,
+        `shadow_contrast_difference_db` is by how much the contrast of the wreck's shadow differs
+        from that image's.
+    """
+    validate.one_of("case", case, tuple(MOSAICS))
+    pixels, beam = MOSAICS[case]
+    device = open_device(device)
+    lines, grid = wreck.lines(progress), wreck.grid(pixels)
+    image = np.empty(grid.shape, np.complex64)
+
+    def form() -> list[Record]:
+        records = []
+        for patch in mosaic(lines, grid, tolerance_db=tolerance_db, beam=beam, device=device):
+            image[patch.rows, patch.columns] = patch.image.pixels
+            records.append(patch.record)
+        return records
+
+    exact = partial(backproject, lines, grid, device=device)
+    records = form()
+    reference_image = exact(beam=beam, accuracy_db=REFERENCE_DB)
+    formed = Image(image.copy(), grid)
+    shadow = wreck.Shadow(wreck.scene())
+    contrast_db, reference_db = (shadow.contrast_db(each) for each in (formed, reference_image))
+    error_db = relative_error_db(formed, reference_image)
+    del formed, reference_image
+    ways = {
+        "seconds": form,
+        "exact_seconds": partial(exact, beam=beam, accuracy_db=tolerance_db),
+        "unlimited_seconds": partial(exact, accuracy_db=tolerance_db),
+    }
+    taken: dict[str, list[float]] = {name: [] for name in ways}
+    for repeat in range(repeats + 1):
+        for name, way in ways.items():
+            start = time.perf_counter()
+            way()
+            taken[name].append(time.perf_counter() - start)
+        if progress is not None:
+            progress(repeat + 1, repeats + 1)
+    found = {name: _statistics(seconds[1:]) for name, seconds in taken.items()}
+    predicted = [r.predicted_error_db for r in records if r.predicted_error_db is not None]
+    return {
+        "case": case,
+        "device": device.info.label,
+        "driver": device.info.driver,
+        "channels": lines.channels,
+        "samples": lines.length,
+        "pixels": list(grid.shape),
+        "patches": len(records),
+        "tolerance_db": tolerance_db,
+        **found,
+        "plan_seconds": sum(record.plan_seconds for record in records),
+        "speedup": found["exact_seconds"]["median"] / found["seconds"]["median"],
+        "speedup_unlimited": found["unlimited_seconds"]["median"] / found["seconds"]["median"],
+        "error_db": error_db,
+        "predicted_error_db": max(predicted),
+        "shadow_contrast_db": contrast_db,
+        "shadow_contrast_difference_db": contrast_db - reference_db,
     }
 
 

@@ -815,7 +815,8 @@ def bench(
     """Time a benchmark case and measure its error; without CASE, all of them run for minutes.
 
     Cases bp-... are exact imaging; cases ffbp-... are factorized imaging, compared with exact
-    imaging. With --json every case is one line.
+    imaging; mosaic-wreck is a mosaic, compared with exact imaging with and without the beam's
+    limits (its lines are simulated first, once, for minutes). With --json every case is one line.
 
     \b
     Example:  clsas bench ffbp-2k --tolerance-db -40 --json
@@ -823,12 +824,15 @@ def bench(
     from clsas import bench as benchmark
 
     if case is not None:
-        _case(case)
+        if case not in benchmark.MOSAICS:
+            _case(case)
         if (tolerance_db if case in benchmark.CASES else accuracy_db) is not None:
-            raise click.UsageError("--accuracy-db goes with bp-..., --tolerance-db with ffbp-...")
-    for name in [case] if case else [*benchmark.CASES, *benchmark.FACTORIZED]:
-        exact = name in benchmark.CASES
-        measure = benchmark.run if exact else benchmark.run_factorized
+            raise click.UsageError("--accuracy-db goes with bp-..., --tolerance-db with others")
+    measures = dict.fromkeys(benchmark.CASES, benchmark.run)
+    measures |= dict.fromkeys(benchmark.FACTORIZED, benchmark.run_factorized)
+    measures |= dict.fromkeys(benchmark.MOSAICS, benchmark.run_mosaic)
+    for name in [case] if case else measures:
+        exact, measure = name in benchmark.CASES, measures[name]
         option, value = ("accuracy_db", accuracy_db) if exact else ("tolerance_db", tolerance_db)
         wish = {} if value is None else {option: value}
         with _progress(name) as progress:

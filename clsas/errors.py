@@ -105,7 +105,6 @@ def root_error(view: View, side: tuple[int, int]) -> float:
     index = np.arange(0, lines.channels, -(-lines.channels // _CHANNELS))
     part = replace(track, place=track.place[index])
     middle_m = phase_centres_m(lines)
-    along = None if view.beam is None else view.beam.directions(lines)
     side = tuple(map(min, side, view.grid.shape))
     seen = view.seen(side)
     random = np.random.default_rng(0)
@@ -119,27 +118,22 @@ def root_error(view: View, side: tuple[int, int]) -> float:
         near = replace(track, place=part.place[some])
         offset_m = random.uniform(-0.5, 0.5, (_PIXELS, 2)) * side @ view.steps_m
         points_m = view.spots_m[spot] + np.concatenate([np.zeros((1, 3)), offset_m])
-        range_m = pairwise_range_m(
-            points_m,
-            lines.tx_m[near_index],
-            lines.rx_m[near_index],
-            velocity if velocity is None else velocity[near_index],
-            lines.sound_speed_m_s,
-        )
+        antennas_m = lines.tx_m[near_index], lines.rx_m[near_index]
+        moving = velocity if velocity is None else velocity[near_index]
+        range_m = pairwise_range_m(points_m, *antennas_m, moving, lines.sound_speed_m_s)
         virtual_m = track.positions_m(near.places_seen_from(points_m[:1], middle_m[near_index])[0])
         on_track_m = pairwise_range_m(points_m, virtual_m, virtual_m)
         on_track_m -= (points_m @ drift(lines))[:, None]
-        near_lines = lines.select(near_index)
-        stretch = 1 + stretches(near_lines, view.grid, points_m[:1], virtual_m[None])
+        stretch = 1 + stretches(*antennas_m, view.grid, points_m[:1], virtual_m[None])
         away_m = (range_m - range_m[0]) - (on_track_m - on_track_m[0]) * stretch
         wrong = 2 * np.pi * view.highest_cycles_per_m * away_m[1:]
         weights = np.ones_like(wrong)
         if view.beam is not None:
-            virtual = replace(near_lines, tx_m=virtual_m, rx_m=virtual_m)
             directions = interpolated_directions(track.samples, view.along, near.place)
+            channels = middle_m[near_index], view.channels_along[near_index]
             weights, of_virtual = (
-                view.beam.weights(sines(points_m[1:], *seen_by).T, wavelength_m(lines))
-                for seen_by in ((near_lines, along[near_index]), (virtual, directions))
+                view.beam.weights(sines(points_m[1:], *places).T, wavelength_m(lines))
+                for places in (channels, (virtual_m, directions))
             )
             wrong = np.hypot(weights * wrong, weights - of_virtual)
         powers.append(np.sum(wrong**2))

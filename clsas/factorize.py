@@ -195,7 +195,8 @@ class _Run:
         self.track = mean_track(lines)
         self.along = None
         if chosen.beam is not None:
-            self.along = tree.beam_directions(chosen.beam, lines, self.track, self.track.samples)
+            along = chosen.beam.directions(lines)
+            self.along = tree.beam_directions(along, self.track, self.track.samples)
         self.phase_centres_m = phase_centres_m(lines)
         self.drift = drift(lines)
         # The thesis's method has none; on the track itself there is nothing to make up for.
@@ -425,7 +426,7 @@ class _Run:
         if not self.ramps:
             return np.zeros_like(batch.place)
         virtual_m = self.track.positions_m(batch.place)
-        stretch = stretches(self.lines, self.grid, batch.root_m, virtual_m)
+        stretch = stretches(self.lines.tx_m, self.lines.rx_m, self.grid, batch.root_m, virtual_m)
         return stretch * self.cycles_per_m / self.samples_per_m
 
     def _backproject(self, batch: _Batch, image: NDArray[np.complex64]) -> cl.Event:

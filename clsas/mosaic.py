@@ -48,7 +48,7 @@ WISHES = ("tolerance_db", "tolerance_wavelengths", "stages", "accuracy_db")
 """How a mosaic may be wished for: at most one of these."""
 
 _TOLERANCE_DB = -50.0
-_LARGEST_SIDE = 2048  # pixels of a patch, where memory allows more: a second of work
+_LARGEST_SIDE = 4096  # pixels of a patch, where memory allows more: seconds of work
 _SMALLEST_SIDE = 128
 _POLL_S = 0.5
 _MOST_WORKERS = 1024  # of one machine
@@ -262,7 +262,7 @@ def mosaic(
         not only what a patch sees; in a folder, which may grow, `track_pings` is 101 unless given.
     patches : (rows, columns), optional
         Patches along either axis; those at the end may be smaller. Unless given they are as large
-        as memory allows, up to 2048 x 2048 pixels.
+        as memory allows, up to 4096 x 4096 pixels.
     memory_bytes : int, optional
         What one patch may take on host and device together; 1 GiB unless given.
     device : Device, str or int, or a sequence of them, optional

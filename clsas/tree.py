@@ -12,7 +12,6 @@ from scipy.ndimage import gaussian_filter1d
 from clsas.aperture import MeanTrack, turned
 from clsas.grid import Grid
 from clsas.interpolation import Interpolator
-from clsas.lines import RangeLines
 from clsas.window import BeamWindow, touches_rectangles
 
 _EVEN_NODES = 2.5  # over how many nodes their spacing is smoothed, rms
@@ -197,11 +196,11 @@ class Division:
 
 
 def beam_directions(
-    beam: BeamWindow, lines: RangeLines, track: MeanTrack, place: NDArray[np.float64]
+    along: NDArray[np.float64], track: MeanTrack, place: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return the unit direction of the track, as the beam has it, at some parameters, [..., 3]."""
+    """Return unit directions at some parameters, [..., 3], from those of the channels [n, 3]."""
     order = np.argsort(track.place, kind="stable")
-    return interpolated_directions(track.place[order], beam.directions(lines)[order], place)
+    return interpolated_directions(track.place[order], along[order], place)
 
 
 def interpolated_directions(

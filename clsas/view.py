@@ -60,9 +60,10 @@ class View:
         self._seen: dict[tuple[int, int], NDArray[np.bool_]] = {}
         self._within: dict[tuple[int, int], NDArray[np.float64]] = {}
         self._in_roots: dict[tuple[int, int], NDArray[np.float64]] = {}
-        self.along = None
+        self.along = self.channels_along = None
         if beam is not None:
-            self.along = beam_directions(beam, lines, self.track, self.track.samples)
+            self.channels_along = beam.directions(lines)
+            self.along = beam_directions(self.channels_along, self.track, self.track.samples)
             self.beam_rates = beam_rate(beam, self.track, self.along, self.spots_m)
         self.rates = self._rates((0, 0), self.spots_m)
 

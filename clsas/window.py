@@ -282,14 +282,16 @@ class BeamWindow:
 
 
 def sines(
-    points_m: NDArray[np.float64], lines: RangeLines, along: NDArray[np.float64]
+    points_m: NDArray[np.float64],
+    phase_centres_m: NDArray[np.float64],
+    along: NDArray[np.float64],
 ) -> NDArray[np.float64]:
     """Return the sine of the aspect angle of every point, float64 [channels, points].
 
-    Takes points [points, 3] and the direction of every channel, [channels, 3]; a phase centre's own
-    sine is 0.
+    Takes points [points, 3] and the phase centre and the direction of every channel, [channels, 3];
+    a phase centre's own sine is 0.
     """
-    offset_m = points_m - (lines.tx_m + lines.rx_m)[:, None] / 2
+    offset_m = points_m - phase_centres_m[:, None]
     distance_m = np.linalg.norm(offset_m, axis=2)
     return np.einsum("cpi,ci->cp", offset_m, along) / np.maximum(distance_m, 1e-30)
 

@@ -191,14 +191,14 @@ def test_subimages_beyond_the_grid_are_not_missed(shape, everything, monkeypatch
 def test_places_from_where_leaves_are_seen_hold_all_that_weigh():
     lines, grid = made(near)
     beam, track = BEAMS[0], mean_track(lines)
-    along = tree.beam_directions(beam, lines, track, track.samples)
+    along = tree.beam_directions(beam.directions(lines), track, track.samples)
     division = Division(grid, ((16, 16),))
     corners = division.roots[:, None]
     half_m = 8 * np.stack([grid.row_step_m, grid.column_step_m])
     begin, end = tree.seen_from(beam, track, along, division.centres_m(0, corners), half_m)
     place = np.linspace(0, 1, 2001)
     position_m = track.positions_m(place)
-    direction = tree.beam_directions(beam, lines, track, place)
+    direction = tree.beam_directions(beam.directions(lines), track, place)
     for (corner,), (first,), (last,) in zip(corners, begin, end, strict=True):
         for pixel in corner + np.array([[0, 0], [0, 15], [15, 0], [15, 15], [7, 8]]):
             pixel_m = grid.origin_m + pixel @ np.stack([grid.row_step_m, grid.column_step_m])
@@ -211,5 +211,5 @@ def test_places_from_where_leaves_are_seen_hold_all_that_weigh():
 def test_directions_between_channels_are_of_length_one():
     lines, _ = made(arc)
     track = mean_track(lines)
-    along = tree.beam_directions(BEAMS[0], lines, track, np.linspace(-1, 2, 50))
+    along = tree.beam_directions(BEAMS[0].directions(lines), track, np.linspace(-1, 2, 50))
     np.testing.assert_allclose(np.linalg.norm(along, axis=1), 1)
