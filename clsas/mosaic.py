@@ -50,6 +50,7 @@ WISHES = ("tolerance_db", "tolerance_wavelengths", "stages", "accuracy_db")
 _TOLERANCE_DB = -50.0
 _LARGEST_SIDE = 4096  # pixels of a patch, where memory allows more: seconds of work
 _SMALLEST_SIDE = 128
+_WORTH_A_PLAN = 5e7  # pixels times channels; fewer are backprojected sooner than planned for
 _POLL_S = 0.5
 _MOST_WORKERS = 1024  # of one machine
 
@@ -378,6 +379,14 @@ class _Job:
     store: Path | None
     local: bool
 
+    def accuracy_db(self, pairs: int) -> float | None:
+        """Return how exactly to backproject so many pairs of pixel and channel, None to plan."""
+        if "accuracy_db" in self.wish:
+            return self.wish["accuracy_db"]
+        if "stages" in self.wish or pairs > _WORTH_A_PLAN:
+            return None
+        return tolerance_in_db(*(self.wish.get(name) for name in WISHES[:2]))
+
     def sight(self) -> _Sight:
         """Return the survey, opened once per process and number of files."""
         if self.lines is not None:
@@ -485,9 +494,10 @@ def _image(
     if missing.all():
         return Record(**known, seconds=time.perf_counter() - start), empty
     beam = None if job.beam is None else replace(job.beam, along=sight.along[seen])
-    if "accuracy_db" in job.wish:
-        image = backproject(lines, grid, **job.wish, beam=beam, device=device)
-        known |= {"predicted_error_db": job.wish["accuracy_db"]}
+    accuracy_db = job.accuracy_db(lines.channels * grid.size)
+    if accuracy_db is not None:
+        image = backproject(lines, grid, accuracy_db=accuracy_db, beam=beam, device=device)
+        known |= {"predicted_error_db": accuracy_db}
     else:
         before = time.perf_counter()
         chosen = _planned(lines, grid, job, beam, device)
