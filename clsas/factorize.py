@@ -112,16 +112,11 @@ def factorize(
             progress=progress,
         )
     check_numbers(lines, chosen.beam)
-    rows, columns = grid.shape
-    pixels = np.empty(grid.shape, np.complex64)
-    (height, width), done = chosen.sides[0], 0
+    pixels, done = np.empty(grid.shape, np.complex64), 0
     try:
         run = _Run(lines, grid, chosen, device)
-        for roots, squares in run.batches():
-            for (row, column), square in zip(roots, squares, strict=True):
-                part = np.s_[row : row + height, column : column + width]
-                pixels[part] = square[: rows - row, : columns - column]
-                done += pixels[part].size
+        for formed in run.into(pixels):
+            done += formed
             if progress is not None:
                 progress(done, grid.size)
     finally:
@@ -158,6 +153,8 @@ class _Batch:
 
     Attributes
     ----------
+    roots : int [roots, 2]
+        Their first pixels.
     root_m : float64 [roots, 3]
         Middles of the roots.
     relative_m : list of float64 [roots, subimages, 3]
@@ -168,6 +165,7 @@ class _Batch:
         Where the raw channels appear on the track.
     """
 
+    roots: NDArray[np.int64]
     root_m: NDArray[np.float64]
     relative_m: list[NDArray[np.float64]]
     nodes: list[Nodes]
@@ -263,36 +261,44 @@ class _Run:
             cl.enqueue_copy(device.queue, buffer, padded, dst_offset=start * line_bytes)
         return buffer
 
-    def batches(self) -> Iterator[tuple[NDArray[np.int64], NDArray[np.complex64]]]:
-        """Yield roots, [n, 2], with their pixels, [n, rows, columns].
+    def into(self, pixels: NDArray[np.complex64]) -> Iterator[int]:
+        """Form all pixels, [rows, columns]; yield how many each time that some are finished.
 
         The geometry of a batch is prepared while the device works on the one before.
         """
-        roots = self.division.roots
-        before = None
+        roots, before = self.division.roots, None
         for start in range(0, len(roots), self.plan.roots_at_once):
-            some = roots[start : start + self.plan.roots_at_once]
-            batch = self._batch(some)
+            batch = self._batch(roots[start : start + self.plan.roots_at_once])
             if before is not None:
-                yield before[0], self._finished(*before[1:])
-            before = some, *self._start(batch)
-        yield before[0], self._finished(*before[1:])
+                yield self._finished(*before)
+            before = self._start(batch, pixels)
+        yield self._finished(*before)
 
-    def _start(self, batch: _Batch) -> tuple[NDArray[np.complex64], cl.Event | None]:
-        """Start a batch; return where its pixels will be, and when."""
-        pixels = np.zeros((len(batch.root_m), *self.plan.sides[0]), np.complex64)
-        if not batch.stride(0):
-            return pixels, None
-        for level in range(len(self.levels)):
-            self._stage(batch, level)
-        return pixels, self._backproject(batch, pixels)
+    def _start(self, batch: _Batch, pixels: NDArray[np.complex64]) -> tuple[int, list[cl.Event]]:
+        """Start a batch; return how many pixels it has, and when they are there."""
+        parts = [self._part(root) for root in batch.roots]
+        if batch.stride(0):
+            for level in range(len(self.levels)):
+                self._stage(batch, level)
+            ready = self._backproject(batch, pixels, parts)
+        else:
+            ready = []
+            for part in parts:
+                pixels[part] = 0
+        return sum(pixels[part].size for part in parts), ready
 
     @staticmethod
-    def _finished(pixels: NDArray[np.complex64], ready: cl.Event | None) -> NDArray[np.complex64]:
-        """Wait for the pixels of a batch that was started."""
-        if ready is not None:
-            ready.wait()
-        return pixels
+    def _finished(formed: int, ready: list[cl.Event]) -> int:
+        """Wait for the pixels of a batch that was started; return how many they are."""
+        for event in ready:
+            event.wait()
+        return formed
+
+    def _part(self, root: NDArray[np.int64]) -> tuple[slice, slice]:
+        """Return which pixels of the image a root has."""
+        ends = np.minimum(root + self.plan.sides[0], self.grid.shape)
+        rows, columns = (slice(int(a), int(b)) for a, b in zip(root, ends, strict=True))
+        return rows, columns
 
     def _batch(self, roots: NDArray[np.int64]) -> _Batch:
         division, chosen, track = self.division, self.plan, self.track
@@ -330,7 +336,8 @@ class _Run:
         seen = tree.seen_from(chosen.beam, track, self.along, centres_m[-1], half_m)
         inside = np.all(corners[-1] < self.grid.shape, axis=-1)
         needs = tree.ranges(division, nodes, seen, inside)
-        return _Batch(root_m, [each - root_m[:, None] for each in centres_m], nodes, needs, seen_at)
+        relative_m = [each - root_m[:, None] for each in centres_m]
+        return _Batch(roots, root_m, relative_m, nodes, needs, seen_at)
 
     def _stage(self, batch: _Batch, level: int) -> None:
         """Form the lines of a stage from those of the one before, or from the raw ones."""
@@ -429,8 +436,13 @@ class _Run:
         stretch = stretches(self.lines.tx_m, self.lines.rx_m, self.grid, batch.root_m, virtual_m)
         return stretch * self.cycles_per_m / self.samples_per_m
 
-    def _backproject(self, batch: _Batch, image: NDArray[np.complex64]) -> cl.Event:
-        """Form the pixels of roots from their last stage, and start reading them."""
+    def _backproject(
+        self,
+        batch: _Batch,
+        image: NDArray[np.complex64],
+        parts: list[tuple[slice, slice]],
+    ) -> list[cl.Event]:
+        """Form the pixels of roots from their last stage, and start reading their parts."""
         device, slot, chosen, level = self.device, self.last_slot, self.plan, self.levels[-1]
         nodes, need, stride = batch.nodes[-1], batch.needs[-1], batch.stride(len(self.levels) - 1)
         roots = len(batch.root_m)
@@ -477,8 +489,10 @@ class _Run:
             *self.beam[1:2],
             wait_for=slot.filled,
         )
-        pixels = slot.buffer("pixels", image.nbytes)
-        cl.enqueue_fill_buffer(device.queue, pixels, np.uint32(0), 0, image.nbytes)
+        height, width = chosen.sides[0]
+        bytes_ = 8 * roots * height * width
+        pixels = slot.buffer("pixels", bytes_)
+        cl.enqueue_fill_buffer(device.queue, pixels, np.uint32(0), 0, bytes_)
         slot.busy = device.run(
             self.backproject,
             (chosen.tile[0] * chosen.tile[1] // (self.width * STACK), roots * per_root),
@@ -493,11 +507,25 @@ class _Run:
             self.cycles_per_m / self.samples_per_m,
             self.filters["final"],
             pixels,
-            chosen.sides[0][1],
+            width,
             0,
             *self.beam,
         )
-        ready = cl.enqueue_copy(device.queue, image, pixels, is_blocking=False)
+        ready = []
+        for index, (down, across) in enumerate(parts):
+            ready.append(
+                cl.enqueue_copy(
+                    device.queue,
+                    image,
+                    pixels,
+                    buffer_origin=(0, index * height, 0),
+                    buffer_pitches=(8 * width, 0),
+                    host_origin=(8 * across.start, down.start, 0),
+                    host_pitches=(8 * image.shape[1], 0),
+                    region=(8 * (across.stop - across.start), down.stop - down.start, 1),
+                    is_blocking=False,
+                )
+            )
         device.queue.flush()
         return ready
 

@@ -29,6 +29,7 @@ STAGES = [(2, 2)]  # the thesis's Ns = 2: one stage, and the final backprojectio
 WAVELENGTH_M = 12e-3
 SPACING_M = 0.1001  # of an array's phase centres
 VISIBLE_DB = -2.0  # a shadow that is less dark does not count
+_FLAT_M = 0.3  # height of what counts as sand
 _BESIDE_M = 1.5, 4.0  # of the mast's shadow: sand that it is compared to
 _PIXELS_LOOKED_AT = 200  # of a patch, for its range errors
 
@@ -124,7 +125,7 @@ class Scene:
         # There channels are in the order of the track.
         order = np.argsort(lines.tx_m[:, 0] + lines.rx_m[:, 0], kind="stable")
         points_m = grid.positions_m()[tuple(pixels.T)]
-        weight = BEAM.weights(sines(points_m, lines, along))[order].T
+        weight = BEAM.weights(sines(points_m, self._phase_centres_m[seen], along))[order].T
         return float(np.abs(errors_m[weight > 0]).max())
 
     @cached_property
@@ -163,10 +164,9 @@ class Shadows:
             x = np.full(len(y_m), x_m[column])
             points_m = np.stack([x, y_m, seabed.height_m(x, y_m)], axis=-1)
             eye_m[0] = x_m[column]
-            light[:, column] = seabed.lit(points_m, eye_m)
-            # From the sand on; the hull is the same without the mast.
-            hidden[:, column] = self.bare.lit(points_m, eye_m) & ~light[:, column]
-            hidden[y_m < y_m[0], column] = False
+            sand = points_m[:, 2] < _FLAT_M
+            light[:, column] = seabed.lit(points_m, eye_m) & sand
+            hidden[:, column] = self.bare.lit(points_m, eye_m) & sand & ~light[:, column]
         middle_m = x_m[np.nonzero(hidden)[1]].mean()
         away_m = np.abs(x_m - middle_m)
         beside = (away_m > _BESIDE_M[0]) & (away_m < _BESIDE_M[1])
