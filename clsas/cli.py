@@ -673,6 +673,7 @@ def mosaic(
         raise ValueError(f"{scene}: [image] taps and upsampling play no part in a mosaic")
     beam = _read_beam(described, given)
     _warn_of_sampling(described, grid)
+    devices = [open_device(name) for name in device] or None
     options = described.mosaic
     output = output or options.get("store") or scene.with_suffix(".zarr")
     lines_path = lines_path or options.get("lines")
@@ -681,19 +682,20 @@ def mosaic(
     patches = patches or options.get("patches")
     memory_mib = memory_mib or options.get("memory_mib")
     if lines_path is None:
-        lines_path = _simulated(described, scene, output)
+        lines_path = _simulated(described, scene, output, click.echo if not as_json else None)
     start = time.perf_counter()
     with _cluster(workers, scheduler) as client:
         formed = clsas.mosaic(
             lines_path, grid, output, **wish, beam=beam, patches=patches,
-            memory_bytes=memory_mib and memory_mib << 20, device=list(device) or None,
+            memory_bytes=memory_mib and memory_mib << 20, device=devices,
             client=client, follow_s=idle_s if follow else None,
         )  # fmt: skip
         before, pixels = len(formed.finished), 0
         with _patch_progress(output.name, len(formed), before) as tell:
             for patch in formed:
                 pixels += patch.grid.size
-                tell(patch)
+                if not as_json:
+                    tell(patch)
     seconds = time.perf_counter() - start
     store = clsas.Store.opened(output)
     records = store.records()
@@ -883,18 +885,22 @@ def _progress(what: str) -> Iterator[Callable[[int, int], None] | None]:
         yield lambda done, total: bar.update(task, completed=done, total=total)
 
 
-def _simulated(described: SceneFile, scene: Path, output: Path) -> Path:
+def _simulated(
+    described: SceneFile, scene: Path, output: Path, say: Callable[..., None] | None
+) -> Path:
     """Return the file of a scene's range lines beside the store; made where it is not there."""
     path = output.with_suffix(".lines.h5")
     if path.exists() and path.stat().st_mtime >= scene.stat().st_mtime:
-        click.echo(f"Range lines of {path}, simulated before", err=True)
+        if say is not None:
+            say(f"{path}: range lines, simulated before", err=True)
         return path
     sonar, track, targets = described.need("sonar", "track", "targets")
     with _progress("simulating") as progress:
         echoes = clsas.simulate(sonar, track, targets, **described.simulate, progress=progress)
     with _progress("compressing") as progress:
         clsas.save(path, clsas.compress(echoes, **described.compress, progress=progress))
-    click.echo(f"{path}: range lines, simulated from {scene}", err=True)
+    if say is not None:
+        say(f"{path}: range lines, simulated from {scene}", err=True)
     return path
 
 

@@ -1,0 +1,209 @@
+"""The command `clsas mosaic`."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+import clsas
+from clsas.cli import main
+from clsas.config import read_scene
+
+SCENE = """
+[sonar]
+preset = "edgetech"
+
+[track]
+start_m = [-12.0, 0.0, 10.0]
+velocity_m_s = [2.0, 0.0, 0.0]
+pings = 60
+ping_interval_s = 0.2
+
+[track.sway]
+amplitude_m = 0.1
+period_s = 10.0
+
+[[targets]]
+position_m = [0.0, 60.0, 0.0]
+
+[[targets]]
+position_m = [1.5, 57.0, 0.0]
+amplitude = 0.5
+
+[grid]
+x = { start_m = -2, stop_m = 2, count = 80 }
+y = { start_m = 56, stop_m = 61, count = 100 }
+
+[image]
+tolerance_db = -40
+
+[image.beam]
+width_deg = 6
+shape = "hann"
+
+[mosaic]
+patches = [2, 2]
+"""
+
+
+def run(*args, code=0):
+    result = CliRunner().invoke(main, list(map(str, args)))
+    assert result.exit_code == code, result.output
+    return result.stdout, result.stderr
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """A scene, its mosaic, and what the command printed."""
+    folder = tmp_path_factory.mktemp("mosaic")
+    (folder / "scene.toml").write_text(SCENE)
+    return folder, run("mosaic", folder / "scene.toml", "--png", folder / "image.png")
+
+
+def test_a_scene_is_all_it_needs(made):
+    folder, (stdout, stderr) = made
+    assert "2 x 2 patches of 50 x 40 pixels, 4 formed in" in stdout
+    assert "error predicted -40" in stdout
+    told = stderr.splitlines()
+    assert told[0].endswith("scene.lines.h5: range lines, simulated from " + told[0].split()[-1])
+    assert sum(line.startswith("patch ") for line in told) == 4
+    assert (folder / "image.png").read_bytes().startswith(b"\x89PNG")
+    scene = read_scene(folder / "scene.toml")
+    exact = clsas.backproject(
+        clsas.load(folder / "scene.lines.h5"), scene.grid, beam=scene.image["beam"]
+    )
+    image = clsas.Store.opened(folder / "scene.zarr").image()
+    assert clsas.relative_error_db(image, exact) <= -40
+
+
+def test_the_same_command_goes_on(made):
+    folder, _ = made
+    shutil.rmtree(folder / "scene.zarr" / "patches" / "1.0")
+    stdout, stderr = run("mosaic", folder / "scene.toml")
+    assert "1 formed in" in stdout
+    assert "3 were there" in stdout
+    assert "simulated before" in stderr
+    result = json.loads(run("mosaic", folder / "scene.toml", "--json")[0])
+    assert result["before"] == result["finished"] == 4
+    assert result["patches"] == [2, 2]
+    assert result["flags"] == {}
+    assert result["predicted_error_db"] <= -40
+
+
+def test_a_changed_scene_is_simulated_anew(made, tmp_path):
+    text = (made[0] / "scene.toml").read_text()
+    (tmp_path / "scene.toml").write_text(text)
+    shutil.copy(made[0] / "scene.lines.h5", tmp_path)
+    before = (tmp_path / "scene.lines.h5").stat().st_mtime
+    (tmp_path / "scene.toml").write_text(text.replace("amplitude = 0.5", "amplitude = 0.7"))
+    import os
+
+    os.utime(tmp_path / "scene.lines.h5", (before - 100, before - 100))
+    _, stderr = run("mosaic", tmp_path / "scene.toml")
+    assert "simulated from" in stderr
+
+
+def test_lines_grid_and_beam_from_the_command_line(made, tmp_path):
+    (tmp_path / "empty.toml").write_text("")
+    stdout, _ = run(
+        "mosaic", tmp_path / "empty.toml", "--lines", made[0] / "scene.lines.h5",
+        "--x", "-2:2:80", "--y", "56:61:100", "--beam-deg", "6", "--beam-shape", "hann",
+        "--tolerance-db", "-40", "--patches", "1x4", "-o", tmp_path / "a.zarr", "--device", "0",
+    )  # fmt: skip
+    assert "1 x 4 patches of 100 x 20 pixels, 4 formed" in stdout
+    image, other = (
+        clsas.Store.opened(path).image() for path in (tmp_path / "a.zarr", made[0] / "scene.zarr")
+    )
+    assert clsas.relative_error_db(image, other) < -37
+
+
+def test_processes_of_this_machine(made, tmp_path):
+    pytest.importorskip("distributed")
+    stdout, stderr = run(
+        "mosaic", made[0] / "scene.toml", "--lines", made[0] / "scene.lines.h5",
+        "-o", tmp_path / "a.zarr", "--workers", "2",
+    )  # fmt: skip
+    assert "4 formed" in stdout
+    assert sum(line.startswith("patch ") for line in stderr.splitlines()) == 4
+    ours, theirs = (
+        clsas.Store.opened(path).image().pixels
+        for path in (tmp_path / "a.zarr", made[0] / "scene.zarr")
+    )
+    np.testing.assert_array_equal(ours, theirs)
+
+
+def test_a_folder_that_has_ended(made, tmp_path):
+    folder = tmp_path / "survey"
+    folder.mkdir()
+    lines = clsas.load(made[0] / "scene.lines.h5")
+    for part in range(3):
+        clsas.save(folder / f"{part}.h5", lines.select(slice(120 * part, 120 * part + 120)))
+    (folder / "end").touch()
+    stdout, _ = run(
+        "mosaic", made[0] / "scene.toml", "--lines", folder, "--follow", "-o", tmp_path / "a.zarr"
+    )
+    assert "4 formed" in stdout
+
+
+def test_flags_are_told(made, tmp_path):
+    stdout, _ = run(
+        "mosaic", made[0] / "scene.toml", "--lines", made[0] / "scene.lines.h5",
+        "--x", "100:104:20", "--y", "56:61:100", "-o", tmp_path / "a.zarr",
+    )  # fmt: skip
+    assert stdout.count("empty: no channel sees it") == 4
+
+
+@pytest.mark.parametrize(
+    ("args", "code", "message"),
+    [
+        (["--patches", "2y2"], 2, "'2y2' must be ROWSxCOLUMNS"),
+        (["--patches", "0x2"], 1, "every entry of patches must be"),
+        (["--patches", "90x2"], 1, "patches must leave each some of 100 pixels"),
+        (["--workers", "2", "--scheduler", "tcp://localhost:1"], 2, "exclude each other"),
+        (["--workers", "2", "--device", "0"], 2, "--device plays no part"),
+        (["--follow"], 2, "--follow goes with --lines, a folder"),
+        (["--tolerance-db", "-30"], 1, "tolerance_db is -40.0 there, -30.0 given"),
+        (["--tolerance-db", "-300"], 2, "tolerance_db must be"),
+        (["--memory-mib", "0"], 2, "--memory-mib"),
+        (["--device", "abacus", "-o", "new.zarr"], 1, "'abacus'"),
+        (["-o", "no/such/new.zarr"], 1, "no/such"),
+        (["--lines", "none.h5"], 2, "'none.h5' does not exist"),
+        (["--lines", "scene.toml"], 1, "scene.toml is not an HDF5 file"),
+        (["--idle-s", "-1", "--lines", "folder", "--follow"], 1, "follow_s must be"),
+        (["--idle-s", "0.1", "--lines", "folder", "--follow"], 1, "folder has no file"),
+    ],
+)
+def test_errors_are_one_message(made, monkeypatch, args, code, message):
+    monkeypatch.chdir(made[0])
+    (made[0] / "folder").mkdir(exist_ok=True)
+    before = sorted(path.name for path in made[0].iterdir())
+    _, stderr = run("mosaic", "scene.toml", *args, code=code)
+    assert message in stderr
+    assert "Traceback" not in stderr
+    assert sorted(path.name for path in made[0].iterdir()) == before
+
+
+def test_a_scheduler_that_is_not_there(made, monkeypatch):
+    pytest.importorskip("distributed")
+    monkeypatch.setattr("clsas.cli._SCHEDULER_S", 0.5)
+    _, stderr = run("mosaic", made[0] / "scene.toml", "--scheduler", "tcp://127.0.0.1:9", code=1)
+    assert "--scheduler tcp://127.0.0.1:9 cannot be reached" in stderr
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("patches = [2]", "[mosaic] patches must be a list of 2"),
+        ("patches = [0, 2]", "[mosaic] every entry of patches must be"),
+        ("memory_mib = 0", "[mosaic] memory_mib must be"),
+        ('lines = "none.h5"', "[mosaic] lines must be a file or folder"),
+        ("patch = 2", "unknown key 'patch' in [mosaic]: did you mean 'patches'"),
+    ],
+)
+def test_errors_of_scene_files(tmp_path, line, message):
+    (tmp_path / "scene.toml").write_text(SCENE.replace("patches = [2, 2]", line))
+    _, stderr = run("mosaic", tmp_path / "scene.toml", code=1)
+    assert message in stderr
+    assert [path.name for path in tmp_path.iterdir()] == ["scene.toml"]
