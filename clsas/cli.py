@@ -13,7 +13,7 @@ import sys
 import tempfile
 import time
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import ExitStack, contextmanager, nullcontext
 from dataclasses import fields, is_dataclass, replace
 from fractions import Fraction
@@ -825,14 +825,13 @@ def bench(
     """
     from clsas import bench as benchmark
 
-    if case is not None:
-        if case not in benchmark.MOSAICS:
-            _case(case)
-        if (tolerance_db if case in benchmark.CASES else accuracy_db) is not None:
-            raise click.UsageError("--accuracy-db goes with bp-..., --tolerance-db with others")
     measures = dict.fromkeys(benchmark.CASES, benchmark.run)
     measures |= dict.fromkeys(benchmark.FACTORIZED, benchmark.run_factorized)
     measures |= dict.fromkeys(benchmark.MOSAICS, benchmark.run_mosaic)
+    if case is not None:
+        _one_of(case, measures)
+        if (tolerance_db if case in benchmark.CASES else accuracy_db) is not None:
+            raise click.UsageError("--accuracy-db goes with bp-..., --tolerance-db with others")
     for name in [case] if case else measures:
         exact, measure = name in benchmark.CASES, measures[name]
         option, value = ("accuracy_db", accuracy_db) if exact else ("tolerance_db", tolerance_db)
@@ -993,9 +992,13 @@ def _case(name: str) -> Any:
     from clsas import bench
 
     cases = bench.CASES | bench.FACTORIZED
+    _one_of(name, cases)
+    return cases[name]
+
+
+def _one_of(name: str, cases: Collection[str]) -> None:
     if name not in cases:
         raise click.BadParameter(f"{name!r} is not one of {', '.join(cases)}")
-    return cases[name]
 
 
 def _read_grid(

@@ -509,6 +509,7 @@ def test_help_shows_an_example_that_parses(monkeypatch):
 def test_bench(monkeypatch):
     monkeypatch.setattr(bench, "CASES", {"one": SMALL, "two": SMALL})
     monkeypatch.setattr(bench, "FACTORIZED", {"fast": SMALL})
+    monkeypatch.setattr(bench, "MOSAICS", {})
     result = run_json("bench", "one", "--repeats", 2)
     assert result["case"] == "one"
     assert result.keys() >= {"device", "driver", "gbp_per_s", "rounding_error_db"}
