@@ -7,9 +7,10 @@ as a whole and, with the same pixels, the part of it round the wreck.
 from __future__ import annotations
 
 import argparse
+import json
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from itertools import product
 from pathlib import Path
 
@@ -24,6 +25,7 @@ from clsas.window import sines, touches_rectangles
 PIXELS = 1024
 NEAR_M = 53.0  # where the part round the wreck begins, across the track
 BEAM = clsas.BeamWindow(5.0, "hann")
+FIXED_BEAM = replace(BEAM, along=(1.0, 0.0, 0.0))  # as clsas.wavenumber has it
 ACCURACY_DB = -60.0  # of plain backprojection
 STAGES = [(2, 2)]  # the thesis's Ns = 2: one stage, and the final backprojection
 WAVELENGTH_M = 12e-3
@@ -49,6 +51,23 @@ class Scene:
     device: Device
     lines: clsas.RangeLines
     pixels: int = PIXELS
+
+    @cached_property
+    def thinned(self) -> Scene:
+        """The same with one line for each place along the track, as the thesis's data had it.
+
+        There pings overlap by a third; its data had been put on a regular grid.
+        """
+        along_m = self._phase_centres_m[:, 0]
+        order = np.argsort(along_m, kind="stable")
+        kept = np.zeros(len(order), bool)
+        kept[order] = np.append(True, np.diff(along_m[order]) > SPACING_M / 2)
+        return self if kept.all() else replace(self, lines=self.lines.select(kept))
+
+    @cached_property
+    def fine(self) -> clsas.Grid:
+        """All of the scene, in 16 times the pixels."""
+        return wreck.grid(4 * self.pixels)
 
     @cached_property
     def whole(self) -> clsas.Grid:
@@ -92,31 +111,21 @@ class Scene:
     def formula_m(self, patch: clsas.Patch) -> float:
         """Return the largest range error of a patch by [45]."""
         grid = patch.grid
-        rows, columns = (max(count - 1, 1) for count in grid.shape)
-        edges_m = grid.positions_m(slice(None, None, rows)).reshape(-1, 3)
+        edges_m = grid.positions_m(slice(None, None, grid.shape[0] - 1)).reshape(-1, 3)
         nearest_m = cdist(edges_m, self._phase_centres_m).min()
-        side_m = max(
-            np.linalg.norm(step_m) * count
-            for step_m, count in zip(
-                (grid.row_step_m, grid.column_step_m), (rows + 1, columns + 1), strict=True
-            )
-        )
+        steps_m = np.linalg.norm([grid.row_step_m, grid.column_step_m], axis=1)
+        side_m = float(np.max(steps_m * grid.shape))
         return sum(nearest.stage_errors_m(STAGES, SPACING_M, side_m, nearest_m))
 
     def measured_m(self, patch: clsas.Patch) -> float:
         """Return the largest range error of a patch by its plan, of channels that see the pixel."""
         grid, along = patch.grid, BEAM.directions(self.lines)
-        rows, columns = grid.shape
-        half_m = np.stack(
-            [(rows - 1) / 2 * grid.row_step_m, (columns - 1) / 2 * grid.column_step_m]
-        )
+        half_m = (np.array(grid.shape)[:, None] - 1) / 2 * [grid.row_step_m, grid.column_step_m]
         # What the patch was formed from.
         centre_m = grid.origin_m + half_m.sum(axis=0)
         seen = touches_rectangles(BEAM, centre_m[None], half_m, self._phase_centres_m, along)[0]
         lines, along = self.lines.select(seen), along[seen]
-        plan = clsas.plan(
-            lines, grid, stages=STAGES, beam=replace(BEAM, along=along), device=self.device
-        )
+        plan = clsas.Plan.from_json(json.dumps(patch.record.plan))
         random = np.random.default_rng(1)
         pixels = random.integers(0, grid.shape, (_PIXELS_LOOKED_AT, 2))
         ends = ([0, count // 2 - 1, count // 2, count - 1] for count in grid.shape)
@@ -133,50 +142,31 @@ class Scene:
         return (self.lines.tx_m + self.lines.rx_m) / 2
 
 
-@dataclass(frozen=True, eq=False)
-class Shadows:
-    """Where the wreck's shadow lies and, beyond that of the hull, its mast's.
+@lru_cache(maxsize=4)
+def mast_shadow(grid: clsas.Grid) -> tuple[np.ndarray, np.ndarray]:
+    """Return which pixels' sand the mast alone hides from broadside, and lit ones beside them."""
+    seabed, track = wreck.scene().need("targets", "track")
+    without = scene.wreck(wreck.X_M, wreck.Y_M, mast_m=0.0)
+    eye_m = track.positions_m.mean(axis=0)
+    x_m, y_m = grid.axes_m
+    hidden, light = np.zeros(grid.shape, bool), np.zeros(grid.shape, bool)
+    for column in np.flatnonzero(np.abs(x_m) < _BESIDE_M[1] + 1):
+        x = np.full(len(y_m), x_m[column])
+        points_m = np.stack([x, y_m, seabed.height_m(x, y_m)], axis=-1)
+        eye_m[0] = x_m[column]
+        sand = points_m[:, 2] < _FLAT_M
+        light[:, column] = seabed.lit(points_m, eye_m) & sand
+        hidden[:, column] = without.lit(points_m, eye_m) & sand & ~light[:, column]
+    away_m = np.abs(x_m - x_m[np.nonzero(hidden)[1]].mean())
+    beside = (away_m > _BESIDE_M[0]) & (away_m < _BESIDE_M[1])
+    return hidden, light & beside & hidden.any(axis=1)[:, None]
 
-    Attributes
-    ----------
-    described : SceneFile
-    """
 
-    described: wreck.SceneFile
-
-    @cached_property
-    def wreck(self) -> wreck.Shadow:
-        """Light and shadow on the sand."""
-        return wreck.Shadow(self.described)
-
-    @cached_property
-    def bare(self) -> clsas.Seabed:
-        """The seabed without the mast."""
-        return scene.wreck(wreck.X_M, wreck.Y_M, mast_m=0.0)
-
-    def mast(self, grid: clsas.Grid) -> tuple[np.ndarray, np.ndarray]:
-        """Return which pixels the mast alone hides from broadside, and lit ones beside them."""
-        seabed, track = self.described.need("targets", "track")
-        eye_m = track.positions_m.mean(axis=0)
-        x_m, y_m = grid.axes_m
-        hidden, light = np.zeros(grid.shape, bool), np.zeros(grid.shape, bool)
-        for column in np.flatnonzero(np.abs(x_m) < _BESIDE_M[1] + 1):
-            x = np.full(len(y_m), x_m[column])
-            points_m = np.stack([x, y_m, seabed.height_m(x, y_m)], axis=-1)
-            eye_m[0] = x_m[column]
-            sand = points_m[:, 2] < _FLAT_M
-            light[:, column] = seabed.lit(points_m, eye_m) & sand
-            hidden[:, column] = self.bare.lit(points_m, eye_m) & sand & ~light[:, column]
-        middle_m = x_m[np.nonzero(hidden)[1]].mean()
-        away_m = np.abs(x_m - middle_m)
-        beside = (away_m > _BESIDE_M[0]) & (away_m < _BESIDE_M[1])
-        return hidden, light & beside & hidden.any(axis=1)[:, None]
-
-    def mast_db(self, image: clsas.Image) -> float:
-        """Return the mean power of the mast's shadow over that of the sand beside it, dB."""
-        hidden, light = self.mast(image.grid)
-        power = np.abs(image.pixels) ** 2
-        return float(10 * np.log10(power[hidden].mean() / power[light].mean()))
+def mast_db(image: clsas.Image) -> float:
+    """Return the mean power of the mast's shadow over that of the sand beside it, dB."""
+    hidden, light = mast_shadow(image.grid)
+    power = np.abs(image.pixels) ** 2
+    return float(10 * np.log10(power[hidden].mean() / power[light].mean()))
 
 
 def arguments(description: str, repeats: int) -> tuple[argparse.Namespace, Scene]:

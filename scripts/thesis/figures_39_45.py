@@ -1,9 +1,13 @@
 #!/usr/bin/env python3
 """THESIS figures 39 to 45: a wreck by backprojection, mosaics and the wavenumber algorithm."""
 
-import math
+import statistics
+import time
 import warnings
+from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 
 import chapter5
 import chapter6
@@ -14,133 +18,217 @@ from clsas import wreck
 
 THESIS = {"42": (8, "λ/13"), "43": (4, "λ/6"), "44": (1, "λ/1")}  # patches a side, worst error
 TOLERANCES_DB = (-20, -30, -40, -50)
-STRIPS = 8  # of a wavenumber image, each with its own middle range
+ALL = "all channels"  # without a beam
+STRIPS = 4  # of a wavenumber image, each with its own middle range
 DYNAMIC_RANGE_DB = 40
-BRIGHTEST = 99.5  # percentile of the power that is the pictures' 0 dB
-PANEL = 300  # dots along a picture's side, about
-STEPS = 20  # of the grey scale
+BRIGHTEST = 99.5  # percentile of the exact image's power that is the pictures' 0 dB
+PANEL = 256  # pixels along a picture's side, about
+STEPS = 16  # of the grey scale
+
+Picture = tuple[str, clsas.Image, float]  # title, image, power of its 0 dB
+
+
+@dataclass(frozen=True, eq=False)
+class Way:
+    """A way to an image: its figure, what is imaged, from which lines, and how."""
+
+    figure: str
+    extent: str
+    scene: chapter6.Scene
+    name: str
+    form: Callable[[clsas.Grid], clsas.Image | tuple[clsas.Image, list[clsas.Patch]]]
+
+    @property
+    def grid(self) -> clsas.Grid:
+        """Of the image."""
+        return getattr(self.scene, self.extent)
+
+    def __call__(self) -> tuple[clsas.Image, list[clsas.Patch]]:
+        """Form the image; say what it warns of."""
+        with warnings.catch_warnings(record=True) as told:
+            warnings.simplefilter("always", clsas.ClsasWarning)
+            formed = self.form(self.grid)
+        for each in told[:1]:
+            print(f"{self.name}, {self.extent}: {each.message}")
+        return formed if isinstance(formed, tuple) else (formed, [])
+
+
+def patched(side: int) -> str:
+    """Name a mosaic of the thesis."""
+    return f"nearest, {side * side} patches" if side > 1 else "nearest, 1 patch"
+
+
+def ways(full: chapter6.Scene) -> list[Way]:
+    """Return all of them; each extent's first is exact."""
+
+    def exact(figure: str, extent: str, name: str, scene=full, **options) -> Way:
+        return Way(figure, extent, scene, name, partial(scene.backproject, **options))
+
+    def mosaic(figure: str, extent: str, name: str, side: int | None, scene=full, **wish) -> Way:
+        patches = side and (side, side)
+        return Way(figure, extent, scene, name, partial(scene.mosaic, patches=patches, **wish))
+
+    found = [
+        exact("40", "whole", "exact"),
+        exact("", "whole", "exact, −40 dB", accuracy_db=-40),
+        exact("", "whole", f"exact, −40 dB, {ALL}", accuracy_db=-40, beam=None),
+        mosaic("", "whole", "tolerance −40 dB", None, tolerance_db=-40),
+        Way("", "whole", full, "wavenumber", full.wavenumber),
+        exact("41", "part", "exact"),
+        exact("", "part", "exact, −40 dB", accuracy_db=-40),
+        exact("", "part", "exact, heading fixed", beam=chapter6.FIXED_BEAM),
+        exact("", "part", f"exact, −40 dB, {ALL}", accuracy_db=-40, beam=None),
+    ]
+    for scene in dict.fromkeys((full.thinned, full)):
+        if scene is not full:
+            found.append(exact("", "part", "exact", scene))
+        for figure, (side, _) in THESIS.items():
+            wish = {"scene": scene, "stages": chapter6.STAGES}
+            found.append(mosaic(figure, "part", patched(side), side, **wish))
+    for db in TOLERANCES_DB:
+        found.append(mosaic("", "part", f"tolerance −{-db} dB", None, tolerance_db=db))
+    for side in (4, 8):
+        name = f"tolerance −40 dB, {side * side} patches"
+        found.append(mosaic("", "part", name, side, tolerance_db=-40))
+    found += [
+        Way("45", "part", full, "wavenumber", full.wavenumber),
+        Way(
+            "",
+            "part",
+            full,
+            f"wavenumber, {STRIPS} strips",
+            partial(full.wavenumber, strips=STRIPS),
+        ),
+        exact("", "fine", "exact"),
+        exact("", "fine", "exact, −40 dB", accuracy_db=-40),
+        exact("", "fine", f"exact, −40 dB, {ALL}", accuracy_db=-40, beam=None),
+    ]
+    for db in TOLERANCES_DB:
+        found.append(mosaic("", "fine", f"tolerance −{-db} dB", None, tolerance_db=db))
+    return found
 
 
 def main() -> None:
-    given, scene = chapter6.arguments(__doc__, repeats=3)
-    shadows = chapter6.Shadows(wreck.scene())
-    whole, part = scene.whole, scene.part
+    given, full = chapter6.arguments(__doc__, repeats=3)
+    shadow = wreck.Shadow(wreck.scene())
+    thin, todo = full.thinned, ways(full)
+    exact, images, rows = {}, {}, {}
+    for way in todo:
+        image, patches = way()
+        reference = exact.setdefault((way.scene, way.extent), image)
+        rows[way] = row(way, image, patches, reference, shadow)
+        if way.extent != "fine":
+            images[way.scene, way.extent, way.name] = image
+    for way, seconds in in_turn(todo, given.repeats).items():
+        rows[way]["seconds"] = f"{seconds:.3f}"
+    chapter5.report(given.out, "figures_39_45", list(rows.values()))
+    fixed = images[full, "part", "exact, heading fixed"]
+    for name in ("wavenumber", f"wavenumber, {STRIPS} strips"):
+        error_db = clsas.relative_error_db(images[full, "part", name], fixed)
+        print(f"{name}, against exact with its heading fixed: {error_db:.1f} dB")
 
-    def mosaic(grid: clsas.Grid, side: int | None, **wish: object) -> clsas.Image:
-        return scene.mosaic(grid, patches=side and (side, side), **wish)[0]
+    def picture(title: str, name: str, extent: str = "part", scene=full) -> Picture:
+        reference = images[scene, "part", name if ALL in name else "exact"]
+        power = np.abs(reference.pixels) ** 2
+        return title, images[scene, extent, name], np.percentile(power, BRIGHTEST)
 
-    work = {
-        ("whole", "40", "exact"): partial(scene.backproject, whole),
-        ("whole", "", "exact, -40 dB"): partial(scene.backproject, whole, -40.0),
-        ("whole", "", "exact, every channel"): partial(scene.backproject, whole, beam=None),
-        ("whole", "", "-40 dB"): partial(mosaic, whole, None, tolerance_db=-40),
-        ("whole", "", "wavenumber"): partial(scene.wavenumber, whole),
-        ("part", "41", "exact"): partial(scene.backproject, part),
-        ("part", "", "exact, -40 dB"): partial(scene.backproject, part, -40.0),
-        ("part", "", "exact, every channel"): partial(scene.backproject, part, beam=None),
+    draw_track(full, given.out)
+    draw([picture("40: exact, whole scene", "exact", "whole")], given.out, "figure_40")
+    others = [
+        picture("41: exact", "exact"),
+        picture("by tolerance, −40 dB", "tolerance −40 dB"),
+        picture("45: wavenumber", "wavenumber"),
+        picture("exact, all channels, by its own brightest", f"exact, −40 dB, {ALL}"),
+    ]
+    draw(others, given.out, "figures_41_45")
+    patches = [(figure, patched(side)) for figure, (side, _) in THESIS.items()]
+    mosaics = [picture(f"{figure}: {name}", name, scene=thin) for figure, name in patches]
+    mosaics.append(picture(f"{patches[-1][1]}, every line", patches[-1][1]))
+    draw(mosaics, given.out, "figures_42_44")
+
+
+def in_turn(todo: list[Way], repeats: int) -> dict[Way, float]:
+    """Return the median seconds of every way, done in turn; all have been done before."""
+    taken: dict[Way, list[float]] = {way: [] for way in todo}
+    for _ in range(repeats):
+        for way in todo:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", clsas.ClsasWarning)
+                start = time.perf_counter()
+                way.form(way.grid)
+                taken[way].append(time.perf_counter() - start)
+    return {way: statistics.median(each) for way, each in taken.items()}
+
+
+def row(
+    way: Way,
+    image: clsas.Image,
+    patches: list[clsas.Patch],
+    exact: clsas.Image,
+    shadow: wreck.Shadow,
+) -> dict[str, object]:
+    """Return what there is to say of an image, but for its seconds."""
+    scene, worst = way.scene, {"thesis": "", "[45]": "", "measured": ""}
+    if way.figure in THESIS:
+        worst = {
+            "thesis": THESIS[way.figure][1],
+            "[45]": chapter6.fraction(max(map(scene.formula_m, patches))),
+            "measured": chapter6.fraction(max(map(scene.measured_m, patches))),
+        }
+    plans = [patch.record.plan for patch in patches]
+    other = image is exact or ALL in way.name  # not to be compared
+    error_db = None if other else clsas.relative_error_db(image, exact)
+    mast_db = chapter6.mast_db(image)
+    return {
+        "figure": way.figure,
+        "pixels": " x ".join(map(str, image.grid.shape)),
+        "lines": scene.lines.channels,
+        "image": way.name,
+        "stages": max(1 + len(plan["sides"]) if plan else 1 for plan in plans) if plans else "",
+        **worst,
+        "seconds": "",
+        "error dB": "" if error_db is None else f"{error_db:.1f}",
+        "shadow dB": f"{shadow.contrast_db(image):.1f}",
+        "mast dB": f"{mast_db:.1f}",
+        "mast": "yes" if mast_db < chapter6.VISIBLE_DB else "no",
     }
-    for number, (side, _) in THESIS.items():
-        key = "part", number, f"nearest, {side * side} patches"
-        work[key] = partial(mosaic, part, side, stages=chapter6.STAGES)
-    for db in TOLERANCES_DB:
-        work["part", "", f"{db} dB"] = partial(mosaic, part, None, tolerance_db=db)
-    for side in (4, 8):
-        key = "part", "", f"-40 dB, {side * side} patches"
-        work[key] = partial(mosaic, part, side, tolerance_db=-40)
-    work["part", "45", "wavenumber"] = partial(scene.wavenumber, part)
-    strips = "part", "", f"wavenumber, {STRIPS} strips"
-    work[strips] = partial(scene.wavenumber, part, STRIPS)
-
-    with warnings.catch_warnings(record=True) as told:
-        warnings.simplefilter("always", clsas.ClsasWarning)
-        images = {key: form() for key, form in work.items()}
-        seconds = chapter5.in_turn(work, given.repeats)
-    for message in dict.fromkeys(str(each.message) for each in told):
-        print("warning:", message)
-
-    rows = []
-    for key, image in images.items():
-        grid, number, how = key
-        exact = images[grid, "40" if grid == "whole" else "41", "exact"]
-        worst, formula_m, measured_m = ("", math.nan, math.nan)
-        if number in THESIS:
-            side, worst = THESIS[number]
-            _, patches = scene.mosaic(part, patches=(side, side), stages=chapter6.STAGES)
-            formula_m = max(map(scene.formula_m, patches))
-            measured_m = max(map(scene.measured_m, patches))
-        mast_db = shadows.mast_db(image)
-        error_db = "" if "every channel" in how else clsas.relative_error_db(image, exact)
-        rows.append(
-            {
-                "figure": number,
-                "grid": f"{grid}, {image.grid.shape[0]} x {image.grid.shape[1]}",
-                "image": how,
-                "thesis": worst,
-                "[45]": chapter6.fraction(formula_m) if number in THESIS else "",
-                "measured": chapter6.fraction(measured_m) if number in THESIS else "",
-                "seconds": f"{seconds[key]:.3f}",
-                "error dB": "" if image is exact or error_db == "" else f"{error_db:.1f}",
-                "shadow dB": f"{shadows.wreck.contrast_db(image):.1f}",
-                "mast dB": f"{mast_db:.1f}",
-                "mast": "yes" if mast_db < chapter6.VISIBLE_DB else "no",
-            }
-        )
-    chapter5.report(given.out, "figures_39_45", rows)
-
-    draw_track(scene, given.out)
-    exact = images["part", "41", "exact"]
-    reference = np.percentile(np.abs(exact.pixels) ** 2, BRIGHTEST)
-    figure = chapter5.figure(7.5, 6.2)
-    axes = figure.subplots()
-    draw(axes, images["whole", "40", "exact"], "40: exact, whole scene", reference, figure)
-    chapter5.plot.save_png(figure, given.out / "figure_40.png", dpi=72)
-
-    titles = {
-        ("part", "41", "exact"): "41: exact",
-        ("part", "42", "nearest, 64 patches"): "42: nearest, 64 patches",
-        ("part", "43", "nearest, 16 patches"): "43: nearest, 16 patches",
-        ("part", "44", "nearest, 1 patches"): "44: nearest, one patch",
-        ("part", "45", "wavenumber"): "45: wavenumber",
-        ("part", "", "-40 dB"): "by tolerance, −40 dB",
-    }
-    figure = chapter5.figure(13, 8)
-    panels = figure.subplots(2, 3, sharex=True, sharey=True).ravel()
-    for (key, title), panel in zip(titles.items(), panels, strict=True):
-        draw(panel, images[key], title, reference)
-    figure.colorbar(
-        panels[0].images[0], ax=list(panels), label="power over the exact image's brightest (dB)"
-    )
-    chapter5.save(figure, given.out, "figures_39_45", dpi=72)
 
 
-def draw_track(scene: chapter6.Scene, out) -> None:
-    """Draw the platform as pings see it: where transmitters are."""
+def draw_track(scene: chapter6.Scene, out: Path) -> None:
+    """Draw where the transmitter was at every ping."""
     tx_m = np.unique(scene.lines.tx_m, axis=0)
     figure = chapter5.figure(8, 2.8)
     axes = figure.subplots()
     axes.plot(tx_m[:, 0], tx_m[:, 1], ".-", markersize=3, linewidth=0.5)
     axes.set(xlabel="along the track, x (m)", ylabel="sway, y (m)")
-    axes.set_title(f"39: {len(tx_m)} pings; y is drawn 80 times as large")
+    axes.set_title(f"39: {len(tx_m)} pings")
     axes.grid(alpha=0.3)
     chapter5.plot.save_png(figure, out / "figure_39.png", dpi=72)
 
 
-def draw(axes, image: clsas.Image, title: str, reference: float, figure=None) -> None:
-    """Draw an image in dB over a reference power."""
+def draw(pictures: list[Picture], out: Path, stem: str) -> None:
+    """Draw one image or four, in dB over a power."""
     from matplotlib import colormaps
 
-    together = max(image.grid.shape[0] // PANEL, 1)
-    drawn = axes.imshow(
-        chapter6.levels(image, together, reference),
-        origin="lower",
-        extent=chapter6.extent_m(image.grid),
-        cmap=colormaps["gray"].resampled(STEPS),
-        vmin=-DYNAMIC_RANGE_DB,
-        vmax=0,
-    )
-    axes.set(title=title, aspect="equal", xlabel="x (m)", ylabel="y (m)")
-    if figure is not None:
-        figure.colorbar(drawn, ax=axes, label="power over the exact image's brightest (dB)")
+    side = 1 if len(pictures) == 1 else 2
+    figure = chapter5.figure(*((7.5, 6.2) if side == 1 else (10.5, 8.6)))
+    panels = figure.subplots(side, side, sharex=True, sharey=True, squeeze=False).ravel()
+    for (title, image, reference), axes in zip(pictures, panels, strict=True):
+        drawn = axes.imshow(
+            chapter6.levels(image, max(image.grid.shape[0] // PANEL, 1), reference),
+            origin="lower",
+            extent=chapter6.extent_m(image.grid),
+            cmap=colormaps["gray"].resampled(STEPS),
+            vmin=-DYNAMIC_RANGE_DB,
+            vmax=0,
+        )
+        axes.set(title=title, aspect="equal")
+    for axes in panels[-side:]:
+        axes.set_xlabel("x (m)")
+    for axes in panels[::side]:
+        axes.set_ylabel("y (m)")
+    figure.colorbar(drawn, ax=list(panels), label="power over the brightest (dB)")
+    chapter5.plot.save_png(figure, out / f"{stem}.png", dpi=54 if side > 1 else 72)
 
 
 if __name__ == "__main__":
