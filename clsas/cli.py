@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import importlib.util
 import json
+import logging
 import math
+import signal
 import sys
 import tempfile
 import time
@@ -31,7 +33,7 @@ import clsas
 from clsas import demo as demonstration
 from clsas import validate
 from clsas.backproject import BEST_ACCURACY_DB, execute, prepare
-from clsas.config import DIAL, EXACT, SceneFile, read_scene
+from clsas.config import DIAL, EXACT, SceneFile, read_scene, simulation_digest
 from clsas.device import choose, open_device
 from clsas.interpolation import TAPS
 from clsas.planner import BEST_TOLERANCE_DB, WORST_TOLERANCE_DB, wavelengths
@@ -690,10 +692,10 @@ def mosaic(
             memory_bytes=memory_mib and memory_mib << 20, device=devices,
             client=client, follow_s=idle_s if follow else None,
         )  # fmt: skip
-        before, pixels = len(formed.finished), 0
+        before, count, pixels = len(formed.finished), 0, 0
         with _patch_progress(output.name, len(formed), before) as tell:
             for patch in formed:
-                pixels += patch.grid.size
+                count, pixels = count + 1, pixels + patch.grid.size
                 if not as_json:
                     tell(patch)
     seconds = time.perf_counter() - start
@@ -709,8 +711,11 @@ def mosaic(
     rows, columns = formed.patch_shape
     text = [
         f"{output}: {' x '.join(map(str, formed.shape))} patches of {rows} x {columns} pixels, "
-        f"{len(records) - before} formed in {seconds:.2f} s "
-        f"({pixels / seconds / 1e6:.3g} Mpixel/s)"
+        + (
+            f"{count} formed in {seconds:.2f} s ({pixels / seconds / 1e6:.3g} Mpixel/s)"
+            if count
+            else "none to form"
+        )
         + (f", {before} were there" if before else "")
         + ("" if worst is None else f"; error predicted {worst:.1f} dB at most")
     ]
@@ -719,8 +724,8 @@ def mosaic(
         as_json,
         "\n".join(text),
         file=output, png=png, shape=grid.shape, patches=formed.shape,
-        patch_shape=formed.patch_shape, finished=len(records), before=before, seconds=seconds,
-        pixels_per_s=pixels / seconds, predicted_error_db=worst,
+        patch_shape=formed.patch_shape, finished=len(records), formed=count, before=before,
+        seconds=seconds, pixels_per_s=pixels / seconds, predicted_error_db=worst,
         flags={f"{row},{column}": f for (row, column), f in flagged.items()},
         seconds_of_patches=sum(record.seconds for record in records.values()),
     )  # fmt: skip
@@ -888,8 +893,9 @@ def _simulated(
     described: SceneFile, scene: Path, output: Path, say: Callable[..., None] | None
 ) -> Path:
     """Return the file of a scene's range lines beside the store; made where it is not there."""
-    path = output.with_suffix(".lines.h5")
-    if path.exists() and path.stat().st_mtime >= scene.stat().st_mtime:
+    digest = simulation_digest(scene.read_bytes(), scene.parent)
+    path = output.with_name(f"{output.stem}-{digest}.lines.h5")
+    if path.exists():
         if say is not None:
             say(f"{path}: range lines, simulated before", err=True)
         return path
@@ -925,9 +931,18 @@ def _cluster(workers: int | None, scheduler: str | None) -> Iterator[Any]:
                     f"--scheduler {scheduler} cannot be reached: {error}"
                 ) from None
         else:
-            cluster = opened.enter_context(
-                LocalCluster(n_workers=workers, threads_per_worker=1, dashboard_address=None)
-            )
+            # Ctrl-C at a terminal is for this process, which then ends the others.
+            heeded = signal.signal(signal.SIGINT, signal.SIG_IGN)
+            try:
+                cluster = LocalCluster(
+                    n_workers=workers,
+                    threads_per_worker=1,
+                    dashboard_address=None,
+                    silence_logs=logging.CRITICAL,
+                )
+            finally:
+                signal.signal(signal.SIGINT, heeded)
+            opened.enter_context(cluster)
             client = opened.enter_context(Client(cluster))
         try:
             yield client

@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import csv
 import difflib
+import hashlib
 import inspect
+import json
 import os
 import tomllib
 from collections.abc import Callable, Iterator, Sequence
@@ -37,6 +39,8 @@ from clsas.window import BeamWindow
 
 PRESETS = ("thesis_wide_beam", "edgetech", "sensotek")
 SEABEDS: dict[str, Callable[..., Seabed]] = {"wreck": wreck, "pipeline": pipeline, "rocks": rocks}
+
+_IMAGING = ("grid", "image", "mosaic")  # tables that range lines do not depend on
 
 DIAL = ("tolerance_db", "tolerance_wavelengths", "stages")
 """Keys of `[image]` of which `clsas.plan` takes one."""
@@ -115,6 +119,18 @@ def parse_scene(text: bytes, *, name: str, folder: Path) -> SceneFile:
         raise ValueError("\n".join(f"{name}: {line}" for line in _explain(error, tables))) from None
     except (TypeError, ValueError) as error:
         raise ValueError(f"{name}: {error}") from None
+
+
+def simulation_digest(text: bytes, folder: Path) -> str:
+    """Return a digest of all that the range lines of a scene file depend on, clsas included."""
+    from clsas import __version__  # which imports this module
+
+    tables = tomllib.loads(text.decode())
+    told = {name: table for name, table in tables.items() if name not in _IMAGING}
+    digest = hashlib.sha256(json.dumps([__version__, told], sort_keys=True, default=str).encode())
+    if isinstance(file := tables.get("track", {}).get("file"), str):
+        digest.update((folder / file).read_bytes())
+    return digest.hexdigest()[:12]
 
 
 def built_in_scene(name: str) -> bytes:

@@ -108,6 +108,7 @@ class Mosaic:
     patch_shape: tuple[int, int]
     finished: dict[tuple[int, int], Record]
     _job: _Job
+    _inputs: dict[str, Any]
     _survey: Survey
     _source: RangeLines | Path
     _devices: tuple[Device, ...]
@@ -138,8 +139,9 @@ class Mosaic:
         """
         survey, sight = self._survey, _Sight.of(self._survey, self._job.beam)
         todo = [place for place in np.ndindex(self.shape) if place not in self.finished]
-        formed_from: dict[tuple[int, int], int] = {}  # channels that the survey had
-        ended = self._idle_s is None or has_ended(self._source)
+        # Of how many channels it is known that a patch, formed, has all it sees of them.
+        known = {place: record.survey_channels for place, record in self.finished.items()}
+        ended = self._idle_s is None
         last_news = time.monotonic()
         workers = min(len(self._devices), max(len(todo), 1))
         # One more than can work: what waits to be taken is held in memory. A cluster holds records.
@@ -152,39 +154,47 @@ class Mosaic:
                 for place in ready[: max(most - len(running), 0)]:
                     ready.remove(place)
                     todo.remove(place)
-                    job = replace(self._job, paths=_paths(survey), lines=_in_memory(survey))
+                    job = replace(self._job, files=_files(survey), in_memory=_in_memory(sight))
                     running[executor.submit(_form, job, *self._window(*place))] = place
-                    formed_from[place] = survey.channels
-                if not running and ended:
+                    known[place] = survey.channels
+                if not running and not todo and ended:
                     return
                 done, _ = wait(
                     running or [Future()],
-                    timeout=None if ended else _POLL_S,
+                    timeout=None if ended and running else _POLL_S,
                     return_when=FIRST_COMPLETED,
                 )
                 for future in done:
                     yield self._finished(running.pop(future), *future.result())
-                if ended:
-                    continue
-                last = has_ended(self._source)  # asked before looking: nothing comes after it
-                paths = files_of(self._source)
-                if len(paths) > len(survey.parts):
-                    survey = open_files(paths, survey)
-                    sight, last_news = _Sight.of(survey, self._job.beam), time.monotonic()
-                    # Patches that channels see which came after they were formed.
-                    todo += [
-                        place
-                        for place, channels in formed_from.items()
-                        if place not in todo
-                        and place not in running.values()
-                        and sight.sees(self._window(*place)[0])[channels:].any()
-                    ]
-                ended = last or time.monotonic() - last_news > self._idle_s
-                ready = self._ready(todo, sight, ended)
+                if not ended:
+                    last = has_ended(self._source)  # asked before looking: nothing comes after it
+                    paths = files_of(self._source)
+                    if paths != survey.parts:
+                        before, survey = len(survey.parts), open_files(paths, survey)
+                        sight, last_news = _Sight.of(survey, self._job.beam), time.monotonic()
+                        self._grow(survey, before)
+                    ended = last or time.monotonic() - last_news > self._idle_s
+                # Patches that channels see which came after they were formed.
+                for place in set(known) - set(running.values()) - set(todo):
+                    if known[place] < survey.channels:
+                        seen = sight.sees(self._window(*place)[0])
+                        if seen[known[place] :].any():
+                            todo.append(place)
+                        known[place] = survey.channels
+                if self._idle_s is not None:
+                    ready = self._ready(todo, sight, ended)
         finally:
             for future in running:
                 future.cancel()
-            executor.shutdown(wait=True)
+            # Patches begun are finished here; workers may have been lost.
+            executor.shutdown(wait=self._client is None)
+
+    def _grow(self, survey: Survey, first: int) -> None:
+        """Keep in the store what the survey has grown by."""
+        store = self._job.opened_store()
+        if store is not None:
+            self._inputs["parts"] += survey.digests(first)
+            store.grow(self._inputs)
 
     def _window(self, row: int, column: int) -> tuple[Grid, int, int, slice, slice]:
         parts = []
@@ -211,7 +221,7 @@ class Mosaic:
 
     def _executor(self, workers: int) -> Executor:
         if self._client is not None:
-            return self._client.get_executor(pure=False, retries=2)
+            return self._client.get_executor(pure=False)
         # Every thread takes a device of its own.
         free: queue.SimpleQueue[Device] = queue.SimpleQueue()
         for device in self._devices:
@@ -317,7 +327,13 @@ def mosaic(
         validate.instance("beam", beam, BeamWindow)
     if patches is not None:
         patch_shape = _shape_of(patches, grid)
-    memory_bytes = validate.count("memory_bytes", memory_bytes or MEMORY_BYTES)
+    if memory_bytes is None:
+        memory_bytes = MEMORY_BYTES
+    memory_bytes = validate.count("memory_bytes", memory_bytes)
+    if not isinstance(source, RangeLines):
+        validate.path("source", source)
+    if client is not None and not hasattr(client, "get_executor"):
+        raise TypeError(f"client must be a distributed.Client, got {client!r}")
     if client is not None and store is None:
         raise ValueError("store must be given with a client")
     if client is not None and isinstance(source, RangeLines):
@@ -328,6 +344,11 @@ def mosaic(
     if follows:
         follow_s = validate.positive("follow_s", follow_s, "s")
     folder = not isinstance(source, RangeLines) and Path(source).is_dir()
+    if folder and beam is not None and beam.normalise:
+        raise ValueError(
+            "beam must not normalise with a folder, which may grow: its scale is that of all "
+            "channels"
+        )
     if follows and not folder:
         raise ValueError(f"source must be a folder to follow, got {source!r}")
     if not isinstance(source, RangeLines):
@@ -345,8 +366,8 @@ def mosaic(
         stored = None if opened is None else opened.patch_shape
         patch_shape = stored or _choose_shape(sight, grid, wish, memory_bytes, devices[0])
     job = _Job(
-        paths=(),
-        lines=None,
+        files=(),
+        in_memory=None,
         wish=wish,
         beam=beam,
         memory_bytes=memory_bytes,
@@ -357,7 +378,9 @@ def mosaic(
     if opened is not None:
         opened.begin(inputs, grid, patch_shape)
         finished = opened.records()
-    found = Mosaic(grid, patch_shape, finished, job, survey, source, devices, client, follow_s)
+    found = Mosaic(
+        grid, patch_shape, finished, job, inputs, survey, source, devices, client, follow_s
+    )
     for place, record in list(finished.items()):
         # Files that were added since may hold channels that see it.
         if record.survey_channels < survey.channels:
@@ -371,8 +394,8 @@ def mosaic(
 class _Job:
     """What every patch of a mosaic has in common; small, it travels with each."""
 
-    paths: tuple[Path, ...]
-    lines: Survey | None
+    files: tuple[tuple[Path, tuple[int, int]], ...]
+    in_memory: _Sight | None
     wish: dict[str, Any]
     beam: BeamWindow | None
     memory_bytes: int
@@ -389,9 +412,12 @@ class _Job:
 
     def sight(self) -> _Sight:
         """Return the survey, opened once per process and number of files."""
-        if self.lines is not None:
-            return _Sight.of(self.lines, self.beam)
-        return _opened(self.paths, _beam_json(self.beam))
+        if self.in_memory is not None:
+            return self.in_memory
+        found = _opened(self.files, _beam_json(self.beam))
+        if found.survey.stamps != tuple(stamp for _, stamp in self.files):
+            raise ValueError("source must not change while a mosaic is formed: a file of it did")
+        return found
 
     def opened_store(self) -> Store | None:
         return None if self.store is None else Store.at(self.store)
@@ -460,8 +486,9 @@ class _Sight:
 
 
 @lru_cache(maxsize=2)
-def _opened(paths: tuple[Path, ...], beam: str | None) -> _Sight:
-    return _Sight.of(open_files(paths), None if beam is None else BeamWindow(**json.loads(beam)))
+def _opened(files: tuple[tuple[Path, tuple[int, int]], ...], beam: str | None) -> _Sight:
+    survey = open_files(tuple(path for path, _ in files))
+    return _Sight.of(survey, None if beam is None else BeamWindow(**json.loads(beam)))
 
 
 def _form(
@@ -494,13 +521,17 @@ def _image(
     if missing.all():
         return Record(**known, seconds=time.perf_counter() - start), empty
     beam = None if job.beam is None else replace(job.beam, along=sight.along[seen])
+    # A normalising beam multiplies by the number of channels: that of all.
+    scale = sight.survey.channels / lines.channels if beam is not None and beam.normalise else 1.0
+    room = _room(lines, grid, job, device)
     accuracy_db = job.accuracy_db(lines.channels * grid.size)
     if accuracy_db is not None:
         image = backproject(lines, grid, accuracy_db=accuracy_db, beam=beam, device=device)
-        known |= {"predicted_error_db": accuracy_db}
+        bytes_ = _host_bytes(lines.channels, lines.length, grid.size)
+        known |= {"predicted_error_db": accuracy_db, "memory_bytes": bytes_}
     else:
         before = time.perf_counter()
-        chosen = _planned(lines, grid, job, beam, device)
+        chosen = plan(lines, grid, **job.wish, beam=beam, device=device, memory_bytes=room)
         known |= {
             "plan_seconds": time.perf_counter() - before,
             "predicted_error_db": chosen.predicted_error_db,
@@ -509,21 +540,21 @@ def _image(
             "plan": json.loads(_without_directions(chosen).to_json()),
         }
         image = factorize(lines, grid, chosen, device=device)
-    return Record(**known, seconds=time.perf_counter() - start), image.pixels
+    pixels = image.pixels if scale == 1 else np.float32(scale) * image.pixels
+    known |= {"has_pixels": bool(pixels.any()), "seconds": time.perf_counter() - start}
+    return Record(**known), pixels
 
 
-def _planned(
-    lines: RangeLines, grid: Grid, job: _Job, beam: BeamWindow | None, device: Device
-) -> Plan:
+def _room(lines: RangeLines, grid: Grid, job: _Job, device: Device) -> int:
+    """Return what may be used on the device, beside lines and pixels here."""
     room = job.memory_bytes - _host_bytes(lines.channels, lines.length, grid.size)
     if room <= 0:
         raise ValueError(
-            f"memory_bytes must be more than {(job.memory_bytes - room) / 2**20:.0f} MiB for "
+            f"memory_bytes must be more than {(job.memory_bytes - room) / 2**20:.1f} MiB for "
             f"{grid.shape[0]} x {grid.shape[1]} pixels from {lines.channels} lines of "
-            f"{lines.length} samples, got {job.memory_bytes / 2**20:.0f} MiB: use smaller patches"
+            f"{lines.length} samples, got {job.memory_bytes / 2**20:.1f} MiB: use smaller patches"
         )
-    most = min(room, device.info.memory_bytes // 2)
-    return plan(lines, grid, **job.wish, beam=beam, device=device, memory_bytes=most)
+    return min(room, device.info.memory_bytes // 2)
 
 
 def _host_bytes(channels: int, length: int, pixels: int) -> int:
@@ -624,12 +655,13 @@ def _without_directions(chosen: Plan) -> Plan:
     return replace(chosen, beam=replace(chosen.beam, along=None))
 
 
-def _paths(survey: Survey) -> tuple[Path, ...]:
-    return tuple(part for part in survey.parts if isinstance(part, Path))
+def _files(survey: Survey) -> tuple[tuple[Path, tuple[int, int]], ...]:
+    pairs = zip(survey.parts, survey.stamps, strict=True)
+    return tuple((part, stamp) for part, stamp in pairs if isinstance(part, Path))
 
 
-def _in_memory(survey: Survey) -> Survey | None:
-    return survey if isinstance(survey.parts[0], RangeLines) else None
+def _in_memory(sight: _Sight) -> _Sight | None:
+    return sight if isinstance(sight.survey.parts[0], RangeLines) else None
 
 
 def _wait_for_first(source: Path, follow_s: float) -> None:
@@ -645,7 +677,7 @@ _LOCAL = threading.local()
 
 def _devices(wish: Any) -> tuple[Device, ...]:
     """Return the devices to work on side by side."""
-    if isinstance(wish, Sequence) and not isinstance(wish, str):
+    if isinstance(wish, Sequence) and not isinstance(wish, (str, bytes)):
         if not wish:
             raise ValueError("device must name at least one device, got an empty sequence")
         found = tuple(open_device(each) for each in wish)
@@ -659,7 +691,7 @@ def _devices(wish: Any) -> tuple[Device, ...]:
             found = (first,)
     names = {device.info.index for device in found}
     if len(names) < len(found):
-        raise ValueError("device must name each device once")
+        raise ValueError(f"device must name each device once, got {wish!r}")
     return found
 
 

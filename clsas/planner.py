@@ -191,7 +191,9 @@ def _allowed(taps: tuple[int, int] | None, depth: int | None) -> Allowed | None:
 def _divisible(view: View) -> bool:
     """Return whether an image can be factorized at all."""
     normalise = view.beam is not None and view.beam.normalise
-    return view.track is not None and view.grid.size > 1 and not normalise
+    if view.track is None or view.grid.size == 1 or normalise:
+        return False
+    return view.sweeps_once
 
 
 def _fastest(

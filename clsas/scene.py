@@ -423,7 +423,7 @@ def wreck(
     TypeError, ValueError
         If a value has the wrong kind or is outside its limits, or the position is off the patch.
     """
-    mast = validate.number("mast_m", mast_m, "m", least=0.0)
+    mast = validate.number("mast_m", mast_m, "m", least=0.0, most=_HIGHEST_MAST_M)
     sand = _Sand.draw(x_m, y_m, cell_m, seed)
     ahead, aside = sand.around(position_m, heading_deg)
     length, width = 25.0, 7.0
@@ -524,6 +524,9 @@ def rocks(
     return sand.seabed(top, 3.0, density_m2, floor_db)
 
 
+_LARGEST_CELL_M, _HIGHEST_MAST_M = 1.0, 100.0  # what shows a wreck at all
+
+
 class _Sand(NamedTuple):
     """Rippled sand on a lattice, for something to stand on."""
 
@@ -538,7 +541,7 @@ class _Sand(NamedTuple):
         cls, x_m: tuple[float, float], y_m: tuple[float, float], cell_m: float, seed: int
     ) -> _Sand:
         x_m, y_m = _extent("x_m", x_m), _extent("y_m", y_m)
-        cell = validate.positive("cell_m", cell_m, "m")
+        cell = validate.number("cell_m", cell_m, "m", above=0.0, most=_LARGEST_CELL_M)
         seed = validate.count("seed", seed, least=0)
         sizes = [(extent[1] - extent[0]) / cell for extent in (y_m, x_m)]
         validate.memory("cell_m", 80 * sizes[0] * sizes[1])

@@ -6,11 +6,14 @@ after its pixels; both are renamed into place, so that neither is ever half ther
 
 from __future__ import annotations
 
+import errno
 import json
 import math
 import os
 import re
+import shutil
 import tempfile
+import uuid
 from dataclasses import asdict, dataclass, fields
 from functools import cached_property
 from pathlib import Path
@@ -57,6 +60,8 @@ class Record:
     plan : dict or None
         The plan, as `clsas.Plan.from_json` reads it, its beam without directions; None for an exact
         image or an empty patch.
+    has_pixels : bool
+        Whether any pixel is not 0.
     """
 
     channels: int
@@ -72,6 +77,7 @@ class Record:
     device: str = ""
     driver: str = ""
     plan: dict[str, Any] | None = None
+    has_pixels: bool = False
 
     @property
     def is_empty(self) -> bool:
@@ -112,7 +118,7 @@ class Store:
             If Zarr is not installed.
         """
         _zarr()
-        return cls(Path(path).resolve())
+        return cls(validate.path("store", path).resolve())
 
     @classmethod
     def opened(cls, path: str | os.PathLike) -> Store:
@@ -128,20 +134,21 @@ class Store:
         store = cls.at(path)
         if not store.path.exists():
             raise FileNotFoundError(2, "there is no mosaic", str(path))
-        if "inputs" not in store._attributes():
-            raise ValueError(f"{path} holds a mosaic that was never begun; form it anew")
+        store._attributes()
         return store
 
     @property
     def patch_shape(self) -> tuple[int, int] | None:
         """Pixels of a patch, or None where there is no mosaic yet."""
-        shape = self._attributes().get("patch_shape")
-        return None if shape is None else (shape[0], shape[1])
+        if not self._is_there():
+            return None
+        rows, columns = self._attributes()["patch_shape"]
+        return rows, columns
 
     @cached_property
     def pixels(self) -> zarr.Array:
         """The pixels, complex64 [rows, columns], on disk."""
-        return _zarr().open_array(self.path / "pixels", mode="r+")
+        return self._array("pixels", "r")
 
     @property
     def grid(self) -> Grid:
@@ -172,27 +179,47 @@ class Store:
         OSError
             If it cannot be written.
         """
+        if not self._is_there():
+            self._create(inputs, grid, patch_shape)
         stored = self._attributes()
-        if "inputs" in stored:
-            self._check(stored["inputs"], inputs)
-            if stored["patch_shape"] != list(patch_shape):
-                mine, given = ("{} x {}".format(*s) for s in (stored["patch_shape"], patch_shape))
-                raise ValueError(
-                    f"{self.path} was made with other inputs: patches of {mine} pixels there, "
-                    f"of {given} given; give it another path or the same inputs"
-                )
-            with tempfile.TemporaryFile(dir=self.path):
-                pass  # raises where it cannot be written
-            if stored["inputs"]["parts"] != inputs["parts"]:
-                self._root("r+").attrs["inputs"] = inputs
-            return
+        self._check(stored["inputs"], inputs)
+        if stored["patch_shape"] != list(patch_shape):
+            mine, given = ("{} x {}".format(*s) for s in (stored["patch_shape"], patch_shape))
+            raise ValueError(
+                f"{self.path} was made with other inputs: patches of {mine} pixels there, "
+                f"of {given} given; give it another path or the same inputs"
+            )
+        with tempfile.TemporaryFile(dir=self.path):
+            pass  # raises where it cannot be written
+        pixels = self.pixels
+        if (pixels.shape, pixels.chunks) != (grid.shape, patch_shape):
+            raise ValueError(f"{self.path} is damaged: its pixels are not those of its grid")
+        self.grow(inputs)
+
+    def grow(self, inputs: dict[str, Any]) -> None:
+        """Keep the inputs of a survey that has grown."""
+        if self._attributes()["inputs"] != inputs:
+            _zarr().open_group(self.path, mode="r+").attrs["inputs"] = inputs
+
+    def _create(self, inputs: dict[str, Any], grid: Grid, patch_shape: tuple[int, int]) -> None:
+        """Create the store, whole or not at all."""
         if not self.path.parent.is_dir():
             raise FileNotFoundError(2, "there is no such folder", str(self.path.parent))
-        zarr = _zarr()
-        # Whole only once it has its inputs; until then it is begun anew.
-        root = zarr.create_group(
-            self.path, attributes={"format": FORMAT}, overwrite=self.path.exists()
-        )
+        temporary = self.path.with_name(f".{uuid.uuid4().hex}.part")
+        try:
+            self._fill(temporary, inputs, grid, patch_shape)
+            try:
+                os.rename(temporary, self.path)
+            except OSError as error:
+                # Another process was first: what it made is checked.
+                if error.errno not in (errno.ENOTEMPTY, errno.EEXIST):
+                    raise
+        finally:
+            shutil.rmtree(temporary, ignore_errors=True)
+
+    @staticmethod
+    def _fill(path: Path, inputs: dict[str, Any], grid: Grid, patch_shape: tuple[int, int]) -> None:
+        root = _zarr().create_group(path)
         names = ("y", "x") if grid.has_axes else ("row", "column")
         root.create_array(
             "pixels",
@@ -215,21 +242,40 @@ class Store:
         if grid.height_m is not None:
             root.create_array("height", data=grid.height_m, dimension_names=names)
         root.create_group("patches")
-        root.attrs.update(version=VERSION, patch_shape=list(patch_shape), grid=plane, inputs=inputs)
+        root.attrs.update(
+            format=FORMAT,
+            version=VERSION,
+            patch_shape=list(patch_shape),
+            grid=plane,
+            inputs=inputs,
+        )
 
     def records(self) -> dict[tuple[int, int], Record]:
-        """Return the records of all finished patches, by row and column."""
+        """Return the records of all finished patches, by row and column.
+
+        A record whose pixels are not there, or not all, does not count.
+        """
         found = {}
         known = {field.name for field in fields(Record)}
-        for folder in (self.path / "patches").iterdir():
+        pixels = self.pixels
+        shape = [math.ceil(n / m) for n, m in zip(pixels.shape, pixels.chunks, strict=True)]
+        folders = self.path / "patches"
+        for folder in folders.iterdir() if folders.is_dir() else ():
             if not (name := re.fullmatch(r"(\d+)\.(\d+)", folder.name)):
+                continue
+            place = int(name[1]), int(name[2])
+            if place[0] >= shape[0] or place[1] >= shape[1]:
                 continue
             try:
                 stored = json.loads((folder / "zarr.json").read_text())["attributes"]
                 record = Record(**{k: v for k, v in stored.items() if k in known})
             except (OSError, ValueError, KeyError, TypeError):
                 continue  # cut off while it was written
-            found[int(name[1]), int(name[2])] = record
+            chunk = self.path / "pixels" / "c" / name[1] / name[2]
+            # Zarr leaves out a chunk that is all zero.
+            size = chunk.stat().st_size if chunk.exists() else 0
+            if size == 8 * math.prod(pixels.chunks) or not (size or record.has_pixels):
+                found[place] = record
         return dict(sorted(found.items()))
 
     def write(
@@ -248,7 +294,7 @@ class Store:
         OSError
             If the disk is full or the store not writable.
         """
-        self.pixels[rows, columns] = pixels
+        self._array("pixels", "r+")[rows, columns] = pixels
         _zarr().create_group(
             self.path / "patches" / f"{row}.{column}", attributes=asdict(record), overwrite=True
         )
@@ -261,7 +307,8 @@ class Store:
 
     def overview(self, most: int = _OVERVIEW) -> Image:
         """Return the mosaic at fewer pixels, each the root of the mean power of those it covers."""
-        grid, (height, width) = self.grid, self.patch_shape
+        validate.count("most", most)
+        grid, (height, width) = self.grid, self.pixels.chunks
         step = math.ceil(max(grid.shape) / most)
         shape = tuple(n // step or 1 for n in grid.shape)
         step = [min(step, n) for n in grid.shape]
@@ -286,24 +333,35 @@ class Store:
         )
         return Image(np.sqrt(power).astype(np.complex64), coarse)
 
-    def _root(self, mode: str) -> zarr.Group:
-        return _zarr().open_group(self.path, mode=mode)
+    def _array(self, name: str, mode: str) -> zarr.Array:
+        try:
+            return _zarr().open_array(self.path / name, mode=mode)
+        except (LookupError, OSError, ValueError, TypeError) as error:
+            raise ValueError(f"{self.path} is damaged: {name} cannot be read: {error}") from error
+
+    def _is_there(self) -> bool:
+        """Return whether the path holds anything."""
+        return self.path.exists() and not (self.path.is_dir() and not any(self.path.iterdir()))
 
     def _attributes(self) -> dict[str, Any]:
-        """Return what is known about the mosaic as a whole; nothing where there is none."""
-        if not self.path.exists() or (self.path.is_dir() and not any(self.path.iterdir())):
-            return {}
+        """Return what is known about the mosaic as a whole; raises ValueError if it is none."""
         try:
-            attributes = dict(self._root("r").attrs)
-        except (OSError, ValueError, KeyError) as error:
+            attributes = json.loads((self.path / "zarr.json").read_text())["attributes"]
+            ours = attributes["format"] == FORMAT
+        except (OSError, ValueError, LookupError, TypeError) as error:
             raise ValueError(f"{self.path} exists and is not a mosaic of clsas") from error
-        if attributes.get("format") != FORMAT:
+        if not ours:
             raise ValueError(f"{self.path} exists and is not a mosaic of clsas")
-        if "inputs" in attributes and attributes.get("version") != VERSION:
+        if attributes.get("version") != VERSION:
             raise ValueError(
                 f"{self.path} is a mosaic of version {attributes.get('version')}, this clsas works "
                 f"with version {VERSION}: give it another path"
             )
+        shape, inputs = attributes.get("patch_shape"), attributes.get("inputs")
+        whole = isinstance(inputs, dict) and isinstance(inputs.get("parts"), list)
+        whole = whole and isinstance(shape, list) and [type(n) for n in shape] == [int, int]
+        if not whole:
+            raise ValueError(f"{self.path} is damaged: its attributes are not those of a mosaic")
         return attributes
 
     def _check(self, stored: dict[str, Any], given: dict[str, Any]) -> None:
@@ -316,6 +374,12 @@ class Store:
             elif name == "grid" and mine != theirs:
                 if stored.get("pixels") == given["pixels"]:
                     differences.append("the grid lies elsewhere")
+            elif isinstance(mine, dict) and isinstance(theirs, dict):
+                differences += [
+                    f"{name}'s {key} is {mine.get(key)} there, {theirs[key]} given"
+                    for key in theirs
+                    if mine.get(key) != theirs[key]
+                ]
             elif mine != theirs:
                 differences.append(f"{name} is {mine} there, {theirs} given")
         if differences:

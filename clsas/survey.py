@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsas import validate
-from clsas.io import read_geometry, read_samples
+from clsas.io import FileFormatError, read_geometry, read_samples
 from clsas.lines import RangeLines
 from clsas.plan import lines_digest
 
@@ -44,12 +44,15 @@ class Survey:
         First channel of every part, and the number of channels.
     lengths : tuple of int
         Samples per channel of every part.
+    stamps : tuple of (int, int)
+        Size and time of change, ns, of every file when it was opened; 0, 0 for lines in memory.
     """
 
     geometry: RangeLines
     parts: tuple[RangeLines | Path, ...]
     begins: tuple[int, ...]
     lengths: tuple[int, ...]
+    stamps: tuple[tuple[int, int], ...]
 
     @property
     def channels(self) -> int:
@@ -61,15 +64,21 @@ class Survey:
         """Samples of every channel, [channels]."""
         return np.repeat(self.lengths, np.diff(self.begins))
 
-    def digests(self) -> list[str]:
-        """Return a digest of every part: of its geometry, and the samples of some of its lines."""
+    def digests(self, first: int = 0) -> list[str]:
+        """Return a digest of every part from the first on.
+
+        It is of geometry and samples; of a file's samples it sees 16 lines.
+        """
         found = []
-        for index, part in enumerate(self.parts):
-            begin, end = self.begins[index : index + 2]
+        for index, part in enumerate(self.parts[first:], first):
+            count = self.begins[index + 1] - self.begins[index]
             digest = hashlib.sha256(lines_digest(self._part_geometry(index)).encode())
-            for channel in np.unique(np.linspace(0, end - begin - 1, _DIGESTED).astype(int)):
-                rows, columns = slice(channel, channel + 1), slice(0, self.lengths[index])
-                digest.update(np.ascontiguousarray(_samples(part, rows, columns)).tobytes())
+            if isinstance(part, RangeLines):
+                digest.update(part.samples)
+            else:
+                for channel in np.unique(np.linspace(0, count - 1, _DIGESTED).astype(int)):
+                    rows, columns = slice(channel, channel + 1), slice(0, self.lengths[index])
+                    digest.update(np.ascontiguousarray(self._samples(index, rows, columns)))
             found.append(digest.hexdigest()[:16])
         return found
 
@@ -122,9 +131,7 @@ class Survey:
         for part, rows, columns in blocks:
             begin = self.begins[part]
             wanted = seen[rows]
-            block = _samples(
-                self.parts[part], slice(rows.start - begin, rows.stop - begin), columns
-            )
+            block = self._samples(part, slice(rows.start - begin, rows.stop - begin), columns)
             block = np.array(block[wanted], np.complex64)  # a copy: it fades
             before, after = columns.start > 0, columns.stop < self.lengths[part]
             fade = np.sin(np.pi / 2 * (np.arange(_TAPER) + 0.5) / _TAPER) ** 2
@@ -173,6 +180,14 @@ class Survey:
                 stop = length if stop > length - 2 * _TAPER else stop
                 yield part, slice(int(run[0]), int(run[-1]) + 1), slice(start, stop)
 
+    def _samples(self, index: int, rows: slice, columns: slice) -> NDArray[np.complex64]:
+        part = self.parts[index]
+        if isinstance(part, RangeLines):
+            return part.samples[rows, columns]
+        if _stamp(part) != self.stamps[index]:
+            raise FileFormatError(f"{part} is not what it was when the survey was opened")
+        return read_samples(part, rows, columns)
+
     def _part_geometry(self, index: int) -> RangeLines:
         channels = self.geometry.select(slice(*self.begins[index : index + 2]))
         return replace(channels, samples=_no_samples(channels.channels))
@@ -195,16 +210,16 @@ def open_survey(source: RangeLines | str | os.PathLike) -> Survey:
     """
     if isinstance(source, RangeLines):
         geometry = replace(source, samples=_no_samples(source.channels))
-        return Survey(geometry, (source,), (0, source.channels), (source.length,))
-    return open_files(files_of(source))
+        return Survey(geometry, (source,), (0, source.channels), (source.length,), ((0, 0),))
+    paths = files_of(source)
+    if not paths:
+        raise ValueError(f"source must hold range lines: the folder {source} has no file *.h5")
+    return open_files(paths)
 
 
 def files_of(source: str | os.PathLike) -> tuple[Path, ...]:
     """Return the files that a survey is made of, by name."""
-    try:
-        path = Path(source)
-    except TypeError:
-        raise TypeError(f"source must be RangeLines or a path, got {source!r}") from None
+    path = validate.path("source", source)
     if not path.is_dir():
         return (path,)
     return tuple(sorted(p for p in path.glob("*.h5") if not p.name.startswith(".")))
@@ -217,14 +232,23 @@ def has_ended(source: str | os.PathLike) -> bool:
 
 
 def open_files(paths: tuple[Path, ...], before: Survey | None = None) -> Survey:
-    """Return the survey of these files; `before` is of the first of them, already open."""
+    """Return the survey of these files; `before` is of the first of them, already open.
+
+    Raises ValueError also if these are not the first of them any more.
+    """
     known = 0 if before is None else len(before.parts)
-    if not paths:
-        raise ValueError("source must hold range lines: the folder has no file *.h5")
+    if before is not None and paths[:known] != before.parts:
+        changed = next(a for a, b in zip((*paths, None), before.parts, strict=False) if a != b)
+        raise ValueError(
+            f"source must grow by files whose names follow the last one, {before.parts[-1].name}, "
+            f"got {'fewer files' if changed is None else changed.name}"
+        )
+    stamps = [] if before is None else list(before.stamps)
     found = [] if before is None else [before.geometry]
     lengths = [] if before is None else list(before.lengths)
     begins = [0] if before is None else list(before.begins)
     for path in paths[known:]:
+        stamps.append(_stamp(path))
         geometry, length = read_geometry(path)
         lengths.append(length)
         begins.append(begins[-1] + geometry.channels)
@@ -244,7 +268,7 @@ def open_files(paths: tuple[Path, ...], before: Survey | None = None) -> Survey:
     names += [] if found[0].rx_velocity_m_s is None else ["rx_velocity_m_s"]
     joined = {name: np.concatenate([getattr(each, name) for each in found]) for name in names}
     geometry = replace(found[0], samples=_no_samples(begins[-1]), **joined)
-    return Survey(geometry, tuple(paths), tuple(begins), tuple(lengths))
+    return Survey(geometry, tuple(paths), tuple(begins), tuple(lengths), tuple(stamps))
 
 
 def largest_gap_m(lines: RangeLines, missing: NDArray[np.bool_]) -> float:
@@ -266,10 +290,9 @@ def largest_gap_m(lines: RangeLines, missing: NDArray[np.bool_]) -> float:
     return longest_m if longest_m > _HOLE * usual_m else 0.0
 
 
-def _samples(part: RangeLines | Path, rows: slice, columns: slice) -> NDArray[np.complex64]:
-    if isinstance(part, RangeLines):
-        return part.samples[rows, columns]
-    return read_samples(part, rows, columns)
+def _stamp(path: Path) -> tuple[int, int]:
+    status = path.stat()
+    return status.st_size, status.st_mtime_ns
 
 
 def _no_samples(channels: int) -> NDArray[np.complex64]:

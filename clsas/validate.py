@@ -11,6 +11,7 @@ import sys
 import warnings
 from collections.abc import Sequence
 from numbers import Real
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
@@ -104,6 +105,15 @@ def instance(name: str, value: object, *kinds: type) -> None:
     if not isinstance(value, kinds):
         names = " or ".join(kind.__name__ for kind in kinds)
         raise TypeError(f"{name} must be of type {names}, got {type(value).__name__}")
+
+
+def path(name: str, value: object) -> Path:
+    """Return `value` as a path; raises TypeError unless it is one, ValueError if it is empty."""
+    if not isinstance(value, (str, os.PathLike)):
+        raise TypeError(f"{name} must be a path, got {value!r}")
+    if not os.fspath(value):
+        raise ValueError(f"{name} must be a path, got an empty one")
+    return Path(os.fspath(value))
 
 
 def progress(given: object) -> None:

@@ -67,6 +67,30 @@ class View:
             self.beam_rates = beam_rate(beam, self.track, self.along, self.spots_m)
         self.rates = self._rates((0, 0), self.spots_m)
 
+    @property
+    def sweeps_once(self) -> bool:
+        """Whether the beam moves over every spot evenly, so that each is seen once.
+
+        Nodes cannot follow a beam that swings with the track as fast as it passes by. As seen from
+        a spot, the aspect angle's sine changes along the track by (1 - sine^2)/distance where the
+        track is straight; half more or less than on average is followed.
+        """
+        if self.beam is None:
+            return True
+        on_track = self.on_track
+        position = self.track.positions_m(self.track.samples[on_track])
+        way_m = np.concatenate([[0], np.linalg.norm(np.diff(position, axis=0), axis=1).cumsum()])
+        sine = np.einsum("psi,si->ps", self.sight[:, on_track], self.along[on_track])
+        way_m += 1e-9 * np.arange(len(way_m))  # a track may stand still
+        rate = -np.gradient(sine, way_m, axis=1)
+        rate *= self.distance_m[:, on_track] / np.maximum(1 - sine**2, 1e-3)
+        low, high = self.beam.limits
+        for each in np.where((sine > low) & (sine < high), rate, np.nan):
+            seen = each[np.isfinite(each)]
+            if seen.size and np.ptp(seen) > abs(seen.mean()):
+                return False
+        return True
+
     def _pixels_m(self, places: Sequence[float]) -> NDArray[np.float64]:
         """Return positions at some parts of the rows and columns, [n, 3]."""
         index = np.array(list(product(places, places))) * (np.array(self.grid.shape) - 1)

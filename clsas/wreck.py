@@ -6,10 +6,7 @@ its range lines, which take minutes to simulate and are kept, and the contrast o
 
 from __future__ import annotations
 
-import hashlib
-import json
 import os
-import tomllib
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
@@ -20,7 +17,7 @@ from numpy.typing import NDArray
 from platformdirs import user_cache_path
 
 from clsas.compress import compress
-from clsas.config import SceneFile, built_in_scene, parse_scene
+from clsas.config import SceneFile, built_in_scene, parse_scene, simulation_digest
 from clsas.grid import Grid
 from clsas.image import Image
 from clsas.io import FileFormatError, load, save
@@ -50,9 +47,7 @@ def lines(progress: Callable[[int, int], None] | None = None) -> RangeLines:
 
     The folder is that of `platformdirs.user_cache_path`, or CLSAS_CACHE where that is set.
     """
-    tables = tomllib.loads(built_in_scene("wreck").decode())
-    told = {name: table for name, table in tables.items() if name not in ("grid", "image")}
-    digest = hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()[:12]
+    digest = simulation_digest(built_in_scene("wreck"), Path())
     path = cache_folder() / f"wreck-{digest}.h5"
     try:
         kept = load(path)

@@ -1,6 +1,8 @@
 """The command `clsas mosaic`."""
 
 import json
+import os
+import re
 import shutil
 
 import numpy as np
@@ -54,6 +56,12 @@ def run(*args, code=0):
     return result.stdout, result.stderr
 
 
+def lines_of(made):
+    """The range lines that were simulated."""
+    (path,) = made[0].glob("scene-*.lines.h5")
+    return path
+
+
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
     """A scene, its mosaic, and what the command printed."""
@@ -67,13 +75,11 @@ def test_a_scene_is_all_it_needs(made):
     assert "2 x 2 patches of 50 x 40 pixels, 4 formed in" in stdout
     assert "error predicted -40" in stdout
     told = stderr.splitlines()
-    assert told[0].endswith("scene.lines.h5: range lines, simulated from " + told[0].split()[-1])
+    assert re.search(r"scene-\w{12}\.lines\.h5: range lines, simulated from .*scene.toml$", told[0])
     assert sum(line.startswith("patch ") for line in told) == 4
     assert (folder / "image.png").read_bytes().startswith(b"\x89PNG")
     scene = read_scene(folder / "scene.toml")
-    exact = clsas.backproject(
-        clsas.load(folder / "scene.lines.h5"), scene.grid, beam=scene.image["beam"]
-    )
+    exact = clsas.backproject(clsas.load(lines_of(made)), scene.grid, beam=scene.image["beam"])
     image = clsas.Store.opened(folder / "scene.zarr").image()
     assert clsas.relative_error_db(image, exact) <= -40
 
@@ -92,23 +98,25 @@ def test_the_same_command_goes_on(made):
     assert result["predicted_error_db"] <= -40
 
 
-def test_a_changed_scene_is_simulated_anew(made, tmp_path):
+def test_another_scene_has_other_lines(made, tmp_path):
+    """Whatever the files' times; what lies beside the store counts only if it is of the scene."""
     text = (made[0] / "scene.toml").read_text()
-    (tmp_path / "scene.toml").write_text(text)
-    shutil.copy(made[0] / "scene.lines.h5", tmp_path)
-    before = (tmp_path / "scene.lines.h5").stat().st_mtime
+    kept = tmp_path / lines_of(made).name
+    shutil.copy(lines_of(made), kept)
+    shutil.copy(lines_of(made), tmp_path / "image.lines.h5")
     (tmp_path / "scene.toml").write_text(text.replace("amplitude = 0.5", "amplitude = 0.7"))
-    import os
-
-    os.utime(tmp_path / "scene.lines.h5", (before - 100, before - 100))
-    _, stderr = run("mosaic", tmp_path / "scene.toml")
+    os.utime(tmp_path / "scene.toml", (0, 0))
+    _, stderr = run("mosaic", tmp_path / "scene.toml", "-o", tmp_path / "image.zarr")
     assert "simulated from" in stderr
+    (tmp_path / "scene.toml").write_text(text.replace("start_m = -2", "start_m = -1"))
+    _, stderr = run("mosaic", tmp_path / "scene.toml")
+    assert "simulated before" in stderr  # the grid is no part of them
 
 
 def test_lines_grid_and_beam_from_the_command_line(made, tmp_path):
     (tmp_path / "empty.toml").write_text("")
     stdout, _ = run(
-        "mosaic", tmp_path / "empty.toml", "--lines", made[0] / "scene.lines.h5",
+        "mosaic", tmp_path / "empty.toml", "--lines", lines_of(made),
         "--x", "-2:2:80", "--y", "56:61:100", "--beam-deg", "6", "--beam-shape", "hann",
         "--tolerance-db", "-40", "--patches", "1x4", "-o", tmp_path / "a.zarr", "--device", "0",
     )  # fmt: skip
@@ -122,7 +130,7 @@ def test_lines_grid_and_beam_from_the_command_line(made, tmp_path):
 def test_processes_of_this_machine(made, tmp_path):
     pytest.importorskip("distributed")
     stdout, stderr = run(
-        "mosaic", made[0] / "scene.toml", "--lines", made[0] / "scene.lines.h5",
+        "mosaic", made[0] / "scene.toml", "--lines", lines_of(made),
         "-o", tmp_path / "a.zarr", "--workers", "2",
     )  # fmt: skip
     assert "4 formed" in stdout
@@ -137,7 +145,7 @@ def test_processes_of_this_machine(made, tmp_path):
 def test_a_folder_that_has_ended(made, tmp_path):
     folder = tmp_path / "survey"
     folder.mkdir()
-    lines = clsas.load(made[0] / "scene.lines.h5")
+    lines = clsas.load(lines_of(made))
     for part in range(3):
         clsas.save(folder / f"{part}.h5", lines.select(slice(120 * part, 120 * part + 120)))
     (folder / "end").touch()
@@ -149,7 +157,7 @@ def test_a_folder_that_has_ended(made, tmp_path):
 
 def test_flags_are_told(made, tmp_path):
     stdout, _ = run(
-        "mosaic", made[0] / "scene.toml", "--lines", made[0] / "scene.lines.h5",
+        "mosaic", made[0] / "scene.toml", "--lines", lines_of(made),
         "--x", "100:104:20", "--y", "56:61:100", "-o", tmp_path / "a.zarr",
     )  # fmt: skip
     assert stdout.count("empty: no channel sees it") == 4

@@ -9,7 +9,7 @@ import sys
 import textwrap
 import threading
 import time
-from types import MappingProxyType
+from types import MappingProxyType, SimpleNamespace
 
 import h5py
 import numpy as np
@@ -159,6 +159,17 @@ class TestFactorized:
         plan = clsas.Plan.from_json(json.dumps(patches[0].record.plan))
         assert plan.tolerance_db == self.TOLERANCE_DB
         assert plan.predicted_error_db == patches[0].record.predicted_error_db
+
+
+def test_a_normalising_beam(tmp_path):
+    """What it multiplies by is that of all channels, not of those that a patch sees."""
+    beam = BeamWindow(8.0, "hann", normalise=True)
+    exact = clsas.backproject(LINES, GRID, beam=beam, accuracy_db=-80)
+    image = whole(clsas.mosaic(LINES, GRID, **(WISH | {"beam": beam})))
+    assert relative_error_db(image, exact) < -65
+    clsas.save(tmp_path / "lines.h5", LINES)
+    with pytest.raises(ValueError, match="beam must not normalise with a folder"):
+        clsas.mosaic(tmp_path, GRID, **(WISH | {"beam": beam}))
 
 
 def test_height_maps_and_points():
@@ -329,6 +340,43 @@ class TestResuming:
         with pytest.raises(ValueError, match="is a mosaic of version 0, this clsas works with"):
             clsas.mosaic(LINES, GRID, tmp_path / "a.zarr", **WISH)
 
+    def test_lines_with_other_samples_are_refused(self, tmp_path):
+        next(iter(clsas.mosaic(LINES, GRID, tmp_path / "a.zarr", **WISH)))
+        samples = LINES.samples.copy()
+        samples[77] *= 5
+        changed = dataclasses.replace(LINES, samples=samples)
+        with pytest.raises(ValueError, match="the range lines are others"):
+            clsas.mosaic(changed, GRID, tmp_path / "a.zarr", **WISH)
+
+    @pytest.mark.parametrize("damage", ["removed", "cut"])
+    def test_pixels_that_are_not_there_are_formed_again(self, tmp_path, damage):
+        list(clsas.mosaic(LINES, GRID, tmp_path / "a.zarr", **WISH))
+        before = Store.opened(tmp_path / "a.zarr").image().pixels
+        chunk = tmp_path / "a.zarr" / "pixels" / "c" / "1" / "2"
+        if damage == "cut":
+            chunk.write_bytes(chunk.read_bytes()[:100])
+        else:
+            chunk.unlink()
+        again = list(clsas.mosaic(LINES, GRID, tmp_path / "a.zarr", **WISH))
+        assert [(patch.row, patch.column) for patch in again] == [(1, 2)]
+        np.testing.assert_array_equal(Store.opened(tmp_path / "a.zarr").image().pixels, before)
+
+    @pytest.mark.parametrize("name", ["pixels/zarr.json", "zarr.json"])
+    @pytest.mark.parametrize("text", ["", "{}", '{"attributes": {"format": "clsas mosaic"}}'])
+    def test_a_damaged_store_is_told(self, tmp_path, name, text):
+        next(iter(clsas.mosaic(LINES, GRID, tmp_path / "a.zarr", **WISH)))
+        (tmp_path / "a.zarr" / name).write_text(text)
+        with pytest.raises(ValueError, match=r"a.zarr (is damaged|exists and is not|is a mosaic)"):
+            clsas.mosaic(LINES, GRID, tmp_path / "a.zarr", **WISH)
+
+    def test_a_file_written_anew_is_read_anew(self, file, tmp_path):
+        whole(clsas.mosaic(file, GRID, **WISH))
+        moved = dataclasses.replace(LINES, tx_m=LINES.tx_m + 0.3, rx_m=LINES.rx_m + 0.3)
+        clsas.save(file, moved)
+        image = whole(clsas.mosaic(file, GRID, **WISH))
+        exact = clsas.backproject(moved, GRID, beam=BEAM, accuracy_db=-80)
+        assert relative_error_db(image, exact) < -65
+
     def test_a_folder_of_something_else_is_left_alone(self, tmp_path):
         (tmp_path / "letter.txt").write_text("dear")
         with pytest.raises(ValueError, match="exists and is not a mosaic of clsas"):
@@ -431,7 +479,7 @@ class TestDistributed:
     def test_bad_arguments(self, file, tmp_path, wrong, message):
         arguments = {"source": file, "store": tmp_path / "a.zarr"} | wrong
         with pytest.raises(ValueError, match=message):
-            clsas.mosaic(grid=GRID, client=object(), **arguments)
+            clsas.mosaic(grid=GRID, client=SimpleNamespace(get_executor=None), **arguments)
 
 
 class TestFollowing:
@@ -504,6 +552,26 @@ class TestFollowing:
         beam = dataclasses.replace(BEAM, track_pings=101)
         reference = clsas.backproject(lines, self.GRID, beam=beam, accuracy_db=-80)
         assert relative_error_db(Store.opened(path).image(), reference) < -65
+
+    def test_a_second_leg_while_following_again(self, lines, record, tmp_path):
+        """Patches finished in an earlier run, and those begun as the last file came, too."""
+        folder, add = record
+        add(range(6))
+        path = tmp_path / "a.zarr"
+        running = iter(clsas.mosaic(folder, self.GRID, path, **self.WISH, follow_s=5))
+        for _ in range(5):
+            next(running)
+        running.close()
+        mosaic = clsas.mosaic(folder, self.GRID, path, **self.WISH, follow_s=5)
+        assert len(mosaic.finished) >= 5
+        # The way back, seen from the other side of the same track.
+        clsas.save(folder / "7.h5", lines.select(np.arange(1199, -1, -1)))
+        (folder / END).touch()
+        for _ in mosaic:
+            pass
+        records = Store.opened(path).records()
+        assert {record.survey_channels for record in records.values()} == {2400}
+        assert not list(clsas.mosaic(folder, self.GRID, path, **self.WISH))
 
     def test_a_folder_that_stays_empty(self, tmp_path):
         (tmp_path / "none").mkdir()

@@ -284,7 +284,7 @@ def test_bad_eyes(arguments, message):
     ("arguments", "error", "message"),
     [
         ({"x_m": (5, 5)}, ValueError, r"x_m must be first < last in m, got \(5, 5\)"),
-        ({"cell_m": 0}, ValueError, "cell_m must be finite and > 0 m, got 0"),
+        ({"cell_m": 0}, ValueError, "cell_m must be finite and > 0 and <= 1 m, got 0"),
         ({"cell_m": 1e-9}, ValueError, "cell_m must ask for at most .* GiB"),
         ({"position_m": (0, 300)}, ValueError, "position_m must lie on the patch, x .*, got .*300"),
         ({"position_m": 3}, ValueError, r"position_m must have shape \(2\)"),
@@ -300,7 +300,7 @@ def test_bad_built_ins(make, arguments, error, message):
 @pytest.mark.parametrize(
     ("make", "arguments", "message"),
     [
-        (scene.wreck, {"mast_m": -1}, "mast_m must be finite and >= 0 m, got -1"),
+        (scene.wreck, {"mast_m": -1}, "mast_m must be finite and >= 0 and <= 100 m, got -1"),
         (scene.wreck, {"heading_deg": np.nan}, "heading_deg must be finite degrees, got nan"),
         (scene.rocks, {"count": 0}, "count must be at least 1, got 0"),
     ],

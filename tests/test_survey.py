@@ -12,7 +12,7 @@ from clsas.geometry import pairwise_range_m
 from clsas.grid import Grid
 from clsas.io import FileFormatError, save
 from clsas.quality import relative_error_db
-from clsas.survey import END, files_of, has_ended, largest_gap_m, open_survey
+from clsas.survey import END, files_of, has_ended, largest_gap_m, open_files, open_survey
 
 GRID = Grid.plane((-3, 3, 61), (30, 90, 121))
 TRACK = along_x(120, 0.05)
@@ -110,6 +110,29 @@ def test_a_digest_changes_with_what_it_is_of():
     assert len({*digest, *open_survey(moved).digests(), *open_survey(louder).digests()}) == 3
 
 
+def test_a_survey_grows_by_files_that_follow(folder):
+    before = open_survey(folder)
+    save(folder / "3.h5", LINES.select(slice(0, 10)))
+    grown = open_files(files_of(folder), before)
+    assert grown.channels == 130
+    assert grown.digests(3) == grown.digests()[3:]
+    assert grown.digests()[:3] == before.digests()
+    save(folder / "25.h5", LINES.select(slice(0, 10)))
+    with pytest.raises(ValueError, match=r"whose names follow the last one, 3\.h5, got 25\.h5"):
+        open_files(files_of(folder), grown)
+    (folder / "25.h5").unlink()
+    (folder / "3.h5").unlink()
+    with pytest.raises(ValueError, match="got fewer files"):
+        open_files(files_of(folder), grown)
+
+
+def test_a_file_that_changed_is_not_read(folder):
+    survey = open_survey(folder)
+    save(folder / "0.h5", LINES.select(slice(0, 49)))
+    with pytest.raises(FileFormatError, match=r"0\.h5 is not what it was"):
+        survey.read(np.ones(120, bool), *ranges_of(PATCH))
+
+
 def test_a_folder_ends_with_a_file_named_end(folder):
     assert not has_ended(folder)
     (folder / END).touch()
@@ -118,7 +141,7 @@ def test_a_folder_ends_with_a_file_named_end(folder):
 
 
 def test_errors(folder, tmp_path):
-    with pytest.raises(TypeError, match="source must be RangeLines or a path, got 3"):
+    with pytest.raises(TypeError, match="source must be a path, got 3"):
         open_survey(3)
     with pytest.raises(FileNotFoundError):
         open_survey(tmp_path / "none.h5")
@@ -133,5 +156,5 @@ def test_errors(folder, tmp_path):
         open_survey(folder)
     empty = tmp_path / "empty"
     empty.mkdir()
-    with pytest.raises(ValueError, match="must hold range lines: the folder has no file"):
+    with pytest.raises(ValueError, match=r"must hold range lines: the folder .*empty has no file"):
         open_survey(empty)
