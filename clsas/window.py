@@ -28,6 +28,7 @@ _HALF_POWER = 0.442946  # sinc^2 is 1/2 here
 _MOST_WEIGHT = 100.0
 _TAYLOR_TERMS, _TAYLOR_SIDE_LOBES_DB = 4, 30.0  # SciPy's choice
 _TRACK_SHARE = 4  # the track's direction is that of cubics through this part of the pings
+_JUMP, _SHORTEST_LEG = 10.0, 5  # steps in usual ones between legs, and pings of a leg
 _ROUNDING = 1e-5  # of sines on the device, amply
 _CHANNELS_TOGETHER = 16
 
@@ -215,7 +216,8 @@ class BeamWindow:
 
         That is `along`, or from the lines the tangent, next to each phase centre, of local cubics:
         least-squares fits to the phase centres of `track_pings` pings each. Successive channels of
-        one transmitter position are a ping.
+        one transmitter position are a ping. A step of ten usual ones begins another leg, which is
+        smoothed by itself.
 
         Raises
         ------
@@ -240,14 +242,8 @@ class BeamWindow:
             )
         sums = np.add.reduceat((lines.tx_m + lines.rx_m) / 2, first, axis=0)
         centres_m = sums / np.diff(np.append(first, lines.channels))[:, None]
-        # Odd, and four pings at least where there are as many.
         wanted = self.track_pings or min(max(pings // _TRACK_SHARE, 5), MOST_TRACK_PINGS)
-        window = min(2 * (wanted // 2) + 1, pings - 1 + pings % 2)
-        if window < 2:
-            tangent = np.diff(centres_m, axis=0).repeat(2, axis=0)
-        else:
-            order = min(3, window - 1)
-            tangent = savgol_filter(centres_m, window, order, deriv=1, axis=0, mode="interp")
+        tangent = np.concatenate([_tangents(leg_m, wanted) for leg_m in _legs(centres_m)])
         speed = np.linalg.norm(tangent, axis=1)
         extent_m = np.linalg.norm(np.ptp(centres_m, axis=0))
         if not speed.min() > 1e-3 * extent_m / pings:
@@ -411,6 +407,27 @@ def _touches(
     # The way to a point of the ball turns by asin(ratio) at most, its unit vector by that chord.
     wider = ratio * (1 + 0.42 * ratio * ratio) + (spread + _ROUNDING)
     return (ratio >= 1) | ((sine + wider > low) & (sine - wider < high))
+
+
+def _legs(centres_m: NDArray[np.float64]) -> list[NDArray[np.float64]]:
+    """Return the phase centres of pings, [n, 3], leg by leg: where a track goes on elsewhere."""
+    steps_m = np.linalg.norm(np.diff(centres_m, axis=0), axis=1)
+    usual_m = np.median(steps_m)
+    starts = [0]
+    for start in np.flatnonzero(steps_m > _JUMP * usual_m) + 1 if usual_m else ():
+        if min(start - starts[-1], len(centres_m) - start) >= _SHORTEST_LEG:
+            starts.append(start)
+    return np.split(centres_m, starts[1:])
+
+
+def _tangents(centres_m: NDArray[np.float64], pings: int) -> NDArray[np.float64]:
+    """Return the tangents of local cubics through so many of a leg's pings, [n, 3]."""
+    count = len(centres_m)
+    # Odd, and four pings at least where there are as many.
+    window = min(2 * (pings // 2) + 1, count - 1 + count % 2)
+    if window < 2:
+        return np.diff(centres_m, axis=0).repeat(2, axis=0)
+    return savgol_filter(centres_m, window, min(3, window - 1), deriv=1, axis=0, mode="interp")
 
 
 def _taylor(u: NDArray[np.float64]) -> NDArray[np.float64]:

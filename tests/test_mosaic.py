@@ -564,8 +564,11 @@ class TestFollowing:
         running.close()
         mosaic = clsas.mosaic(folder, self.GRID, path, **self.WISH, follow_s=5)
         assert len(mosaic.finished) >= 5
-        # The way back, seen from the other side of the same track.
-        clsas.save(folder / "7.h5", lines.select(np.arange(1199, -1, -1)))
+        # The way back, beside the first.
+        back = lines.select(np.arange(1199, -1, -1))
+        aside_m = np.array([0.0, 2.0, 0.0])
+        back = dataclasses.replace(back, tx_m=back.tx_m + aside_m, rx_m=back.rx_m + aside_m)
+        clsas.save(folder / "7.h5", back)
         (folder / END).touch()
         for _ in mosaic:
             pass

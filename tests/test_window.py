@@ -410,3 +410,15 @@ def test_what_does_not_fit_the_lines_is_refused():
     bare = dataclasses.replace(lines, carrier_hz=0.0)
     with pytest.raises(ValueError, match=r"carrier_hz must be above 0 .*'inverse'"):
         backproject(bare, grid, beam=BeamWindow(20, "inverse", element_length_m=0.015))
+
+
+def test_directions_of_legs():
+    """Each leg has its own, up to its ends."""
+    leg = np.zeros((60, 3))
+    leg[:, 0] = np.linspace(0, 30, 60)
+    across = leg[:, [1, 0, 2]] + [40, 5, 0]
+    tx_m = np.concatenate([leg, leg[::-1] + [0, 20, 0], across])
+    lines = RangeLines(np.ones((180, 1), complex), 0.0, 0.1, tx_m, tx_m, 1e5, 1500.0)
+    directions = BeamWindow(10).directions(lines)
+    expected = np.repeat([[1, 0, 0], [-1, 0, 0], [0, 1, 0]], 60, axis=0)
+    np.testing.assert_allclose(directions, expected, atol=1e-9)
