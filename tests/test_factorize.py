@@ -619,3 +619,37 @@ def test_given_stages_refuse_what_they_cannot_do():
         plan(lines, grid, stages=[(1, 2)], beam=BeamWindow(20, "hann", normalise=True))
     with pytest.raises(ValueError, match="lines must have channels at more than one place"):
         plan(lines.select([0]), grid, stages=[(1, 2)])
+
+
+def array_pings(sway_m, period_m):
+    """Pings of 6 receivers that overlap, of an array that does not turn with its track."""
+    x_m = 0.4 * (np.arange(80) - 39.5)
+    sway = sway_m * np.sin(2 * np.pi * x_m / period_m)
+    ping_m = np.stack([x_m, sway, np.full(80, 15.0)], axis=1)
+    rx_m = ping_m[:, None] + 0.2 * np.outer(np.arange(6) - 2.5, [1, 0, 0])
+    return np.repeat(ping_m, 6, axis=0), rx_m.reshape(-1, 3)
+
+
+@pytest.mark.parametrize("beam", [None, BeamWindow(6.0, "hann")], ids=["all", "beam"])
+@pytest.mark.parametrize("tolerance_db", [-25, -45])
+def test_overlapping_pings_of_a_swaying_array(device, beam, tolerance_db):
+    """No curve goes through such phase centres; ranges are stretched instead."""
+    grid = Grid.plane((-3, 3, 150), (36, 44, 200))
+    lines, _ = over(grid, *array_pings(0.2, 40.0), carrier_hz=125e3, band=0.12)
+    chosen = plan(
+        lines, grid, tolerance_db=tolerance_db, beam=beam, costs=EXACT_IS_SLOW, device=device
+    )
+    assert not chosen.is_exact
+    exact = backproject(lines, grid, device=device, beam=beam, accuracy_db=-80)
+    error_db = relative_error_db(factorize(lines, grid, chosen, device=device), exact)
+    assert error_db <= chosen.predicted_error_db <= tolerance_db
+
+
+def test_a_beam_that_swings_with_the_track_is_not_factorized():
+    """As fast as it passes by: nodes would not follow it."""
+    track = TRACK.copy()
+    track[:, 1] = 0.05 * np.sin(2 * np.pi * track[:, 0] / 2)
+    lines, grid = over(around(0, 40), track)
+    beam = BeamWindow(8.0, "hann", track_pings=21)
+    assert plan(lines, grid, tolerance_db=-30, beam=beam, costs=EXACT_IS_SLOW).is_exact
+    assert not plan(lines, grid, tolerance_db=-30, costs=EXACT_IS_SLOW).is_exact
