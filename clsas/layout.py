@@ -220,12 +220,11 @@ def tiles(
     """Return the tiles that `lay_out` makes, None where it makes groups."""
     if not grid.is_planar:
         return None
-    tree = KDTree(antennas_m)
     window_sine = np.inf if beam is None else np.ptp(np.clip(beam.limits, -1, 1))
     tried = []
     for side in _SIDES:
         shape = Tiles(grid, side, width)
-        nearest = max(tree.query(shape.centres_m(slice(None)))[0].min(), 1e-30)
+        nearest = max(_nearest_m(shape, antennas_m), 1e-30)
         remainder_m = 0.15 * shape.radius_m**4 / (8 * nearest**3)
         remainder_m += 0.04 * shape.block_radius_m**3 / nearest**2
         remainder_m += 0.2 * speed_ratio * shape.radius_m**3 / nearest**2
@@ -243,6 +242,24 @@ def tiles(
             if shape_error <= most and sine_error <= most_sine:
                 return shape
     return None
+
+
+def _nearest_m(tiles: Tiles, antennas_m: NDArray[np.float64]) -> float:
+    """Return the least distance between antennas and centres of tiles, or a little less."""
+    grid, counts = tiles.grid, (tiles.down - 1, tiles.across - 1)
+    sides_m = [
+        n * tiles.side * s
+        for n, s in zip(counts, (grid.row_step_m, grid.column_step_m), strict=True)
+    ]
+    lengths_m = [np.linalg.norm(side) for side in sides_m]
+    if abs(sides_m[0] @ sides_m[1]) > 1e-9 * lengths_m[0] * lengths_m[1]:
+        return float(KDTree(antennas_m).query(tiles.centres_m(slice(None)))[0].min())
+    # Of the rectangle on whose lattice the centres lie.
+    way_m = antennas_m - tiles.centres_m(slice(0, 1))
+    for side, length in zip(sides_m, lengths_m, strict=True):
+        along = np.clip(way_m @ side / max(length, 1e-150) ** 2, 0, 1)
+        way_m = way_m - along[:, None] * side
+    return float(np.linalg.norm(way_m, axis=1).min())
 
 
 def largest_radius_m(cycles_per_m: float) -> float:

@@ -90,7 +90,7 @@ class Patch:
 
 @dataclass(frozen=True, eq=False)
 class Mosaic:
-    """A mosaic to be formed by iterating over it, which yields a `Patch` as each is finished.
+    """A mosaic to be formed by iterating over it once, which yields each `Patch` when finished.
 
     Attributes
     ----------

@@ -6,7 +6,6 @@ import copy
 import functools
 import math
 from collections.abc import Callable, Sequence
-from itertools import product
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -93,8 +92,8 @@ class View:
 
     def _pixels_m(self, places: Sequence[float]) -> NDArray[np.float64]:
         """Return positions at some parts of the rows and columns, [n, 3]."""
-        index = np.array(list(product(places, places))) * (np.array(self.grid.shape) - 1)
-        return self.grid.origin_m + index @ self.steps_m
+        index = np.stack(np.meshgrid(places, places, indexing="ij"), axis=-1).reshape(-1, 2)
+        return self.grid.origin_m + index * (np.array(self.grid.shape) - 1) @ self.steps_m
 
     def seen(self, side: tuple[int, int]) -> NDArray[np.bool_]:
         """Return from where channels see anything of subimages at the spots, [spots, samples]."""

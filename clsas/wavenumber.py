@@ -13,7 +13,7 @@ import scipy.fft
 from numpy.typing import NDArray
 
 from clsas import validate
-from clsas.backproject import warn_unseen, wavelength_m
+from clsas.backproject import check_numbers, warn_unseen, wavelength_m
 from clsas.geometry import bistatic_range_m, pairwise_range_m
 from clsas.grid import Grid
 from clsas.image import Image
@@ -163,6 +163,7 @@ def wavenumber(
     if not grid.is_planar:
         kind = "heights" if grid.points_m is None else "points"
         raise ValueError(f"grid must be a plane with rows along the track, got {kind}")
+    check_numbers(lines, beam)
     if beam is not None:
         if beam.normalise:
             raise ValueError("beam must not normalise: sums of weights are clsas.backproject's")

@@ -332,3 +332,10 @@ def test_memory_is_refused_before_work_begins(monkeypatch):
     ((name, size),) = asked
     assert name == "lines and grid"
     assert 16 * GRID.size < size < 1e9
+
+
+def test_samples_that_float32_cannot_sum_are_refused():
+    lines = straight()
+    huge = dataclasses.replace(lines, samples=np.full_like(lines.samples, 3e37))
+    with pytest.raises(ValueError, match=r"samples must be at most .* got 3e\+37"):
+        wavenumber(huge, GRID)
