@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 from dataclasses import dataclass
-from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -221,21 +220,23 @@ def cycles_per_pixel(
     position, tangent = track.positions_m(place), track.tangents_m(place)
     steps = np.stack([grid.row_step_m, grid.column_step_m])
     tangent_steps = tangent @ steps.T
-    rates = np.zeros((len(centres_m), len(place), 2))
     across = np.linspace(-0.5, 0.5, 3 if beam is None else 5)
     extents_m = np.array(sides)[:, None] * steps
     between_m = np.linalg.norm(np.abs(extents_m).sum(axis=0)) * (across[1] - across[0]) / 2
-    for down, right in product(across, across):
-        sight = (centres_m + [down, right] @ extents_m)[:, None] - position
-        distance = np.maximum(np.linalg.norm(sight, axis=-1), nearest_m)
+    rates = np.zeros((len(centres_m), len(place), 2))
+    for down in across:
+        # A row of places in every rectangle at a time: few large arrays.
+        offset_m = down * extents_m[0] + across[:, None] * extents_m[1]
+        sight = (centres_m[:, None] + offset_m)[:, :, None] - position
+        distance = np.maximum(np.sqrt(np.einsum("posi,posi->pos", sight, sight)), nearest_m)
         sight /= distance[..., None]
-        turn = np.einsum("psi,si->ps", sight, tangent)[..., None] * (sight @ steps.T)
+        turn = np.einsum("posi,si->pos", sight, tangent)[..., None] * (sight @ steps.T)
         turn = np.abs(tangent_steps - turn) / distance[..., None]
         if beam is not None:
             low, high = beam.limits
-            sine, reach = np.einsum("psi,si->ps", sight, along), between_m / distance
+            sine, reach = np.einsum("posi,si->pos", sight, along), between_m / distance
             turn[(sine + reach < low) | (sine - reach > high)] = 0
-        np.maximum(rates, turn, out=rates)
+        np.maximum(rates, turn.max(axis=1), out=rates)
     return cycles_per_m / 2 * np.moveaxis(rates, -1, 0)
 
 
