@@ -78,11 +78,12 @@ class Interpolator:
 
     def weights(self, nu: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the taps' weights at positions `nu` from the middle, shape [..., taps]."""
-        even, odd = (
-            np.stack([np.polyval(c, nu**2) for c in self.coefficients[:, part]], axis=-1)
-            for part in (0, 1)
-        )
-        odd = odd * np.asarray(nu)[..., None]
+        nu = np.asarray(nu)
+        square = (nu * nu)[..., None, None]
+        values = np.zeros((*nu.shape, *self.coefficients.shape[:2]))
+        for power in range(self.coefficients.shape[2]):  # the highest first
+            values = values * square + self.coefficients[..., power]
+        even, odd = values[..., 0], values[..., 1] * nu[..., None]
         return np.concatenate([(even - odd)[..., ::-1], even + odd], axis=-1)
 
     def response(self, frequency: NDArray[np.float64]) -> NDArray[np.float64]:
