@@ -93,7 +93,7 @@ def mean_track(lines: RangeLines) -> MeanTrack | None:
     are tried, and the shortest way through the phase centres is taken. The curve gets as many
     intervals as it takes to follow them.
     """
-    centres_m = phase_centres_m(lines)
+    centres_m = lines.phase_centres_m
     order, along = _order(centres_m)
     if along[-1] == 0:
         return None
@@ -118,11 +118,6 @@ def mean_track(lines: RangeLines) -> MeanTrack | None:
         place = place + np.clip(np.einsum("ci,ci->c", away, tangent) / square, -0.1, 0.1)
         track = MeanTrack(best, place)
     return track
-
-
-def phase_centres_m(lines: RangeLines) -> NDArray[np.float64]:
-    """Return the middles between transmitters and receivers, [channels, 3]."""
-    return (lines.tx_m + lines.rx_m) / 2
 
 
 def stretches(

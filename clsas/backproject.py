@@ -211,7 +211,7 @@ def antennas_and_phase(
     if not np.array_equal(lines.tx_m, lines.rx_m):
         antennas_m = np.unique(np.concatenate([lines.tx_m, lines.rx_m]), axis=0)
     if beam is not None:
-        antennas_m = np.concatenate([antennas_m, (lines.tx_m + lines.rx_m) / 2])
+        antennas_m = np.concatenate([antennas_m, lines.phase_centres_m])
     of_phase = interpolation.cycles_per_m(lines, spectrum.centre)
     return antennas_m, math.hypot(of_phase, 0.3 / lines.range_step_m)
 
@@ -746,7 +746,7 @@ def warn_unseen(
         return
     sine = sines(
         centres_m[:: max(len(centres_m) // 1024, 1)],
-        (some.tx_m + some.rx_m) / 2,
+        some.phase_centres_m,
         along[:: max(lines.channels // 64, 1)],
     )
     low, high = np.degrees(np.arcsin(np.clip([sine.min(), sine.max()], -1, 1)))

@@ -29,7 +29,7 @@ from clsas.backproject import BEST_ACCURACY_DB
 from clsas.compress import check_options as check_compression
 from clsas.grid import Grid
 from clsas.interpolation import TAPS
-from clsas.planner import BEST_TOLERANCE_DB, WORST_TOLERANCE_DB
+from clsas.planner import checked_pairs, tolerance_in_db
 from clsas.scene import PointTargets, Seabed, pipeline, rocks, wreck
 from clsas.simulate import Scene
 from clsas.simulate import check_options as check_simulation
@@ -413,19 +413,8 @@ class _Image(_Table):
             if len(dial) > 1 or (dial and options.keys() & set(EXACT)):
                 others = [name for name in (*DIAL, *EXACT) if name in options and name != dial[0]]
                 raise ValueError(f"{dial[0]} must stand alone, got also {', '.join(others)}")
-            if self.tolerance_db is not None:
-                validate.number(
-                    "tolerance_db",
-                    self.tolerance_db,
-                    "dB",
-                    least=BEST_TOLERANCE_DB,
-                    most=WORST_TOLERANCE_DB,
-                )
-            if self.tolerance_wavelengths is not None:
-                validate.positive("tolerance_wavelengths", self.tolerance_wavelengths)
-            for beams, divisions in self.stages or []:
-                validate.count("QR of stages", beams)
-                validate.count("QI of stages", divisions)
+            tolerance_in_db(self.tolerance_db, self.tolerance_wavelengths)
+            checked_pairs(self.stages or [])
             if self.accuracy_db is not None:
                 validate.number(
                     "accuracy_db", self.accuracy_db, "dB", least=BEST_ACCURACY_DB, below=0.0

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from clsas.aperture import drift, phase_centres_m, stretches
+from clsas.aperture import drift, stretches
 from clsas.backproject import wavelength_m
 from clsas.device import Device
 from clsas.geometry import pairwise_range_m
@@ -104,7 +104,7 @@ def root_error(view: View, side: tuple[int, int]) -> float:
     lines, track = view.lines, view.track
     index = np.arange(0, lines.channels, -(-lines.channels // _CHANNELS))
     part = replace(track, place=track.place[index])
-    middle_m = phase_centres_m(lines)
+    middle_m = lines.phase_centres_m
     side = tuple(map(min, side, view.grid.shape))
     seen = view.seen(side)
     random = np.random.default_rng(0)
@@ -158,7 +158,6 @@ def excess_error(
     interpolation makes of them; in the last stage, where `beam_cycles` is given, weighted.
     """
     track, random = view.track, np.random.default_rng(0)
-    wavelength_m = view.lines.sound_speed_m_s / max(view.lines.carrier_hz, 1e-3)
     weighted = view.beam is not None and beam_cycles is not None
     seen = view.seen(side)
     wrong = total = 0.0
@@ -180,7 +179,7 @@ def excess_error(
             if weighted:
                 along = interpolated_directions(track.samples, view.along, at)
                 sine = np.einsum("psi,si->ps", sight[1:], along) / range_m[1:]
-                result *= view.beam.weights(sine, wavelength_m)
+                result *= view.beam.weights(sine, wavelength_m(view.lines))
             return result
 
         of_nodes = steering(nodes.place[0])
@@ -194,7 +193,7 @@ def excess_error(
 
 def nearest_error(view: View, stages: Sequence[tuple[int, int]]) -> float:
     """Return the power of the error of nearest beams: THESIS [45], spread evenly."""
-    centres_m = phase_centres_m(view.lines)[np.argsort(view.track.place)]
+    centres_m = view.lines.phase_centres_m[np.argsort(view.track.place)]
     spacing_m = np.linalg.norm(np.diff(centres_m, axis=0), axis=1).mean()
     image_m = np.max(np.array(view.grid.shape) * np.linalg.norm(view.steps_m, axis=1))
     total_m = sum(stage_errors_m(stages, spacing_m, image_m, view.nearest_m))

@@ -10,7 +10,7 @@ import pyopencl as cl
 from numpy.typing import NDArray
 
 from clsas import tree, validate
-from clsas.aperture import cycles_per_pixel, drift, mean_track, phase_centres_m, stretches
+from clsas.aperture import cycles_per_pixel, drift, mean_track, stretches
 from clsas.backproject import (
     backproject,
     beam_arguments,
@@ -195,7 +195,7 @@ class _Run:
         if chosen.beam is not None:
             along = chosen.beam.directions(lines)
             self.along = tree.beam_directions(along, self.track, self.track.samples)
-        self.phase_centres_m = phase_centres_m(lines)
+        self.phase_centres_m = lines.phase_centres_m
         self.drift = drift(lines)
         # The thesis's method has none; on the track itself there is nothing to make up for.
         self.ramps = not chosen.nearest and (

@@ -99,6 +99,16 @@ class RangeLines:
         return self.samples.shape[1]
 
     @property
+    def phase_centres_m(self) -> NDArray[np.float64]:
+        """Middles between transmitters and receivers, metres, shape [channels, 3]."""
+        return (self.tx_m + self.rx_m) / 2
+
+    @property
+    def ping_starts(self) -> NDArray[np.int64]:
+        """First channel of every ping: successive channels of one transmitter position are one."""
+        return np.flatnonzero(np.append(True, (np.diff(self.tx_m, axis=0) != 0).any(axis=1)))
+
+    @property
     def wavenumber_rad_m(self) -> float:
         """Wavenumber k of the carrier, radians per metre (one way)."""
         return 2 * np.pi * self.carrier_hz / self.sound_speed_m_s

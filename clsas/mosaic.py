@@ -176,11 +176,9 @@ class Mosaic:
                     ended = last or time.monotonic() - last_news > self._idle_s
                 # Patches that channels see which came after they were formed.
                 for place in set(known) - set(running.values()) - set(todo):
-                    if known[place] < survey.channels:
-                        seen = sight.sees(self._window(*place)[0])
-                        if seen[known[place] :].any():
-                            todo.append(place)
-                        known[place] = survey.channels
+                    if sight.sees_later(self._window(*place)[0], known[place]):
+                        todo.append(place)
+                    known[place] = survey.channels
                 if self._idle_s is not None:
                     ready = self._ready(todo, sight, ended)
         finally:
@@ -364,7 +362,7 @@ def mosaic(
     opened = None if store is None else Store.at(store)
     if patches is None:
         stored = None if opened is None else opened.patch_shape
-        patch_shape = stored or _choose_shape(sight, grid, wish, memory_bytes, devices[0])
+        patch_shape = stored or _choose_shape(sight, grid, memory_bytes)
     job = _Job(
         files=(),
         in_memory=None,
@@ -383,10 +381,8 @@ def mosaic(
     )
     for place, record in list(finished.items()):
         # Files that were added since may hold channels that see it.
-        if record.survey_channels < survey.channels:
-            seen = sight.sees(found._window(*place)[0])
-            if seen[record.survey_channels :].any():
-                del finished[place]
+        if sight.sees_later(found._window(*place)[0], record.survey_channels):
+            del finished[place]
     return found
 
 
@@ -436,7 +432,7 @@ class _Sight:
     def of(cls, survey: Survey, beam: BeamWindow | None) -> _Sight:
         geometry = survey.geometry
         along = None if beam is None else beam.directions(geometry)
-        return cls(survey, beam, along, (geometry.tx_m + geometry.rx_m) / 2)
+        return cls(survey, beam, along, geometry.phase_centres_m)
 
     @property
     def settled(self) -> int:
@@ -445,8 +441,7 @@ class _Sight:
             return 0  # any channel may see any patch
         if self.beam.along is not None:
             return self.survey.channels
-        tx_m = self.survey.geometry.tx_m
-        pings = np.flatnonzero(np.append(True, (np.diff(tx_m, axis=0) != 0).any(axis=1)))
+        pings = self.survey.geometry.ping_starts
         later = self.beam.track_pings // 2 + 1
         return int(pings[-later]) if len(pings) > 2 * later else 0
 
@@ -472,9 +467,13 @@ class _Sight:
             )[0]
         return seen
 
+    def sees_later(self, grid: Grid, first: int) -> bool:
+        """Return whether any channel from the first on may contribute to a grid."""
+        return first < self.survey.channels and bool(self.sees(grid)[first:].any())
+
     def has_passed(self, grid: Grid, settled: int) -> bool:
         """Return whether the latest settled channels have a grid behind their beam."""
-        if self.sees(grid)[settled:].any():
+        if self.sees_later(grid, settled):
             return False
         centre_m, half_m = _box(grid)
         offset_m = centre_m - self.phase_centres_m[settled - 1]
@@ -523,20 +522,26 @@ def _image(
     beam = None if job.beam is None else replace(job.beam, along=sight.along[seen])
     # A normalising beam multiplies by the number of channels: that of all.
     scale = sight.survey.channels / lines.channels if beam is not None and beam.normalise else 1.0
-    room = _room(lines, grid, job, device)
+    host_bytes = _host_bytes(lines.channels, lines.length, grid.size)
+    if host_bytes >= job.memory_bytes:
+        raise ValueError(
+            f"memory_bytes must be more than {host_bytes / 2**20:.1f} MiB for "
+            f"{grid.shape[0]} x {grid.shape[1]} pixels from {lines.channels} lines of "
+            f"{lines.length} samples, got {job.memory_bytes / 2**20:.1f} MiB: use smaller patches"
+        )
     accuracy_db = job.accuracy_db(lines.channels * grid.size)
     if accuracy_db is not None:
         image = backproject(lines, grid, accuracy_db=accuracy_db, beam=beam, device=device)
-        bytes_ = _host_bytes(lines.channels, lines.length, grid.size)
-        known |= {"predicted_error_db": accuracy_db, "memory_bytes": bytes_}
+        known |= {"predicted_error_db": accuracy_db, "memory_bytes": host_bytes}
     else:
         before = time.perf_counter()
+        room = min(job.memory_bytes - host_bytes, device.info.memory_bytes // 2)
         chosen = plan(lines, grid, **job.wish, beam=beam, device=device, memory_bytes=room)
         known |= {
             "plan_seconds": time.perf_counter() - before,
             "predicted_error_db": chosen.predicted_error_db,
             "predicted_seconds": chosen.predicted_seconds,
-            "memory_bytes": _bytes(lines, grid, chosen),
+            "memory_bytes": host_bytes + int(chosen.memory_bytes),
             "plan": json.loads(_without_directions(chosen).to_json()),
         }
         image = factorize(lines, grid, chosen, device=device)
@@ -545,31 +550,13 @@ def _image(
     return Record(**known), pixels
 
 
-def _room(lines: RangeLines, grid: Grid, job: _Job, device: Device) -> int:
-    """Return what may be used on the device, beside lines and pixels here."""
-    room = job.memory_bytes - _host_bytes(lines.channels, lines.length, grid.size)
-    if room <= 0:
-        raise ValueError(
-            f"memory_bytes must be more than {(job.memory_bytes - room) / 2**20:.1f} MiB for "
-            f"{grid.shape[0]} x {grid.shape[1]} pixels from {lines.channels} lines of "
-            f"{lines.length} samples, got {job.memory_bytes / 2**20:.1f} MiB: use smaller patches"
-        )
-    return min(room, device.info.memory_bytes // 2)
-
-
 def _host_bytes(channels: int, length: int, pixels: int) -> int:
     """Return what lines and pixels of a patch take, with the copy of either that work makes."""
     return 2 * 8 * (channels * length + pixels)
 
 
-def _bytes(lines: RangeLines, grid: Grid, chosen: Plan) -> int:
-    return _host_bytes(lines.channels, lines.length, grid.size) + int(chosen.memory_bytes)
-
-
-def _choose_shape(
-    sight: _Sight, grid: Grid, wish: dict[str, Any], memory_bytes: int, device: Device
-) -> tuple[int, int]:
-    """Return the largest patches whose middle one fits the memory, with its plan."""
+def _choose_shape(sight: _Sight, grid: Grid, memory_bytes: int) -> tuple[int, int]:
+    """Return the pixels of the largest patches that are expected to fit the memory."""
     side = _LARGEST_SIDE
     needed = 0
     while side >= _SMALLEST_SIDE or side == _LARGEST_SIDE:

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from clsas.aperture import mean_track, phase_centres_m
+from clsas.aperture import mean_track
 from clsas.geometry import pairwise_range_m
 from clsas.grid import Grid
 from clsas.lines import RangeLines
@@ -140,7 +140,7 @@ def plan_errors_m(
     pixels = np.asarray(pixels)
     points_m = grid.origin_m + pixels[:, :1] * grid.row_step_m + pixels[:, 1:] * grid.column_step_m
     errors_m = -pairwise_range_m(points_m, *ends_m)
-    position_m = phase_centres_m(lines)[order]
+    position_m = lines.phase_centres_m[order]
     beam = np.arange(lines.channels)  # of the stage before, that holds each channel
     for level, (side, beams) in enumerate(zip(plan.sides, plan.nearest, strict=True)):
         centres_m = division.centres_m(level, pixels // side * side)

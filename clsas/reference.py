@@ -197,7 +197,7 @@ def _sum_channels(
         place = (range_m - block.first_range_m[:, None]) / block.range_step_m
         values = evaluate(block.samples.astype(np.complex128), place)
         if beam is not None:
-            q = sines(points, (block.tx_m + block.rx_m) / 2, along[first : first + step])
+            q = sines(points, block.phase_centres_m, along[first : first + step])
             weights = beam.weights(q, wavelength_m(lines))
             values *= weights
             sums += weights.sum(axis=0)

@@ -280,8 +280,7 @@ def largest_gap_m(lines: RangeLines, missing: NDArray[np.bool_]) -> float:
     if np.count_nonzero(there) < 2:
         return 0.0
     every_m, some_m = (
-        np.unique((lines.tx_m[each] + lines.rx_m[each]) / 2, axis=0)
-        for each in (np.ones_like(there), there)
+        np.unique(lines.phase_centres_m[each], axis=0) for each in (np.ones_like(there), there)
     )
     axis = np.ptp(every_m, axis=0).argmax()
     steps_m = np.diff(np.sort(every_m[:, axis]))

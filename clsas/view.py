@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import KDTree
 
 from clsas import interpolation
-from clsas.aperture import cycles_per_pixel, mean_track, phase_centres_m, turned
+from clsas.aperture import cycles_per_pixel, mean_track, turned
 from clsas.grid import Grid
 from clsas.interpolation import Interpolator, Resampling
 from clsas.lines import RangeLines
@@ -54,7 +54,7 @@ class View:
         # Between the places that are looked at a pixel may come nearer.
         dense_m = self._pixels_m(np.linspace(0, 1, 65))
         cell_m = np.linalg.norm(self.steps_m, axis=1) @ (np.array(grid.shape) - 1) / 128
-        nearest_m = KDTree(phase_centres_m(lines)).query(dense_m)[0].min() - cell_m
+        nearest_m = KDTree(lines.phase_centres_m).query(dense_m)[0].min() - cell_m
         self.nearest_m = max(float(nearest_m), 1e-9)
         self._seen: dict[tuple[int, int], NDArray[np.bool_]] = {}
         self._within: dict[tuple[int, int], NDArray[np.float64]] = {}

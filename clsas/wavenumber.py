@@ -164,12 +164,8 @@ def wavenumber(
         kind = "heights" if grid.points_m is None else "points"
         raise ValueError(f"grid must be a plane with rows along the track, got {kind}")
     check_numbers(lines, beam)
-    if beam is not None:
-        if beam.normalise:
-            raise ValueError("beam must not normalise: sums of weights are clsas.backproject's")
-        if beam.shape == "inverse" and not lines.carrier_hz:
-            raise ValueError("carrier_hz must be above 0 for a beam of the shape 'inverse'")
-        beam.table(wavelength_m(lines))  # refuses to amplify too much
+    if beam is not None and beam.normalise:
+        raise ValueError("beam must not normalise: sums of weights are clsas.backproject's")
     band = _band(lines)
     track = _straighten(lines, grid, beam, motion_compensation)
     aspects = _aspects(lines, track, beam, band)

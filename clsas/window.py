@@ -232,16 +232,15 @@ class BeamWindow:
                     f"got {len(self.along)}"
                 )
             return np.broadcast_to(self.along, (lines.channels, 3))
-        new = np.append(True, (np.diff(lines.tx_m, axis=0) != 0).any(axis=1))
-        first = np.flatnonzero(new)
+        first, channels_m = lines.ping_starts, lines.phase_centres_m
         pings = len(first)
         if pings < 2:
             raise ValueError(
                 f"along must be given: {lines.channels} channels of one transmitter position have "
                 f"no track"
             )
-        sums = np.add.reduceat((lines.tx_m + lines.rx_m) / 2, first, axis=0)
-        centres_m = sums / np.diff(np.append(first, lines.channels))[:, None]
+        counts = np.diff(np.append(first, lines.channels))
+        centres_m = np.add.reduceat(channels_m, first, axis=0) / counts[:, None]
         wanted = self.track_pings or min(max(pings // _TRACK_SHARE, 5), MOST_TRACK_PINGS)
         tangent = np.concatenate([_tangents(leg_m, wanted) for leg_m in _legs(centres_m)])
         speed = np.linalg.norm(tangent, axis=1)
@@ -250,10 +249,10 @@ class BeamWindow:
             raise ValueError("along must be given: the lines' phase centres stand still")
         tangent /= speed[:, None]
         # Of an array, a channel ahead of its ping's middle lies where later pings are.
-        ping = np.cumsum(new) - 1
+        ping = np.repeat(np.arange(pings), counts)
         steps_m = np.linalg.norm(np.diff(centres_m, axis=0), axis=1)
         covered_m = np.concatenate([[0.0], np.cumsum(steps_m)])
-        ahead_m = (lines.tx_m + lines.rx_m) / 2 - centres_m[ping]
+        ahead_m = channels_m - centres_m[ping]
         place_m = covered_m[ping] + np.einsum("ci,ci->c", ahead_m, tangent[ping])
         found = np.stack([np.interp(place_m, covered_m, each) for each in tangent.T], axis=-1)
         return found / np.linalg.norm(found, axis=1, keepdims=True)
@@ -304,7 +303,7 @@ def channel_ranges(
     That is the first channel whose window touches a ball and the one after the last; both 0 where
     there is none. Runs of channels are tried before single ones.
     """
-    phase_centres_m = (lines.tx_m + lines.rx_m) / 2
+    phase_centres_m = lines.phase_centres_m
     count, run = lines.channels, _CHANNELS_TOGETHER
     starts = np.arange(0, count, run)
     run_of = np.arange(count) // run

@@ -4,7 +4,7 @@ from cases import along_x, beside
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from clsas.aperture import cycles_per_pixel, drift, mean_track, phase_centres_m, turned
+from clsas.aperture import cycles_per_pixel, drift, mean_track, turned
 from clsas.grid import Grid
 from clsas.lines import RangeLines
 
@@ -74,8 +74,8 @@ def test_the_order_of_channels_does_not_matter(name):
 def test_the_track_of_pings_of_many_receivers_is_straight():
     lines = lines_of(*pings())
     track = mean_track(lines)
-    assert distance_m(track, phase_centres_m(lines)).max() < 0.01 * WAVELENGTH
-    x = phase_centres_m(lines)[:, 0]
+    assert distance_m(track, lines.phase_centres_m).max() < 0.01 * WAVELENGTH
+    x = lines.phase_centres_m[:, 0]
     order = np.argsort(x)
     assert (np.diff(track.place[order]) >= -1e-9).all()
 

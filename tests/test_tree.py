@@ -6,7 +6,7 @@ from cases import along_x
 from test_factorize import BEAMS, EXACT_IS_SLOW, arc, around, made, near, over, straight, swaying
 
 from clsas import interpolation, tree
-from clsas.aperture import cycles_per_pixel, mean_track, phase_centres_m
+from clsas.aperture import cycles_per_pixel, mean_track
 from clsas.backproject import backproject
 from clsas.factorize import factorize
 from clsas.interpolation import Spectrum
@@ -63,7 +63,7 @@ def interpolation_error_db(case, side, aperture, root=(128, 128)):
     """Of steering functions of pixels in subimages of a size, anywhere in a root; float64."""
     lines, grid = made(case)
     rng = np.random.default_rng(0)
-    track, centres_m = mean_track(lines), phase_centres_m(lines)
+    track, centres_m = mean_track(lines), lines.phase_centres_m
     division = Division(grid, (root, side))
     cycles_per_m = lines.carrier_cycles_per_m
     wrong = total = 0.0
@@ -109,7 +109,7 @@ def any_nodes():
     track = mean_track(lines)
     middle_m = Division(grid, ((64, 64),)).centres_m(0, np.array([[0, 0], [64, 64]]))
     rates = cycles_per_pixel(track, grid, middle_m, (64, 64), lines.carrier_cycles_per_m, 0.1)
-    place = track.places_seen_from(middle_m, phase_centres_m(lines))
+    place = track.places_seen_from(middle_m, lines.phase_centres_m)
     aperture = interpolation.design(6, 2.0, FLAT)
     return place, interpolated_nodes(track, 64 * rates.sum(axis=0), place, aperture)
 

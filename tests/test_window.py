@@ -21,7 +21,6 @@ from cases import (
 )
 from scipy.signal.windows import taylor
 
-from clsas.aperture import phase_centres_m
 from clsas.backproject import backproject, execute, prepare
 from clsas.grid import Grid
 from clsas.layout import Groups, Tiles
@@ -174,7 +173,7 @@ def test_ranges_hold_every_channel_that_sees_a_part_and_few_others():
     channel = np.arange(1000)
     wasted = 0
     for centre, (first, end) in zip(centres, ranges, strict=True):
-        seen = (beam.weights(sines(centre + ball, phase_centres_m(lines), along)) > 0).any(axis=1)
+        seen = (beam.weights(sines(centre + ball, lines.phase_centres_m, along)) > 0).any(axis=1)
         assert np.all(~seen | ((channel >= first) & (channel < end)))
         if seen.any():
             wasted += (end - first) - np.ptp(channel[seen]) - 1
@@ -225,7 +224,7 @@ def test_an_image_is_the_weighted_sum(name, device):
     assert isinstance(preparation.layout, Groups if name[-6:] in ("points", "eights") else Tiles)
     chosen, where = pixels_of(case)
     wanted = same_interpolator(preparation, where)
-    seen = beam.weights(sines(where, phase_centres_m(made(case)[0]), preparation.along), 0.0015) > 0
+    seen = beam.weights(sines(where, made(case)[0].phase_centres_m, preparation.along), 0.0015) > 0
     assert 0.02 < seen.mean() < 0.98 or name == "inverse"
     assert relative_error_db(execute(preparation).pixels.ravel()[chosen], wanted) <= -75
 
@@ -297,7 +296,7 @@ def test_an_unseen_pixel_of_a_normalised_image_is_zero(platform):
     beam = BeamWindow(1, "hann", normalise=True)
     pixels = backproject(lines, grid, device=platform, beam=beam).pixels
     sums = beam.weights(
-        sines(grid.positions_m()[1], phase_centres_m(lines), beam.directions(lines))
+        sines(grid.positions_m()[1], lines.phase_centres_m, beam.directions(lines))
     ).sum(axis=0)
     assert 50 < (sums == 0).sum() < 350
     np.testing.assert_array_equal(pixels[1] != 0, sums > 1e-6)

@@ -58,7 +58,7 @@ class Scene:
 
         There pings overlap by a third; its data had been put on a regular grid.
         """
-        along_m = self._phase_centres_m[:, 0]
+        along_m = self.lines.phase_centres_m[:, 0]
         order = np.argsort(along_m, kind="stable")
         kept = np.zeros(len(order), bool)
         kept[order] = np.append(True, np.diff(along_m[order]) > SPACING_M / 2)
@@ -112,7 +112,7 @@ class Scene:
         """Return the largest range error of a patch by [45]."""
         grid = patch.grid
         edges_m = grid.positions_m(slice(None, None, grid.shape[0] - 1)).reshape(-1, 3)
-        nearest_m = cdist(edges_m, self._phase_centres_m).min()
+        nearest_m = cdist(edges_m, self.lines.phase_centres_m).min()
         steps_m = np.linalg.norm([grid.row_step_m, grid.column_step_m], axis=1)
         side_m = float(np.max(steps_m * grid.shape))
         return sum(nearest.stage_errors_m(STAGES, SPACING_M, side_m, nearest_m))
@@ -123,7 +123,9 @@ class Scene:
         half_m = (np.array(grid.shape)[:, None] - 1) / 2 * [grid.row_step_m, grid.column_step_m]
         # What the patch was formed from.
         centre_m = grid.origin_m + half_m.sum(axis=0)
-        seen = touches_rectangles(BEAM, centre_m[None], half_m, self._phase_centres_m, along)[0]
+        seen = touches_rectangles(BEAM, centre_m[None], half_m, self.lines.phase_centres_m, along)[
+            0
+        ]
         lines, along = self.lines.select(seen), along[seen]
         plan = clsas.Plan.from_json(json.dumps(patch.record.plan))
         random = np.random.default_rng(1)
@@ -134,12 +136,8 @@ class Scene:
         # There channels are in the order of the track.
         order = np.argsort(lines.tx_m[:, 0] + lines.rx_m[:, 0], kind="stable")
         points_m = grid.positions_m()[tuple(pixels.T)]
-        weight = BEAM.weights(sines(points_m, self._phase_centres_m[seen], along))[order].T
+        weight = BEAM.weights(sines(points_m, self.lines.phase_centres_m[seen], along))[order].T
         return float(np.abs(errors_m[weight > 0]).max())
-
-    @cached_property
-    def _phase_centres_m(self) -> np.ndarray:
-        return (self.lines.tx_m + self.lines.rx_m) / 2
 
 
 @lru_cache(maxsize=4)
