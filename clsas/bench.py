@@ -307,7 +307,7 @@ def run_mosaic(
     -------
     dict
         What was measured, ready for JSON. `seconds` are of all of `clsas.mosaic`, from lines in
-        memory to patches in memory, with all planning; `exact_seconds` and `unlimited_seconds` of
+        memory to the image in memory, with all planning; `exact_seconds` and `unlimited_seconds` of
         `clsas.backproject` with the beam and without; `speedup` and `speedup_unlimited` are their
         medians over that of the mosaic. `error_db` is against an exact image of -80 dB,
         `shadow_contrast_difference_db` is by how much the contrast of the wreck's shadow differs
@@ -317,19 +317,15 @@ def run_mosaic(
     pixels, beam = MOSAICS[case]
     device = open_device(device)
     lines, grid = wreck.lines(progress), wreck.grid(pixels)
-    image = np.empty(grid.shape, np.complex64)
 
-    def form() -> list[Record]:
-        records = []
-        for patch in mosaic(lines, grid, tolerance_db=tolerance_db, beam=beam, device=device):
-            image[patch.rows, patch.columns] = patch.image.pixels
-            records.append(patch.record)
-        return records
+    def form() -> tuple[Image, list[Record]]:
+        records: list[Record] = []
+        wanted = mosaic(lines, grid, tolerance_db=tolerance_db, beam=beam, device=device)
+        return wanted.image(lambda patch: records.append(patch.record)), records
 
     exact = partial(backproject, lines, grid, device=device)
-    records = form()
+    formed, records = form()
     reference_image = exact(beam=beam, accuracy_db=REFERENCE_DB)
-    formed = Image(image.copy(), grid)
     shadow = wreck.Shadow(wreck.scene())
     contrast_db, reference_db = (shadow.contrast_db(each) for each in (formed, reference_image))
     error_db = relative_error_db(formed, reference_image)

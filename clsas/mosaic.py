@@ -14,10 +14,11 @@ import queue
 import tempfile
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, ThreadPoolExecutor, wait
 from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -90,7 +91,9 @@ class Patch:
 
 @dataclass(frozen=True, eq=False)
 class Mosaic:
-    """A mosaic to be formed by iterating over it once, which yields each `Patch` when finished.
+    """A mosaic to be formed once: patch by patch, or whole as `image`.
+
+    Iterating over it yields each `Patch` when finished.
 
     Attributes
     ----------
@@ -186,6 +189,40 @@ class Mosaic:
                 future.cancel()
             # Patches begun are finished here; workers may have been lost.
             executor.shutdown(wait=self._client is None)
+
+    def image(self, tell: Callable[[Patch], object] | None = None) -> Image:
+        """Form what is not finished and return the whole image.
+
+        Patches that the store held already are read from it. Those that no channel sees are zero.
+
+        Parameters
+        ----------
+        tell : callable, optional
+            Called with every patch once its pixels are in the image: those that the store held
+            first, then the others as they are finished, again should they be formed again.
+
+        Returns
+        -------
+        Image
+            On all of `grid`. It takes 8 bytes per pixel of memory, beside that of the patches which
+            are being formed.
+
+        Raises
+        ------
+        OSError
+            If the store cannot be read or written; what is finished stays.
+        ValueError
+            If the image does not fit into this machine's memory, or what imaging one patch raises,
+            with its place.
+        """
+        validate.memory("the mosaic", 8 * self.grid.size)
+        pixels = np.empty(self.grid.shape, np.complex64)
+        stored = (self._finished(place, record, None) for place, record in self.finished.items())
+        for patch in chain(stored, self):
+            pixels[patch.rows, patch.columns] = patch.image.pixels
+            if tell is not None:
+                tell(patch)
+        return Image(pixels, self.grid)
 
     def _grow(self, survey: Survey, first: int) -> None:
         """Keep in the store what the survey has grown by."""
@@ -288,7 +325,7 @@ def mosaic(
     Returns
     -------
     Mosaic
-        To be iterated over.
+        To be iterated over, or asked for its image.
 
     Raises
     ------

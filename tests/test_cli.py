@@ -391,6 +391,11 @@ FIXED = ["--taps", "4", "--upsampling", "2"]
             "--x and --y must ask for at most ",
         ),
         (
+            ["image", "lines.h5", "--x", "0:1:9", "--y", f"0:1:{10**30}", "-o", "new.h5"],
+            1,
+            "--x and --y must ask for at most ",
+        ),
+        (
             ["image", "lines.h5", *GRID, "-o", "new.h5", *FIXED, "--accuracy-db", "-60"],
             2,
             "--accuracy-db plays no part",
@@ -479,7 +484,7 @@ def test_traceback_on_request(made):
 
 
 def test_pictures_without_matplotlib_are_refused_before_any_work(made, tmp_path, monkeypatch):
-    monkeypatch.setattr(cli.importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     scene = made[0] / "scene.toml"
     png = ("--png", tmp_path / "x.png")
     _, stderr = run("simulate", scene, "-o", tmp_path / "echoes.h5", *png, code=1)

@@ -195,7 +195,7 @@ def test_errors_are_one_message(made, monkeypatch, args, code, message):
 
 def test_a_scheduler_that_is_not_there(made, monkeypatch):
     pytest.importorskip("distributed")
-    monkeypatch.setattr("clsas.cli._SCHEDULER_S", 0.5)
+    monkeypatch.setattr("clsas.cli.mosaics._SCHEDULER_S", 0.5)
     _, stderr = run("mosaic", made[0] / "scene.toml", "--scheduler", "tcp://127.0.0.1:9", code=1)
     assert "--scheduler tcp://127.0.0.1:9 cannot be reached" in stderr
 

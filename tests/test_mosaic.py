@@ -41,28 +41,21 @@ def file(tmp_path):
     return tmp_path / "lines.h5"
 
 
-def whole(patches, grid=GRID):
-    pixels = np.full(grid.shape, np.nan, np.complex64)
-    for patch in patches:
-        assert np.isnan(pixels[patch.rows, patch.columns]).all()
-        pixels[patch.rows, patch.columns] = patch.image.pixels
-    return clsas.Image(pixels, grid)
-
-
 def test_patches_make_the_image(platform, exact):
-    image = whole(clsas.mosaic(LINES, GRID, **WISH, device=platform))
+    image = clsas.mosaic(LINES, GRID, **WISH, device=platform).image()
+    assert image.grid is GRID
     assert relative_error_db(image, exact) < -65
 
 
 def test_every_patch_has_its_own_pixels(exact):
-    seen = set()
+    seen = []
     for patch in clsas.mosaic(LINES, GRID, **WISH):
-        seen.add((patch.row, patch.column))
+        seen.append((patch.row, patch.column))
         expected = GRID.positions_m(patch.rows, patch.columns)
         np.testing.assert_allclose(patch.grid.positions_m(), expected, atol=1e-9)
         assert 0 < patch.record.channels < 160  # the beam's
         assert not patch.record.flags
-    assert seen == set(np.ndindex(2, 4))
+    assert sorted(seen) == list(np.ndindex(2, 4))
 
 
 def test_a_store_holds_pixels_and_records(file, tmp_path, exact):
@@ -109,7 +102,7 @@ def test_the_directions_are_those_of_the_whole_track():
     lines = lines_over(GRID, track, carrier_hz=100e3, step_m=0.03)
     beam = BeamWindow(8.0, "rectangular")
     reference = clsas.backproject(lines, GRID, beam=beam, accuracy_db=-80)
-    image = whole(clsas.mosaic(lines, GRID, **(WISH | {"beam": beam})))
+    image = clsas.mosaic(lines, GRID, **(WISH | {"beam": beam})).image()
     assert relative_error_db(image, reference) < -65
 
 
@@ -128,23 +121,24 @@ class TestFactorized:
 
     @pytest.fixture(scope="class")
     @classmethod
-    def patches(cls, scene):
-        return list(
-            clsas.mosaic(
-                scene[0], cls.GRID, tolerance_db=cls.TOLERANCE_DB, beam=cls.BEAM, patches=(2, 2)
-            )
+    def formed(cls, scene):
+        """The whole image, and its patches."""
+        patches = []
+        mosaic = clsas.mosaic(
+            scene[0], cls.GRID, tolerance_db=cls.TOLERANCE_DB, beam=cls.BEAM, patches=(2, 2)
         )
+        return mosaic.image(patches.append), patches
 
-    def test_every_patch_is_as_good_as_predicted(self, scene, patches):
-        for patch in patches:
+    def test_every_patch_is_as_good_as_predicted(self, scene, formed):
+        for patch in formed[1]:
             assert patch.record.plan["sides"]  # not plain backprojection
             exact = clsas.Image(scene[1].pixels[patch.rows, patch.columns], patch.grid)
             measured = relative_error_db(patch.image, exact)
             assert measured <= patch.record.predicted_error_db <= self.TOLERANCE_DB
 
-    def test_there_are_no_seams(self, scene, patches):
+    def test_there_are_no_seams(self, scene, formed):
         """Along borders the error is what it is elsewhere, and neighbours agree."""
-        image, exact = whole(patches, self.GRID).pixels, scene[1].pixels
+        image, exact = formed[0].pixels, scene[1].pixels
         level = np.sqrt(np.mean(np.abs(exact) ** 2))
         error = np.abs(image - exact) / level
         for border in (error[254:258], error[:, 254:258]):
@@ -155,17 +149,18 @@ class TestFactorized:
             step_db = 20 * np.log10(np.sqrt(np.mean(np.abs(step) ** 2)) / level)
             assert step_db <= self.TOLERANCE_DB + 4
 
-    def test_a_record_holds_its_plan(self, patches):
-        plan = clsas.Plan.from_json(json.dumps(patches[0].record.plan))
+    def test_a_record_holds_its_plan(self, formed):
+        record = formed[1][0].record
+        plan = clsas.Plan.from_json(json.dumps(record.plan))
         assert plan.tolerance_db == self.TOLERANCE_DB
-        assert plan.predicted_error_db == patches[0].record.predicted_error_db
+        assert plan.predicted_error_db == record.predicted_error_db
 
 
 def test_a_normalising_beam(tmp_path):
     """What it multiplies by is that of all channels, not of those that a patch sees."""
     beam = BeamWindow(8.0, "hann", normalise=True)
     exact = clsas.backproject(LINES, GRID, beam=beam, accuracy_db=-80)
-    image = whole(clsas.mosaic(LINES, GRID, **(WISH | {"beam": beam})))
+    image = clsas.mosaic(LINES, GRID, **(WISH | {"beam": beam})).image()
     assert relative_error_db(image, exact) < -65
     clsas.save(tmp_path / "lines.h5", LINES)
     with pytest.raises(ValueError, match="beam must not normalise with a folder"):
@@ -177,8 +172,15 @@ def test_height_maps_and_points():
     hill = 0.3 * np.exp(-(np.add.outer((y - 35) ** 2, x**2)))
     for grid in (GRID.with_height(hill), Grid.points(GRID.with_height(hill).positions_m())):
         exact = clsas.backproject(LINES, grid, beam=BEAM, accuracy_db=-80)
-        image = whole(clsas.mosaic(LINES, grid, **WISH), grid)
+        image = clsas.mosaic(LINES, grid, **WISH).image()
         assert relative_error_db(image, exact) < -65
+
+
+def test_an_image_larger_than_memory_is_refused():
+    """Before anything is formed."""
+    grid = Grid.plane((-4, 4, 10**7), (30, 40, 10**7))
+    with pytest.raises(ValueError, match=r"the mosaic must ask for at most .* GiB"):
+        clsas.mosaic(LINES, grid, beam=BEAM).image()
 
 
 def test_the_thesis_stages_work_in_patches():
@@ -187,9 +189,10 @@ def test_the_thesis_stages_work_in_patches():
 
 
 def test_patches_that_do_not_divide_the_grid(exact):
-    patches = list(clsas.mosaic(LINES, GRID, **(WISH | {"patches": (7, 3)})))
+    patches = []
+    image = clsas.mosaic(LINES, GRID, **(WISH | {"patches": (7, 3)})).image(patches.append)
     assert {patch.image.grid.shape for patch in patches} == {(9, 27), (9, 26), (6, 27), (6, 26)}
-    assert relative_error_db(whole(patches), exact) < -65
+    assert relative_error_db(image, exact) < -65
 
 
 @pytest.mark.parametrize(
@@ -233,7 +236,11 @@ def test_a_wish_is_checked_before_any_patch():
 def test_a_patch_that_no_channel_sees_is_empty_and_flagged(tmp_path):
     """Half of the scene lies behind the beams, and some beyond the lines' end."""
     grid = Grid.plane((-4, 120, 64), (30, 40, 20))
-    patches = list(clsas.mosaic(LINES, grid, tmp_path / "a.zarr", **(WISH | {"patches": (1, 4)})))
+    mosaic = clsas.mosaic(LINES, grid, tmp_path / "a.zarr", **(WISH | {"patches": (1, 4)}))
+    patches = []
+    image = mosaic.image(patches.append)
+    assert image.pixels[:, :16].any()
+    assert not image.pixels[:, 16:].any()
     assert [patch.record.is_empty for patch in patches] == [False, True, True, True]
     for patch in patches[1:]:
         assert not patch.image.pixels.any()
@@ -249,8 +256,9 @@ def test_missing_samples_are_flagged(file, tmp_path):
     reference = clsas.backproject(
         LINES.select(kept), GRID, beam=dataclasses.replace(BEAM, along=along[kept])
     )
-    patches = list(clsas.mosaic(file, GRID, tmp_path / "a.zarr", **WISH))
-    assert relative_error_db(whole(patches), reference) < -58
+    patches = []
+    image = clsas.mosaic(file, GRID, tmp_path / "a.zarr", **WISH).image(patches.append)
+    assert relative_error_db(image, reference) < -58
     flagged = [patch for patch in patches if patch.record.flags]
     assert 0 < len(flagged) < len(patches)
     assert flagged[0].record.missing_channels == 4
@@ -281,6 +289,21 @@ class TestResuming:
         assert all(kept[place].stat().st_mtime_ns == then for place, then in times.items())
         assert relative_error_db(Store.opened(path).image(), exact) < -65
         assert not list(clsas.mosaic(file, GRID, path, **WISH))
+
+    def test_the_image_has_what_was_there_and_what_was_not(self, tmp_path):
+        path = tmp_path / "a.zarr"
+        before = clsas.mosaic(LINES, GRID, path, **WISH).image()
+        chunk = path / "pixels" / "c" / "1" / "2"
+        chunk.write_bytes(chunk.read_bytes()[:100])
+        patches = []
+        again = clsas.mosaic(LINES, GRID, path, **WISH).image(patches.append)
+        np.testing.assert_array_equal(again.pixels, before.pixels)
+        told = [(patch.row, patch.column) for patch in patches]
+        assert told[-1] == (1, 2)  # after those that were there
+        assert sorted(told) == list(np.ndindex(2, 4))
+        there = clsas.mosaic(LINES, GRID, path, **WISH)
+        assert len(there.finished) == 8
+        np.testing.assert_array_equal(there.image().pixels, before.pixels)
 
     def test_after_kill(self, file, tmp_path, exact):
         """Kill -9 in the middle, again and again."""
@@ -370,10 +393,10 @@ class TestResuming:
             clsas.mosaic(LINES, GRID, tmp_path / "a.zarr", **WISH)
 
     def test_a_file_written_anew_is_read_anew(self, file, tmp_path):
-        whole(clsas.mosaic(file, GRID, **WISH))
+        clsas.mosaic(file, GRID, **WISH).image()
         moved = dataclasses.replace(LINES, tx_m=LINES.tx_m + 0.3, rx_m=LINES.rx_m + 0.3)
         clsas.save(file, moved)
-        image = whole(clsas.mosaic(file, GRID, **WISH))
+        image = clsas.mosaic(file, GRID, **WISH).image()
         exact = clsas.backproject(moved, GRID, beam=BEAM, accuracy_db=-80)
         assert relative_error_db(image, exact) < -65
 
@@ -439,9 +462,9 @@ def test_devices_side_by_side(exact):
     mosaic = clsas.mosaic(
         LINES, GRID, **(WISH | {"patches": (6, 8)}), device=[info.index for info in infos]
     )
-    patches = list(mosaic)
+    patches = []
+    assert relative_error_db(mosaic.image(patches.append), exact) < -65
     assert {patch.record.device for patch in patches} == {info.label for info in infos}
-    assert relative_error_db(whole(patches), exact) < -65
 
 
 class TestDistributed:
@@ -570,10 +593,10 @@ class TestFollowing:
         back = dataclasses.replace(back, tx_m=back.tx_m + aside_m, rx_m=back.rx_m + aside_m)
         clsas.save(folder / "7.h5", back)
         (folder / END).touch()
-        for _ in mosaic:
-            pass
-        records = Store.opened(path).records()
-        assert {record.survey_channels for record in records.values()} == {2400}
+        image = mosaic.image()
+        store = Store.opened(path)
+        assert {record.survey_channels for record in store.records().values()} == {2400}
+        np.testing.assert_array_equal(image.pixels, store.image().pixels)
         assert not list(clsas.mosaic(folder, self.GRID, path, **self.WISH))
 
     def test_a_folder_that_stays_empty(self, tmp_path):

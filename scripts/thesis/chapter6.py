@@ -95,11 +95,9 @@ class Scene:
 
     def mosaic(self, grid: clsas.Grid, **wish: object) -> tuple[clsas.Image, list[clsas.Patch]]:
         """Form a mosaic by `stages` or `tolerance_db`."""
-        made = clsas.mosaic(self.lines, grid, beam=BEAM, device=self.device, **wish)
-        pixels, patches = np.empty(grid.shape, np.complex64), list(made)
-        for patch in patches:
-            pixels[patch.rows, patch.columns] = patch.image.pixels
-        return clsas.Image(pixels, grid), patches
+        patches: list[clsas.Patch] = []
+        wanted = clsas.mosaic(self.lines, grid, beam=BEAM, device=self.device, **wish)
+        return wanted.image(patches.append), patches
 
     def wavenumber(self, grid: clsas.Grid, strips: int = 1) -> clsas.Image:
         """Form a wavenumber image, each of some strips of rows for its own middle range."""

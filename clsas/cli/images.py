@@ -1,0 +1,179 @@
+"""Commands that form an image of range lines, or say how: image, plan."""
+
+from __future__ import annotations
+
+import time
+from contextlib import nullcontext
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import click
+
+import clsas
+from clsas import validate
+from clsas.backproject import execute, prepare
+from clsas.cli import options
+from clsas.cli.inputs import DEFAULT_WISH, load, read_beam, read_grid, read_wish, warn_of_sampling
+from clsas.cli.outputs import progress_bar, report
+from clsas.cli.parameters import INPUT
+from clsas.config import DIAL
+from clsas.device import open_device
+from clsas.interpolation import TAPS
+from clsas.planner import WORST_TOLERANCE_DB
+from clsas.tradeoff import summary
+
+
+@click.command()
+@click.argument("lines_file", metavar="LINES.H5", type=INPUT)
+@options.output("Image")
+@options.grid
+@options.dial
+@click.option("--exact", is_flag=True, help="Backproject plainly, as the three options below do.")
+@click.option(
+    "--accuracy-db",
+    type=float,
+    callback=options.check_accuracy_db,
+    help="Relative rms error wanted. [default: -60]",
+)
+@click.option(
+    "--taps",
+    type=int,
+    callback=options.checked(partial(validate.one_of, "taps", allowed=TAPS)),
+    help="Fix the interpolator's taps: 2, 4, 6 or 8.",
+)
+@click.option(
+    "--upsampling", type=float,
+    callback=options.checked(partial(validate.number, "upsampling", least=1.0, most=64.0)),
+    help="Fix how much lines are upsampled.",
+)  # fmt: skip
+@options.beam
+@options.device
+@options.png("the image in dB")
+@options.dynamic_range
+@click.option("--profile", is_flag=True, help="Also report the time of every kernel.")
+@options.as_json
+def image(
+    lines_file: Path,
+    output: Path,
+    scene: Path | None,
+    exact: bool,
+    device: str | None,
+    png: Path | None,
+    dynamic_range_db: float,
+    profile: bool,
+    as_json: bool,
+    **given: Any,
+) -> None:
+    """Form the image of range lines, fast to a tolerance or exactly.
+
+    The grid is that of --scene, or given by --x, --y and --z. How is told by one of
+    --tolerance-db, --tolerance-wavelengths, --stages and --exact, or by [image] of the scene;
+    otherwise the error against the exact image is to stay below -50 dB. Where nothing is faster
+    within a tolerance, the image is backprojected plainly.
+
+    \b
+    Example:  clsas image lines.h5 --x -2.5:2.5:1024 --y 40:45:1024 -o image.h5 --png image.png
+    """
+    described, grid = read_grid(scene, given)
+    wish = read_wish(described, given, exact)
+    beam = read_beam(described, given)
+    warn_of_sampling(described, grid)
+    lines = load(lines_file, clsas.RangeLines)
+    opened = open_device(device)
+    results: dict[str, Any] = {"method": "exact"}
+    chosen, why = None, ""
+    if wish.keys() & set(DIAL):
+        start = time.perf_counter()
+        chosen = clsas.plan(lines, grid, **wish, beam=beam, device=opened)
+        results["plan_seconds"] = time.perf_counter() - start
+        _warn_of_error(chosen)
+        if chosen.is_exact:
+            wish = {"accuracy_db": chosen.predicted_error_db}
+            why, chosen = f"exact: nothing faster within {chosen.tolerance_db:.4g} dB; ", None
+    with (
+        progress_bar("imaging") as progress,
+        opened.profile() if profile else nullcontext({}) as kernels,
+    ):
+        start = time.perf_counter()
+        if chosen is not None:
+            formed = clsas.factorize(lines, grid, chosen, device=opened, progress=progress)
+            how = f"{summary(chosen)}; error predicted {chosen.predicted_error_db:.0f} dB"
+            results |= {
+                "method": "stages" if chosen.nearest else "factorized",
+                "predicted_error_db": chosen.predicted_error_db,
+                "predicted_seconds": chosen.predicted_seconds,
+            }
+        else:
+            preparation = prepare(lines, grid, device=opened, beam=beam, **wish)
+            formed = execute(preparation, progress=progress)
+            interpolator, ratio = preparation.interpolator, preparation.resampling.ratio
+            how = (
+                f"{why}{interpolator.taps} taps on lines upsampled {ratio:.3g} times, "
+                f"{interpolator.error_db:.0f} dB"
+            )
+            results |= {
+                "taps": interpolator.taps,
+                "upsampling": ratio,
+                "interpolation_error_db": interpolator.error_db,
+            }
+        seconds = time.perf_counter() - start
+    clsas.save(output, formed)
+    if png is not None:
+        from clsas import plot
+
+        plot.save_png(plot.image_db(formed, dynamic_range_db=dynamic_range_db), png)
+    planned = f", planned in {results['plan_seconds']:.2f} s" if "plan_seconds" in results else ""
+    table = "".join(
+        f"\n  {name}: {times.count} runs of {1e3 * times.minimum_s:.3g} to "
+        f"{1e3 * times.maximum_s:.3g} ms, median {1e3 * times.median_s:.3g} ms"
+        for name, times in kernels.items()
+    )
+    report(
+        as_json,
+        f"{output}: {' x '.join(map(str, grid.shape))} pixels from {lines.channels} lines in "
+        f"{seconds:.2f} s{planned} on {opened.info.label} ({how}){table}",
+        file=output, png=png, shape=grid.shape, channels=lines.channels,
+        device=opened.info.label, driver=opened.info.driver, **results, seconds=seconds,
+        kernels=kernels,
+    )  # fmt: skip
+
+
+@click.command()
+@click.argument("lines_file", metavar="LINES.H5", type=INPUT)
+@options.grid
+@options.dial
+@options.beam
+@options.device
+@options.as_json
+def plan(
+    lines_file: Path, scene: Path | None, device: str | None, as_json: bool, **given: Any
+) -> None:
+    """Show how an image would be formed, how long it takes and how much it errs.
+
+    Grid, dial and beam as for `clsas image`; where the scene asks for an exact image, a
+    tolerance of -50 dB counts. With --json the plan is printed whole, as Plan.to_json has it.
+
+    \b
+    Example:  clsas plan lines.h5 --x -2.5:2.5:1024 --y 40:45:1024 --tolerance-db -40
+    """
+    described, grid = read_grid(scene, given)
+    wish = read_wish(described, given)
+    beam = read_beam(described, given)
+    lines = load(lines_file, clsas.RangeLines)
+    if not wish.keys() & set(DIAL):
+        wish = DEFAULT_WISH
+    chosen = clsas.plan(lines, grid, **wish, beam=beam, device=device)
+    _warn_of_error(chosen)
+    click.echo(chosen.to_json() if as_json else chosen.describe())
+
+
+def _warn_of_error(chosen: clsas.Plan) -> None:
+    """Warn where the thesis's method may leave no image."""
+    if chosen.nearest and chosen.predicted_error_db > WORST_TOLERANCE_DB:
+        click.echo(
+            f"Warning: with these stages the error may be as large as "
+            f"{chosen.predicted_error_db:.0f} dB, too large for an image to be of use: sum fewer "
+            "lines (QR), or divide more (QI)",
+            err=True,
+        )

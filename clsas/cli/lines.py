@@ -1,0 +1,95 @@
+"""Commands that make range lines: simulate, compress."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Any
+
+import click
+
+import clsas
+from clsas.cli import options
+from clsas.cli.inputs import load, warn_of_sampling
+from clsas.cli.outputs import progress_bar, report
+from clsas.cli.parameters import INPUT
+from clsas.config import read_scene
+
+
+@click.command()
+@click.argument("scene_file", metavar="SCENE.TOML", type=INPUT)
+@options.output("Echoes")
+@options.png("track and grid")
+@options.as_json
+def simulate(scene_file: Path, output: Path, png: Path | None, as_json: bool) -> None:
+    """Simulate the echoes of a scene file.
+
+    \b
+    Example:  clsas simulate scene.toml -o echoes.h5
+    """
+    scene = read_scene(scene_file)
+    sonar, track, targets = scene.need("sonar", "track", "targets")
+    warn_of_sampling(scene)
+    with progress_bar("simulating") as progress:
+        start = time.perf_counter()
+        echoes = clsas.simulate(sonar, track, targets, **scene.simulate, progress=progress)
+        seconds = time.perf_counter() - start
+    clsas.save(output, echoes)
+    if png is not None:
+        from clsas import plot
+
+        plot.save_png(plot.geometry(echoes, scene.grid), png)
+    report(
+        as_json,
+        f"{output}: {echoes.channels} channels of {echoes.length} samples in {seconds:.2f} s",
+        file=output, png=png, channels=echoes.channels, length=echoes.length, seconds=seconds,
+    )  # fmt: skip
+
+
+@click.command()
+@click.argument("echoes_file", metavar="ECHOES.H5", type=INPUT)
+@options.output("Range lines")
+@options.scene
+@click.option("--window", help="Band window: none, hamming, taylor, ... [default: none]")
+@click.option("--oversampling", type=float, help="Samples per bandwidth. [default: 2]")
+@options.png("the lines")
+@options.as_json
+def compress(
+    echoes_file: Path,
+    output: Path,
+    scene: Path | None,
+    window: str | None,
+    oversampling: float | None,
+    png: Path | None,
+    as_json: bool,
+) -> None:
+    """Compress echoes into range lines.
+
+    \b
+    Example:  clsas compress echoes.h5 -o lines.h5 --window hamming
+    """
+    wanted = _overruled(
+        read_scene(scene).compress if scene else {}, window=window, oversampling=oversampling
+    )
+    echoes = load(echoes_file, clsas.Echoes)
+    with progress_bar("compressing") as progress:
+        start = time.perf_counter()
+        lines = clsas.compress(echoes, **wanted, progress=progress)
+        seconds = time.perf_counter() - start
+    clsas.save(output, lines)
+    if png is not None:
+        from clsas import plot
+
+        plot.save_png(plot.range_lines(lines), png)
+    report(
+        as_json,
+        f"{output}: {lines.channels} lines of {lines.length} samples, "
+        f"{1e3 * lines.range_step_m:.4g} mm apart, in {seconds:.2f} s",
+        file=output, png=png, channels=lines.channels, length=lines.length,
+        range_step_m=lines.range_step_m, seconds=seconds,
+    )  # fmt: skip
+
+
+def _overruled(described: dict[str, Any], **given: Any) -> dict[str, Any]:
+    """Return a scene file's options, overruled by those given."""
+    return described | {name: value for name, value in given.items() if value is not None}

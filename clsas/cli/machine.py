@@ -1,0 +1,84 @@
+"""Commands for a new machine: devices, calibrate, demo."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+from pathlib import Path
+
+import click
+
+import clsas
+from clsas import demo as demonstration
+from clsas.cli import options
+from clsas.cli.outputs import print_json, progress_bar, report
+from clsas.cli.parameters import need_matplotlib
+from clsas.device import choose, open_device
+
+
+@click.command()
+@options.as_json
+def devices(as_json: bool) -> None:
+    """List OpenCL devices, and say which one is used and why.
+
+    \b
+    Example:  CLSAS_DEVICE=0 clsas devices
+    """
+    used, reason = choose()
+    found = clsas.list_devices()
+    if as_json:
+        print_json({"devices": found, "used": used.index, "reason": reason})
+        return
+    for info in found:
+        click.echo(
+            f"{info.index}  {info.label}\n"
+            f"   driver {info.driver}\n"
+            f"   {info.kind.upper()}, {info.compute_units} compute units, "
+            f"{info.memory_bytes / 2**30:.1f} GiB ({info.max_buffer_bytes / 2**30:.1f} GiB in one "
+            f"buffer), {'fp64' if info.fp64 else 'no fp64'}, vectors of {info.width}"
+        )
+    click.echo(f"Used: {used.index} ({reason})")
+
+
+@click.command()
+@options.device
+@options.as_json
+def calibrate(device: str | None, as_json: bool) -> None:
+    """Measure what the parts of imaging cost on a device, and store it for planning.
+
+    \b
+    Example:  clsas calibrate --device 0
+    """
+    from clsas import costs
+    from clsas.calibrate import calibrate as measure
+
+    opened = open_device(device)
+    with progress_bar("calibrating") as progress:
+        found = measure(opened, progress=progress)
+    stored = costs.load(opened) == found
+    parts = "".join(f"\n{getattr(found, part.name):>12.4g}  {part.name}" for part in fields(found))
+    report(
+        as_json,
+        f"{opened.info.label}, {'' if stored else 'not '}stored in {costs.path()}{parts}",
+        device=opened.info.label, driver=opened.info.driver, file=costs.path(), stored=stored,
+        costs=found,
+    )  # fmt: skip
+
+
+@click.command()
+@click.option(
+    "--out", type=click.Path(file_okay=False, path_type=Path), default="clsas-demo",
+    show_default=True, help="Folder for the files.",
+)  # fmt: skip
+@options.device
+@options.as_json
+def demo(out: Path, device: str | None, as_json: bool) -> None:
+    """Run the thesis's wide-beam case, from simulation to picture and measured figures.
+
+    \b
+    Example:  clsas demo --out my-demo
+    """
+    need_matplotlib()
+    say = (lambda line: None) if as_json else click.echo
+    results = demonstration.run(out, device=device, say=say, progress=progress_bar)
+    if as_json:
+        print_json(results)

@@ -1,0 +1,230 @@
+"""The command that forms an image patch by patch: mosaic."""
+
+from __future__ import annotations
+
+import logging
+import signal
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any
+
+import click
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+
+import clsas
+from clsas.cli import options
+from clsas.cli.inputs import read_beam, read_grid, read_wish, warn_of_sampling
+from clsas.cli.outputs import progress_bar, report
+from clsas.cli.parameters import COUNTS, INPUT
+from clsas.config import DIAL, SceneFile, simulation_digest
+from clsas.device import open_device
+
+_SCHEDULER_S = 10  # to answer
+
+
+@click.command()
+@click.argument("scene", metavar="SCENE.TOML", type=INPUT)
+@click.option(
+    "--lines", "lines_path", type=click.Path(exists=True, path_type=Path),
+    help="Range lines, or a folder of files of them. [default: simulated from the scene]",
+)  # fmt: skip
+@click.option(
+    "-o", "--output", type=click.Path(path_type=Path),
+    help="Zarr store to write or go on with. [default: SCENE.zarr]",
+)  # fmt: skip
+@options.axes
+@options.dial
+@click.option("--accuracy-db", type=float, help="Backproject exactly, with this rms error.")
+@options.beam
+@click.option("--patches", type=COUNTS, help="Patches along y and x, such as 8x8.")
+@click.option("--memory-mib", type=click.IntRange(1), help="What a patch may take. [default: 1024]")
+@click.option("--device", multiple=True, help="Once for every device that is to work.")
+@click.option("--workers", type=click.IntRange(1), help="Work in so many processes (Dask).")
+@click.option("--scheduler", metavar="ADDRESS", help="Work on a Dask cluster: tcp://host:8786.")
+@click.option("--follow", is_flag=True, help="Go on while files are added to the folder --lines.")
+@click.option(
+    "--idle-s", type=float, default=60.0, show_default=True,
+    help="With --follow: until nothing came for so long, or a file `end` did.",
+)  # fmt: skip
+@options.png("an overview in dB")
+@options.dynamic_range
+@options.as_json
+def mosaic(
+    scene: Path,
+    lines_path: Path | None,
+    output: Path | None,
+    patches: tuple[int, int] | None,
+    memory_mib: int | None,
+    device: tuple[str, ...],
+    workers: int | None,
+    scheduler: str | None,
+    follow: bool,
+    idle_s: float,
+    png: Path | None,
+    dynamic_range_db: float,
+    as_json: bool,
+    **given: Any,
+) -> None:
+    """Form an image of any size patch by patch, into a Zarr store.
+
+    Grid, dial and beam as for `clsas image`. The same command goes on where it was interrupted, by
+    Ctrl-C or by anything else. A scene without --lines is simulated first.
+
+    \b
+    Example:  clsas mosaic scene.toml --lines lines.h5 -o image.zarr --png image.png
+    """
+    if workers is not None and scheduler is not None:
+        raise click.UsageError("--workers and --scheduler exclude each other")
+    if device and (workers or scheduler):
+        raise click.UsageError("--device plays no part with --workers and --scheduler")
+    described, grid = read_grid(scene, given, memory=False)
+    wish = read_wish(described, given)
+    if set(wish) - {*DIAL, "accuracy_db"}:
+        raise ValueError(f"{scene}: [image] taps and upsampling play no part in a mosaic")
+    beam = read_beam(described, given)
+    warn_of_sampling(described, grid)
+    devices = [open_device(name) for name in device] or None
+    in_scene = described.mosaic
+    output = output or in_scene.get("store") or scene.with_suffix(".zarr")
+    lines_path = lines_path or in_scene.get("lines")
+    if follow and (lines_path is None or not lines_path.is_dir()):
+        raise click.UsageError("--follow goes with --lines, a folder")
+    patches = patches or in_scene.get("patches")
+    memory_mib = memory_mib or in_scene.get("memory_mib")
+    if lines_path is None:
+        lines_path = _simulated(described, scene, output, click.echo if not as_json else None)
+    start = time.perf_counter()
+    with _cluster(workers, scheduler) as client:
+        formed = clsas.mosaic(
+            lines_path, grid, output, **wish, beam=beam, patches=patches,
+            memory_bytes=memory_mib and memory_mib << 20, device=devices,
+            client=client, follow_s=idle_s if follow else None,
+        )  # fmt: skip
+        before, count, pixels = len(formed.finished), 0, 0
+        with _patch_progress(output.name, len(formed), before) as tell:
+            for patch in formed:
+                count, pixels = count + 1, pixels + patch.grid.size
+                if not as_json:
+                    tell(patch)
+    seconds = time.perf_counter() - start
+    store = clsas.Store.opened(output)
+    records = store.records()
+    if png is not None:
+        from clsas import plot
+
+        plot.save_png(plot.image_db(store.overview(), dynamic_range_db=dynamic_range_db), png)
+    errors = [r.predicted_error_db for r in records.values() if r.predicted_error_db is not None]
+    flagged = {place: record.flags for place, record in records.items() if record.flags}
+    worst = max(errors, default=None)
+    rows, columns = formed.patch_shape
+    text = [
+        f"{output}: {' x '.join(map(str, formed.shape))} patches of {rows} x {columns} pixels, "
+        + (
+            f"{count} formed in {seconds:.2f} s ({pixels / seconds / 1e6:.3g} Mpixel/s)"
+            if count
+            else "none to form"
+        )
+        + (f", {before} were there" if before else "")
+        + ("" if worst is None else f"; error predicted {worst:.1f} dB at most")
+    ]
+    text += [f"  patch {row},{column}: {'; '.join(f)}" for (row, column), f in flagged.items()]
+    report(
+        as_json,
+        "\n".join(text),
+        file=output, png=png, shape=grid.shape, patches=formed.shape,
+        patch_shape=formed.patch_shape, finished=len(records), formed=count, before=before,
+        seconds=seconds, pixels_per_s=pixels / seconds, predicted_error_db=worst,
+        flags={f"{row},{column}": f for (row, column), f in flagged.items()},
+        seconds_of_patches=sum(record.seconds for record in records.values()),
+    )  # fmt: skip
+
+
+def _simulated(
+    described: SceneFile, scene: Path, output: Path, say: Callable[..., None] | None
+) -> Path:
+    """Return the file of a scene's range lines beside the store; made where it is not there."""
+    digest = simulation_digest(scene.read_bytes(), scene.parent)
+    path = output.with_name(f"{output.stem}-{digest}.lines.h5")
+    if path.exists():
+        if say is not None:
+            say(f"{path}: range lines, simulated before", err=True)
+        return path
+    sonar, track, targets = described.need("sonar", "track", "targets")
+    with progress_bar("simulating") as progress:
+        echoes = clsas.simulate(sonar, track, targets, **described.simulate, progress=progress)
+    with progress_bar("compressing") as progress:
+        clsas.save(path, clsas.compress(echoes, **described.compress, progress=progress))
+    if say is not None:
+        say(f"{path}: range lines, simulated from {scene}", err=True)
+    return path
+
+
+@contextmanager
+def _cluster(workers: int | None, scheduler: str | None) -> Iterator[Any]:
+    """Give a client of a Dask cluster, or None where there is none to be used."""
+    if workers is None and scheduler is None:
+        yield None
+        return
+    try:
+        from distributed import Client, LocalCluster
+        from distributed.scheduler import KilledWorker
+    except ImportError:
+        raise ImportError(
+            "--workers and --scheduler need Dask: pip install 'clsas[mosaic]'"
+        ) from None
+    with ExitStack() as opened:
+        if scheduler is not None:
+            try:
+                client = opened.enter_context(Client(scheduler, timeout=_SCHEDULER_S))
+            except (OSError, ValueError) as error:
+                raise click.ClickException(
+                    f"--scheduler {scheduler} cannot be reached: {error}"
+                ) from None
+        else:
+            # Ctrl-C at a terminal is for this process, which then ends the others.
+            heeded = signal.signal(signal.SIGINT, signal.SIG_IGN)
+            try:
+                cluster = LocalCluster(
+                    n_workers=workers,
+                    threads_per_worker=1,
+                    dashboard_address=None,
+                    silence_logs=logging.CRITICAL,
+                )
+            finally:
+                signal.signal(signal.SIGINT, heeded)
+            opened.enter_context(cluster)
+            client = opened.enter_context(Client(cluster))
+        try:
+            yield client
+        except KilledWorker as error:
+            raise click.ClickException(
+                f"workers died on one patch, over and over: {error}"
+            ) from None
+
+
+@contextmanager
+def _patch_progress(name: str, total: int, done: int) -> Iterator[Callable[[clsas.Patch], None]]:
+    """Give a function that tells of a patch: a line each and, on a terminal, a moving bar."""
+    columns = (
+        TextColumn(name), BarColumn(), TextColumn("{task.completed}/{task.total}"),
+        TaskProgressColumn(), TimeRemainingColumn(),
+    )  # fmt: skip
+    console = Console(stderr=True, soft_wrap=True, highlight=False)
+    with Progress(
+        *columns, console=console, transient=True, disable=not console.is_terminal
+    ) as bar:
+        task = bar.add_task(name, total=total, completed=done)
+
+        def tell(patch: clsas.Patch) -> None:
+            record = patch.record
+            parts = [f"{record.seconds:.2f} s", f"{record.channels} channels"]
+            if record.predicted_error_db is not None:
+                parts.append(f"error predicted {record.predicted_error_db:.1f} dB")
+            line = f"patch {patch.row},{patch.column}: {', '.join((*parts, *record.flags))}"
+            console.print(line, markup=False)
+            bar.advance(task)
+
+        yield tell

@@ -1,0 +1,108 @@
+"""Options that several commands share."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import click
+
+from clsas import validate
+from clsas.backproject import BEST_ACCURACY_DB
+from clsas.cli.parameters import AXIS, INPUT, RATIO, STAGES, Output
+from clsas.planner import BEST_TOLERANCE_DB, WORST_TOLERANCE_DB, wavelengths
+from clsas.window import SHAPES
+
+
+def checked(check: Callable[[Any], object]) -> Callable:
+    """Return an option's callback that makes a usage error of what a check of its value raises."""
+
+    def callback(ctx: click.Context, param: click.Parameter, value: Any) -> Any:
+        try:
+            for each in value if param.multiple else [value]:
+                if each is not None:
+                    check(each)
+        except (TypeError, ValueError) as error:
+            raise click.BadParameter(str(error), ctx, param) from error
+        return value
+
+    return callback
+
+
+def output(kind: str) -> Callable:
+    """Return the option for the file that is the result."""
+    return click.option("-o", "--output", type=Output(), required=True, help=f"{kind} to write.")
+
+
+def png(what: str) -> Callable:
+    """Return the option for a picture of the result."""
+    return click.option("--png", type=Output(), help=f"Also draw {what}.")
+
+
+def _together(*options: Callable) -> Callable:
+    """Return several options as one decorator, in the order in which --help shows them."""
+
+    def decorate(command: Callable) -> Callable:
+        for option in reversed(options):
+            command = option(command)
+        return command
+
+    return decorate
+
+
+as_json = click.option("--json", "as_json", is_flag=True, help="Print results as JSON.")
+dynamic_range = click.option(
+    "--dynamic-range-db", type=float, default=60.0, show_default=True, help="Of the PNG.",
+    callback=checked(partial(validate.positive, "dynamic_range_db", unit="dB")),
+)  # fmt: skip
+scene = click.option("--scene", type=INPUT, help="Scene file for what the options leave out.")
+device = click.option("--device", help="Index or part of the name, as `clsas devices` shows.")
+axes = _together(
+    click.option("--x", type=AXIS, help="First and last pixel centre along x (m), how many."),
+    click.option("--y", type=AXIS, help="The same along y."),
+    click.option(
+        "--z", type=float, callback=checked(partial(validate.number, "z", unit="m")),
+        help="Height of the plane (m). [default: 0]",
+    ),
+)  # fmt: skip
+grid = _together(scene, axes)
+check_tolerance_db = checked(
+    partial(
+        validate.number, "tolerance_db", unit="dB", least=BEST_TOLERANCE_DB, most=WORST_TOLERANCE_DB
+    )
+)
+check_accuracy_db = checked(
+    partial(validate.number, "accuracy_db", unit="dB", least=BEST_ACCURACY_DB, below=0.0)
+)
+dial = _together(
+    click.option(
+        "--tolerance-db", type=float, callback=check_tolerance_db,
+        help="Relative rms error allowed against the exact image. [default: -50]",
+    ),
+    click.option(
+        "--tolerance-wavelengths", type=RATIO,
+        callback=checked(
+            partial(
+                validate.number, "tolerance_wavelengths", unit="wavelengths",
+                least=wavelengths(BEST_TOLERANCE_DB), most=wavelengths(WORST_TOLERANCE_DB),
+            )
+        ),
+        help="The same as a range error in wavelengths, such as 1/30.",
+    ),
+    click.option(
+        "--stages", type=STAGES, metavar="QRxQI,...",
+        help="The thesis's method: QR and QI of every stage, such as 2x2,2x2.",
+    ),
+)  # fmt: skip
+beam = _together(
+    click.option("--beam-deg", type=float, help="Use a beam of this full width only."),
+    click.option(
+        "--beam-shape", type=click.Choice(SHAPES), help="Its shape. [default: rectangular]"
+    ),
+    click.option("--squint-deg", type=float, help="Its middle, ahead of broadside. [default: 0]"),
+    click.option(
+        "--element-length-m", type=float,
+        help="For the shape 'inverse', which divides by the two-way pattern of such elements.",
+    ),
+)  # fmt: skip

@@ -1,0 +1,121 @@
+"""What values of options and arguments may be: their types for click."""
+
+from __future__ import annotations
+
+import importlib.util
+import math
+import tempfile
+from collections.abc import Callable
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import click
+
+
+class Parsed(click.ParamType):
+    """What a function reads from a text.
+
+    Parameters
+    ----------
+    name : str
+        The form of the text, as --help shows it.
+    parse : callable
+        Raises ValueError or ArithmeticError where the text is wrong.
+    wanted : str
+        What the text must be, as the message says it.
+    """
+
+    def __init__(self, name: str, parse: Callable[[str], Any], wanted: str) -> None:
+        self.name = name
+        self._parse = parse
+        self._wanted = wanted
+
+    def convert(self, value: str, param: Any, ctx: Any) -> Any:
+        """Return what is read; a wrong text is a usage error."""
+        try:
+            return self._parse(value)
+        except (ValueError, ArithmeticError):
+            self.fail(f"{value!r} must be {self._wanted}", param, ctx)
+
+
+def _axis(text: str) -> tuple[float, float, int]:
+    start, stop, count = text.split(":")
+    axis = float(start), float(stop), int(count)
+    if not (math.isfinite(axis[0]) and math.isfinite(axis[1]) and axis[2] > 0):
+        raise ValueError
+    return axis
+
+
+def _place(text: str) -> tuple[float, float]:
+    x, y = text.split(",")
+    return float(x), float(y)
+
+
+def _ratio(text: str) -> float:
+    return float(Fraction(text))
+
+
+def _stages(text: str) -> tuple[tuple[int, int], ...]:
+    pairs = [stage.lower().split("x") for stage in text.split(",")]
+    stages = tuple((int(beams), int(divisions)) for beams, divisions in pairs)
+    if min(map(min, stages)) < 1:
+        raise ValueError
+    return stages
+
+
+def _counts(text: str) -> tuple[int, int]:
+    rows, columns = text.lower().split("x")
+    return int(rows), int(columns)
+
+
+AXIS = Parsed("START:STOP:N", _axis, "START:STOP:N, metres and a number of pixels")
+PLACE = Parsed("X,Y", _place, "X,Y in metres")
+RATIO = Parsed("NUMBER", _ratio, "a number or a fraction such as 1/30")
+STAGES = Parsed("stages", _stages, "QRxQI for every stage, such as 2x2,2x2")
+COUNTS = Parsed("ROWSxCOLUMNS", _counts, "ROWSxCOLUMNS, such as 8x8")
+INPUT = click.Path(exists=True, dir_okay=False, path_type=Path)
+
+
+class Output(click.Path):
+    """A file to write: what would keep it from being written is said before any work."""
+
+    def __init__(self) -> None:
+        super().__init__(dir_okay=False, writable=True, path_type=Path)
+
+    def convert(self, value: Any, param: Any, ctx: Any) -> Path:
+        """Return the path; what keeps it from being written is a usage error."""
+        path: Any = super().convert(value, param, ctx)
+        if not path.parent.is_dir():
+            self.fail(f"there is no folder {str(path.parent)!r}", param, ctx)
+        try:
+            special = _exists(path) and not path.is_file()
+            with tempfile.TemporaryFile(dir=path.parent):
+                pass
+        except OSError as error:
+            self.fail(f"{str(path)!r} cannot be written: {error.strerror}", param, ctx)
+        if special:
+            self.fail(f"{str(path)!r} is not an ordinary file", param, ctx)
+        for other in ctx.command.params:
+            # Whichever comes second on the command line finds the first one here.
+            taken = ctx.params.get(other.name) if isinstance(other.type, Output) else None
+            if other is not param and taken is not None and taken.resolve() == path.resolve():
+                self.fail(f"{other.opts[0]} and {param.opts[0]} must be two files", param, ctx)
+        if param.name == "png":
+            need_matplotlib()
+        return path
+
+
+def _exists(path: Path) -> bool:
+    """Return whether a path is taken; raises OSError where it cannot be (a long name)."""
+    try:
+        path.stat()
+    except FileNotFoundError:
+        return False
+    return True
+
+
+def need_matplotlib() -> None:
+    """End the command where pictures cannot be drawn."""
+    if importlib.util.find_spec("matplotlib") is None:
+        raise click.ClickException("pictures need matplotlib: pip install 'clsas[plot]'")
