@@ -18,6 +18,7 @@
  *   MOVING     receivers move at `velocity` (in units of the sound speed) during the echo's flight.
  *   BEAM       intervals of the table of the channels' weights by aspect angle; 0 is no weights.
  *   NORMALISE  with BEAM: sum the weights too.
+ *   CENTRED    every line is aligned on its tile's centre, at one sample: there are no references.
  *
  * Buffers
  *   samples    float, each line with `pitch` samples including its zero margins: WIDTH > 1 a plane
@@ -31,6 +32,7 @@
  *              the grid's origin). With the pairs a short distance between far points is exact.
  *   ranges     int [parts][3]: the first channel that a tile or group sees, the one after the last,
  *              and the first one's line. What is held per (part, channel) begins with that channel.
+ *              The parts at work begin at number first_range.
  *   reference  per (part, channel): nearest sample (int, counted from the line's first margin
  *              sample), the fraction to the tile centre's range (samples) and phase (cycles in
  *              [-0.5, 0.5]), each [parts][channel_pitch].
@@ -277,14 +279,14 @@ INLINE Derivatives distance_derivatives(vfloat x, vfloat y, vfloat z, float4 a, 
 }
 
 __kernel void expand_tiles(__global const float *geometry, int channel_pitch,
-                           int geometry_pitch, __global const int *ranges,
+                           int geometry_pitch, __global const int *ranges, int first_range,
                            __global const float *centres, float4 step_column, float4 step_row,
                            float samples_per_m, float2 drift, __global float *expansion EXPAND_ARGUMENTS)
 {
     const int entry = get_global_id(0) * WIDTH;
     const int tile = get_global_id(1);
     /* What lies beyond a tile's channels is not used. */
-    const int channel = clamp(ranges[3 * tile] + entry, 0, geometry_pitch - WIDTH);
+    const int channel = clamp(ranges[3 * (first_range + tile)] + entry, 0, geometry_pitch - WIDTH);
     __global const float *centre = centres + 6 * tile;
 
     const vfloat tx = FROMS(TX, 0), ty = FROMS(TX, 1), tz = FROMS(TX, 2);
@@ -375,28 +377,35 @@ __kernel void expand_tiles(__global const float *geometry, int channel_pitch,
 /* Planar grids: pixels of a tile by the expansion of expand_tiles.
  * Global size (TILE^2 / (4 WIDTH), tiles), tiles counted from first_tile, row by row over the image. */
 __kernel void backproject_tiles(__global const float *samples, int pitch,
+#if CENTRED
+                                int centre_sample,
+#else
                                 __global const int *reference_sample,
                                 __global const float *reference_fraction,
                                 __global const float *reference_phase,
+#endif
                                 __global const float *expansion, int channel_pitch,
-                                __global const int *ranges, float cycles_per_sample,
+                                __global const int *ranges, int first_range, float cycles_per_sample,
                                 __global const float *weights, __global float2 *pixels, int columns,
                                 int first_tile BEAM_ARGUMENTS)
 {
     const int item = get_global_id(0);
     const int tile = get_global_id(1);
-    const int begin = ranges[3 * tile], end = ranges[3 * tile + 1];
+    ranges += 3 * (first_range + tile);
+    const int begin = ranges[0], end = ranges[1];
     if (begin >= end)
         return;
     const int tiles_across = columns / TILE_COLUMNS;
     const int block_column = item % BLOCKS_ACROSS * BLOCK_COLUMNS;
     const int block_row = item / BLOCKS_ACROSS * ITEM_ROWS;
     const size_t first = (size_t)tile * channel_pitch;
+#if !CENTRED
     reference_sample += first;
     reference_fraction += first;
     reference_phase += first;
+#endif
     expansion += TERMS * first;
-    samples += (size_t)ranges[3 * tile + 2] * 2 * pitch;
+    samples += (size_t)ranges[2] * 2 * pitch;
 
     /* Lanes from their block's centre, blocks' centres from the tile's, in pixels. */
     const vfloat lane_i = LANE_COLUMNS, lane_j = LANE_ROWS;
@@ -458,11 +467,18 @@ __kernel void backproject_tiles(__global const float *samples, int pitch,
             + lane_j * lane_j * (h2 + k2 * i);
         const vfloat bend = lane_i * (lane_i * k1 + lane_j * (2.0f * k2)) + lane_j * lane_j * (3.0f * k3);
 
-        const float4 position = move + reference_fraction[entry];
+#if CENTRED
+        const int nearest_sample = centre_sample;
+        const float fraction = 0.0f, turn = 0.0f;
+#else
+        const int nearest_sample = reference_sample[entry];
+        const float fraction = reference_fraction[entry], turn = reference_phase[entry];
+#endif
+        const float4 position = move + fraction;
         const float4 shifted = position + ROUNDER;
         const float4 start = position - (shifted - ROUNDER) - 0.5f;
-        const int4 centre = reference_sample[entry] + (as_int4(shifted) - 0x4B400000);
-        const float4 cycles = move * cycles_per_sample + reference_phase[entry];
+        const int4 centre = nearest_sample + (as_int4(shifted) - 0x4B400000);
+        const float4 cycles = move * cycles_per_sample + turn;
         const float4 phase = cycles - ((cycles + ROUNDER) - ROUNDER);
 
         __global const float *line = samples + (size_t)entry * 2 * pitch;

@@ -72,23 +72,21 @@ INLINE void sincos_cycles(vfloat t, vfloat *sine, vfloat *cosine)
     *cosine = c * z + 0.999999222f;
 }
 
-/* The TAPS (build option) weights of an interpolation at nu in [-0.5, 0.5] from the middle of its taps: the one
- * at +-(pair + 0.5) has E(nu^2) +- nu O(nu^2). filter: float [TAPS / 2][2][TAPS / 2], per pair from
+/* The weights of an interpolation by an even number of taps, a constant, at nu in [-0.5, 0.5] from their middle: the
+ * one at +-(pair + 0.5) has E(nu^2) +- nu O(nu^2). filter: float [taps / 2][2][taps / 2], per pair from
  * the innermost the coefficients of E, then O, highest power first. */
-#ifdef TAPS
-INLINE void filter_weights(__global const float *filter, vfloat nu, vfloat *weight)
+INLINE void filter_weights(__global const float *filter, const int taps, vfloat nu, vfloat *weight)
 {
     const vfloat square = nu * nu;
 #pragma unroll
-    for (int pair = 0; pair < TAPS / 2; pair++) {
-        vfloat even = filter[pair * TAPS], odd = filter[pair * TAPS + TAPS / 2];
+    for (int pair = 0; pair < taps / 2; pair++) {
+        vfloat even = filter[pair * taps], odd = filter[pair * taps + taps / 2];
 #pragma unroll
-        for (int power = 1; power < TAPS / 2; power++) {
-            even = even * square + filter[pair * TAPS + power];
-            odd = odd * square + filter[pair * TAPS + TAPS / 2 + power];
+        for (int power = 1; power < taps / 2; power++) {
+            even = even * square + filter[pair * taps + power];
+            odd = odd * square + filter[pair * taps + taps / 2 + power];
         }
-        weight[TAPS / 2 + pair] = even + nu * odd;
-        weight[TAPS / 2 - 1 - pair] = even - nu * odd;
+        weight[taps / 2 + pair] = even + nu * odd;
+        weight[taps / 2 - 1 - pair] = even - nu * odd;
     }
 }
-#endif

@@ -12,7 +12,7 @@
  * Build options
  *   WIDTH          lanes: consecutive samples of a line, or consecutive channels (common.h).
  *   TAPS           of the range interpolation h, even (filter_weights in common.h).
- *   APERTURE_TAPS  of the aperture interpolation a.
+ *   APERTURE_TAPS  of the aperture interpolation a, even; 1: channels are added to one virtual channel each.
  *   GIVEN          1: shifts and phases come from the host (the first stage, whose channels may be
  *                  anything); 0: from the positions of virtual channels.
  *   RAMP           1: phases vary along the lines (with GIVEN only); 0: every ramp is 0.
@@ -20,25 +20,29 @@
  * Buffers
  *   parent      lines of float, `parent_pitch` samples each: [...][2][parent_pitch], real parts and
  *               imaginary ones; with WIDTH 1 interleaved.
- *   children    int [children][8]: the parent's first line; the root; the channels [begin, end) that the
- *               child uses; what to subtract from a channel to find its line among the parent's; the
- *               child's first virtual channel and how many it has; unused.
+ *   children    int [roots][children_per_root][5]: the channels [begin, end) that the child uses; what to subtract
+ *               from a channel to find its line among the parent's; the child's first virtual channel and how
+ *               many it has. The children at work begin at number first_child, with a root.
  *   Per root and channel, [roots][channel_pitch]:
  *   base        int: the first virtual channel it contributes to, never decreasing.
- *   aperture    float [APERTURE_TAPS]: its weights a.
- *   GIVEN only  order (int: its line), start (int: parent sample of tap 0 for k = 0), nu, cycles and ramp
- *               (float; cycles per sample).
- *   otherwise   positions  float [roots][3][channel_pitch]: of channels, m from the root's centre.
- *               offsets    float [children][6]: the parent's centre from the root's, the child's from
+ *   between     float: its place from the middle of the virtual channels it contributes to.
+ *   GIVEN only  order (int: its line), start (int: parent sample of tap 0 for k = 0), nu, cycles and, with RAMP,
+ *               ramp (float; cycles per sample).
+ *   otherwise   parents    int [children_per_root]: which of the parents_per_root each child belongs to; either
+ *                          of those at work has lines_per_parent lines.
+ *               positions  float [roots][3][channel_pitch]: of channels, m from the root's centre.
+ *               offsets    float [children_per_root][6]: the parent's centre from the root's, the child's from
  *                          its parent's, m.
  *               drift      velocity of receivers over the sound speed: what motion in flight adds to the
  *                          range to x is -drift.(x - channel), to first order.
  *               parent_centre: sample of a parent line that is its subimage's centre.
  *   half_length: samples of a line before the one of the child's centre.
- *   lines       [children][lines_per_child][2][pitch], samples `guard` to guard + length - 1 written,
+ *   filter, aperture_filter: coefficients of h and a (filter_weights in common.h).
+ *   lines       [children at work][lines_per_child][2][pitch], samples `guard` to guard + length - 1 written,
  *               `length` a multiple of WIDTH.
  *
- * Work-groups (any size along axis 0; 1 with WIDTH > 1) form a child each.
+ * Work-groups (any size along axis 0; 1 with WIDTH > 1) form a child each, or with several groups along axis 1
+ * `part_length` samples of it, a multiple of 8 WIDTH.
  * Samples outside the parent's line are never read: the place is moved inside, where the host has put zeros.
  */
 
@@ -105,27 +109,31 @@ INLINE vfloat filtered(const float *weight, vfloat low, vfloat high)
 #if GIVEN
 #define PARENT_LINE(c) (parent + (size_t)order[chunk + (c)] * 2 * parent_pitch)
 #else
-#define PARENT_LINE(c) (parent + (size_t)(chunk + (c) - children[4]) * 2 * parent_pitch)
+#define PARENT_LINE(c) (parent + (size_t)(chunk + (c) - children[2]) * 2 * parent_pitch)
 #endif
 
 /* The line of virtual channel `node`. */
 #define NODE_LINE(node) (lines + (size_t)((node) - first_node) * 2 * pitch + (WIDTH == 1 ? 2 : 1) * guard)
 #define HAS(node) ((node) >= first_node && (node) < end_node)
 
-__kernel void stage(__global const float *parent, int parent_pitch, __global const int *children,
-                    __global const int *base, __global const float *aperture, int channel_pitch,
+__kernel void stage(__global const float *parent, int parent_pitch, __global const int *children, int first_child,
+                    int children_per_root, __global const int *base, __global const float *between, int channel_pitch,
 #if GIVEN
                     __global const int *order, __global const int *start, __global const float *nu,
-                    __global const float *cycles, __global const float *ramp,
+                    __global const float *cycles,
+#if RAMP
+                    __global const float *ramp,
+#endif
 #else
+                    __global const int *parents, int parents_per_root, int lines_per_parent,
                     __global const float *positions, __global const float *offsets, float4 drift,
                     float samples_per_m, float cycles_per_m, int parent_centre,
 #endif
                     int half_length,
-                    __global const float *filter, __global float *lines, int lines_per_child, int pitch,
-                    int length, int guard)
+                    __global const float *filter, __global const float *aperture_filter, __global float *lines, int lines_per_child, int pitch,
+                    int length, int part_length, int guard)
 {
-    __local float taps[TAPS][CHUNK], cosine[CHUNK], sine[CHUNK];
+    __local float taps[TAPS][CHUNK], aperture[APERTURE_TAPS][CHUNK], cosine[CHUNK], sine[CHUNK];
 #if RAMP
     __local float phase[CHUNK]; /* at the child's centre; cosine and sine are of the turn per WIDTH samples */
 #endif
@@ -136,23 +144,28 @@ __kernel void stage(__global const float *parent, int parent_pitch, __global con
     float aligned_re[1][CHUNK], aligned_im[1][CHUNK];
 #endif
 
-    const int child = get_group_id(0), item = get_local_id(0), items = get_local_size(0);
-    children += 8 * child;
-    const int root = children[1], begin = children[2], end = children[3];
-    const int first_node = children[5], end_node = first_node + children[6];
-    parent += (size_t)children[0] * 2 * parent_pitch;
-    lines += (size_t)child * lines_per_child * 2 * pitch;
-    base += root * channel_pitch;
-    aperture += root * channel_pitch * APERTURE_TAPS;
+    const int item = get_local_id(0), items = get_local_size(0);
+    const int from = get_group_id(1) * part_length, to = length - from < part_length ? length : from + part_length;
+    const int root = get_group_id(0) / children_per_root, in_root = get_group_id(0) % children_per_root;
+    children += 5 * (first_child + get_group_id(0));
+    const int begin = children[0], end = children[1];
+    const int first_node = children[3], end_node = first_node + children[4];
+    lines += get_group_id(0) * lines_per_child * 2 * pitch;
+    const int row = (first_child / children_per_root + root) * channel_pitch;
+    base += row;
+    between += row;
 #if GIVEN
-    order += root * channel_pitch;
-    start += root * channel_pitch;
-    nu += root * channel_pitch;
-    cycles += root * channel_pitch;
-    ramp += root * channel_pitch;
+    order += row;
+    start += row;
+    nu += row;
+    cycles += row;
+#if RAMP
+    ramp += row;
+#endif
 #else
-    positions += root * 3 * channel_pitch;
-    offsets += 6 * child;
+    parent += (size_t)(root * parents_per_root + parents[in_root]) * lines_per_parent * 2 * parent_pitch;
+    positions += 3 * row;
+    offsets += 6 * in_root;
     const float dx = offsets[3], dy = offsets[4], dz = offsets[5];
     const float drifted = drift.x * dx + drift.y * dy + drift.z * dz;
 #endif
@@ -163,7 +176,7 @@ __kernel void stage(__global const float *parent, int parent_pitch, __global con
         TOGETHER;
         for (int c = item * WIDTH; c < count; c += items * WIDTH) {
 #if GIVEN
-            const vfloat between = LOAD(nu + chunk + c), turns = LOAD(cycles + chunk + c);
+            const vfloat away = LOAD(nu + chunk + c), turns = LOAD(cycles + chunk + c);
             for (int lane = 0; lane < WIDTH; lane++)
                 first[c + lane] = start[chunk + c + lane];
 #else
@@ -179,13 +192,13 @@ __kernel void stage(__global const float *parent, int parent_pitch, __global con
             const vfloat turns = change * cycles_per_m;
             const vfloat shift = change * samples_per_m - 0.5f;
             const vfloat shifted = shift + ROUNDER;
-            const vfloat between = shift - (shifted - ROUNDER);
+            const vfloat away = shift - (shifted - ROUNDER);
             const vint whole = ROUNDED_VINT(shifted) + (parent_centre - half_length + 1 - TAPS / 2);
             for (int lane = 0; lane < WIDTH; lane++)
                 first[c + lane] = ((const int *)&whole)[lane];
 #endif
             vfloat weight[TAPS], s, co;
-            filter_weights(filter, between, weight);
+            filter_weights(filter, TAPS, away, weight);
 #if RAMP
             STORE_LOCAL(turns, phase + c);
             sincos_cycles(WIDTH * LOAD(ramp + chunk + c), &s, &co);
@@ -195,13 +208,22 @@ __kernel void stage(__global const float *parent, int parent_pitch, __global con
 #pragma unroll
             for (int t = 0; t < TAPS; t++)
                 STORE_LOCAL(weight[t], taps[t] + c);
+#if APERTURE_TAPS > 1
+            vfloat share[APERTURE_TAPS];
+            filter_weights(aperture_filter, APERTURE_TAPS, LOAD(between + chunk + c), share);
+#else
+            const vfloat share[1] = {1.0f};
+#endif
+#pragma unroll
+            for (int t = 0; t < APERTURE_TAPS; t++)
+                STORE_LOCAL(share[t], aperture[t] + c);
             STORE_LOCAL(co, cosine + c);
             STORE_LOCAL(s, sine + c);
         }
         TOGETHER;
         int node = chunk_node;
-        for (int block = item * BLOCK; block < length; block += items * BLOCK) {
-            const int block_end = length - block < BLOCK ? length : block + BLOCK;
+        for (int block = from + item * BLOCK; block < to; block += items * BLOCK) {
+            const int block_end = to - block < BLOCK ? to : block + BLOCK;
             for (int c = 0; c < count; c++) {
                 __global const float *line = PARENT_LINE(c);
 #ifdef PREFETCH
@@ -281,11 +303,10 @@ __kernel void stage(__global const float *parent, int parent_pitch, __global con
                         re[APERTURE_TAPS - 1] = im[APERTURE_TAPS - 1] = 0.0f;
                     }
                     const vfloat a = aligned_re[(k - block) / WIDTH][c], b = aligned_im[(k - block) / WIDTH][c];
-                    __global const float *weight = aperture + channel * APERTURE_TAPS;
 #pragma unroll
                     for (int t = 0; t < APERTURE_TAPS; t++) {
-                        re[t] += weight[t] * a;
-                        im[t] += weight[t] * b;
+                        re[t] += aperture[t][c] * a;
+                        im[t] += aperture[t][c] * b;
                     }
                 }
 #pragma unroll
@@ -301,7 +322,7 @@ __kernel void stage(__global const float *parent, int parent_pitch, __global con
     }
     /* Virtual channels beyond the last that any channel reaches. */
     for (int node = end > begin ? max(chunk_node + APERTURE_TAPS, first_node) : first_node; node < end_node; node++)
-        for (int k = item * WIDTH; k < length; k += items * WIDTH) {
+        for (int k = from + item * WIDTH; k < to; k += items * WIDTH) {
             STORE_RE(0.0f, NODE_LINE(node), k, pitch);
             STORE_IM(0.0f, NODE_LINE(node), k, pitch);
         }

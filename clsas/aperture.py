@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,7 +39,11 @@ class MeanTrack:
     def positions_m(self, place: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the curve's positions, [..., 3]."""
         inside = np.clip(place, 0, 1)
-        return self.spline(inside) + (place - inside)[..., None] * self.spline(inside, 1)
+        position_m = self.spline(inside)
+        beyond = inside != place
+        way = (place - inside)[beyond]
+        position_m[beyond] += way[:, None] * self.spline(inside[beyond], 1)
+        return position_m
 
     def tangents_m(self, place: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the derivative of the position by the parameter, [..., 3]."""
@@ -214,25 +219,33 @@ def cycles_per_pixel(
     along = along if along is None else along[::every]
     position, tangent = track.positions_m(place), track.tangents_m(place)
     steps = np.stack([grid.row_step_m, grid.column_step_m])
-    tangent_steps = tangent @ steps.T
     across = np.linspace(-0.5, 0.5, 3 if beam is None else 5)
     extents_m = np.array(sides)[:, None] * steps
     between_m = np.linalg.norm(np.abs(extents_m).sum(axis=0)) * (across[1] - across[0]) / 2
-    rates = np.zeros((len(centres_m), len(place), 2))
-    for down in across:
-        # A row of places in every rectangle at a time: few large arrays.
-        offset_m = down * extents_m[0] + across[:, None] * extents_m[1]
-        sight = (centres_m[:, None] + offset_m)[:, :, None] - position
-        distance = np.maximum(np.sqrt(np.einsum("posi,posi->pos", sight, sight)), nearest_m)
-        sight /= distance[..., None]
-        turn = np.einsum("posi,si->pos", sight, tangent)[..., None] * (sight @ steps.T)
-        turn = np.abs(tangent_steps - turn) / distance[..., None]
+    rates = np.zeros((2, len(centres_m), len(place)))
+    # Products of the sight to a place in a rectangle follow from those of that to its middle.
+    sight = centres_m[:, None] - position
+    square = np.einsum("psi,psi->ps", sight, sight)
+    ahead = np.einsum("psi,si->ps", sight, tangent)
+    leaning = [sight @ step for step in steps]
+    sideways = None if beam is None else np.einsum("psi,si->ps", sight, along)
+    for down, right in product(across, across):
+        offset_m = down * extents_m[0] + right * extents_m[1]
+        distance = square + 2 * (down * sides[0] * leaning[0] + right * sides[1] * leaning[1])
+        distance += offset_m @ offset_m
+        distance = np.maximum(np.sqrt(np.maximum(distance, 0, out=distance)), nearest_m)
+        inverse = 1 / distance
+        turn = (ahead + tangent @ offset_m) * inverse**2
         if beam is not None:
             low, high = beam.limits
-            sine, reach = np.einsum("posi,si->pos", sight, along), between_m / distance
-            turn[(sine + reach < low) | (sine - reach > high)] = 0
-        np.maximum(rates, turn.max(axis=1), out=rates)
-    return cycles_per_m / 2 * np.moveaxis(rates, -1, 0)
+            sine, reach = (sideways + along @ offset_m) * inverse, between_m * inverse
+            inverse[(sine + reach < low) | (sine - reach > high)] = 0  # as if far away
+        for rate, step, lean in zip(rates, steps, leaning, strict=True):
+            here = turn * (lean + offset_m @ step)
+            np.subtract(tangent @ step, here, out=here)
+            here *= inverse
+            np.maximum(rate, np.abs(here, out=here), out=rate)
+    return cycles_per_m / 2 * rates
 
 
 def turned(track: MeanTrack, rate: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import itertools
 import math
+import os
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,7 +15,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from clsas import interpolation, validate
-from clsas.device import Device, Slot, open_device
+from clsas.device import Device, Slot, aligned, open_device
 from clsas.geometry import bistatic_range_m, pairwise_range_m
 from clsas.grid import Grid
 from clsas.image import Image
@@ -34,6 +36,7 @@ _MOST_CYCLES = 1e10  # float64 leaves 1e-6 of a cycle
 _LARGEST_SUM = 1e37
 _FASTEST = 0.05  # of a receiver, in sound speeds: cl/backproject.cl iterates on it
 _CHANNELS_AT_ONCE = 512  # bounds a float32 partial sum; lines that stay in a CPU's cache
+_LINES_AT_ONCE = 32  # upsampled together: what stays in a core's cache
 _UNSEEN = 1e-6  # a sum of weights that is none
 _PART_BYTES = 64 << 20  # device memory for one set of parts: a job of some tenths of a second
 
@@ -382,6 +385,7 @@ class _Run:
             "MOVING": int(self.moving),
             "BEAM": 0 if p.beam is None else INTERVALS,
             "NORMALISE": int(p.beam is not None and p.beam.normalise),
+            "CENTRED": 0,
         }
         name = "backproject_tiles" if self.tiled else "backproject_points"
         self.kernel = device.kernel("backproject", name, **options)
@@ -410,9 +414,9 @@ class _Run:
         lines = self.p.lines.select(channels)
         line_slot = next(self.line_slots)
         line_slot.wait()
-        upsampled = self.p.resampling.apply(lines.samples)
-        width = self.p.device.info.width
-        line_slot.fill("samples", padded_lines(upsampled, width, self.margin, self.pitch))
+        width, resampling = self.p.device.info.width, self.p.resampling
+        samples = upsampled_lines(lines.samples, resampling, width, self.margin, self.pitch)
+        line_slot.fill("samples", samples)
         geometry = self._geometry(lines, channels)
         line_slot.fill("geometry", geometry)
         for parts in _slices(band, self.parts_at_once):
@@ -474,6 +478,7 @@ class _Run:
                 pitch,
                 geometry_pitch,
                 slot["ranges"],
+                0,
                 slot["centres"],
                 *(np.append(step, 0).astype(np.float32) for step in steps_m),
                 p.samples_per_m,
@@ -483,13 +488,13 @@ class _Run:
                 wait_for=line_slot.filled + slot.filled,
             )
             size = (layout.part_pixels // (device.info.width * STACK), count)
-            pitches = (pitch,)
+            pitches, ranges = (pitch,), (slot["ranges"], 0)
             rest = (layout.across * layout.side, first_part)
         else:
             geometry = line_slot["geometry"]
             slot.fill("offsets", layout.offset_m[parts].reshape(-1, 3).T)
             size = (count,)
-            pitches = (geometry_pitch, pitch)
+            pitches, ranges = (geometry_pitch, pitch), (slot["ranges"],)
             points = count * layout.part_pixels
             rest = (first_part, slot["centres"], slot["offsets"], points, p.samples_per_m)
         return device.run(
@@ -502,7 +507,7 @@ class _Run:
             slot["phase"],
             geometry,
             *pitches,
-            slot["ranges"],
+            *ranges,
             p.cycles_per_m / p.samples_per_m,
             self.weights,
             pixels[0],
@@ -614,22 +619,33 @@ def _windowed_ranges(
     return range_m, window(lines.first_range_m)
 
 
-def padded_lines(
-    samples: NDArray[np.complex64], width: int, margin: int, pitch: int
+def upsampled_lines(
+    samples: NDArray[np.complex64],
+    resampling: Resampling,
+    width: int,
+    margin: int,
+    pitch: int,
+    gain: NDArray[np.float32] | None = None,
 ) -> NDArray[np.float32]:
-    """Return lines as the kernels want them: `pitch` samples each, zeros before and after.
+    """Return lines upsampled as the kernels want them: `pitch` samples each, zeros around.
 
-    With one lane per work-item they stay interleaved, [channels, 2 pitch]; with more, real and
-    imaginary parts are planes, [channels, 2, pitch].
+    With one lane per work-item they are interleaved, [channels, pitch, 2]; with more, real and
+    imaginary parts are planes, [channels, 2, pitch]. `gain` is as in `Resampling.apply`.
     """
-    inside = slice(margin, margin + samples.shape[1])
-    if width == 1:
-        padded = np.zeros((len(samples), pitch), np.complex64)
-        padded[:, inside] = samples
-        return padded.view(np.float32)
-    padded = np.zeros((len(samples), 2, pitch), np.float32)
-    padded[:, 0, inside] = samples.real
-    padded[:, 1, inside] = samples.imag
+    of_line = (pitch, 2) if width == 1 else (2, pitch)
+    padded = aligned(np.zeros, (len(samples), *of_line), np.float32)
+    inside = slice(margin, margin + resampling.length)
+
+    def fill(some: slice) -> None:
+        upsampled = resampling.apply(samples[some], gain)
+        for part, values in enumerate((upsampled.real, upsampled.imag)):
+            if width == 1:
+                padded[some, inside, part] = values
+            else:
+                padded[some, part, inside] = values
+
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        list(pool.map(fill, _slices(slice(0, len(samples)), _LINES_AT_ONCE)))
     return padded
 
 

@@ -85,7 +85,7 @@ def other_errors(
     return Errors(
         roots=root_error(view, sides[0]),
         nodes=tuple(
-            excess_error(view, side, aperture, crowd, beam_cycles if level == last else None)
+            excess_error(view, side, aperture, crowd, beam_cycles if level == last else 0.0)
             for level, (side, crowd) in enumerate(zip(sides, crowding, strict=True))
         ),
         leaves=float(leaf_error(view, np.array([sides[-1]]), device)[0]),
@@ -149,16 +149,16 @@ def excess_error(
     side: tuple[int, int],
     aperture: Interpolator,
     crowding: float,
-    beam_cycles: float | None,
+    beam_cycles: float,
 ) -> float:
     """Return the power of the error that a stage's nodes add to that of the aperture's filter.
 
     The filter takes nodes as equally spaced and weights as constant. Evaluated as it is, for
-    subimages and pixels of them at random: steering functions between nodes against what
-    interpolation makes of them; in the last stage, where `beam_cycles` is given, weighted.
+    subimages and pixels of them at random: weighted steering functions between nodes against what
+    interpolation makes of them.
     """
     track, random = view.track, np.random.default_rng(0)
-    weighted = view.beam is not None and beam_cycles is not None
+    weighted = view.beam is not None
     seen = view.seen(side)
     wrong = total = 0.0
     for spot in np.flatnonzero(seen.any(axis=1))[::_SOME_SPOTS]:
@@ -185,7 +185,7 @@ def excess_error(
         of_nodes = steering(nodes.place[0])
         index = nodes.base[0][:, None] + np.arange(nodes.taps)
         between = np.einsum("pct,ct->pc", of_nodes[:, index], nodes.weights[0])
-        exact = steering(place[nodes.order[0]])
+        exact = steering(nodes.ordered(place[None])[0])
         wrong += np.sum(np.abs(between - exact) ** 2)
         total += np.sum(np.abs(exact) ** 2)
     return max(wrong / max(total, 1e-30) - power(aperture.error_db), 0.0)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
@@ -10,31 +12,30 @@ import pyopencl as cl
 from numpy.typing import NDArray
 
 from clsas import tree, validate
-from clsas.aperture import cycles_per_pixel, drift, mean_track, stretches
 from clsas.backproject import (
     backproject,
     beam_arguments,
     check_numbers,
     float_pairs,
     lookup_room,
-    padded_lines,
+    upsampled_lines,
     warn_unseen,
 )
 from clsas.device import Device, Slot, open_device
-from clsas.geometry import bistatic_range_m, pairwise_range_m
+from clsas.geometry import bistatic_range_m
 from clsas.grid import Grid
 from clsas.image import Image
 from clsas.layout import STACK, Tiles
 from clsas.lines import RangeLines
 from clsas.plan import GUARD, Plan, margin, padded_length
 from clsas.planner import BEST_TOLERANCE_DB, WORST_TOLERANCE_DB, plan
-from clsas.tree import Division, Nodes, Ranges
+from clsas.sector import Geometry, Sector
+from clsas.tree import Division
 from clsas.window import INTERVALS, BeamWindow
 
 _GROUP = 64  # work-items that share a subimage where each has one lane
+_GROUPS_PER_UNIT = 4  # at least, of compute units: so that they end together
 _MOST_GAIN = 3.0  # of frequencies, which are amplified where lines hold next to nothing
-_ON_TRACK = 1e-4  # wavelengths
-_LINES_AT_ONCE = 256  # upsampled together: what stays in a CPU's cache
 
 
 def factorize(
@@ -148,34 +149,28 @@ class _Level:
 
 
 @dataclass(frozen=True, eq=False)
-class _Batch:
-    """Some roots: where their subimages are, and which virtual channels they have.
+class _Tables:
+    """What a device is told of a sector's roots, all at once.
 
     Attributes
     ----------
-    roots : int [roots, 2]
-        Their first pixels.
-    root_m : float64 [roots, 3]
-        Middles of the roots.
-    relative_m : list of float64 [roots, subimages, 3]
-        Middles of the subimages from those of their roots, stage by stage.
-    nodes : list of Nodes
-    needs : list of Ranges
-    place : float64 [roots, channels]
-        Where the raw channels appear on the track.
+    slot : Slot
+        Its buffers.
+    pitches : list of int
+        Channels of a row, stage by stage.
+    strides : list of int
+        Lines of a subimage, stage by stage.
+    node_pitch : int
+        Virtual channels of a root in the last stage.
+    geometry_pitch : int
+        All of these in a row.
     """
 
-    roots: NDArray[np.int64]
-    root_m: NDArray[np.float64]
-    relative_m: list[NDArray[np.float64]]
-    nodes: list[Nodes]
-    needs: list[Ranges]
-    place: NDArray[np.float64]
-
-    def stride(self, level: int) -> int:
-        """Return how many lines a subimage of a stage has at most."""
-        need = self.needs[level]
-        return int((need.last - need.first).max())
+    slot: Slot
+    pitches: list[int]
+    strides: list[int]
+    node_pitch: int
+    geometry_pitch: int
 
 
 class _Run:
@@ -184,39 +179,25 @@ class _Run:
     def __init__(self, lines: RangeLines, grid: Grid, chosen: Plan, device: Device) -> None:
         self.lines, self.grid, self.plan, self.device = lines, grid, chosen, device
         self.width = device.info.width
-        resampling = chosen.resampling
-        self.samples_per_m = resampling.ratio / lines.range_step_m
-        self.cycles_per_m = (
-            lines.carrier_cycles_per_m + resampling.centre_cycles_per_sample / lines.range_step_m
-        )
-        self.division = Division(grid, chosen.sides)
-        self.track = mean_track(lines)
-        self.along = None
-        if chosen.beam is not None:
-            along = chosen.beam.directions(lines)
-            self.along = tree.beam_directions(along, self.track, self.track.samples)
-        self.phase_centres_m = lines.phase_centres_m
-        self.drift = drift(lines)
-        # The thesis's method has none; on the track itself there is nothing to make up for.
-        self.ramps = not chosen.nearest and (
-            not np.array_equal(lines.tx_m, lines.rx_m)
-            or np.abs(self.phase_centres_m - self.track.positions_m(self.track.place)).max()
-            > _ON_TRACK * lines.sound_speed_m_s / max(lines.carrier_hz, 1.0)
-        )
+        self.geometry = Geometry(lines, grid, chosen)
+        self.division = self.geometry.division
         self.levels = [
             _Level(half, -(-(2 * half + 1) // self.width) * self.width)
             for half in chosen.half_lengths
         ]
         self.filters = {
             name: device.upload(getattr(chosen, name).coefficients.astype(np.float32))
-            for name in ("align", "final")
+            for name in ("align", "aperture", "final")
         }
         options = {"WIDTH": self.width, "TAPS": chosen.align.taps}
         options["APERTURE_TAPS"] = chosen.aperture.taps
-        self.first_stage = device.kernel("stage", "stage", GIVEN=1, RAMP=int(self.ramps), **options)
+        ramp = int(self.geometry.ramps)
+        self.first_stage = device.kernel("stage", "stage", GIVEN=1, RAMP=ramp, **options)
         self.later_stage = device.kernel("stage", "stage", GIVEN=0, RAMP=0, **options)
         block_m = Tiles(grid, chosen.tile[0], self.width).block_radius_m
-        fits = block_m * self.samples_per_m <= lookup_room(chosen.final.taps)
+        fits = block_m * self.geometry.samples_per_m <= lookup_room(chosen.final.taps)
+        # Where tile and leaf are one, every line is aligned on its centre.
+        self.centred = chosen.tile == chosen.sides[-1]
         last = {
             "WIDTH": self.width,
             "TAPS": chosen.final.taps,
@@ -227,15 +208,27 @@ class _Run:
             "MOVING": 0,
             "BEAM": 0 if chosen.beam is None else INTERVALS,
             "NORMALISE": 0,
+            "CENTRED": int(self.centred),
         }
         self.expand = device.kernel("backproject", "expand_tiles", **last)
         self.backproject = device.kernel("backproject", "backproject_tiles", **last)
         self.per_sine, self.beam = beam_arguments(device, chosen.beam, lines)
-        self.margin = margin(self.levels[0].half)
-        self.pitch = padded_length(resampling, self.levels[0].half)
+        self.pitch = padded_length(chosen.resampling, self.levels[0].half)
         self.samples = self._upload_lines()
-        self.slots = [Slot(device) for _ in self.levels]
-        self.last_slot = Slot(device)
+        self.tiles = Division(grid, (chosen.sides[0], chosen.sides[-1], chosen.tile))
+        self.per_root, self.leaf_of = self.tiles.per_root(2), self.tiles.parents(2)
+        first = np.zeros((1, 2), np.int64)
+        centres_m = self.tiles.centres_m(2, self.tiles.corners(2, first))[0]
+        self.tile_m = centres_m - self.tiles.centres_m(0, first)
+        self.centres = device.upload(np.tile(float_pairs(self.tile_m), (chosen.roots_at_once, 1)))
+        later = range(1, len(self.levels))
+        self.offsets = {level: self._offsets(level) for level in later}
+        self.parents = {
+            level: device.upload(self.division.parents(level).astype(np.int32)) for level in later
+        }
+        # One set of tables is filled while the device works with the other.
+        self.table_slots = itertools.cycle([Slot(device), Slot(device)])
+        self.slot = Slot(device)
 
     def _upload_lines(self) -> cl.Buffer:
         """Return all lines on the device, upsampled."""
@@ -254,33 +247,44 @@ class _Run:
         gain = np.clip(1 / response, 1 / _MOST_GAIN, _MOST_GAIN).astype(np.float32)
         if self.plan.nearest:
             gain = None
-        buffer = device.buffer(count * line_bytes)
-        for start in range(0, count, _LINES_AT_ONCE):
-            upsampled = resampling.apply(self.lines.samples[start : start + _LINES_AT_ONCE], gain)
-            padded = padded_lines(upsampled, self.width, self.margin, self.pitch)
-            cl.enqueue_copy(device.queue, buffer, padded, dst_offset=start * line_bytes)
-        return buffer
+        zeros = margin(self.levels[0].half)
+        return device.share(
+            upsampled_lines(self.lines.samples, resampling, self.width, zeros, self.pitch, gain)
+        )
+
+    def _offsets(self, level: int) -> cl.Buffer:
+        """Return the middles of parents from their root's, and of their subimages from theirs."""
+        parent_m = self.geometry.relative_m[level - 1][self.division.parents(level)]
+        offsets_m = [parent_m, self.geometry.relative_m[level] - parent_m]
+        return self.device.upload(np.concatenate(offsets_m, axis=1).astype(np.float32))
 
     def into(self, pixels: NDArray[np.complex64]) -> Iterator[int]:
         """Form all pixels, [rows, columns]; yield how many each time that some are finished.
 
-        The geometry of a batch is prepared while the device works on the one before.
+        The geometry of a sector is prepared while the device works on the one before.
         """
-        roots, before = self.division.roots, None
-        for start in range(0, len(roots), self.plan.roots_at_once):
-            batch = self._batch(roots[start : start + self.plan.roots_at_once])
-            if before is not None:
-                yield self._finished(*before)
-            before = self._start(batch, pixels)
-        yield self._finished(*before)
+        roots, at_once, under_way = self.division.roots, self.plan.roots_at_once, deque()
+        for start in range(0, len(roots), self.plan.roots_prepared):
+            sector = self.geometry.sector(roots[start : start + self.plan.roots_prepared])
+            tables = self._upload_tables(sector)
+            for first in range(0, len(sector.roots), at_once):
+                under_way.append(self._start(sector, tables, first, pixels))
+                if len(under_way) > 2:  # so that an interruption need not wait long
+                    yield self._finished(*under_way.popleft())
+            tables.slot.busy = cl.enqueue_marker(self.device.queue)
+        while under_way:
+            yield self._finished(*under_way.popleft())
 
-    def _start(self, batch: _Batch, pixels: NDArray[np.complex64]) -> tuple[int, list[cl.Event]]:
-        """Start a batch; return how many pixels it has, and when they are there."""
-        parts = [self._part(root) for root in batch.roots]
-        if batch.stride(0):
+    def _start(
+        self, sector: Sector, tables: _Tables, first: int, pixels: NDArray[np.complex64]
+    ) -> tuple[int, list[cl.Event]]:
+        """Start some roots of a sector; return how many pixels these are, and when they are there."""
+        batch = slice(first, min(first + self.plan.roots_at_once, len(sector.roots)))
+        parts = [self._part(root) for root in sector.roots[batch]]
+        if tables.strides[0]:
             for level in range(len(self.levels)):
-                self._stage(batch, level)
-            ready = self._backproject(batch, pixels, parts)
+                self._stage(tables, level, batch)
+            ready = self._backproject(sector, tables, batch, pixels, parts)
         else:
             ready = []
             for part in parts:
@@ -289,7 +293,7 @@ class _Run:
 
     @staticmethod
     def _finished(formed: int, ready: list[cl.Event]) -> int:
-        """Wait for the pixels of a batch that was started; return how many they are."""
+        """Wait for the pixels of roots that were started; return how many they are."""
         for event in ready:
             event.wait()
         return formed
@@ -300,216 +304,163 @@ class _Run:
         rows, columns = (slice(int(a), int(b)) for a, b in zip(root, ends, strict=True))
         return rows, columns
 
-    def _batch(self, roots: NDArray[np.int64]) -> _Batch:
-        division, chosen, track = self.division, self.plan, self.track
-        corners = [division.corners(level, roots) for level in range(len(self.levels))]
-        centres_m = [division.centres_m(*each) for each in enumerate(corners)]
-        root_m = centres_m[0][:, 0]
-        seen_at = place = track.places_seen_from(root_m, self.phase_centres_m)
-        nodes = []
-        if chosen.nearest:
-            position_m = np.broadcast_to(self.phase_centres_m, (*place.shape, 3))
-            for factor in chosen.nearest:
-                nodes.append(tree.nearest_nodes(place, position_m, factor))
-                place, position_m = nodes[-1].place, nodes[-1].position_m
-        else:
-            rates = cycles_per_pixel(
-                track,
-                self.grid,
-                root_m,
-                chosen.sides[0],
-                chosen.highest_cycles_per_m,
-                division.radius_m(len(self.levels) - 1),
-                chosen.beam,
-                self.along,
-            )
-            for level, (rows, columns) in enumerate(chosen.sides):
-                rate = chosen.crowding[level] * (rows * rates[0] + columns * rates[1])
-                if chosen.beam is not None and level == len(self.levels) - 1:
-                    rate += chosen.beam_cycles * tree.beam_rate(
-                        chosen.beam, track, self.along, root_m
-                    )
-                nodes.append(tree.interpolated_nodes(track, rate, place, chosen.aperture))
-                place = nodes[-1].place
-        half_m = np.array(chosen.sides[-1])[:, None] / 2
-        half_m = half_m * [self.grid.row_step_m, self.grid.column_step_m]
-        seen = tree.seen_from(chosen.beam, track, self.along, centres_m[-1], half_m)
-        inside = np.all(corners[-1] < self.grid.shape, axis=-1)
-        needs = tree.ranges(division, nodes, seen, inside)
-        relative_m = [each - root_m[:, None] for each in centres_m]
-        return _Batch(roots, root_m, relative_m, nodes, needs, seen_at)
-
-    def _stage(self, batch: _Batch, level: int) -> None:
-        """Form the lines of a stage from those of the one before, or from the raw ones."""
-        device, slot, shape = self.device, self.slots[level], self.levels[level]
-        nodes, need, stride = batch.nodes[level], batch.needs[level], batch.stride(level)
-        roots, subimages = need.first.shape
-        children = np.zeros((roots, subimages, 8), np.int32)
-        children[..., 1] = np.arange(roots)[:, None]
-        children[..., 2], children[..., 3] = need.begin, need.end
-        children[..., 5], children[..., 6] = need.first, need.last - need.first
+    def _upload_tables(self, sector: Sector) -> _Tables:
+        """Start copying to the device all that it is told of a sector's roots."""
+        slot, levels = next(self.table_slots), range(len(self.levels))
         slot.wait()
-        slot.fill("base", _padded(nodes.base, np.int32))
-        slot.fill("aperture", _padded(nodes.weights, np.float32))
+        strides = [sector.stride(level) for level in levels]
+        for name, values in self.geometry.references(sector).items():
+            slot.fill(name, _padded(values))
+        for level, (nodes, need) in enumerate(zip(sector.nodes, sector.needs, strict=True)):
+            children = np.zeros((*need.first.shape, 5), np.int32)
+            children[..., 0], children[..., 1] = need.begin, need.end
+            if level:
+                parents = self.division.parents(level)
+                children[..., 2] = sector.needs[level - 1].first[:, parents]
+                position_m = sector.positions_m(level - 1).swapaxes(1, 2)
+                slot.fill(f"positions{level}", _padded(position_m.astype(np.float32)))
+            children[..., 3], children[..., 4] = need.first, need.last - need.first
+            slot.fill(f"children{level}", children)
+            slot.fill(f"base{level}", _padded(nodes.base.astype(np.int32)))
+            slot.fill(f"between{level}", _padded(nodes.between.astype(np.float32)))
+
+        rows = [float_pairs(sector.positions_m(-1).reshape(-1, 3))]
+        if self.plan.beam is not None:
+            along = tree.interpolated_directions(
+                self.geometry.track.samples, self.geometry.along, sector.nodes[-1].place
+            )
+            rows.append((along * self.per_sine).astype(np.float32).reshape(-1, 3))
+        geometry = np.pad(np.concatenate(rows, axis=1).T, ((0, 0), (0, 16)), mode="edge")
+        slot.fill("geometry", geometry)
+        need, (roots, node_pitch) = sector.needs[-1], sector.nodes[-1].place.shape
+        root = np.arange(roots)[:, None]
+        ranges = np.empty((roots, self.per_root, 3), np.int32)
+        ranges[..., 0] = root * node_pitch + need.first[:, self.leaf_of]
+        ranges[..., 1] = root * node_pitch + need.last[:, self.leaf_of]
+        in_batch = root % self.plan.roots_at_once
+        ranges[..., 2] = (in_batch * need.first.shape[1] + self.leaf_of) * strides[-1]
+        slot.fill("ranges", ranges)
+        pitches = [_pitch(nodes.base.shape[1]) for nodes in sector.nodes]
+        return _Tables(slot, pitches, strides, node_pitch, geometry.shape[1])
+
+    def _stage(self, tables: _Tables, level: int, batch: slice) -> None:
+        """Form the lines of a stage from those of the one before, or from the raw ones."""
+        device, table, shape, stride = (
+            self.device,
+            tables.slot,
+            self.levels[level],
+            tables.strides[level],
+        )
+        per_root = self.division.per_root(level)
+        children = (batch.stop - batch.start) * per_root
         if level == 0:
             kernel, parent, parent_pitch = self.first_stage, self.samples, self.pitch
-            references = self._references(batch, shape.half)
-            for name, values in references.items():
-                slot.fill(name, values)
-            geometry = [slot[name] for name in references]
+            names = ("order", "start", "nu", "cycles", *(["ramp"] if self.geometry.ramps else []))
+            geometry = [table[name] for name in names]
         else:
             kernel, before = self.later_stage, self.levels[level - 1]
-            parent, parent_pitch = self.slots[level - 1]["lines"], before.pitch
-            parents, parent_m = self.division.parents(level), batch.relative_m[level - 1]
-            index = np.arange(roots)[:, None] * parent_m.shape[1] + parents
-            children[..., 0] = index * batch.stride(level - 1)
-            children[..., 4] = batch.needs[level - 1].first[:, parents]
-            position_m = batch.nodes[level - 1].position_m - batch.root_m[:, None]
-            slot.fill("positions", _padded(position_m, np.float32).swapaxes(1, 2))
-            offsets = [parent_m[:, parents], batch.relative_m[level] - parent_m[:, parents]]
-            slot.fill("offsets", np.concatenate(offsets, axis=-1).astype(np.float32))
+            parent, parent_pitch = self.slot[f"lines{level - 1}"], before.pitch
             geometry = [
-                slot["positions"],
-                slot["offsets"],
-                np.append(self.drift, 0).astype(np.float32),
-                self.samples_per_m,
-                self.cycles_per_m,
+                self.parents[level],
+                self.division.per_root(level - 1),
+                tables.strides[level - 1],
+                table[f"positions{level}"],
+                self.offsets[level],
+                np.append(self.geometry.drift, 0).astype(np.float32),
+                self.geometry.samples_per_m,
+                self.geometry.cycles_per_m,
                 before.centre,
             ]
-        slot.fill("children", children)
         items = _GROUP if self.width == 1 else 1
-        slot.busy = device.run(
+        # Few children are divided, so that there is work for all.
+        step = _GROUP if self.width == 1 else 8 * self.width
+        parts = -(-_GROUPS_PER_UNIT * device.info.compute_units // children)
+        part_length = step * -(-shape.length // (step * parts))
+        device.run(
             kernel,
-            (roots * subimages * items,),
+            (children * items, -(-shape.length // part_length)),
             parent,
             parent_pitch,
-            slot["children"],
-            slot["base"],
-            slot["aperture"],
-            _pitch(nodes.base.shape[1]),
+            table[f"children{level}"],
+            batch.start * per_root,
+            per_root,
+            table[f"base{level}"],
+            table[f"between{level}"],
+            tables.pitches[level],
             *geometry,
             shape.half,
             self.filters["align"],
-            slot.zeros("lines", 8 * roots * subimages * stride * shape.pitch),
+            self.filters["aperture"],
+            self.slot.zeros(f"lines{level}", 8 * children * stride * shape.pitch),
             stride,
             shape.pitch,
             shape.length,
+            part_length,
             GUARD,
-            wait_for=slot.filled,
-            local=(items,),
+            wait_for=table.filled,
+            local=(items, 1),
         )
-
-    def _references(self, batch: _Batch, half: int) -> dict[str, NDArray]:
-        """Return how roots see the raw channels, in the order of their nodes.
-
-        First sample, place between samples, phase in cycles and its ramp; all from float64.
-        """
-        lines, resampling = self.lines, self.plan.resampling
-        range_m = pairwise_range_m(
-            batch.root_m, lines.tx_m, lines.rx_m, lines.rx_velocity_m_s, lines.sound_speed_m_s
-        )
-        place = (range_m - lines.first_range_m) / lines.range_step_m + resampling.lead
-        cycles = lines.carrier_cycles_per_m * range_m
-        cycles += place * resampling.centre_cycles_per_sample
-        place *= resampling.ratio
-        place += self.margin - resampling.first - half
-        lower = np.floor(place)
-        start = np.clip(lower + 1 - self.plan.align.taps // 2, -half, self.pitch)
-        order = batch.nodes[0].order
-
-        def ordered(values: NDArray[np.float64], kind: type) -> NDArray:
-            return _padded(np.take_along_axis(values, order, axis=1), kind)
-
-        return {
-            "order": _padded(order, np.int32),
-            "start": ordered(start, np.int32),
-            "nu": ordered(place - lower - 0.5, np.float32),
-            "cycles": ordered(cycles - np.rint(cycles), np.float32),
-            "ramp": ordered(self._ramp(batch), np.float32),
-        }
-
-    def _ramp(self, batch: _Batch) -> NDArray[np.float64]:
-        """Return by how many cycles per sample the phase of channels grows beyond their place's."""
-        if not self.ramps:
-            return np.zeros_like(batch.place)
-        virtual_m = self.track.positions_m(batch.place)
-        stretch = stretches(self.lines.tx_m, self.lines.rx_m, self.grid, batch.root_m, virtual_m)
-        return stretch * self.cycles_per_m / self.samples_per_m
 
     def _backproject(
         self,
-        batch: _Batch,
+        sector: Sector,
+        tables: _Tables,
+        batch: slice,
         image: NDArray[np.complex64],
         parts: list[tuple[slice, slice]],
     ) -> list[cl.Event]:
         """Form the pixels of roots from their last stage, and start reading their parts."""
-        device, slot, chosen, level = self.device, self.last_slot, self.plan, self.levels[-1]
-        nodes, need, stride = batch.nodes[-1], batch.needs[-1], batch.stride(len(self.levels) - 1)
-        roots = len(batch.root_m)
-        tiles = Division(self.grid, (chosen.sides[0], chosen.sides[-1], chosen.tile))
-        per_root, leaf_of = tiles.per_root(2), tiles.parents(2)
-        relative_m = tiles.centres_m(2, tiles.corners(2, np.zeros((1, 2), np.int64)))
-        relative_m = relative_m - tiles.centres_m(0, np.zeros((1, 1, 2), np.int64))
-        first, last = need.first[:, leaf_of], need.last[:, leaf_of]
-        ranges = np.empty((roots, per_root, 3), np.int32)
-        root = np.arange(roots)[:, None]
-        ranges[..., 0] = root * nodes.place.shape[1] + first
-        ranges[..., 1] = root * nodes.place.shape[1] + last
-        ranges[..., 2] = (root * need.first.shape[1] + leaf_of) * stride
-        pitch = -(-stride // 16) * 16
-
-        position_m = nodes.position_m - batch.root_m[:, None]
-        rows = [float_pairs(position_m.reshape(-1, 3))]
-        if chosen.beam is not None:
-            along = tree.interpolated_directions(self.track.samples, self.along, nodes.place)
-            rows.append((along * self.per_sine).astype(np.float32).reshape(-1, 3))
-        geometry = np.pad(np.concatenate(rows, axis=1).T, ((0, 0), (0, 16)), mode="edge")
-        slot.wait()
-        slot.fill("geometry", geometry)
-        slot.fill("ranges", ranges)
-        centres_m = np.broadcast_to(relative_m, (roots, per_root, 3))
-        slot.fill("centres", float_pairs(centres_m.reshape(-1, 3)))
-        for name, values in self._leaf_references(batch, leaf_of, centres_m, pitch).items():
-            slot.fill(name, values)
+        device, slot, chosen, level = self.device, self.slot, self.plan, self.levels[-1]
+        tiles, first_tile = len(parts) * self.per_root, batch.start * self.per_root
+        pitch = -(-tables.strides[-1] // 16) * 16
+        if self.centred:
+            references = [level.centre]
+        else:
+            slot.wait()
+            values = self._leaf_references(sector, batch, pitch)
+            for name, each in values.items():
+                slot.fill(name, each)
+            references = [slot[name] for name in values]
         steps_m = (self.grid.column_step_m, self.grid.row_step_m)
+        samples_per_m = self.geometry.samples_per_m
         terms = 9 + (10 if chosen.beam is not None else 0)
-        expansion = slot.buffer("expansion", 4 * terms * roots * per_root * pitch)
-        slot.busy = device.run(
+        expansion = slot.buffer("expansion", 4 * terms * tiles * pitch)
+        device.run(
             self.expand,
-            (pitch // self.width, roots * per_root),
-            slot["geometry"],
+            (pitch // self.width, tiles),
+            tables.slot["geometry"],
             pitch,
-            geometry.shape[1],
-            slot["ranges"],
-            slot["centres"],
+            tables.geometry_pitch,
+            tables.slot["ranges"],
+            first_tile,
+            self.centres,
             *(np.append(step, 0).astype(np.float32) for step in steps_m),
-            self.samples_per_m,
-            np.array([self.drift @ s * self.samples_per_m for s in steps_m], np.float32),
+            samples_per_m,
+            np.array([self.geometry.drift @ s * samples_per_m for s in steps_m], np.float32),
             expansion,
             *self.beam[1:2],
-            wait_for=slot.filled,
         )
         height, width = chosen.sides[0]
-        bytes_ = 8 * roots * height * width
+        bytes_ = 8 * len(parts) * height * width
         pixels = slot.buffer("pixels", bytes_)
         cl.enqueue_fill_buffer(device.queue, pixels, np.uint32(0), 0, bytes_)
         slot.busy = device.run(
             self.backproject,
-            (chosen.tile[0] * chosen.tile[1] // (self.width * STACK), roots * per_root),
-            self.slots[-1]["lines"],
+            (chosen.tile[0] * chosen.tile[1] // (self.width * STACK), tiles),
+            slot[f"lines{len(self.levels) - 1}"],
             level.pitch,
-            slot["sample"],
-            slot["fraction"],
-            slot["phase"],
+            *references,
             expansion,
             pitch,
-            slot["ranges"],
-            self.cycles_per_m / self.samples_per_m,
+            tables.slot["ranges"],
+            first_tile,
+            self.geometry.cycles_per_m / samples_per_m,
             self.filters["final"],
             pixels,
             width,
             0,
             *self.beam,
+            wait_for=slot.filled,
         )
         ready = []
         for index, (down, across) in enumerate(parts):
@@ -529,30 +480,23 @@ class _Run:
         device.queue.flush()
         return ready
 
-    def _leaf_references(
-        self, batch: _Batch, leaf_of: NDArray[np.int64], centres_m: NDArray[np.float64], pitch: int
-    ) -> dict[str, NDArray]:
-        """Return where tiles' centres lie in the lines of their leaves, [tiles, pitch].
-
-        Where tile and leaf are one, every line is aligned on its centre.
-        """
-        level, shape = self.levels[-1], (*centres_m.shape[:2], pitch)
-        sample = np.full(shape, level.centre, np.int32)
+    def _leaf_references(self, sector: Sector, batch: slice, pitch: int) -> dict[str, NDArray]:
+        """Return where tiles' centres lie in the lines of their leaves, [roots, tiles, pitch]."""
+        shape, centre = (batch.stop - batch.start, self.per_root, pitch), self.levels[-1].centre
+        sample = np.full(shape, centre, np.int32)
         fraction, phase = np.zeros((2, *shape), np.float32)
-        if self.plan.tile != self.plan.sides[-1]:
-            nodes, need = batch.nodes[-1], batch.needs[-1]
-            for root, position_m in enumerate(nodes.position_m - batch.root_m[:, None]):
-                first = need.first[root, leaf_of]
-                index = np.minimum(first[:, None] + np.arange(pitch), len(position_m) - 1)
-                leaf_m = batch.relative_m[-1][root, leaf_of]
-                tile_m, node_m = centres_m[root], position_m[index]
-                range_m = bistatic_range_m(tile_m[:, None], node_m, node_m)
-                range_m -= bistatic_range_m(leaf_m[:, None], node_m, node_m)
-                range_m -= (tile_m - leaf_m) @ self.drift[:, None]
-                place = range_m * self.samples_per_m
-                sample[root] += np.rint(place).astype(np.int32)
-                fraction[root] = place - np.rint(place)
-                phase[root] = np.remainder(self.cycles_per_m * range_m + 0.5, 1) - 0.5
+        first = sector.needs[-1].first[batch][:, self.leaf_of]
+        leaf_m = self.geometry.relative_m[-1][self.leaf_of]
+        for root, position_m in enumerate(sector.positions_m(-1)[batch]):
+            index = np.minimum(first[root][:, None] + np.arange(pitch), len(position_m) - 1)
+            node_m = position_m[index]
+            range_m = bistatic_range_m(self.tile_m[:, None], node_m, node_m)
+            range_m -= bistatic_range_m(leaf_m[:, None], node_m, node_m)
+            range_m -= (self.tile_m - leaf_m) @ self.geometry.drift[:, None]
+            place = range_m * self.geometry.samples_per_m
+            sample[root] += np.rint(place).astype(np.int32)
+            fraction[root] = place - np.rint(place)
+            phase[root] = np.remainder(self.geometry.cycles_per_m * range_m + 0.5, 1) - 0.5
         return {"sample": sample, "fraction": fraction, "phase": phase}
 
 
@@ -561,8 +505,9 @@ def _pitch(channels: int) -> int:
     return -(-channels // 16) * 16 + 16
 
 
-def _padded(values: NDArray, kind: type) -> NDArray:
-    """Return [roots, channels, ...] as the stages' kernel wants it: rows of whole vectors."""
-    padding = [(0, 0)] * values.ndim
-    padding[1] = (0, _pitch(values.shape[1]) - values.shape[1])
-    return np.pad(values.astype(kind), padding)
+def _padded(values: NDArray) -> NDArray:
+    """Return [..., channels] as the stages' kernel wants it: rows of whole vectors."""
+    count = values.shape[-1]
+    padded = np.zeros((*values.shape[:-1], _pitch(count)), values.dtype)
+    padded[..., :count] = values
+    return padded

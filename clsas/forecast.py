@@ -19,6 +19,8 @@ from clsas.view import View
 
 MARGIN_DB = 1.0  # between prediction and tolerance, for what measured errors scatter
 _MOST_BATCH_BYTES = 48 << 20  # what stays near a CPU's caches
+_MOST_TABLE_BYTES = 64 << 20
+_ROOTS_PREPARED = 16  # enough for few and large arrays
 
 
 @dataclass(frozen=True)
@@ -64,7 +66,7 @@ def factorized(
         else:
             if level:
                 turns = way.crowding[level - 1] * view.turns(sides[level - 1], seen)
-                used = min(channels, view.channels_used(*of_aperture, turns))
+                used = min(channels, view.channels(*of_aperture, turns))
             turns = way.crowding[level] * view.turns(side, seen)
             if view.beam is not None and level == len(sides) - 1:
                 turns += way.beam_cycles * view.cycles(view.beam_rates, seen)
@@ -88,9 +90,13 @@ def factorized(
     )
     tile = _tile(view, sides[-1], device) if nearest else sides[-1]
     line_bytes = 8 * lines.channels * padded_length(resampling, halves[0])
-    root_bytes = _root_bytes(view, way, tile, stages)
+    root_bytes, table_bytes = _root_bytes(view, way, tile, stages)
     room = min(memory_bytes - line_bytes, _MOST_BATCH_BYTES)
-    at_once = min(max(int(room // root_bytes), 1), stages[0].subimages)
+    # Tables come in two sets.
+    at_once = min(max(int(room // (root_bytes + 2 * table_bytes)), 1), stages[0].subimages)
+    room = min(memory_bytes - line_bytes - at_once * root_bytes, _MOST_TABLE_BYTES)
+    of_batch = 2 * at_once * table_bytes
+    prepared = at_once * min(max(int(room // of_batch), 1), -(-_ROOTS_PREPARED // at_once))
     batches = -(-stages[0].subimages // at_once)
     besides = 1e-9 * (costs.call_ns + costs.batch_ns * batches * len(sides))
     error = other_error + sum(power(stage.error_db) for stage in stages)
@@ -106,11 +112,12 @@ def factorized(
         half_lengths=halves,
         highest_cycles_per_m=view.highest_cycles_per_m,
         roots_at_once=at_once,
+        roots_prepared=prepared,
         stages=tuple(stages),
         predicted_error_db=in_db(error) + (0.0 if nearest else MARGIN_DB),
         predicted_seconds=sum(stage.seconds for stage in stages) + besides,
         exact_seconds=exact.seconds(costs),
-        memory_bytes=int(line_bytes + at_once * root_bytes),
+        memory_bytes=int(line_bytes + at_once * root_bytes + 2 * prepared * table_bytes),
         device=device.info.label,
         lines_digest=lines_digest(lines),
         grid_digest=grid_digest(grid),
@@ -120,9 +127,14 @@ def factorized(
     )
 
 
-def _root_bytes(view: View, way: Way, tile: tuple[int, int], stages: Sequence[Stage]) -> float:
-    """Return the device memory that a root takes while it is worked on: see `factorize`."""
-    taps, channels, result = way.filters.aperture.taps, view.lines.channels, 0.0
+def _root_bytes(
+    view: View, way: Way, tile: tuple[int, int], stages: Sequence[Stage]
+) -> tuple[float, float]:
+    """Return the device memory that a root takes while it is worked on, and that of its tables.
+
+    See `factorize`.
+    """
+    taps, channels, work, tables = way.filters.aperture.taps, view.lines.channels, 0.0, 0.0
     density, sides = 2 * way.filters.aperture.upsampling, way.sides
     for level, side in enumerate(sides):
         if way.nearest:
@@ -137,12 +149,14 @@ def _root_bytes(view: View, way: Way, tile: tuple[int, int], stages: Sequence[St
             if view.beam is not None and level == len(sides) - 1:
                 most += density * way.beam_cycles * view.cycles(view.beam_rates, seen, np.max)
         subimages = _subimages(sides[0], side)
-        result += 8 * subimages * most * (stages[level].samples + 2 * GUARD)
-        result += subimages * 56 + (channels + 32) * (4 + 4 * taps + (12 if level else 16))
+        work += 8 * subimages * most * (stages[level].samples + 2 * GUARD)
+        tables += subimages * 20 + (channels + 32) * (8 + (12 if level else 20))
         channels = everywhere
     terms = 9 if view.beam is None else 19
-    result += _subimages(sides[0], tile) * ((most + 16) * (12 + 4 * terms) + 36)
-    return result + 36 * channels + 8 * math.prod(sides[0])
+    tiles = _subimages(sides[0], tile)
+    references = 0 if tile == sides[-1] else 12
+    work += tiles * ((most + 16) * (references + 4 * terms) + 24) + 8 * math.prod(sides[0])
+    return work, tables + tiles * 12 + 36 * channels
 
 
 def _subimages(root: tuple[int, int], side: tuple[int, int]) -> int:
@@ -178,6 +192,7 @@ def plain(
         half_lengths=(),
         highest_cycles_per_m=view.highest_cycles_per_m,
         roots_at_once=1,
+        roots_prepared=1,
         stages=(),
         predicted_error_db=exact.accuracy_db,
         predicted_seconds=seconds,

@@ -304,16 +304,19 @@ class Resampling:
         """
         padded = np.zeros((len(samples), self.fft_length), samples.dtype)
         padded[:, self.lead : self.lead + samples.shape[1]] = samples
-        spectrum = scipy.fft.fft(padded, axis=1, workers=-1, overwrite_x=True)
-        spectrum = np.roll(spectrum, -self.shift_bins, axis=1)
+        spectrum = scipy.fft.fft(padded, axis=1, overwrite_x=True)
+        if self.shift_bins:
+            spectrum = np.roll(spectrum, -self.shift_bins, axis=1)
+        factor = np.full(self.fft_length, self.ratio, samples.real.dtype)
         if gain is not None:
-            spectrum *= gain
+            factor *= gain
         upper = self.fft_length // 2  # bins of negative frequency, at the end
-        lower = self.fft_length - upper
-        wide = np.zeros((len(samples), self.upsampled_length), samples.dtype)
-        wide[:, :lower] = self.ratio * spectrum[:, :lower]
-        wide[:, self.upsampled_length - upper :] = self.ratio * spectrum[:, lower:]
-        result = scipy.fft.ifft(wide, axis=1, workers=-1, overwrite_x=True)
+        lower, beyond = self.fft_length - upper, self.upsampled_length - upper
+        wide = np.empty((len(samples), self.upsampled_length), samples.dtype)
+        np.multiply(spectrum[:, :lower], factor[:lower], out=wide[:, :lower])
+        wide[:, lower:beyond] = 0
+        np.multiply(spectrum[:, lower:], factor[lower:], out=wide[:, beyond:])
+        result = scipy.fft.ifft(wide, axis=1, overwrite_x=True)
         return result[:, self.first : self.first + self.length]
 
 

@@ -79,8 +79,8 @@ class Plan:
         Samples to either side of a subimage's centre that its lines hold, stage by stage.
     highest_cycles_per_m : float
         Phase per metre of range at the upper end of the lines' band.
-    roots_at_once : int
-        Root subimages that are worked on together.
+    roots_at_once, roots_prepared : int
+        Root subimages that are worked on together, and whose geometry is prepared together.
     stages : tuple of Stage
         What is expected of every stage, and of the backprojection at the end.
     predicted_error_db, predicted_seconds : float
@@ -112,6 +112,7 @@ class Plan:
     half_lengths: tuple[int, ...]
     highest_cycles_per_m: float
     roots_at_once: int
+    roots_prepared: int
     stages: tuple[Stage, ...]
     predicted_error_db: float
     predicted_seconds: float
@@ -151,7 +152,10 @@ class Plan:
         check(nested, "sides", "pairs of rows and columns that divide each other")
         for name in ("predicted_error_db", "predicted_seconds", "exact_seconds"):
             check(numbers((getattr(self, name),), 1, -np.inf), name, "a number")
-        check(whole(self.roots_at_once, 1), "roots_at_once", "a whole number from 1")
+        for name in ("roots_at_once", "roots_prepared"):
+            check(whole(getattr(self, name), 1), name, "a whole number from 1")
+        fits = self.roots_prepared % self.roots_at_once == 0
+        check(fits, "roots_prepared", "a multiple of roots_at_once")
         check(type(self.memory_bytes) is int and self.memory_bytes >= 0, "memory_bytes", "bytes")
         if not levels:
             return

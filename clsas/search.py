@@ -113,7 +113,7 @@ def search(
                 cycles = view.cycles_in_root(pairs[root], [pairs[i] for i in within])
                 cycles = cycles @ sides[within].T
             # Channels of a parent of size j that a child of size i uses.
-            used = view.channels_used(choice.aperture_taps, 2 * choice.density, cycles)
+            used = view.channels(choice.aperture_taps, 2 * choice.density, cycles)
             step = np.where(divides[np.ix_(within, within)].T, used, np.inf)
             step *= per_channel[within, None]
             last = last_ns(within, choice, np.diag(cycles))

@@ -18,6 +18,7 @@ _EVEN_NODES = 2.5  # over how many nodes their spacing is smoothed, rms
 _LEAST_RATE = 0.3  # of the mean over the track
 _LEAST_NODES = 2.0  # between the track's ends
 _COARSER = 2  # of the track's samples those at which it is decided what they see
+_RUN = 8  # of these, tried together
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,24 +30,38 @@ class Nodes:
     place : float64 [roots, nodes]
         On the mean track.
     position_m : float64 [roots, nodes, 3]
-    order : int64 [roots, channels]
-        The channels of the stage before in the order of `base`.
+    order : int64 [roots, channels] or None
+        The channels of the stage before in the order of `base`; None where they come in it.
     base : int64 [roots, channels]
         First node that each of these contributes to, never decreasing.
-    weights : float64 [roots, channels, taps]
-        What it contributes to that node and those after it.
+    between : float64 [roots, channels]
+        Where it lies from the middle of the nodes that it contributes to, -0.5 to 0.5 nodes.
+    aperture : Interpolator or None
+        What it contributes to them; None where it is added to one.
     """
 
     place: NDArray[np.float64]
     position_m: NDArray[np.float64]
-    order: NDArray[np.int64]
+    order: NDArray[np.int64] | None
     base: NDArray[np.int64]
-    weights: NDArray[np.float64]
+    between: NDArray[np.float64]
+    aperture: Interpolator | None
 
     @property
     def taps(self) -> int:
         """Nodes that a channel contributes to."""
-        return self.weights.shape[-1]
+        return 1 if self.aperture is None else self.aperture.taps
+
+    @property
+    def weights(self) -> NDArray[np.float64]:
+        """What channels contribute to their nodes, from `base` on, [roots, channels, taps]."""
+        if self.aperture is None:
+            return np.ones((*self.base.shape, 1))
+        return self.aperture.weights(self.between)
+
+    def ordered(self, values: NDArray) -> NDArray:
+        """Return what there is of every channel, [roots, channels], in the order of `base`."""
+        return values if self.order is None else np.take_along_axis(values, self.order, axis=1)
 
 
 def interpolated_nodes(
@@ -73,14 +88,15 @@ def interpolated_nodes(
     cycles = density * turned(track, _even(track, rate, density))
     turns = np.stack([np.interp(p, track.samples, c) for p, c in zip(place, cycles, strict=True)])
     turns -= (origin := np.floor(turns.min(axis=1, keepdims=True)) - (taps // 2 - 1))
-    order = np.argsort(turns, axis=1, kind="stable")
-    turns = np.take_along_axis(turns, order, axis=1)
+    order = None
+    if (np.diff(turns) < 0).any():
+        order = np.argsort(turns, axis=1, kind="stable")
+        turns = np.take_along_axis(turns, order, axis=1)
     lower = np.floor(turns)
     base = lower.astype(np.int64) - (taps // 2 - 1)
-    weights = aperture.weights(turns - lower - 0.5)
     wanted = origin + np.arange(base.max() + taps)
     nodes = np.stack([np.interp(w, c, track.samples) for w, c in zip(wanted, cycles, strict=True)])
-    return Nodes(nodes, track.positions_m(nodes), order, base, weights)
+    return Nodes(nodes, track.positions_m(nodes), order, base, turns - lower - 0.5, aperture)
 
 
 def _even(track: MeanTrack, rate: NDArray[np.float64], density: float) -> NDArray[np.float64]:
@@ -91,18 +107,22 @@ def _even(track: MeanTrack, rate: NDArray[np.float64], density: float) -> NDArra
     the track's ends and where nearly nothing turns, nodes go on much as they are beside.
     """
     on_track = np.flatnonzero(np.abs(track.samples - 0.5) <= 0.5)
-    result = np.empty_like(rate)
-    for root, each in enumerate(rate):
-        seen = on_track[each[on_track] > 0]
-        if not seen.size:
-            result[root] = 1.0
-            continue
-        inside = np.interp(on_track, seen, each[seen])
-        inside = np.maximum(inside, max(_LEAST_RATE * inside.mean(), _LEAST_NODES / density))
-        nodes_per_sample = density * inside.mean() / (len(on_track) - 1)
-        smooth = gaussian_filter1d(np.log(inside), _EVEN_NODES / nodes_per_sample, mode="nearest")
-        result[root] = np.exp(np.interp(np.arange(len(each)), on_track, smooth))
-    return result
+    inside = np.ones((len(rate), len(on_track)))
+    for root, each in enumerate(rate[:, on_track]):
+        seen = np.flatnonzero(each > 0)
+        if seen.size:
+            inside[root] = np.interp(np.arange(len(each)), seen, each[seen])
+    mean = inside.mean(axis=1, keepdims=True)
+    inside = np.maximum(inside, np.maximum(_LEAST_RATE * mean, _LEAST_NODES / density))
+    nodes_per_sample = density * inside.mean(axis=1) / (len(on_track) - 1)
+    # Roots of much the same width are smoothed in one go.
+    width = np.rint(2 * np.log2(_EVEN_NODES / nodes_per_sample)).astype(int)
+    inside = np.log(inside, out=inside)
+    for each in np.unique(width):
+        mine = width == each
+        inside[mine] = gaussian_filter1d(inside[mine], 2 ** (each / 2), mode="nearest")
+    before, after = on_track[0], rate.shape[1] - 1 - on_track[-1]
+    return np.pad(np.exp(inside), ((0, 0), (before, after)), mode="edge")
 
 
 def nearest_nodes(
@@ -127,7 +147,8 @@ def nearest_nodes(
         np.add.reduceat(sorted_m, starts, axis=1) / counts[:, None],
         order,
         base,
-        np.ones((roots, channels, 1)),
+        np.zeros((roots, channels)),
+        None,
     )
 
 
@@ -182,6 +203,16 @@ class Division:
         rows, columns = self._divided(level - 1, level)
         row, column = np.divmod(np.arange(down * across), across)
         return row // rows * (across // columns) + column // columns
+
+    def by_parent(self, level: int, values: NDArray) -> NDArray:
+        """Return what there is of every subimage of a size, [roots, subimages], by their parents.
+
+        That is [roots, parents, subimages of each].
+        """
+        down, across = self._divided(0, level - 1)
+        rows, columns = self._divided(level - 1, level)
+        split = values.reshape(len(values), down, rows, across, columns).swapaxes(2, 3)
+        return split.reshape(len(values), down * across, rows * columns)
 
     def radius_m(self, level: int) -> float:
         """Half a subimage's longer diagonal."""
@@ -249,18 +280,40 @@ def seen_from(
         return np.full(shape, -np.inf), np.full(shape, np.inf)
     samples = track.samples
     on_track = np.flatnonzero(np.abs(samples - 0.5) <= 0.5)[::_COARSER]
-    places = samples[on_track]
+    places, along = samples[on_track], along[on_track]
     position_m = track.positions_m(places)
     origin_m = position_m[0]
+    position_m, centres_m = position_m - origin_m, centres_m.reshape(-1, 3) - origin_m
+    # Runs of places first, each the one in its middle with what is around it; then single ones.
+    runs = [slice(start, start + _RUN) for start in range(0, len(places), _RUN)]
+    middle = np.array([min(run.start + _RUN // 2, len(places) - 1) for run in runs])
+    around_m, spread = np.empty((2, len(runs)))
+    for index, run in enumerate(runs):
+        for result, values in ((around_m, position_m), (spread, along)):
+            away = np.linalg.norm(values[run] - values[middle[index]], axis=1)
+            result[index] = away.max()
     seen = touches_rectangles(
-        beam, centres_m.reshape(-1, 3) - origin_m, half_m, position_m - origin_m, along[on_track]
+        beam, centres_m, half_m, position_m[middle], along[middle], around_m, spread
     )
-    first, last = seen.argmax(axis=1), seen.shape[1] - 1 - seen[:, ::-1].argmax(axis=1)
+    ever = seen.any(axis=1)
+    of_first, of_last = seen.argmax(axis=1), len(runs) - 1 - seen[:, ::-1].argmax(axis=1)
+    widest = _RUN * of_first, np.minimum(_RUN * (of_last + 1), len(places)) - 1
+    first, last = widest[0].copy(), widest[1].copy()
+    for index, run in enumerate(runs):
+        for edge, of_edge, step in ((first, of_first, 1), (last, of_last, -1)):
+            mine = np.flatnonzero(ever & (of_edge == index))
+            if mine.size:
+                some = position_m[run][::step], along[run][::step]
+                seen = touches_rectangles(beam, centres_m[mine], half_m, *some)
+                found = np.where(seen.any(axis=1), seen.argmax(axis=1), len(some[0]))
+                edge[mine] += step * found
+    # What no single place sees may be seen from between them.
+    between = first > last
+    first[between], last[between] = widest[0][between], widest[1][between]
     # The edge lies between two samples.
     edges = np.concatenate([[-np.inf], places[1:-1], [np.inf]])
     begin, end = edges[np.maximum(first - 1, 0)], edges[np.minimum(last + 1, len(places) - 1)]
-    never = ~seen.any(axis=1)
-    begin[never] = end[never] = -np.inf
+    begin[~ever] = end[~ever] = -np.inf
     return begin.reshape(shape), end.reshape(shape)
 
 
@@ -280,50 +333,57 @@ class Ranges:
 def ranges(
     division: Division,
     nodes: list[Nodes],
+    place: NDArray[np.float64],
     seen: tuple[NDArray[np.float64], NDArray[np.float64]],
     inside: NDArray[np.bool_],
 ) -> list[Ranges]:
-    """Return what every subimage needs, stage by stage, so that the leaves have all they need.
+    """Return what every subimage needs, stage by stage.
+
+    Weighted by the beam a steering function is 0 where the subimage is not seen from, on nodes and
+    channels alike: they have no part in it, though a filter's taps reach them.
 
     Parameters
     ----------
     nodes : list of Nodes
         Per stage.
+    place : float64 [roots, channels]
+        Of the raw channels on the track.
     seen : two float64 [roots, leaves]
         From where to where on the track a leaf is seen.
     inside : bool [roots, leaves]
         Whether it holds a pixel of the grid.
     """
-    count = nodes[-1].place.shape[1]
-    first = _rowwise(nodes[-1].place, seen[0], "right") - 1
-    last = _rowwise(nodes[-1].place, seen[1], "left") + 1
-    first, last = np.clip(first, 0, count), np.clip(last, 0, count)
-    empty = ~inside | (last <= first) | (seen[1] <= seen[0])
+    places = [nodes[0].ordered(place), *(each.place for each in nodes)]
+    # Beyond what channels contribute to there are nodes that hold nothing.
+    counts = [np.full((len(place), 1), place.shape[1])]
+    for each in nodes:
+        counts.append(np.take_along_axis(each.base, counts[-1] - 1, axis=1) + each.taps)
+    empty = ~inside | (seen[1] <= seen[0])
+    start, stop = np.where(empty, np.inf, seen[0]), np.where(empty, -np.inf, seen[1])
     result = []
     for level in reversed(range(len(nodes))):
-        base, taps = nodes[level].base, nodes[level].taps
-        begin = _rowwise(base, first - taps + 1, "left")
-        end = _rowwise(base, last, "left")
+        begin = np.clip(_rowwise(places[level], start, "left"), 0, counts[level])
+        end = np.clip(_rowwise(places[level], stop, "right"), 0, counts[level])
+        # One more on either side: spacings may be wider than what sees a subimage.
+        first = np.clip(_rowwise(places[level + 1], start, "left") - 1, 0, counts[level + 1])
+        last = np.clip(_rowwise(places[level + 1], stop, "right") + 1, 0, counts[level + 1])
+        empty = (end <= begin) | (last <= first) | (stop < start)
         for array in (first, last, begin, end):
             array[empty] = 0
         result.append(Ranges(first, last, begin, end))
         if level:
-            parents = division.parents(level)
-            shape = (len(first), division.per_root(level - 1))
-            first = np.full(shape, np.iinfo(np.int64).max)
-            last = np.zeros(shape, np.int64)
-            for root in range(len(begin)):
-                used = ~empty[root]
-                np.minimum.at(first[root], parents[used], begin[root, used])
-                np.maximum.at(last[root], parents[used], end[root, used])
-            empty = last <= first
+            start = division.by_parent(level, start).min(axis=-1)
+            stop = division.by_parent(level, stop).max(axis=-1)
     return result[::-1]
 
 
 def _rowwise(
     rows: NDArray[np.float64], values: NDArray[np.float64], side: str
 ) -> NDArray[np.int64]:
-    """Return np.searchsorted of every row."""
-    return np.stack(
-        [np.searchsorted(row, value, side) for row, value in zip(rows, values, strict=True)]
-    )
+    """Return np.searchsorted of every row, [rows, n] and [rows, values]."""
+    # All rows at once: one after the other, moved apart.
+    least, most = rows[:, 0].min(), rows[:, -1].max()
+    apart = np.arange(len(rows))[:, None] * (most - least + 2)
+    values = np.clip(values, least - 1, most + 1)
+    found = np.searchsorted((rows + apart).ravel(), (values + apart).ravel(), side)
+    return found.reshape(values.shape) - np.arange(len(rows))[:, None] * rows.shape[1]

@@ -138,11 +138,7 @@ class View:
 
         `taps` and `density`, nodes per cycle, are those of the filter along the aperture.
         """
-        return density * turns + (taps if self.beam is None else 1)
-
-    def channels_used(self, taps: int, density: float, turns: ArrayLike) -> ArrayLike:
-        """Return how many of these a smaller subimage uses, while that is seen."""
-        return density * turns + 2 * taps
+        return density * turns + (taps if self.beam is None else 2)
 
     def within(self, root: tuple[int, int]) -> View:
         """Return this view with the rates of subimages in roots of a size."""

@@ -355,6 +355,8 @@ def touches_rectangles(
     half_m: NDArray[np.float64],
     track_m: NDArray[np.float64],
     along: NDArray[np.float64],
+    around_m: float | NDArray[np.float64] = 0.0,
+    spread: float | NDArray[np.float64] = 0.0,
 ) -> NDArray[np.bool_]:
     """Return whether a window may touch rectangles, bool [rectangles, places].
 
@@ -365,16 +367,25 @@ def touches_rectangles(
         Half their sides, as vectors.
     track_m, along : float64 [places, 3]
         Positions on the track and its unit direction there.
+    around_m, spread : float or float64 [places]
+        How far from them other positions and directions may lie that these stand for.
     """
     sine, distance_m = _sines(centres_m, track_m, along)
     np.maximum(distance_m, 1e-9, out=distance_m)
-    reach = (np.linalg.norm(np.abs(half_m).sum(axis=0)) / distance_m) ** 2
+    inverse = 1 / distance_m
+    reach = (np.linalg.norm(np.abs(half_m).sum(axis=0)) * inverse) ** 2
     for half in half_m:
         ahead = (centres_m @ half)[:, None] - track_m @ half
-        ahead /= distance_m
+        ahead *= inverse
         ahead *= sine
-        reach += np.abs(along @ half - ahead) / distance_m
+        np.subtract(along @ half, ahead, out=ahead)
+        ahead *= inverse
+        reach += np.abs(ahead, out=ahead)
     low, high = window.limits
+    if np.any(around_m) or np.any(spread):
+        ratio = np.minimum(around_m * inverse, 0.5)
+        # From so much nearer the rectangle reaches further, and half way to it anywhere.
+        reach = (reach + ratio + ratio**3) / (1 - ratio) + spread + 10 * (ratio == 0.5)
     return (sine + reach > low) & (sine - reach < high)
 
 

@@ -74,7 +74,7 @@ def interpolation_error_db(case, side, aperture, root=(128, 128)):
         rate = side[0] * rates[0] + side[1] * rates[1]
         nodes = interpolated_nodes(track, rate, place, aperture)
         between = nodes.base[0][:, None] + np.arange(nodes.taps)
-        of_channels = track.positions_m(place[0][nodes.order[0]])
+        of_channels = track.positions_m(nodes.ordered(place)[0])
         leaves_m = division.centres_m(1, division.corners(1, corner[None]))[0]
         for centre_m in leaves_m[rng.integers(0, len(leaves_m), 6)]:
             offset = rng.integers(0, side, (40, 2)) - (np.array(side) - 1) / 2
@@ -116,7 +116,7 @@ def any_nodes():
 
 def test_every_channel_lies_between_its_middle_nodes():
     place, nodes = any_nodes()
-    place = np.take_along_axis(place, nodes.order, axis=1)
+    place = nodes.ordered(place)
     rows = np.arange(2)[:, None]
     assert (np.diff(nodes.place, axis=1) > 0).all()
     assert (nodes.place[rows, nodes.base + 2] <= place + 1e-9).all()
@@ -156,12 +156,12 @@ def test_nearest_nodes_are_means_of_neighbours(channels, factor):
 def everything(monkeypatch):
     """Images whose subimages get all nodes and channels there are."""
 
-    def widened(division, nodes, seen, inside):
+    def widened(division, nodes, place, seen, inside):
         everywhere = np.full_like(seen[0], -np.inf), np.full_like(seen[1], np.inf)
-        return ranges(division, nodes, everywhere, np.ones_like(inside))
+        return ranges(division, nodes, place, everywhere, np.ones_like(inside))
 
     ranges = tree.ranges
-    monkeypatch.setattr(importlib.import_module("clsas.factorize").tree, "ranges", widened)
+    monkeypatch.setattr(importlib.import_module("clsas.sector").tree, "ranges", widened)
 
 
 @pytest.mark.parametrize("beam", BEAMS, ids=["hann", "wide", "squint"])

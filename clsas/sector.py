@@ -1,0 +1,176 @@
+"""The geometry of some roots of a factorized image: what the device is told of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsas import tree
+from clsas.aperture import cycles_per_pixel, drift, mean_track, stretches
+from clsas.geometry import pairwise_range_m
+from clsas.grid import Grid
+from clsas.lines import RangeLines
+from clsas.plan import Plan, margin, padded_length
+from clsas.tree import Division, Nodes, Ranges
+
+_ON_TRACK = 1e-4  # wavelengths
+
+
+@dataclass(frozen=True, eq=False)
+class Sector:
+    """Some roots: which virtual channels their subimages have, and how they see the raw ones.
+
+    Attributes
+    ----------
+    roots : int [roots, 2]
+        Their first pixels.
+    root_m : float64 [roots, 3]
+        Middles of the roots.
+    nodes : list of Nodes
+        Stage by stage.
+    needs : list of Ranges
+    place : float64 [roots, channels]
+        Where the raw channels appear on the track.
+    """
+
+    roots: NDArray[np.int64]
+    root_m: NDArray[np.float64]
+    nodes: list[Nodes]
+    needs: list[Ranges]
+    place: NDArray[np.float64]
+
+    def stride(self, level: int) -> int:
+        """Return how many lines a subimage of a stage has at most."""
+        need = self.needs[level]
+        return int((need.last - need.first).max())
+
+    def positions_m(self, level: int) -> NDArray[np.float64]:
+        """Return the virtual channels of a stage from the middles of their roots."""
+        return self.nodes[level].position_m - self.root_m[:, None]
+
+
+class Geometry:
+    """How lines see the roots of a plan, in float64; channels are in the order of the track.
+
+    Attributes
+    ----------
+    channels : int [channels]
+        Which line each is.
+    division : Division
+    drift : float64 [3]
+    relative_m : list of float64 [subimages, 3]
+        Middles of the subimages from that of their root, stage by stage.
+    ramps : bool
+        Whether channels' phases are turned along their lines.
+    samples_per_m, cycles_per_m : float
+        Of the upsampled lines.
+    """
+
+    def __init__(self, lines: RangeLines, grid: Grid, chosen: Plan) -> None:
+        self.lines, self.grid, self.plan = lines, grid, chosen
+        self.samples_per_m = chosen.resampling.samples_per_m(lines)
+        self.cycles_per_m = chosen.resampling.cycles_per_m(lines)
+        self.division = Division(grid, chosen.sides)
+        track = mean_track(lines)
+        self.channels = np.argsort(track.place, kind="stable")
+        self.track = replace(track, place=track.place[self.channels])
+        self.along = None
+        if chosen.beam is not None:
+            along = chosen.beam.directions(lines)[self.channels]
+            self.along = tree.beam_directions(along, self.track, track.samples)
+        self.phase_centres_m = lines.phase_centres_m[self.channels]
+        velocity = lines.rx_velocity_m_s
+        self._path = (
+            lines.tx_m[self.channels],
+            lines.rx_m[self.channels],
+            velocity if velocity is None else velocity[self.channels],
+            lines.sound_speed_m_s,
+        )
+        self.drift = drift(lines)
+        first = np.zeros((1, 2), np.int64)
+        centres_m = [
+            self.division.centres_m(level, self.division.corners(level, first))[0]
+            for level in range(len(chosen.sides))
+        ]
+        self.relative_m = [each - centres_m[0] for each in centres_m]
+        # The thesis's method has none; on the track itself there is nothing to make up for.
+        off_m = np.abs(self.phase_centres_m - self.track.positions_m(self.track.place)).max()
+        wavelength_m = lines.sound_speed_m_s / max(lines.carrier_hz, 1.0)
+        away = not np.array_equal(lines.tx_m, lines.rx_m) or off_m > _ON_TRACK * wavelength_m
+        self.ramps = bool(away and not chosen.nearest)
+
+    def sector(self, roots: NDArray[np.int64]) -> Sector:
+        """Return the geometry of some roots, given by their first pixels [roots, 2]."""
+        division, chosen, track, last = self.division, self.plan, self.track, len(self.plan.sides)
+        root_m = division.centres_m(0, roots)
+        seen_at = place = track.places_seen_from(root_m, self.phase_centres_m)
+        nodes = []
+        if chosen.nearest:
+            position_m = np.broadcast_to(self.phase_centres_m, (*place.shape, 3))
+            for factor in chosen.nearest:
+                nodes.append(tree.nearest_nodes(place, position_m, factor))
+                place, position_m = nodes[-1].place, nodes[-1].position_m
+        else:
+            rates = cycles_per_pixel(
+                track,
+                self.grid,
+                root_m,
+                chosen.sides[0],
+                chosen.highest_cycles_per_m,
+                division.radius_m(last - 1),
+                chosen.beam,
+                self.along,
+            )
+            for level, (rows, columns) in enumerate(chosen.sides):
+                rate = chosen.crowding[level] * (rows * rates[0] + columns * rates[1])
+                if chosen.beam is not None and level == last - 1:
+                    rate += chosen.beam_cycles * tree.beam_rate(
+                        chosen.beam, track, self.along, root_m
+                    )
+                nodes.append(tree.interpolated_nodes(track, rate, place, chosen.aperture))
+                place = nodes[-1].place
+        corners = division.corners(last - 1, roots)
+        half_m = np.array(chosen.sides[-1])[:, None] / 2
+        half_m = half_m * [self.grid.row_step_m, self.grid.column_step_m]
+        leaves_m = division.centres_m(last - 1, corners)
+        seen = tree.seen_from(chosen.beam, track, self.along, leaves_m, half_m)
+        inside = np.all(corners < self.grid.shape, axis=-1)
+        needs = tree.ranges(division, nodes, seen_at, seen, inside)
+        return Sector(roots, root_m, nodes, needs, seen_at)
+
+    def references(self, sector: Sector) -> dict[str, NDArray]:
+        """Return how roots see the raw channels, in the order of their nodes, [roots, channels].
+
+        The line, its first sample, the place between samples, phase in cycles and its ramp.
+        """
+        lines, resampling, half = self.lines, self.plan.resampling, self.plan.half_lengths[0]
+        nodes = sector.nodes[0]
+        range_m = pairwise_range_m(sector.root_m, *self._path)
+        place = (range_m - lines.first_range_m[self.channels]) / lines.range_step_m
+        place += resampling.lead
+        cycles = lines.carrier_cycles_per_m * range_m
+        cycles += place * resampling.centre_cycles_per_sample
+        cycles -= np.rint(cycles)
+        place *= resampling.ratio
+        place += margin(half) - resampling.first - half
+        lower = np.floor(place)
+        pitch = padded_length(resampling, half)
+        start = np.clip(lower + 1 - self.plan.align.taps // 2, -half, pitch)
+        channel = np.broadcast_to(self.channels, place.shape)
+        references = {
+            "order": nodes.ordered(channel).astype(np.int32),
+            "start": nodes.ordered(start).astype(np.int32),
+            "nu": nodes.ordered(place - lower - 0.5).astype(np.float32),
+            "cycles": nodes.ordered(cycles).astype(np.float32),
+        }
+        if self.ramps:
+            references["ramp"] = nodes.ordered(self._ramp(sector)).astype(np.float32)
+        return references
+
+    def _ramp(self, sector: Sector) -> NDArray[np.float64]:
+        """Return by how many cycles per sample the phase of channels grows beyond their place's."""
+        virtual_m = self.track.positions_m(sector.place)
+        stretch = stretches(*self._path[:2], self.grid, sector.root_m, virtual_m)
+        return stretch * self.cycles_per_m / self.samples_per_m
