@@ -42,18 +42,18 @@ class Costs:
         Per pixel and channel of either, where a beam weighs it.
     """
 
-    call_ns: float = 1.5e7
-    upsampled_sample_ns: float = 20.0
-    reference_ns: float = 600.0
-    batch_ns: float = 2e6
-    channel_ns: float = 30.0
-    sample_ns: float = 0.35
+    call_ns: float = 2e7
+    upsampled_sample_ns: float = 13.0
+    reference_ns: float = 200.0
+    batch_ns: float = 3.5e5
+    channel_ns: float = 15.0
+    sample_ns: float = 0.25
     sample_tap_ns: float = 0.045
-    leaf_ns: float = 0.75
+    leaf_ns: float = 0.8
     part_ns: float = 20.0
-    pixel_ns: float = 0.65
+    pixel_ns: float = 0.68
     point_ns: float = 0.8
-    beam_ns: float = 0.25
+    beam_ns: float = 0.24
 
     def __post_init__(self) -> None:
         """Check every cost."""

@@ -200,7 +200,9 @@ class Device:
         return cl.Buffer(self.context, cl.mem_flags.READ_WRITE | how, hostbuf=array)
 
     def upload(self, array: np.ndarray) -> cl.Buffer:
-        """Return a buffer that holds a copy of `array`."""
+        """Return a buffer that holds a copy of `array`; one of anything where that is empty."""
+        if not array.size:
+            return self.buffer(0)
         flags = cl.mem_flags.READ_WRITE | cl.mem_flags.COPY_HOST_PTR
         return cl.Buffer(self.context, flags, hostbuf=np.ascontiguousarray(array))
 
@@ -258,9 +260,7 @@ class Slot:
         self.device.uploads.flush()
 
 
-def aligned(
-    make: Callable[..., np.ndarray], shape: tuple[int, ...], kind: DTypeLike
-) -> np.ndarray:
+def aligned(make: Callable[..., np.ndarray], shape: tuple[int, ...], kind: DTypeLike) -> np.ndarray:
     """Return np.empty or np.zeros of a shape that begins where vectors and pages do."""
     count = math.prod(shape) * np.dtype(kind).itemsize
     memory = make(count + _ALIGNMENT, np.uint8)

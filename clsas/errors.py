@@ -149,16 +149,16 @@ def excess_error(
     side: tuple[int, int],
     aperture: Interpolator,
     crowding: float,
-    beam_cycles: float,
+    beam_cycles: float | None,
 ) -> float:
     """Return the power of the error that a stage's nodes add to that of the aperture's filter.
 
     The filter takes nodes as equally spaced and weights as constant. Evaluated as it is, for
-    subimages and pixels of them at random: weighted steering functions between nodes against what
-    interpolation makes of them.
+    subimages and pixels of them at random: steering functions between nodes against what
+    interpolation makes of them; unless `beam_cycles` is None, weighted by the beam.
     """
     track, random = view.track, np.random.default_rng(0)
-    weighted = view.beam is not None
+    weighted = view.beam is not None and beam_cycles is not None
     seen = view.seen(side)
     wrong = total = 0.0
     for spot in np.flatnonzero(seen.any(axis=1))[::_SOME_SPOTS]:

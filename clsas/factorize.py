@@ -278,7 +278,7 @@ class _Run:
     def _start(
         self, sector: Sector, tables: _Tables, first: int, pixels: NDArray[np.complex64]
     ) -> tuple[int, list[cl.Event]]:
-        """Start some roots of a sector; return how many pixels these are, and when they are there."""
+        """Start some roots of a sector; return how many pixels they have, and when to read."""
         batch = slice(first, min(first + self.plan.roots_at_once, len(sector.roots)))
         parts = [self._part(root) for root in sector.roots[batch]]
         if tables.strides[0]:

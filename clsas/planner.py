@@ -215,10 +215,11 @@ def _fastest(
     beam_cycles = 0.0 if view.beam is None else _LEAST_BEAM_CYCLES
     needed, spared = math.inf, 0.0 if most is None else root_error(view, most) + 0.05 * allowed
     tree: Tree | None = None
+    leaf_pixels = 1
     while most is not None and spared < 0.9 * allowed:
         filters_db = in_db(allowed - spared) - MARGIN_DB
         if tree is None:
-            tree = search(view, filters_db, most, beam_cycles, device, costs, choices)
+            tree = search(view, filters_db, most, leaf_pixels, beam_cycles, device, costs, choices)
             crowding = () if tree is None else (1.0,) * len(tree.sides)
         choice = None if tree is None else tree.filters(view.spectrum, filters_db)
         if choice is None:
@@ -253,6 +254,8 @@ def _fastest(
                     1.1 * c if excess > share else c
                     for c, excess in zip(crowding, others.nodes, strict=True)
                 )
+            elif others.nodes[-1] > share:  # smaller leaves have fewer nodes, less evenly spaced
+                leaf_pixels, tree = 2 * math.prod(found.sides[-1]), None
             else:
                 spared += max(others.total - spared, 0.1 * allowed)
     return None, needed

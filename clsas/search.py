@@ -47,6 +47,7 @@ def search(
     view: View,
     filters_db: float,
     most: tuple[int, int],
+    leaf_pixels: int,
     beam_cycles: float,
     device: Device,
     costs: Costs,
@@ -54,7 +55,8 @@ def search(
 ) -> Tree | None:
     """Return the fastest tree whose filters err by no more than `filters_db` together.
 
-    None where there is none with roots of `most` rows and columns.
+    None where there is none with roots of `most` rows and columns and leaves of `leaf_pixels` at
+    least.
 
     For every number of stages and choice of filters, the fastest way from the whole grid to the
     leaves is a shortest path over the sizes that subimages may have.
@@ -82,7 +84,8 @@ def search(
         channels = view.channels(*aperture, turns + beam_cycles * for_beam[index])
         beam = view.beam is not None
         cost_ns = costs.leaf_line_ns(pixels[index], choice.final_taps, beam=beam)
-        return np.where(too_curved[index], np.inf, counts[index] * cost_ns * channels)
+        barred = too_curved[index] | (pixels[index] < leaf_pixels)
+        return np.where(barred, np.inf, counts[index] * cost_ns * channels)
 
     # In a root phases turn no less than in the middle of it.
     least_turns = np.sum(view.cycles_in_root((0, 0), pairs) * sides, axis=1)

@@ -116,7 +116,7 @@ def _even(track: MeanTrack, rate: NDArray[np.float64], density: float) -> NDArra
     inside = np.maximum(inside, np.maximum(_LEAST_RATE * mean, _LEAST_NODES / density))
     nodes_per_sample = density * inside.mean(axis=1) / (len(on_track) - 1)
     # Roots of much the same width are smoothed in one go.
-    width = np.rint(2 * np.log2(_EVEN_NODES / nodes_per_sample)).astype(int)
+    width = np.ceil(2 * np.log2(_EVEN_NODES / nodes_per_sample)).astype(int)
     inside = np.log(inside, out=inside)
     for each in np.unique(width):
         mine = width == each
@@ -168,11 +168,14 @@ class Division:
 
     @property
     def roots(self) -> NDArray[np.int64]:
-        """First row and column of every root, [roots, 2], column by column."""
+        """First row and column of every root, [roots, 2], row by row.
+
+        Most grids have their rows along the track: these roots share the samples of lines.
+        """
         rows, columns = (
             np.arange(0, n, side) for n, side in zip(self.grid.shape, self.sides[0], strict=True)
         )
-        across, down = np.meshgrid(columns, rows, indexing="ij")
+        down, across = np.meshgrid(rows, columns, indexing="ij")
         return np.stack([down.ravel(), across.ravel()], axis=1)
 
     def per_root(self, level: int) -> int:
