@@ -219,7 +219,7 @@ def cycles_per_pixel(
     along = along if along is None else along[::every]
     position, tangent = track.positions_m(place), track.tangents_m(place)
     steps = np.stack([grid.row_step_m, grid.column_step_m])
-    across = np.linspace(-0.5, 0.5, 3 if beam is None else 5)
+    across = np.linspace(-0.5, 0.5, 3)
     extents_m = np.array(sides)[:, None] * steps
     between_m = np.linalg.norm(np.abs(extents_m).sum(axis=0)) * (across[1] - across[0]) / 2
     rates = np.zeros((2, len(centres_m), len(place)))

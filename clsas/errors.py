@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -23,6 +24,19 @@ from clsas.window import sines
 _FLOAT32 = 4.5e-8  # rms error of a phase in the stages over the phase across a root: measured
 _CHANNELS, _PLACES, _PIXELS = 256, 300, 24  # at which errors are evaluated
 _SOME_SPOTS = 6  # one in so many of the spots, there
+
+
+def _kept(function: Callable[..., float]) -> Callable[..., float]:
+    """Return a function of a view that keeps with it what it returned."""
+
+    @functools.wraps(function)
+    def kept(view: View, *arguments: Hashable) -> float:
+        key = function.__name__, *arguments
+        if key not in view.kept:
+            view.kept[key] = function(view, *arguments)
+        return view.kept[key]
+
+    return kept
 
 
 def power(error_db: float) -> float:
@@ -92,6 +106,7 @@ def other_errors(
     )
 
 
+@_kept
 def root_error(view: View, side: tuple[int, int]) -> float:
     """Return the power of the error of roots: of rounding, and of channels put on the mean track.
 
@@ -144,6 +159,7 @@ def root_error(view: View, side: tuple[int, int]) -> float:
     return float(off_track + rounding)
 
 
+@_kept
 def excess_error(
     view: View,
     side: tuple[int, int],

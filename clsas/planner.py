@@ -14,7 +14,7 @@ from clsas.costs import load as load_costs
 from clsas.device import Device, open_device
 from clsas.errors import excess_error, in_db, nearest_error, other_errors, power, root_error
 from clsas.exact import Exact, expect
-from clsas.filters import ALIGN_TAPS, Filters
+from clsas.filters import ALIGN_TAPS, Choice, Filters
 from clsas.forecast import MARGIN_DB, Way
 from clsas.grid import Grid
 from clsas.interpolation import Interpolator
@@ -215,6 +215,7 @@ def _fastest(
     beam_cycles = 0.0 if view.beam is None else _LEAST_BEAM_CYCLES
     needed, spared = math.inf, 0.0 if most is None else root_error(view, most) + 0.05 * allowed
     tree: Tree | None = None
+    designed: Choice | None = None
     leaf_pixels = 1
     while most is not None and spared < 0.9 * allowed:
         filters_db = in_db(allowed - spared) - MARGIN_DB
@@ -224,7 +225,8 @@ def _fastest(
         choice = None if tree is None else tree.filters(view.spectrum, filters_db)
         if choice is None:
             break
-        filters = choice.design(view.spectrum)
+        if choice != designed:
+            designed, filters = choice, choice.design(view.spectrum)
         way = Way(tree.sides, filters, crowding=crowding, beam_cycles=beam_cycles)
         within = view.within(tree.sides[0])
         others = other_errors(within, way.sides, filters.aperture, crowding, beam_cycles, device)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import cache, partial
+from functools import partial
 from itertools import product
 
 import numpy as np
@@ -147,11 +147,10 @@ def root_limits(view: View, allowed: float) -> tuple[int, int] | None:
         min((side for side in sides if side >= n), default=sides[-1])
         for sides, n in zip((_ROWS, _COLUMNS), view.grid.shape, strict=True)
     )
-    error = cache(partial(root_error, view))
-    while error((rows, columns)) > allowed:
+    while root_error(view, (rows, columns)) > allowed:
         smaller = [(rows // 2, columns), (rows, columns // 2)]
         smaller = [side for side in smaller if side[0] >= _ROWS[0] and side[1] >= _COLUMNS[0]]
         if not smaller:
             return None
-        rows, columns = min(smaller, key=error)
+        rows, columns = min(smaller, key=partial(root_error, view))
     return rows, columns

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import functools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -32,10 +32,13 @@ class View:
         Over the whole grid, its corners among them.
     rates : float64 [2, spots, samples]
         Cycles per pixel row and column and per unit of the track's parameter.
+    kept : dict
+        What was found out about this view before.
     """
 
     def __init__(self, lines: RangeLines, grid: Grid, beam: BeamWindow | None) -> None:
         self.lines, self.grid, self.beam = lines, grid, beam
+        self.kept: dict[Hashable, float] = {}
         self.spectrum = interpolation.measure_spectrum(lines)
         occupied = self.spectrum.frequency[np.cumsum(self.spectrum.power) < 1 - 1e-6]
         half_band = (occupied[-1] if len(occupied) else 0.5) / lines.range_step_m
@@ -57,7 +60,7 @@ class View:
         nearest_m = KDTree(lines.phase_centres_m).query(dense_m)[0].min() - cell_m
         self.nearest_m = max(float(nearest_m), 1e-9)
         self._seen: dict[tuple[int, int], NDArray[np.bool_]] = {}
-        self._within: dict[tuple[int, int], NDArray[np.float64]] = {}
+        self._within: dict[tuple[int, int], View] = {}
         self._in_roots: dict[tuple[int, int], NDArray[np.float64]] = {}
         self.along = self.channels_along = None
         if beam is not None:
@@ -143,10 +146,9 @@ class View:
     def within(self, root: tuple[int, int]) -> View:
         """Return this view with the rates of subimages in roots of a size."""
         if root not in self._within:
-            self._within[root] = self._rates(root, self.spots_m)
-        view = copy.copy(self)
-        view.rates = self._within[root]
-        return view
+            view = self._within[root] = copy.copy(self)
+            view.rates, view.kept = self._rates(root, self.spots_m), {}
+        return self._within[root]
 
     def cycles_in_root(
         self, root: tuple[int, int], sides: Sequence[tuple[int, int]]
