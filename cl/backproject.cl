@@ -18,6 +18,7 @@
  *   MOVING     receivers move at `velocity` (in units of the sound speed) during the echo's flight.
  *   BEAM       intervals of the table of the channels' weights by aspect angle; 0 is no weights.
  *   NORMALISE  with BEAM: sum the weights too.
+ *   ALONE      these sums are all of the pixels, which are set; 0: they are added to them.
  *   CENTRED    every line is aligned on its tile's centre, at one sample: there are no references.
  *
  * Buffers
@@ -148,6 +149,12 @@ INLINE void interpolate(__global const float *line, int pitch, int centre, vfloa
 #undef IM
 }
 
+#if ALONE
+#define ADD_TO =
+#else
+#define ADD_TO +=
+#endif
+
 /* Adds a work-item's STACK blocks to the image at (row, column), the first block's first pixel. */
 INLINE void add_to_image(const vfloat *re, const vfloat *im, __global float2 *pixels, int columns,
                                 int row, int column)
@@ -156,10 +163,10 @@ INLINE void add_to_image(const vfloat *re, const vfloat *im, __global float2 *pi
     for (int block = 0; block < STACK; block++) {
         __global float2 *corner = pixels + (size_t)(row + block * BLOCK_ROWS) * columns + column;
 #if WIDTH == 1
-        *corner += (float2)(re[block], im[block]);
+        *corner ADD_TO (float2)(re[block], im[block]);
 #else
         for (int lane = 0; lane < WIDTH; lane++)
-            corner[(size_t)(lane / BLOCK_COLUMNS) * columns + lane % BLOCK_COLUMNS] +=
+            corner[(size_t)(lane / BLOCK_COLUMNS) * columns + lane % BLOCK_COLUMNS] ADD_TO
                 (float2)(((const float *)&re[block])[lane], ((const float *)&im[block])[lane]);
 #endif
     }
@@ -393,8 +400,10 @@ __kernel void backproject_tiles(__global const float *samples, int pitch,
     const int tile = get_global_id(1);
     ranges += 3 * (first_range + tile);
     const int begin = ranges[0], end = ranges[1];
+#if !ALONE
     if (begin >= end)
         return;
+#endif
     const int tiles_across = columns / TILE_COLUMNS;
     const int block_column = item % BLOCKS_ACROSS * BLOCK_COLUMNS;
     const int block_row = item / BLOCKS_ACROSS * ITEM_ROWS;

@@ -103,7 +103,7 @@ INLINE vfloat filtered(const float *weight, vfloat low, vfloat high)
 /* Lines of different channels lie apart: a CPU fetches those of the channel after the next meanwhile. */
 #if defined(__clang__) && WIDTH > 1
 #define PREFETCH(p) __builtin_prefetch((const void *)(size_t)(p))
-#define AHEAD 2
+#define AHEAD 4
 #endif
 
 #if GIVEN

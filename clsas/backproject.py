@@ -385,6 +385,7 @@ class _Run:
             "MOVING": int(self.moving),
             "BEAM": 0 if p.beam is None else INTERVALS,
             "NORMALISE": int(p.beam is not None and p.beam.normalise),
+            "ALONE": 0,
             "CENTRED": 0,
         }
         name = "backproject_tiles" if self.tiled else "backproject_points"

@@ -43,17 +43,17 @@ class Costs:
     """
 
     call_ns: float = 2e7
-    upsampled_sample_ns: float = 13.0
-    reference_ns: float = 200.0
-    batch_ns: float = 3.5e5
-    channel_ns: float = 15.0
-    sample_ns: float = 0.25
-    sample_tap_ns: float = 0.045
+    upsampled_sample_ns: float = 8.0
+    reference_ns: float = 450.0
+    batch_ns: float = 5e4
+    channel_ns: float = 12.0
+    sample_ns: float = 0.28
+    sample_tap_ns: float = 0.03
     leaf_ns: float = 0.8
-    part_ns: float = 20.0
+    part_ns: float = 30.0
     pixel_ns: float = 0.68
-    point_ns: float = 0.8
-    beam_ns: float = 0.24
+    point_ns: float = 1.0
+    beam_ns: float = 0.2
 
     def __post_init__(self) -> None:
         """Check every cost."""

@@ -34,7 +34,7 @@ from clsas.tree import Division
 from clsas.window import INTERVALS, BeamWindow
 
 _GROUP = 64  # work-items that share a subimage where each has one lane
-_GROUPS_PER_UNIT = 4  # at least, of compute units: so that they end together
+_GROUPS_PER_UNIT = 3  # at least, of compute units: so that they end together
 _MOST_GAIN = 3.0  # of frequencies, which are amplified where lines hold next to nothing
 
 
@@ -208,6 +208,7 @@ class _Run:
             "MOVING": 0,
             "BEAM": 0 if chosen.beam is None else INTERVALS,
             "NORMALISE": 0,
+            "ALONE": 1,
             "CENTRED": int(self.centred),
         }
         self.expand = device.kernel("backproject", "expand_tiles", **last)
@@ -441,9 +442,7 @@ class _Run:
             *self.beam[1:2],
         )
         height, width = chosen.sides[0]
-        bytes_ = 8 * len(parts) * height * width
-        pixels = slot.buffer("pixels", bytes_)
-        cl.enqueue_fill_buffer(device.queue, pixels, np.uint32(0), 0, bytes_)
+        pixels = slot.buffer("pixels", 8 * len(parts) * height * width)
         slot.busy = device.run(
             self.backproject,
             (chosen.tile[0] * chosen.tile[1] // (self.width * STACK), tiles),

@@ -18,7 +18,7 @@ from clsas.plan import GUARD, Plan, Stage, grid_digest, lines_digest, padded_len
 from clsas.view import View
 
 MARGIN_DB = 1.0  # between prediction and tolerance, for what measured errors scatter
-_MOST_BATCH_BYTES = 48 << 20  # what stays near a CPU's caches
+_CACHED_BYTES, _BATCH_BYTES = 16 << 20, 256 << 20  # of a batch, on CPUs and elsewhere
 _MOST_TABLE_BYTES = 64 << 20
 _ROOTS_PREPARED = 16  # enough for few and large arrays
 
@@ -91,10 +91,12 @@ def factorized(
     tile = _tile(view, sides[-1], device) if nearest else sides[-1]
     line_bytes = 8 * lines.channels * padded_length(resampling, halves[0])
     root_bytes, table_bytes = _root_bytes(view, way, tile, stages)
-    room = min(memory_bytes - line_bytes, _MOST_BATCH_BYTES)
+    room = memory_bytes - line_bytes
+    batch_bytes = _CACHED_BYTES if device.info.kind == "cpu" else _BATCH_BYTES
     # Tables come in two sets.
-    at_once = min(max(int(room // (root_bytes + 2 * table_bytes)), 1), stages[0].subimages)
-    room = min(memory_bytes - line_bytes - at_once * root_bytes, _MOST_TABLE_BYTES)
+    at_once = int(min(room // (root_bytes + 2 * table_bytes), batch_bytes // root_bytes))
+    at_once = min(max(at_once, 1), stages[0].subimages)
+    room = min(room - at_once * root_bytes, _MOST_TABLE_BYTES)
     of_batch = 2 * at_once * table_bytes
     prepared = at_once * min(max(int(room // of_batch), 1), -(-_ROOTS_PREPARED // at_once))
     batches = -(-stages[0].subimages // at_once)

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.distance import cdist
 
 from clsas import tree
 from clsas.aperture import cycles_per_pixel, drift, mean_track, stretches
@@ -16,6 +17,7 @@ from clsas.plan import Plan, margin, padded_length
 from clsas.tree import Division, Nodes, Ranges
 
 _ON_TRACK = 1e-4  # wavelengths
+_OF_BEAM = 1 / 16  # of what a beam covers: by how much it may be taken to cover more
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,6 +91,8 @@ class Geometry:
             lines.sound_speed_m_s,
         )
         self.drift = drift(lines)
+        self._steps_m = np.stack([grid.row_step_m, grid.column_step_m])
+        self._seen = Division(grid, (chosen.sides[0], self._together(), chosen.sides[-1]))
         first = np.zeros((1, 2), np.int64)
         centres_m = [
             self.division.centres_m(level, self.division.corners(level, first))[0]
@@ -100,6 +104,25 @@ class Geometry:
         wavelength_m = lines.sound_speed_m_s / max(lines.carrier_hz, 1.0)
         away = not np.array_equal(lines.tx_m, lines.rx_m) or off_m > _ON_TRACK * wavelength_m
         self.ramps = bool(away and not chosen.nearest)
+
+    def _together(self) -> tuple[int, int]:
+        """Return the size of rectangles of leaves for all of which it is decided who sees them.
+
+        They lie within a leaf's parent, and add little to what the beam covers.
+        """
+        leaf, parent = self.plan.sides[-1], self.plan.sides[max(len(self.plan.sides) - 2, 0)]
+        if self.plan.beam is None:
+            return parent
+        corners_m = self.division.centres_m(0, self.division.roots)
+        nearest_m = cdist(corners_m, self.phase_centres_m).min()
+        most_m = _OF_BEAM * nearest_m * np.ptp(np.clip(self.plan.beam.limits, -1, 1))
+        rows, columns = leaf
+        for wider in ((2, 1), (1, 2)) * 10:
+            side = rows * wider[0], columns * wider[1]
+            extents_m = side @ np.abs(self._steps_m @ self.along.T)
+            if parent[0] % side[0] == parent[1] % side[1] == 0 and extents_m.max() <= most_m:
+                rows, columns = side
+        return rows, columns
 
     def sector(self, roots: NDArray[np.int64]) -> Sector:
         """Return the geometry of some roots, given by their first pixels [roots, 2]."""
@@ -131,12 +154,11 @@ class Geometry:
                     )
                 nodes.append(tree.interpolated_nodes(track, rate, place, chosen.aperture))
                 place = nodes[-1].place
-        corners = division.corners(last - 1, roots)
-        half_m = np.array(chosen.sides[-1])[:, None] / 2
-        half_m = half_m * [self.grid.row_step_m, self.grid.column_step_m]
-        leaves_m = division.centres_m(last - 1, corners)
-        seen = tree.seen_from(chosen.beam, track, self.along, leaves_m, half_m)
-        inside = np.all(corners < self.grid.shape, axis=-1)
+        seen_m = self._seen.centres_m(1, self._seen.corners(1, roots))
+        half_m = np.array(self._seen.sides[1])[:, None] / 2 * self._steps_m
+        seen = tree.seen_from(chosen.beam, track, self.along, seen_m, half_m)
+        seen = tuple(each[:, self._seen.parents(2)] for each in seen)
+        inside = np.all(division.corners(last - 1, roots) < self.grid.shape, axis=-1)
         needs = tree.ranges(division, nodes, seen_at, seen, inside)
         return Sector(roots, root_m, nodes, needs, seen_at)
 
