@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from dataclasses import dataclass
-from functools import partial
 from itertools import product
 
 import numpy as np
+from numpy.typing import NDArray
 
 from clsas.costs import Costs
 from clsas.device import Device
@@ -43,6 +44,145 @@ class Tree:
         return choose(spectrum, self.align_taps, self.aperture_taps, len(self.sides), filters_db)
 
 
+@dataclass(frozen=True, eq=False)
+class _Sizes:
+    """What is known of subimages of every size, [sizes] each.
+
+    Attributes
+    ----------
+    view : View
+    sides : int [sizes, 2]
+        Rows and columns.
+    pixels, counts : int
+        Of a subimage, and how many there are.
+    share : float
+        Which part of the channels sees anything of one.
+    reach_m : float
+        By how much a pixel's range may differ from that of its centre.
+    beam_turns : float
+        Cycles that virtual channels of a leaf must be dense enough for, besides its phases'.
+    leaf : bool
+        Whether leaves may be of this size.
+    """
+
+    view: View
+    sides: NDArray[np.int64]
+    pixels: NDArray[np.int64]
+    counts: NDArray[np.int64]
+    share: NDArray[np.float64]
+    reach_m: NDArray[np.float64]
+    beam_turns: NDArray[np.float64]
+    leaf: NDArray[np.bool_]
+
+    @property
+    def pairs(self) -> list[tuple[int, int]]:
+        """Return `sides` as pairs of int."""
+        return [(int(rows), int(columns)) for rows, columns in self.sides]
+
+    @functools.cached_property
+    def inside(self) -> NDArray[np.bool_]:
+        """Whether subimages of one size, [sizes, sizes], are divided into those of another."""
+        return (self.sides[:, None] % self.sides == 0).all(axis=-1)
+
+    def cycles(
+        self, root: tuple[int, int], within: NDArray[np.int64] | slice = slice(None)
+    ) -> NDArray[np.float64]:
+        """Return the turns of phases of subimages of some sizes in a root.
+
+        [i, j]: while a subimage of size i is seen, of phases that turn as for size j.
+        """
+        per_side = self.view.cycles_in_root(root, [tuple(side) for side in self.sides[within]])
+        return per_side @ self.sides[within].T
+
+    def in_root(self, root: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        """Return the sizes inside a root's, and their `cycles` there."""
+        within = np.flatnonzero(self.inside[root])
+        return within, self.cycles(self.pairs[root], within)
+
+
+def _sizes(
+    view: View, device: Device, filters_db: float, leaf_pixels: int, beam_cycles: float
+) -> _Sizes:
+    """Return all sizes of subimages that a grid may be divided into."""
+    rows, columns = (
+        [side for side in sides if side < 2 * max(n, min(sides))]
+        for sides, n in zip((_ROWS, _COLUMNS), view.grid.shape, strict=True)
+    )
+    pairs = list(product(rows, columns))
+    sides = np.array(pairs)
+    pixels = np.prod(sides, axis=1)
+    beam_turns = np.zeros(len(sides))
+    if view.beam is not None:
+        beam_turns[:] = [view.cycles(view.beam_rates, view.seen(side)) for side in pairs]
+    curved = leaf_error(view, sides, device) > 0.25 * power(filters_db)
+    return _Sizes(
+        view,
+        sides,
+        pixels,
+        counts=np.prod(-(-np.array(view.grid.shape) // sides), axis=1),
+        share=np.array([view.share_seen(side) for side in pairs]),
+        reach_m=np.array([view.reach_m(side) for side in pairs]),
+        beam_turns=beam_cycles * beam_turns,
+        leaf=~curved & (pixels >= leaf_pixels),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Option:
+    """Filters for a number of stages, and what they make things cost.
+
+    Attributes
+    ----------
+    choice : Choice
+    stages : int
+    channel_ns : float [sizes]
+        Of every channel of all subimages of a size, in a stage.
+    pixels_ns : float [sizes]
+        Of every virtual channel of all leaves of a size, in the last.
+    once_ns : float
+        What it takes however the grid is divided.
+    """
+
+    choice: Choice
+    stages: int
+    channel_ns: NDArray[np.float64]
+    pixels_ns: NDArray[np.float64]
+    once_ns: float
+
+    def channels(self, view: View, turns: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the virtual channels of subimages whose phases turn by so many cycles."""
+        return view.channels(self.choice.aperture_taps, 2 * self.choice.density, turns)
+
+    def roots_ns(self, sizes: _Sizes, costs: Costs) -> NDArray[np.float64]:
+        """Return the cost of the first stage, [sizes]."""
+        per_channel = sizes.share * self.channel_ns + sizes.counts * costs.reference_ns
+        return sizes.view.lines.channels * per_channel + self.once_ns
+
+
+def _options(sizes: _Sizes, filters_db: float, costs: Costs, allowed: Allowed) -> list[_Option]:
+    """Return all ways to filter, and their costs."""
+    view, options = sizes.view, []
+    for stages, *taps in product(allowed.stages, allowed.align_taps, allowed.aperture_taps):
+        choice = choose(view.spectrum, *taps, stages, filters_db)
+        if choice is None:
+            continue
+        samples = 2 * sizes.reach_m * choice.rate / view.lines.range_step_m
+        samples += choice.final_taps + 16
+        beam = view.beam is not None
+        of_leaf = costs.leaf_line_ns(sizes.pixels, choice.final_taps, beam=beam)
+        options.append(
+            _Option(
+                choice,
+                stages,
+                channel_ns=sizes.counts * costs.line_ns(samples, sum(taps)),
+                pixels_ns=np.where(sizes.leaf, sizes.counts * of_leaf, np.inf),
+                once_ns=costs.upsampled_sample_ns * view.lines.samples.size * choice.rate
+                + stages * costs.batch_ns,
+            )
+        )
+    return options
+
+
 def search(
     view: View,
     filters_db: float,
@@ -58,84 +198,60 @@ def search(
     None where there is none with roots of `most` rows and columns and leaves of `leaf_pixels` at
     least.
 
-    For every number of stages and choice of filters, the fastest way from the whole grid to the
-    leaves is a shortest path over the sizes that subimages may have.
+    For every root, number of stages and choice of filters, the fastest way to the leaves is a
+    shortest path over the sizes that subimages may have. Those are tried first that could be
+    fastest, until none of the others can be.
     """
-    lines, grid = view.lines, view.grid
-    rows, columns = (
-        [side for side in sides if side < 2 * max(n, min(sides))]
-        for sides, n in zip((_ROWS, _COLUMNS), grid.shape, strict=True)
-    )
-    pairs = list(product(rows, columns))
-    sides = np.array(pairs)
-    counts = np.prod(-(-np.array(grid.shape) // sides), axis=1)
-    pixels = np.prod(sides, axis=1)
-    share = np.array([view.share_seen(side) for side in pairs])
-    divides = (sides[:, None] % sides == 0).all(axis=-1) & (sides[:, None] != sides).any(axis=-1)
-    too_curved = leaf_error(view, sides, device) > 0.25 * power(filters_db)
-    reach_m = np.array([view.reach_m(side) for side in pairs])
-    for_beam = np.zeros(len(sides))  # cycles of its edges, while a subimage is seen
-    if view.beam is not None:
-        for_beam[:] = [view.cycles(view.beam_rates, view.seen(side)) for side in pairs]
-
-    def last_ns(index: np.ndarray, choice: Choice, turns: np.ndarray) -> np.ndarray:
-        """Return the cost of backprojecting leaves, of sizes and phases' turns [n]."""
-        aperture = choice.aperture_taps, 2 * choice.density
-        channels = view.channels(*aperture, turns + beam_cycles * for_beam[index])
-        beam = view.beam is not None
-        cost_ns = costs.leaf_line_ns(pixels[index], choice.final_taps, beam=beam)
-        barred = too_curved[index] | (pixels[index] < leaf_pixels)
-        return np.where(barred, np.inf, counts[index] * cost_ns * channels)
-
-    # In a root phases turn no less than in the middle of it.
-    least_turns = np.sum(view.cycles_in_root((0, 0), pairs) * sides, axis=1)
-    everything = np.arange(len(sides))
-    choices: list[tuple[int, Choice, np.ndarray, float, np.ndarray]] = []
-    for stages, *taps in product(allowed.stages, allowed.align_taps, allowed.aperture_taps):
-        choice = choose(view.spectrum, *taps, stages, filters_db)
-        if choice is None:
-            continue
-        samples = 2 * reach_m * choice.rate / lines.range_step_m + choice.final_taps + 16
-        per_channel = counts * costs.line_ns(samples, sum(taps))
-        once = costs.upsampled_sample_ns * lines.samples.size * choice.rate
-        once += stages * costs.batch_ns
-        least = last_ns(everything, choice, least_turns)
-        choices.append((stages, choice, per_channel, once, least))
-    best = math.inf, None, []
-    roots = np.flatnonzero((sides <= most).all(axis=1))
-    for root in roots[np.argsort(-pixels[roots], kind="stable")]:  # those that cost less first
-        within = np.flatnonzero((sides[root] % sides == 0).all(axis=1))
-        cycles = None
-        for stages, choice, per_channel, once, least in choices:
-            first = share[root] * per_channel[root] + counts[root] * costs.reference_ns
-            first = lines.channels * first + once
-            if first + least[within].min() >= best[0]:
-                continue
-            if cycles is None:
-                # While a subimage of size i is seen, of phases that turn as for size j.
-                cycles = view.cycles_in_root(pairs[root], [pairs[i] for i in within])
-                cycles = cycles @ sides[within].T
-            # Channels of a parent of size j that a child of size i uses.
-            used = view.channels(choice.aperture_taps, 2 * choice.density, cycles)
-            step = np.where(divides[np.ix_(within, within)].T, used, np.inf)
-            step *= per_channel[within, None]
-            last = last_ns(within, choice, np.diag(cycles))
-            total = np.where(within == root, first, np.inf)
-            path = []
-            for _ in range(stages - 1):
-                through = total + step
-                path.append(through.argmin(axis=1))
-                total = through.min(axis=1)
-            leaf = int((total + last).argmin())
-            if (total + last)[leaf] < best[0]:
-                chain = [leaf]
-                for parents in reversed(path):
-                    chain.append(int(parents[chain[-1]]))
-                best = (total + last)[leaf], choice, within[chain[::-1]]
-    _, choice, chain = best
-    if choice is None:
+    sizes = _sizes(view, device, filters_db, leaf_pixels, beam_cycles)
+    options = _options(sizes, filters_db, costs, allowed)
+    roots = np.flatnonzero((sizes.sides <= most).all(axis=1))
+    if not options or not roots.size:
         return None
-    return Tree(tuple(pairs[i] for i in chain), choice.align_taps, choice.aperture_taps)
+    # In a root phases turn no less than in the middle of it.
+    everything, turns = np.arange(len(sizes.sides)), sizes.cycles((0, 0))
+    roots_ns = np.array([option.roots_ns(sizes, costs) for option in options])
+    least_ns = np.array([_onward(sizes, option, everything, turns)[0] for option in options])
+    least_ns = (roots_ns + least_ns)[:, roots]
+    in_root = functools.cache(sizes.in_root)
+    best_ns, best = math.inf, None
+    for place in np.argsort(least_ns, axis=None, kind="stable"):
+        if least_ns.flat[place] >= best_ns:
+            break
+        index, root = place // len(roots), int(roots[place % len(roots)])
+        within, turns = in_root(root)
+        onward_ns, children = _onward(sizes, options[index], within, turns)
+        size = int(np.searchsorted(within, root))
+        cost_ns = roots_ns[index, root] + onward_ns[size]
+        if cost_ns < best_ns:
+            path = [size]
+            for each in children:
+                path.append(int(each[path[-1]]))
+            choice = options[index].choice
+            sides = tuple(sizes.pairs[within[size]] for size in path)
+            best_ns, best = cost_ns, Tree(sides, choice.align_taps, choice.aperture_taps)
+    return best
+
+
+def _onward(
+    sizes: _Sizes, option: _Option, within: NDArray[np.int64], turns: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], list[NDArray[np.int64]]]:
+    """Return what it costs to come from subimages of some sizes to pixels, in the stages left.
+
+    Beside it, stage by stage, the sizes (as places in `within`) that are best to go on to.
+    `turns` are those of `_Sizes.cycles`.
+    """
+    # To a child of size i from a parent of size j: the channels of the parent that it uses.
+    step_ns = option.channels(sizes.view, turns) * option.channel_ns[within, None]
+    smaller = sizes.inside[np.ix_(within, within)].T & (within[:, None] != within)
+    step_ns[~smaller] = np.inf
+    onward_ns = option.channels(sizes.view, np.diag(turns) + sizes.beam_turns[within])
+    onward_ns = onward_ns * option.pixels_ns[within]
+    children = []
+    for _ in range(option.stages - 1):
+        through_ns = step_ns + onward_ns[:, None]
+        children.append(through_ns.argmin(axis=0))
+        onward_ns = through_ns.min(axis=0)
+    return onward_ns, children[::-1]
 
 
 def root_limits(view: View, allowed: float) -> tuple[int, int] | None:
@@ -152,5 +268,5 @@ def root_limits(view: View, allowed: float) -> tuple[int, int] | None:
         smaller = [side for side in smaller if side[0] >= _ROWS[0] and side[1] >= _COLUMNS[0]]
         if not smaller:
             return None
-        rows, columns = min(smaller, key=partial(root_error, view))
+        rows, columns = min(smaller, key=functools.partial(root_error, view))
     return rows, columns

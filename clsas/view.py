@@ -139,9 +139,16 @@ class View:
     def channels(self, taps: int, density: float, turns: ArrayLike) -> ArrayLike:
         """Return the virtual channels of a subimage while whose phase turns by some cycles.
 
-        `taps` and `density`, nodes per cycle, are those of the filter along the aperture.
+        `taps` and `density`, nodes per cycle, are those of the filter along the aperture, which
+        reaches beyond the track's ends.
         """
-        return density * turns + (taps if self.beam is None else 2)
+        return density * turns + 2 + self.ends_seen * (taps / 2 - 1)
+
+    @functools.cached_property
+    def ends_seen(self) -> float:
+        """How many ends of the track the beam sees a spot from, on average."""
+        ends = np.flatnonzero(self.on_track)[[0, -1]]
+        return float(self.seen((16, 16))[:, ends].sum(axis=1).mean())
 
     def within(self, root: tuple[int, int]) -> View:
         """Return this view with the rates of subimages in roots of a size."""
