@@ -243,8 +243,9 @@ class _Run:
                 f"a part of them, or backproject exactly"
             )
         # Every stage's range interpolation weakens the band's edges a little: make up for it.
-        response = self.plan.align.response(resampling.frequency) ** len(self.levels)
-        response *= self.plan.final.response(resampling.frequency)
+        frequency = resampling.frequency / resampling.ratio
+        response = self.plan.align.response(frequency) ** len(self.levels)
+        response *= self.plan.final.response(frequency)
         gain = np.clip(1 / response, 1 / _MOST_GAIN, _MOST_GAIN).astype(np.float32)
         if self.plan.nearest:
             gain = None

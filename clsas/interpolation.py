@@ -89,12 +89,12 @@ class Interpolator:
     def response(self, frequency: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the gain at some frequencies, mean over all positions.
 
-        `frequency` is in cycles per sample before upsampling, from the spectral centre.
+        `frequency` is in cycles per (upsampled) sample, from the spectral centre.
         """
         nu = np.linspace(-0.5, 0.5, _POSITIONS)
         place = np.arange(self.taps) - (self.taps - 1) / 2
         away = place - nu[:, None]
-        turns = np.asarray(frequency)[..., None, None] / self.upsampling * away
+        turns = np.asarray(frequency)[..., None, None] * away
         return np.mean(np.sum(self.weights(nu) * np.cos(2 * np.pi * turns), axis=-1), axis=-1)
 
 

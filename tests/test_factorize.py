@@ -490,7 +490,7 @@ def test_a_beam_beside_a_plan_is_refused():
 def test_progress_counts_pixels(platform):
     lines, grid = made(coarse_pixels)
     calls = []
-    chosen = dataclasses.replace(planned(coarse_pixels, -20), roots_at_once=3)
+    chosen = dataclasses.replace(planned(coarse_pixels, -20), roots_at_once=3, roots_prepared=6)
     factorize(lines, grid, chosen, device=platform, progress=lambda *call: calls.append(call))
     done, total = zip(*calls, strict=True)
     assert len(calls) > 2
