@@ -150,23 +150,23 @@ INLINE void interpolate(__global const float *line, int pitch, int centre, vfloa
 }
 
 #if ALONE
-#define ADD_TO =
+#define PUT =
 #else
-#define ADD_TO +=
+#define PUT +=
 #endif
 
-/* Adds a work-item's STACK blocks to the image at (row, column), the first block's first pixel. */
-INLINE void add_to_image(const vfloat *re, const vfloat *im, __global float2 *pixels, int columns,
+/* Adds a work-item's STACK blocks to the pixels from (row, column) on, or with ALONE sets these to them. */
+INLINE void put(const vfloat *re, const vfloat *im, __global float2 *pixels, int columns,
                                 int row, int column)
 {
 #pragma unroll
     for (int block = 0; block < STACK; block++) {
         __global float2 *corner = pixels + (size_t)(row + block * BLOCK_ROWS) * columns + column;
 #if WIDTH == 1
-        *corner ADD_TO (float2)(re[block], im[block]);
+        *corner PUT (float2)(re[block], im[block]);
 #else
         for (int lane = 0; lane < WIDTH; lane++)
-            corner[(size_t)(lane / BLOCK_COLUMNS) * columns + lane % BLOCK_COLUMNS] ADD_TO
+            corner[(size_t)(lane / BLOCK_COLUMNS) * columns + lane % BLOCK_COLUMNS] PUT
                 (float2)(((const float *)&re[block])[lane], ((const float *)&im[block])[lane]);
 #endif
     }
@@ -382,7 +382,7 @@ __kernel void expand_tiles(__global const float *geometry, int channel_pitch,
 }
 
 /* Planar grids: pixels of a tile by the expansion of expand_tiles.
- * Global size (TILE^2 / (4 WIDTH), tiles), tiles counted from first_tile, row by row over the image. */
+ * Global size (TILE_ROWS TILE_COLUMNS / (4 WIDTH), tiles), tiles counted from first_tile, row by row over the image. */
 __kernel void backproject_tiles(__global const float *samples, int pitch,
 #if CENTRED
                                 int centre_sample,
@@ -513,10 +513,10 @@ __kernel void backproject_tiles(__global const float *samples, int pitch,
             im[block] += line_re * sine + line_im * cosine;
         }
     }
-    add_to_image(re, im, pixels, columns, ((first_tile + tile) / tiles_across) * TILE_ROWS + block_row,
+    put(re, im, pixels, columns, ((first_tile + tile) / tiles_across) * TILE_ROWS + block_row,
                  ((first_tile + tile) % tiles_across) * TILE_COLUMNS + block_column);
 #if BEAM && NORMALISE
-    add_to_image(sum, sum, sums, columns, ((first_tile + tile) / tiles_across) * TILE_ROWS + block_row,
+    put(sum, sum, sums, columns, ((first_tile + tile) / tiles_across) * TILE_ROWS + block_row,
                  ((first_tile + tile) % tiles_across) * TILE_COLUMNS + block_column);
 #endif
 }
@@ -636,8 +636,8 @@ __kernel void backproject_points(__global const float *samples, int pitch,
             im[block] += line_re * sine + line_im * cosine;
         }
     }
-    add_to_image(re, im, pixels, BLOCK_COLUMNS, (first_group + group) * ITEM_ROWS, 0);
+    put(re, im, pixels, BLOCK_COLUMNS, (first_group + group) * ITEM_ROWS, 0);
 #if BEAM && NORMALISE
-    add_to_image(sum, sum, sums, BLOCK_COLUMNS, (first_group + group) * ITEM_ROWS, 0);
+    put(sum, sum, sums, BLOCK_COLUMNS, (first_group + group) * ITEM_ROWS, 0);
 #endif
 }

@@ -109,7 +109,7 @@ INLINE vfloat filtered(const float *weight, vfloat low, vfloat high)
 #if GIVEN
 #define PARENT_LINE(c) (parent + (size_t)order[chunk + (c)] * 2 * parent_pitch)
 #else
-#define PARENT_LINE(c) (parent + (size_t)(chunk + (c) - children[2]) * 2 * parent_pitch)
+#define PARENT_LINE(c) (parent + (size_t)(chunk + (c) - parents_first) * 2 * parent_pitch)
 #endif
 
 /* The line of virtual channel `node`. */
@@ -148,7 +148,7 @@ __kernel void stage(__global const float *parent, int parent_pitch, __global con
     const int from = get_group_id(1) * part_length, to = length - from < part_length ? length : from + part_length;
     const int root = get_group_id(0) / children_per_root, in_root = get_group_id(0) % children_per_root;
     children += 5 * (first_child + get_group_id(0));
-    const int begin = children[0], end = children[1];
+    const int begin = children[0], end = children[1], parents_first = children[2];
     const int first_node = children[3], end_node = first_node + children[4];
     lines += get_group_id(0) * lines_per_child * 2 * pitch;
     const int row = (first_child / children_per_root + root) * channel_pitch;

@@ -248,6 +248,7 @@ class Slot:
             self._buffers[name] = make(bytes_)
         elif self._buffers[name].size < bytes_:
             self.device.finish()  # the smaller one may be in use
+            del self._buffers[name]
             self._buffers[name] = make(bytes_)
         return self._buffers[name]
 

@@ -120,7 +120,6 @@ def root_error(view: View, side: tuple[int, int]) -> float:
     index = np.arange(0, lines.channels, -(-lines.channels // _CHANNELS))
     part = replace(track, place=track.place[index])
     middle_m = lines.phase_centres_m
-    side = tuple(map(min, side, view.grid.shape))
     seen = view.seen(side)
     random = np.random.default_rng(0)
     powers, total = [], 0.0

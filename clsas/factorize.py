@@ -160,16 +160,13 @@ class _Tables:
         Channels of a row, stage by stage.
     strides : list of int
         Lines of a subimage, stage by stage.
-    node_pitch : int
-        Virtual channels of a root in the last stage.
     geometry_pitch : int
-        All of these in a row.
+        Virtual channels of all roots in the last stage, in a row.
     """
 
     slot: Slot
     pitches: list[int]
     strides: list[int]
-    node_pitch: int
     geometry_pitch: int
 
 
@@ -242,13 +239,13 @@ class _Run:
                 f"{device.info.label}, {device.info.max_buffer_bytes / 2**20:.0f} MiB: image "
                 f"a part of them, or backproject exactly"
             )
-        # Every stage's range interpolation weakens the band's edges a little: make up for it.
-        frequency = resampling.frequency / resampling.ratio
-        response = self.plan.align.response(frequency) ** len(self.levels)
-        response *= self.plan.final.response(frequency)
-        gain = np.clip(1 / response, 1 / _MOST_GAIN, _MOST_GAIN).astype(np.float32)
-        if self.plan.nearest:
-            gain = None
+        gain = None
+        if not self.plan.nearest:
+            # Range interpolation weakens the band's edges a little in every stage.
+            frequency = resampling.frequency / resampling.ratio
+            response = self.plan.align.response(frequency) ** len(self.levels)
+            response *= self.plan.final.response(frequency)
+            gain = np.clip(1 / response, 1 / _MOST_GAIN, _MOST_GAIN).astype(np.float32)
         zeros = margin(self.levels[0].half)
         return device.share(
             upsampled_lines(self.lines.samples, resampling, self.width, zeros, self.pitch, gain)
@@ -283,7 +280,7 @@ class _Run:
         """Start some roots of a sector; return how many pixels they have, and when to read."""
         batch = slice(first, min(first + self.plan.roots_at_once, len(sector.roots)))
         parts = [self._part(root) for root in sector.roots[batch]]
-        if tables.strides[0]:
+        if all(tables.strides):
             for level in range(len(self.levels)):
                 self._stage(tables, level, batch)
             ready = self._backproject(sector, tables, batch, pixels, parts)
@@ -343,7 +340,7 @@ class _Run:
         ranges[..., 2] = (in_batch * need.first.shape[1] + self.leaf_of) * strides[-1]
         slot.fill("ranges", ranges)
         pitches = [_pitch(nodes.base.shape[1]) for nodes in sector.nodes]
-        return _Tables(slot, pitches, strides, node_pitch, geometry.shape[1])
+        return _Tables(slot, pitches, strides, geometry.shape[1])
 
     def _stage(self, tables: _Tables, level: int, batch: slice) -> None:
         """Form the lines of a stage from those of the one before, or from the raw ones."""

@@ -15,6 +15,7 @@ from clsas.errors import in_db, leaf_error, power
 from clsas.exact import Exact
 from clsas.filters import Filters
 from clsas.plan import GUARD, Plan, Stage, grid_digest, lines_digest, padded_length
+from clsas.sector import OF_BEAM
 from clsas.view import View
 
 MARGIN_DB = 1.0  # between prediction and tolerance, for what measured errors scatter
@@ -148,8 +149,10 @@ def _root_bytes(
                 density * way.crowding[level] * view.turns(side, where, np.max) + taps + 2
                 for where in (np.ones_like(seen), seen)
             )
-            if view.beam is not None and level == len(sides) - 1:
-                most += density * way.beam_cycles * view.cycles(view.beam_rates, seen, np.max)
+            if view.beam is not None:
+                if level == len(sides) - 1:
+                    most += density * way.beam_cycles * view.cycles(view.beam_rates, seen, np.max)
+                most *= 1 + OF_BEAM
         subimages = _subimages(sides[0], side)
         work += 8 * subimages * most * (stages[level].samples + 2 * GUARD)
         tables += subimages * 20 + (channels + 32) * (8 + (12 if level else 20))

@@ -17,7 +17,8 @@ from clsas.plan import Plan, margin, padded_length
 from clsas.tree import Division, Nodes, Ranges
 
 _ON_TRACK = 1e-4  # wavelengths
-_OF_BEAM = 1 / 16  # of what a beam covers: by how much it may be taken to cover more
+OF_BEAM = 1 / 16
+"""Of what a beam covers: by how much it may be taken to cover more."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,14 +116,17 @@ class Geometry:
             return parent
         corners_m = self.division.centres_m(0, self.division.roots)
         nearest_m = cdist(corners_m, self.phase_centres_m).min()
-        most_m = _OF_BEAM * nearest_m * np.ptp(np.clip(self.plan.beam.limits, -1, 1))
-        rows, columns = leaf
-        for wider in ((2, 1), (1, 2)) * 10:
-            side = rows * wider[0], columns * wider[1]
-            extents_m = side @ np.abs(self._steps_m @ self.along.T)
-            if parent[0] % side[0] == parent[1] % side[1] == 0 and extents_m.max() <= most_m:
-                rows, columns = side
-        return rows, columns
+        most_m = OF_BEAM * nearest_m * np.ptp(np.clip(self.plan.beam.limits, -1, 1))
+        along_m = np.abs(self._steps_m @ self.along.T)
+
+        def fits(side: tuple[int, int]) -> bool:
+            inside = parent[0] % side[0] == parent[1] % side[1] == 0
+            return inside and (side @ along_m).max() <= most_m
+
+        side = leaf
+        while wider := [each for each in _doubled(side) if fits(each)]:
+            side = min(wider, key=lambda each: (each @ along_m).max())
+        return side
 
     def sector(self, roots: NDArray[np.int64]) -> Sector:
         """Return the geometry of some roots, given by their first pixels [roots, 2]."""
@@ -196,3 +200,8 @@ class Geometry:
         virtual_m = self.track.positions_m(sector.place)
         stretch = stretches(*self._path[:2], self.grid, sector.root_m, virtual_m)
         return stretch * self.cycles_per_m / self.samples_per_m
+
+
+def _doubled(side: tuple[int, int]) -> list[tuple[int, int]]:
+    """Return a size with twice the rows, and with twice the columns."""
+    return [(2 * side[0], side[1]), (side[0], 2 * side[1])]

@@ -365,11 +365,8 @@ def ranges(
     start, stop = np.where(empty, np.inf, seen[0]), np.where(empty, -np.inf, seen[1])
     result = []
     for level in reversed(range(len(nodes))):
-        begin = np.clip(_rowwise(places[level], start, "left"), 0, counts[level])
-        end = np.clip(_rowwise(places[level], stop, "right"), 0, counts[level])
-        # One more on either side: spacings may be wider than what sees a subimage.
-        first = np.clip(_rowwise(places[level + 1], start, "left") - 1, 0, counts[level + 1])
-        last = np.clip(_rowwise(places[level + 1], stop, "right") + 1, 0, counts[level + 1])
+        begin, end = _between(places[level], counts[level], start, stop, int(level > 0))
+        first, last = _between(places[level + 1], counts[level + 1], start, stop, 1)
         empty = (end <= begin) | (last <= first) | (stop < start)
         for array in (first, last, begin, end):
             array[empty] = 0
@@ -377,7 +374,30 @@ def ranges(
         if level:
             start = division.by_parent(level, start).min(axis=-1)
             stop = division.by_parent(level, stop).max(axis=-1)
-    return result[::-1]
+    result = result[::-1]
+    for level in range(1, len(nodes)):
+        # A track may have gaps, where virtual channels hold nothing.
+        parent, need = result[level - 1], result[level]
+        empty = (parent.last <= parent.first)[:, division.parents(level)]
+        for array in (need.first, need.last, need.begin, need.end):
+            array[empty] = 0
+    return result
+
+
+def _between(
+    places: NDArray[np.float64],
+    counts: NDArray[np.int64],
+    start: NDArray[np.float64],
+    stop: NDArray[np.float64],
+    more: int,
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return which of ascending places lie between others, first and one past the last.
+
+    `more` on either side are taken where places may lie further apart than these.
+    """
+    first = _rowwise(places, start, "left") - more
+    last = _rowwise(places, stop, "right") + more
+    return np.clip(first, 0, counts), np.clip(last, 0, counts)
 
 
 def _rowwise(

@@ -384,8 +384,9 @@ def touches_rectangles(
     low, high = window.limits
     if np.any(around_m) or np.any(spread):
         ratio = np.minimum(around_m * inverse, 0.5)
-        # From so much nearer the rectangle reaches further, and half way to it anywhere.
-        reach = (reach + ratio + ratio**3) / (1 - ratio) + spread + 10 * (ratio == 0.5)
+        # From so much nearer the rectangle reaches further; half way to it, anywhere.
+        reach = (reach + ratio + ratio**3) / (1 - ratio) + spread
+        reach[ratio == 0.5] = np.inf
     return (sine + reach > low) & (sine - reach < high)
 
 
