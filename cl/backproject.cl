@@ -156,8 +156,7 @@ INLINE void interpolate(__global const float *line, int pitch, int centre, vfloa
 #endif
 
 /* Adds a work-item's STACK blocks to the pixels from (row, column) on, or with ALONE sets these to them. */
-INLINE void put(const vfloat *re, const vfloat *im, __global float2 *pixels, int columns,
-                                int row, int column)
+INLINE void put(const vfloat *re, const vfloat *im, __global float2 *pixels, int columns, int row, int column)
 {
 #pragma unroll
     for (int block = 0; block < STACK; block++) {
@@ -514,10 +513,10 @@ __kernel void backproject_tiles(__global const float *samples, int pitch,
         }
     }
     put(re, im, pixels, columns, ((first_tile + tile) / tiles_across) * TILE_ROWS + block_row,
-                 ((first_tile + tile) % tiles_across) * TILE_COLUMNS + block_column);
+        ((first_tile + tile) % tiles_across) * TILE_COLUMNS + block_column);
 #if BEAM && NORMALISE
     put(sum, sum, sums, columns, ((first_tile + tile) / tiles_across) * TILE_ROWS + block_row,
-                 ((first_tile + tile) % tiles_across) * TILE_COLUMNS + block_column);
+        ((first_tile + tile) % tiles_across) * TILE_COLUMNS + block_column);
 #endif
 }
 

@@ -15,6 +15,7 @@ from clsas import tree, validate
 from clsas.backproject import (
     backproject,
     beam_arguments,
+    channel_pitch,
     check_numbers,
     float_pairs,
     lookup_room,
@@ -411,7 +412,7 @@ class _Run:
         """Form the pixels of roots from their last stage, and start reading their parts."""
         device, slot, chosen, level = self.device, self.slot, self.plan, self.levels[-1]
         tiles, first_tile = len(parts) * self.per_root, batch.start * self.per_root
-        pitch = -(-tables.strides[-1] // 16) * 16
+        pitch = channel_pitch(tables.strides[-1])
         if self.centred:
             references = [level.centre]
         else:
@@ -499,7 +500,7 @@ class _Run:
 
 def _pitch(channels: int) -> int:
     """Channels of a row in a table, with room for a vector that begins at the last."""
-    return -(-channels // 16) * 16 + 16
+    return channel_pitch(channels) + 16
 
 
 def _padded(values: NDArray) -> NDArray:

@@ -216,14 +216,10 @@ class Mosaic:
             with its place.
         """
         validate.memory("the mosaic", 8 * self.grid.size)
-        pixels: NDArray[np.complex64] | None = None
+        pixels = np.empty(self.grid.shape, np.complex64)
         stored = (self._finished(place, record, None) for place, record in self.finished.items())
         for patch in chain(stored, self):
-            if patch.image.grid.shape == self.grid.shape:
-                pixels = patch.image.pixels  # all of it
-            else:
-                pixels = np.zeros(self.grid.shape, np.complex64) if pixels is None else pixels
-                pixels[patch.rows, patch.columns] = patch.image.pixels
+            pixels[patch.rows, patch.columns] = patch.image.pixels
             if tell is not None:
                 tell(patch)
         return Image(pixels, self.grid)

@@ -74,9 +74,9 @@ class _Sizes:
     beam_turns: NDArray[np.float64]
     leaf: NDArray[np.bool_]
 
-    @property
+    @functools.cached_property
     def pairs(self) -> list[tuple[int, int]]:
-        """Return `sides` as pairs of int."""
+        """`sides` as pairs of int."""
         return [(int(rows), int(columns)) for rows, columns in self.sides]
 
     @functools.cached_property

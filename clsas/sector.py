@@ -114,8 +114,8 @@ class Geometry:
         leaf, parent = self.plan.sides[-1], self.plan.sides[max(len(self.plan.sides) - 2, 0)]
         if self.plan.beam is None:
             return parent
-        corners_m = self.division.centres_m(0, self.division.roots)
-        nearest_m = cdist(corners_m, self.phase_centres_m).min()
+        root_m = self.division.centres_m(0, self.division.roots)
+        nearest_m = cdist(root_m, self.phase_centres_m).min()
         most_m = OF_BEAM * nearest_m * np.ptp(np.clip(self.plan.beam.limits, -1, 1))
         along_m = np.abs(self._steps_m @ self.along.T)
 
