@@ -549,6 +549,18 @@ def test_samples_whose_sum_overflows_are_refused(good):
         factorize(huge, good["grid"], chosen)
 
 
+@pytest.mark.parametrize("seed", [2, 5])
+def test_roots_that_overhang_the_grid_keep_the_tolerance(seed):
+    """Pixels of a root of 512 rows on a grid of 257 lie further from its middle than half of it."""
+    off_m = np.random.default_rng(seed).normal(0, 0.01, (200, 3)) * [0, 1, 1]
+    grid = around(-10.0, 40.0, shape=(257, 100), pixel_m=(0.015, 0.01))
+    lines, _ = over(grid, along_x(200, 0.008) + off_m)
+    chosen = plan(lines, grid, tolerance_db=-55, costs=EXACT_IS_SLOW)
+    assert not chosen.is_exact
+    exact = backproject(lines, grid, accuracy_db=-80)
+    assert relative_error_db(factorize(lines, grid, chosen), exact) <= -55
+
+
 def test_a_gap_in_the_track_stays_empty(platform):
     """No channel sees the pixels beside it, though virtual channels lie there."""
     x = np.arange(-14, 14, 0.02)

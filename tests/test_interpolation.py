@@ -50,6 +50,19 @@ def test_weights_mirror_and_keep_a_constant(taps):
     np.testing.assert_allclose(weights.sum(axis=-1), 1, atol=10 * error + 1e-14)
 
 
+@pytest.mark.parametrize("frequency", [0.0, 0.1, 0.25])
+def test_the_response_is_what_a_tone_of_upsampled_samples_keeps(frequency):
+    """On average over all places between samples, in cycles per upsampled sample."""
+    interpolator = design(8, 1.5, flat(0.8))
+    sample = np.arange(-40, 41)
+    tone = np.exp(2j * np.pi * frequency * sample)
+    kept = []
+    for place in np.linspace(-0.5, 0.5, 201) + 0.5:
+        taps = tone[40 - 3 : 40 + 5] @ interpolator.weights(place - 0.5)
+        kept.append(taps / np.exp(2j * np.pi * frequency * place))
+    assert interpolator.response(frequency) == pytest.approx(np.mean(kept).real, abs=1e-3)
+
+
 @pytest.mark.parametrize("taps", TAPS)
 @pytest.mark.parametrize("upsampling", [1.0, 2.0, 5.0])
 def test_the_predicted_error_is_that_of_tones(taps, upsampling):
