@@ -17,9 +17,11 @@
  *   BISTATIC   receiver positions differ from the transmitter's.
  *   MOVING     receivers move at `velocity` (in units of the sound speed) during the echo's flight.
  *   BEAM       intervals of the table of the channels' weights by aspect angle; 0 is no weights.
+ *   ONE_CUBIC  for points with BEAM: those of a block lie so close that the cubic of one serves all.
  *   NORMALISE  with BEAM: sum the weights too.
  *   ALONE      these sums are all of the pixels, which are set; 0: they are added to them.
- *   CENTRED    every line is aligned on its tile's centre, at one sample: there are no references.
+ *   CENTRED    every line is aligned on its part's centre, at one sample: there are no references. Lines stand
+ *              for `shares` others each.
  *
  * Buffers
  *   samples    float, each line with `pitch` samples including its zero margins: WIDTH > 1 a plane
@@ -41,6 +43,7 @@
  *   beam       float [BEAM][4]: the weight as cubics of a place in this table, constant terms first,
  *              from 0 to 1 each. A pixel's place is along.e - lowest, with e the unit vector to it
  *              from the middle of transmitter and receiver; beyond low and high the weight is 0.
+ *   shares     float [geometry_pitch], with CENTRED and NORMALISE: what the weight of a channel counts.
  *   sums       float2, as pixels: the sum of the weights, twice.
  */
 
@@ -69,6 +72,7 @@
 #define LANE_COLUMNS 0.0f
 #define LANE_ROWS 0.0f
 #endif
+#define MIDDLE (WIDTH == 16 ? 5 : 0) /* a lane in a block's middle */
 #define STACK 4
 #define ITEM_ROWS (BLOCK_ROWS * STACK)
 #define BLOCKS_ACROSS (TILE_COLUMNS / BLOCK_COLUMNS)
@@ -193,8 +197,13 @@ INLINE void put(const vfloat *re, const vfloat *im, __global float2 *pixels, int
 
 #if BEAM
 #define EXPAND_ARGUMENTS , float lowest
-#if NORMALISE
+#if NORMALISE && CENTRED
+#define BEAM_ARGUMENTS \
+    , __global const float *beam, float lowest, float low, float high, __global float2 *sums, __global const float *shares
+#define SHARE(channel) shares[channel]
+#elif NORMALISE
 #define BEAM_ARGUMENTS , __global const float *beam, float lowest, float low, float high, __global float2 *sums
+#define SHARE(channel) 1.0f
 #else
 #define BEAM_ARGUMENTS , __global const float *beam, float lowest, float low, float high
 #endif
@@ -218,6 +227,12 @@ INLINE vfloat beam_weights(__global const float *beam, vfloat place, float low, 
 {
     INTERVAL(vfloat, place, nearest)
     const vint interval = ROUNDED_VINT(nearest + ROUNDER);
+#if ONE_CUBIC
+    const int one = ((const int *)&interval)[MIDDLE];
+    __global const float *cubic = beam + 4 * one;
+    const vfloat middle = place - one;
+    return beam_weight(cubic[0], cubic[1], cubic[2], cubic[3], middle, low - one, high - one);
+#else
     vfloat c0, c1, c2, c3;
 #pragma unroll
     for (int lane = 0; lane < WIDTH; lane++) {
@@ -228,6 +243,7 @@ INLINE vfloat beam_weights(__global const float *beam, vfloat place, float low, 
         ((float *)&c3)[lane] = cubic[3];
     }
     return beam_weight(c0, c1, c2, c3, place - nearest, low - nearest, high - nearest);
+#endif
 }
 #else
 #define EXPAND_ARGUMENTS
@@ -505,7 +521,7 @@ __kernel void backproject_tiles(__global const float *samples, int pitch,
             sine *= weight;
             cosine *= weight;
 #if NORMALISE
-            sum[block] += weight;
+            sum[block] += SHARE(channel) * weight;
 #endif
 #endif
             re[block] += line_re * cosine - line_im * sine;
@@ -530,29 +546,38 @@ INLINE vfloat distance_change(float x, float y, float z, vfloat dx, vfloat dy, v
 
 /* Any pixels: groups of WIDTH * STACK points near a common centre, whose range differences to the centre
  * are computed without cancellation. Global size: groups.
- * offsets: float [3][groups * WIDTH * STACK], m from the group's centre; centres, reference_*: per group
- * as per tile; pixels: float2 [groups * WIDTH * STACK]. */
+ * offsets: float [3][points], m from the group's centre, from number first_range on as centres and ranges; these and
+ * reference_* per group as per tile; drift: as for expand_tiles, per metre; pixels: float2 [groups * WIDTH * STACK]. */
 __kernel void backproject_points(__global const float *samples, int pitch,
+#if CENTRED
+                                 int centre_sample, float4 drift,
+#else
                                  __global const int *reference_sample,
                                  __global const float *reference_fraction,
                                  __global const float *reference_phase,
+#endif
                                  __global const float *geometry, int geometry_pitch, int channel_pitch,
-                                 __global const int *ranges, float cycles_per_sample,
+                                 __global const int *ranges, int first_range, float cycles_per_sample,
                                  __global const float *weights, __global float2 *pixels, int first_group,
                                  __global const float *centres, __global const float *offsets, int points,
                                  float samples_per_m BEAM_ARGUMENTS)
 {
     const int group = get_global_id(0);
-    const int begin = ranges[3 * group], end = ranges[3 * group + 1];
+    ranges += 3 * (first_range + group);
+    const int begin = ranges[0], end = ranges[1];
+#if !ALONE
     if (begin >= end)
         return;
+#endif
+#if !CENTRED
     const size_t first = (size_t)group * channel_pitch;
     reference_sample += first;
     reference_fraction += first;
     reference_phase += first;
-    samples += (size_t)ranges[3 * group + 2] * 2 * pitch;
-    offsets += (size_t)group * STACK * WIDTH;
-    __global const float *centre = centres + 6 * group;
+#endif
+    samples += (size_t)ranges[2] * 2 * pitch;
+    offsets += (size_t)(first_range + group) * STACK * WIDTH;
+    __global const float *centre = centres + 6 * (first_range + group);
 
     vfloat re[STACK], im[STACK];
 #pragma unroll
@@ -591,6 +616,13 @@ __kernel void backproject_points(__global const float *samples, int pitch,
 #if BEAM
         const float ux = ROW(ALONG, 0), uy = ROW(ALONG, 1), uz = ROW(ALONG, 2);
 #endif
+#if CENTRED
+        const int nearest_sample = centre_sample;
+        const float fraction = 0.0f, turn = 0.0f;
+#else
+        const int nearest_sample = reference_sample[entry];
+        const float fraction = reference_fraction[entry], turn = reference_phase[entry];
+#endif
         __global const float *line = samples + (size_t)entry * 2 * pitch;
 #pragma unroll
         for (int block = 0; block < STACK; block++) {
@@ -602,7 +634,7 @@ __kernel void backproject_points(__global const float *samples, int pitch,
             const vfloat q = (ux * x + uy * y + uz * z) / sqrt(x * x + y * y + z * z + FLT_MIN);
             const vfloat weight = beam_weights(beam, q - lowest, low, high);
 #if NORMALISE
-            sum[block] += weight;
+            sum[block] += SHARE(channel) * weight;
 #endif
 #endif
             const vfloat out_change = distance_change(tx, ty, tz, dx, dy, dz);
@@ -616,17 +648,20 @@ __kernel void backproject_points(__global const float *samples, int pitch,
 #else
             const vfloat path = 2.0f * out_change;
 #endif
+#if CENTRED
+            const vfloat move = (0.5f * path - (drift.x * dx + drift.y * dy + drift.z * dz)) * samples_per_m;
+#else
             const vfloat move = path * (0.5f * samples_per_m);
-            const vfloat t = move + reference_fraction[entry];
+#endif
+            const vfloat t = move + fraction;
 #ifndef WINDOW
             const int whole = 0;
 #else
-            const int whole = ROUNDED_INT(t.s5 + ROUNDER); /* a lane in the block's middle */
+            const int whole = ROUNDED_INT(((const float *)&t)[MIDDLE] + ROUNDER);
 #endif
             vfloat line_re, line_im, sine, cosine;
-            interpolate(line, pitch, reference_sample[entry] + whole, t - (whole + 0.5f), weights, &line_re,
-                        &line_im);
-            sincos_cycles(move * cycles_per_sample + reference_phase[entry], &sine, &cosine);
+            interpolate(line, pitch, nearest_sample + whole, t - (whole + 0.5f), weights, &line_re, &line_im);
+            sincos_cycles(move * cycles_per_sample + turn, &sine, &cosine);
 #if BEAM
             sine *= weight;
             cosine *= weight;

@@ -31,8 +31,8 @@
  *   otherwise   parents    int [children_per_root]: which of the parents_per_root each child belongs to; either
  *                          of those at work has lines_per_parent lines.
  *               positions  float [roots][3][channel_pitch]: of channels, m from the root's centre.
- *               offsets    float [children_per_root][6]: the parent's centre from the root's, the child's from
- *                          its parent's, m.
+ *               offsets    float [roots][children_per_root][6]: the parent's centre from the root's, the
+ *                          child's from its parent's, m.
  *               drift      velocity of receivers over the sound speed: what motion in flight adds to the
  *                          range to x is -drift.(x - channel), to first order.
  *               parent_centre: sample of a parent line that is its subimage's centre.
@@ -147,7 +147,8 @@ __kernel void stage(__global const float *parent, int parent_pitch, __global con
     const int item = get_local_id(0), items = get_local_size(0);
     const int from = get_group_id(1) * part_length, to = length - from < part_length ? length : from + part_length;
     const int root = get_group_id(0) / children_per_root, in_root = get_group_id(0) % children_per_root;
-    children += 5 * (first_child + get_group_id(0));
+    const int child = first_child + get_group_id(0);
+    children += 5 * child;
     const int begin = children[0], end = children[1], parents_first = children[2];
     const int first_node = children[3], end_node = first_node + children[4];
     lines += get_group_id(0) * lines_per_child * 2 * pitch;
@@ -165,7 +166,7 @@ __kernel void stage(__global const float *parent, int parent_pitch, __global con
 #else
     parent += (size_t)(root * parents_per_root + parents[in_root]) * lines_per_parent * 2 * parent_pitch;
     positions += 3 * row;
-    offsets += 6 * in_root;
+    offsets += 6 * child;
     const float dx = offsets[3], dy = offsets[4], dz = offsets[5];
     const float drifted = drift.x * dx + drift.y * dy + drift.z * dz;
 #endif

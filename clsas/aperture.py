@@ -12,6 +12,7 @@ from scipy.interpolate import BSpline, make_lsq_spline
 
 from clsas.grid import Grid
 from clsas.lines import RangeLines
+from clsas.surface import Surface
 from clsas.window import BeamWindow
 
 _POINTS = 257  # along the track, where rates are evaluated
@@ -128,13 +129,13 @@ def mean_track(lines: RangeLines) -> MeanTrack | None:
 def stretches(
     tx_m: NDArray[np.float64],
     rx_m: NDArray[np.float64],
-    grid: Grid,
+    plane: Grid,
     points_m: NDArray[np.float64],
     virtual_m: NDArray[np.float64],
 ) -> NDArray[np.float64]:
     """Return by how much faster channels' ranges grow than those of places that stand for them.
 
-    Across the grid's plane the range of a channel grows along its gradient there, the mean of the
+    Across the plane the range of a channel grows along its gradient there, the mean of the
     unit vectors from transmitter and receiver. Of what that differs from the gradient g of the
     place on the track, the part along g is a stretch of the range line about the point, and can be
     made up for; places_seen_from leaves little across it. Drift is common to both.
@@ -150,7 +151,7 @@ def stretches(
     -------
     float64 [points, channels]
     """
-    normal = np.cross(grid.row_step_m, grid.column_step_m)
+    normal = np.cross(plane.row_step_m, plane.column_step_m)
     normal = normal / max(np.linalg.norm(normal), 1e-300)
 
     def sight(from_m: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -176,11 +177,11 @@ def drift(lines: RangeLines) -> NDArray[np.float64]:
     return lines.rx_velocity_m_s.mean(axis=0) / lines.sound_speed_m_s
 
 
-def cycles_per_pixel(
+def cycles_per_extent(
     track: MeanTrack,
-    grid: Grid,
+    surface: Surface,
     centres_m: NDArray[np.float64],
-    sides: tuple[int, int],
+    extents: NDArray[np.float64],
     cycles_per_m: float,
     nearest_m: float,
     beam: BeamWindow | None = None,
@@ -191,14 +192,15 @@ def cycles_per_pixel(
 
     A channel's range to a pixel at d from a subimage's centre c exceeds that to c by e.d, with e
     the direction from the channel to c. Along the track, of tangent t, that changes by
-    -(t - e (e.t)).d / R: for subimages of some rows and columns the phase turns by at most their
-    number times the results, in cycles per unit of the track's parameter.
+    -(t - e (e.t)).d / R: for subimages of some extents the phase turns by at most these times the
+    results, in cycles per unit of the track's parameter.
 
     Parameters
     ----------
     centres_m : float64 [n, 3]
-        Middles of rectangles of `sides` pixels; the result holds everywhere within them.
-    sides : (rows, columns)
+        Middles of boxes of some extents; the result holds everywhere within them.
+    extents : float64 [axes]
+        See `Surface`.
     cycles_per_m : float
         Phase per metre of range.
     nearest_m : float
@@ -212,27 +214,29 @@ def cycles_per_pixel(
 
     Returns
     -------
-    float64 [2, n, samples]
-        Per row and per column, at `track.samples`.
+    float64 [axes, n, samples]
+        Per row, per column and per metre of relief, at `track.samples`.
     """
     place = track.samples[::every]
     along = along if along is None else along[::every]
     position, tangent = track.positions_m(place), track.tangents_m(place)
-    steps = np.stack([grid.row_step_m, grid.column_step_m])
+    steps = surface.steps_m
     across = np.linspace(-0.5, 0.5, 3)
-    extents_m = np.array(sides)[:, None] * steps
-    between_m = np.linalg.norm(np.abs(extents_m).sum(axis=0)) * (across[1] - across[0]) / 2
-    rates = np.zeros((2, len(centres_m), len(place)))
-    # Products of the sight to a place in a rectangle follow from those of that to its middle.
+    sides_m = extents[:, None] * steps
+    between_m = np.linalg.norm(np.abs(sides_m).sum(axis=0)) * (across[1] - across[0]) / 2
+    rates = np.zeros((len(steps), len(centres_m), len(place)))
+    # Products of the sight to a place in a box follow from those of that to its middle.
     sight = centres_m[:, None] - position
     square = np.einsum("psi,psi->ps", sight, sight)
     ahead = np.einsum("psi,si->ps", sight, tangent)
     leaning = [sight @ step for step in steps]
     sideways = None if beam is None else np.einsum("psi,si->ps", sight, along)
-    for down, right in product(across, across):
-        offset_m = down * extents_m[0] + right * extents_m[1]
-        distance = square + 2 * (down * sides[0] * leaning[0] + right * sides[1] * leaning[1])
-        distance += offset_m @ offset_m
+    within = [across if axis < 2 or extent else (0.0,) for axis, extent in enumerate(extents)]
+    for parts in product(*within):
+        offset_m = parts @ sides_m
+        distance = square + offset_m @ offset_m
+        for moved, lean in zip(parts * extents, leaning, strict=True):
+            distance += 2 * moved * lean
         distance = np.maximum(np.sqrt(np.maximum(distance, 0, out=distance)), nearest_m)
         inverse = 1 / distance
         turn = (ahead + tangent @ offset_m) * inverse**2

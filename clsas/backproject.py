@@ -384,6 +384,7 @@ class _Run:
             "BISTATIC": int(self.bistatic),
             "MOVING": int(self.moving),
             "BEAM": 0 if p.beam is None else INTERVALS,
+            "ONE_CUBIC": 0,
             "NORMALISE": int(p.beam is not None and p.beam.normalise),
             "ALONE": 0,
             "CENTRED": 0,
@@ -495,7 +496,7 @@ class _Run:
             geometry = line_slot["geometry"]
             slot.fill("offsets", layout.offset_m[parts].reshape(-1, 3).T)
             size = (count,)
-            pitches, ranges = (geometry_pitch, pitch), (slot["ranges"],)
+            pitches, ranges = (geometry_pitch, pitch), (slot["ranges"], 0)
             points = count * layout.part_pixels
             rest = (first_part, slot["centres"], slot["offsets"], points, p.samples_per_m)
         return device.run(

@@ -84,11 +84,13 @@ class _Image:
         """How often it takes what `_HOST` costs."""
         e = self.expected
         if isinstance(e, Exact):
-            return [1.0, self.channels * e.samples, 0.0, 0.0, e.parts * self.channels]
+            grouped = 0.0 if e.tiled else e.parts * e.part_pixels
+            lines = self.channels * e.samples
+            return [1.0, lines, 0.0, 0.0, grouped, e.parts * self.channels]
         roots = e.stages[0].subimages
         batches = -(-roots // e.roots_at_once)
         lines = self.channels * e.resampling.length
-        return [1.0, lines, roots * self.channels, batches * len(e.sides), 0.0]
+        return [1.0, lines, roots * self.channels, batches * len(e.sides), 0.0, 0.0]
 
     @property
     def stage_work(self) -> list[float]:
@@ -110,7 +112,7 @@ class _Image:
         return e.stages[-1].operations * COST[e.final.taps]
 
 
-_HOST = ("call_ns", "upsampled_sample_ns", "reference_ns", "batch_ns", "part_ns")
+_HOST = ("call_ns", "upsampled_sample_ns", "reference_ns", "batch_ns", "group_ns", "part_ns")
 _STAGES = ("channel_ns", "sample_ns", "sample_tap_ns")
 
 

@@ -34,6 +34,8 @@ class Costs:
         Per aligned sample in a stage, and per tap of either filter.
     leaf_ns : float
         Per pixel and virtual channel of the last stage, with 4 taps.
+    group_ns : float
+        Per pixel off a plane: to put it into a group, on the host.
     part_ns : float
         Per tile, or group, and channel of an exact image: references, on the host.
     pixel_ns, point_ns : float
@@ -50,6 +52,7 @@ class Costs:
     sample_ns: float = 0.28
     sample_tap_ns: float = 0.03
     leaf_ns: float = 0.8
+    group_ns: float = 300.0
     part_ns: float = 30.0
     pixel_ns: float = 0.68
     point_ns: float = 1.0
@@ -64,9 +67,10 @@ class Costs:
         """Return the cost of a channel of a subimage in a stage, by the taps of both filters."""
         return samples * (self.sample_ns + self.sample_tap_ns * taps) + self.channel_ns
 
-    def leaf_line_ns(self, pixels: ArrayLike, taps: int, *, beam: bool) -> ArrayLike:
+    def leaf_line_ns(self, pixels: ArrayLike, taps: int, *, tiled: bool, beam: bool) -> ArrayLike:
         """Return the cost of a virtual channel of a leaf that is backprojected."""
-        return pixels * (self.leaf_ns * COST[taps] + self.beam_ns * beam) + self.channel_ns
+        leaf_ns = self.leaf_ns if tiled else max(self.leaf_ns, self.point_ns)
+        return pixels * (leaf_ns * COST[taps] + self.beam_ns * beam) + self.channel_ns
 
     def pair_ns(self, taps: int, *, tiled: bool, beam: bool) -> float:
         """Return the cost of a pixel and channel of an exact image."""

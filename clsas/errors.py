@@ -15,7 +15,7 @@ from clsas.backproject import wavelength_m
 from clsas.device import Device
 from clsas.geometry import pairwise_range_m
 from clsas.interpolation import Interpolator
-from clsas.layout import BLOCKS
+from clsas.layout import BLOCKS, ROUNDING
 from clsas.nearest import stage_errors_m
 from clsas.tree import interpolated_directions, interpolated_nodes
 from clsas.view import View
@@ -53,9 +53,12 @@ def leaf_error(view: View, sides: NDArray[np.int64], device: Device) -> NDArray[
     """Return the power of the error that expanding leaves of some sizes adds.
 
     See `layout.lay_out`: the fourth order of a tile, and the third within a block. In long leaves
-    the former is 0.35 of the largest rms.
+    the former is 0.35 of the largest rms. Off a plane nothing is expanded, and float32 rounds.
     """
-    steps_m = np.linalg.norm(view.steps_m, axis=1)
+    if not view.surface.is_plane:
+        radius_m = np.array([view.surface.radius_m(tuple(side)) for side in sides.tolist()])
+        return (ROUNDING * view.highest_cycles_per_m * radius_m) ** 2
+    steps_m = np.linalg.norm(view.surface.steps_m, axis=1)
     radius_m = np.hypot(*(sides * steps_m).T) / 2
     block_m = np.hypot(*(np.array(BLOCKS[device.info.width]) * steps_m)) / 2
     nearest_m = np.maximum(view.nearest_m, 1e-6)
@@ -130,15 +133,14 @@ def root_error(view: View, side: tuple[int, int]) -> float:
         near_index = index[some]
         velocity = lines.rx_velocity_m_s
         near = replace(track, place=part.place[some])
-        offset_m = random.uniform(-0.5, 0.5, (_PIXELS, 2)) * side @ view.steps_m
-        points_m = view.spots_m[spot] + np.concatenate([np.zeros((1, 3)), offset_m])
+        points_m = view.spots_m[spot] + _pixels_m(view, side, random)
         antennas_m = lines.tx_m[near_index], lines.rx_m[near_index]
         moving = velocity if velocity is None else velocity[near_index]
         range_m = pairwise_range_m(points_m, *antennas_m, moving, lines.sound_speed_m_s)
         virtual_m = track.positions_m(near.places_seen_from(points_m[:1], middle_m[near_index])[0])
         on_track_m = pairwise_range_m(points_m, virtual_m, virtual_m)
         on_track_m -= (points_m @ drift(lines))[:, None]
-        stretch = 1 + stretches(*antennas_m, view.grid, points_m[:1], virtual_m[None])
+        stretch = 1 + stretches(*antennas_m, view.surface.plane, points_m[:1], virtual_m[None])
         away_m = (range_m - range_m[0]) - (on_track_m - on_track_m[0]) * stretch
         wrong = 2 * np.pi * view.highest_cycles_per_m * away_m[1:]
         weights = np.ones_like(wrong)
@@ -153,7 +155,8 @@ def root_error(view: View, side: tuple[int, int]) -> float:
         powers.append(np.sum(wrong**2))
         total += np.sum(weights**2)
     off_track = sum(powers) / max(total, 1e-30)
-    radius_m = np.linalg.norm(side * np.linalg.norm(view.steps_m, axis=1)) / 2
+    sides_m = view.extents(side, np.max) * np.linalg.norm(view.surface.steps_m, axis=1)
+    radius_m = np.linalg.norm(sides_m) / 2
     rounding = (2 * np.pi * _FLOAT32 * view.highest_cycles_per_m * radius_m) ** 2
     return float(off_track + rounding)
 
@@ -179,12 +182,11 @@ def excess_error(
     for spot in np.flatnonzero(seen.any(axis=1))[::_SOME_SPOTS]:
         places = track.samples[seen[spot]]
         place = np.linspace(places[0], places[-1], _PLACES)
-        rate = crowding * (side[0] * view.rates[0, spot] + side[1] * view.rates[1, spot])
+        rate = crowding * (view.extents(side) @ view.rates[:, spot])
         if weighted:
             rate = rate + beam_cycles * view.beam_rates[spot]
         nodes = interpolated_nodes(track, rate[None], place[None], aperture)
-        offset_m = random.uniform(-0.5, 0.5, (_PIXELS, 2)) * side @ view.steps_m
-        points_m = view.spots_m[spot] + np.concatenate([np.zeros((1, 3)), offset_m])
+        points_m = view.spots_m[spot] + _pixels_m(view, side, random)
 
         def steering(at: NDArray[np.float64], points_m: NDArray[np.float64] = points_m) -> NDArray:
             sight = points_m[:, None] - track.positions_m(at)
@@ -206,10 +208,19 @@ def excess_error(
     return max(wrong / max(total, 1e-30) - power(aperture.error_db), 0.0)
 
 
+def _pixels_m(
+    view: View, side: tuple[int, int], random: np.random.Generator
+) -> NDArray[np.float64]:
+    """Return pixels of a subimage at random from its middle, and that before them, [n, 3]."""
+    extents = view.extents(side)
+    places = random.uniform(-0.5, 0.5, (_PIXELS, len(extents))) * extents
+    return np.concatenate([np.zeros((1, 3)), places @ view.surface.steps_m])
+
+
 def nearest_error(view: View, stages: Sequence[tuple[int, int]]) -> float:
     """Return the power of the error of nearest beams: THESIS [45], spread evenly."""
     centres_m = view.lines.phase_centres_m[np.argsort(view.track.place)]
     spacing_m = np.linalg.norm(np.diff(centres_m, axis=0), axis=1).mean()
-    image_m = np.max(np.array(view.grid.shape) * np.linalg.norm(view.steps_m, axis=1))
+    image_m = np.max(np.array(view.grid.shape) * np.linalg.norm(view.surface.steps_m, axis=1))
     total_m = sum(stage_errors_m(stages, spacing_m, image_m, view.nearest_m))
     return (2 * math.pi * view.lines.carrier_cycles_per_m * total_m) ** 2 / 3

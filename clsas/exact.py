@@ -60,7 +60,9 @@ class Exact:
         pair_ns = costs.pair_ns(self.taps, tiled=self.tiled, beam=self.weighted)
         part_ns = costs.part_ns + self.part_pixels * pair_ns
         of_lines_ns = self.channels * self.samples * costs.upsampled_sample_ns
-        return 1e-9 * (costs.call_ns + of_lines_ns + self.parts * self.seen * part_ns)
+        of_groups_ns = 0.0 if self.tiled else self.parts * self.part_pixels * costs.group_ns
+        of_parts_ns = self.parts * self.seen * part_ns
+        return 1e-9 * (costs.call_ns + of_lines_ns + of_groups_ns + of_parts_ns)
 
 
 def expect(view: View, accuracy_db: float, device: Device) -> Exact:

@@ -11,28 +11,24 @@ import numpy as np
 import pyopencl as cl
 from numpy.typing import NDArray
 
-from clsas import tree, validate
+from clsas import validate
 from clsas.backproject import (
     backproject,
-    beam_arguments,
     channel_pitch,
     check_numbers,
-    float_pairs,
-    lookup_room,
     upsampled_lines,
     warn_unseen,
 )
 from clsas.device import Device, Slot, open_device
-from clsas.geometry import bistatic_range_m
 from clsas.grid import Grid
 from clsas.image import Image
-from clsas.layout import STACK, Tiles
+from clsas.leaves import Finish, Level, PlaneLeaves, SurfaceLeaves
 from clsas.lines import RangeLines
 from clsas.plan import GUARD, Plan, margin, padded_length
 from clsas.planner import BEST_TOLERANCE_DB, WORST_TOLERANCE_DB, plan
 from clsas.sector import Geometry, Sector
-from clsas.tree import Division
-from clsas.window import INTERVALS, BeamWindow
+from clsas.surface import surface_of
+from clsas.window import BeamWindow
 
 _GROUP = 64  # work-items that share a subimage where each has one lane
 _GROUPS_PER_UNIT = 3  # at least, of compute units: so that they end together
@@ -55,7 +51,7 @@ def factorize(
     lines : RangeLines
         Any number of channels, monostatic, bistatic or moving.
     grid : Grid
-        Any number of pixels. Off a plane the image is backprojected plainly.
+        Any number of pixels: a plane, a height map or arbitrary points.
     plan_or_tolerance : Plan or float
         A plan made by `clsas.plan` for these lines and this grid, or the relative rms error
         wanted against the exact image, dB, from -75 to -10.
@@ -131,24 +127,6 @@ def factorize(
     return image
 
 
-@dataclass(frozen=True)
-class _Level:
-    """The lines of one stage: `half` samples to either side of a subimage's centre."""
-
-    half: int
-    length: int
-
-    @property
-    def pitch(self) -> int:
-        """Samples of a line with the zeros around it."""
-        return self.length + 2 * GUARD
-
-    @property
-    def centre(self) -> int:
-        """Sample of the subimage's centre."""
-        return self.half + GUARD
-
-
 @dataclass(frozen=True, eq=False)
 class _Tables:
     """What a device is told of a sector's roots, all at once.
@@ -161,14 +139,11 @@ class _Tables:
         Channels of a row, stage by stage.
     strides : list of int
         Lines of a subimage, stage by stage.
-    geometry_pitch : int
-        Virtual channels of all roots in the last stage, in a row.
     """
 
     slot: Slot
     pitches: list[int]
     strides: list[int]
-    geometry_pitch: int
 
 
 class _Run:
@@ -176,52 +151,27 @@ class _Run:
 
     def __init__(self, lines: RangeLines, grid: Grid, chosen: Plan, device: Device) -> None:
         self.lines, self.grid, self.plan, self.device = lines, grid, chosen, device
-        self.width = device.info.width
-        self.geometry = Geometry(lines, grid, chosen)
+        self.width, surface = device.info.width, surface_of(grid)
+        self.geometry = Geometry(lines, surface, chosen)
         self.division = self.geometry.division
         self.levels = [
-            _Level(half, -(-(2 * half + 1) // self.width) * self.width)
+            Level(half, -(-(2 * half + 1) // self.width) * self.width)
             for half in chosen.half_lengths
         ]
         self.filters = {
             name: device.upload(getattr(chosen, name).coefficients.astype(np.float32))
-            for name in ("align", "aperture", "final")
+            for name in ("align", "aperture")
         }
         options = {"WIDTH": self.width, "TAPS": chosen.align.taps}
         options["APERTURE_TAPS"] = chosen.aperture.taps
         ramp = int(self.geometry.ramps)
         self.first_stage = device.kernel("stage", "stage", GIVEN=1, RAMP=ramp, **options)
         self.later_stage = device.kernel("stage", "stage", GIVEN=0, RAMP=0, **options)
-        block_m = Tiles(grid, chosen.tile[0], self.width).block_radius_m
-        fits = block_m * self.geometry.samples_per_m <= lookup_room(chosen.final.taps)
-        # Where tile and leaf are one, every line is aligned on its centre.
-        self.centred = chosen.tile == chosen.sides[-1]
-        last = {
-            "WIDTH": self.width,
-            "TAPS": chosen.final.taps,
-            "TILE_ROWS": chosen.tile[0],
-            "TILE_COLUMNS": chosen.tile[1],
-            "PERMUTE": int(device.info.permute and fits),
-            "BISTATIC": 0,
-            "MOVING": 0,
-            "BEAM": 0 if chosen.beam is None else INTERVALS,
-            "NORMALISE": 0,
-            "ALONE": 1,
-            "CENTRED": int(self.centred),
-        }
-        self.expand = device.kernel("backproject", "expand_tiles", **last)
-        self.backproject = device.kernel("backproject", "backproject_tiles", **last)
-        self.per_sine, self.beam = beam_arguments(device, chosen.beam, lines)
         self.pitch = padded_length(chosen.resampling, self.levels[0].half)
         self.samples = self._upload_lines()
-        self.tiles = Division(grid, (chosen.sides[0], chosen.sides[-1], chosen.tile))
-        self.per_root, self.leaf_of = self.tiles.per_root(2), self.tiles.parents(2)
-        first = np.zeros((1, 2), np.int64)
-        centres_m = self.tiles.centres_m(2, self.tiles.corners(2, first))[0]
-        self.tile_m = centres_m - self.tiles.centres_m(0, first)
-        self.centres = device.upload(np.tile(float_pairs(self.tile_m), (chosen.roots_at_once, 1)))
+        kind = PlaneLeaves if surface.is_plane else SurfaceLeaves
+        self.leaves = kind(lines, self.geometry, self.levels[-1], device)
         later = range(1, len(self.levels))
-        self.offsets = {level: self._offsets(level) for level in later}
         self.parents = {
             level: device.upload(self.division.parents(level).astype(np.int32)) for level in later
         }
@@ -252,12 +202,6 @@ class _Run:
             upsampled_lines(self.lines.samples, resampling, self.width, zeros, self.pitch, gain)
         )
 
-    def _offsets(self, level: int) -> cl.Buffer:
-        """Return the middles of parents from their root's, and of their subimages from theirs."""
-        parent_m = self.geometry.relative_m[level - 1][self.division.parents(level)]
-        offsets_m = [parent_m, self.geometry.relative_m[level] - parent_m]
-        return self.device.upload(np.concatenate(offsets_m, axis=1).astype(np.float32))
-
     def into(self, pixels: NDArray[np.complex64]) -> Iterator[int]:
         """Form all pixels, [rows, columns]; yield how many each time that some are finished.
 
@@ -270,39 +214,22 @@ class _Run:
             for first in range(0, len(sector.roots), at_once):
                 under_way.append(self._start(sector, tables, first, pixels))
                 if len(under_way) > 2:  # so that an interruption need not wait long
-                    yield self._finished(*under_way.popleft())
+                    yield under_way.popleft()()
             tables.slot.busy = cl.enqueue_marker(self.device.queue)
         while under_way:
-            yield self._finished(*under_way.popleft())
+            yield under_way.popleft()()
 
     def _start(
         self, sector: Sector, tables: _Tables, first: int, pixels: NDArray[np.complex64]
-    ) -> tuple[int, list[cl.Event]]:
-        """Start some roots of a sector; return how many pixels they have, and when to read."""
+    ) -> Finish:
+        """Start forming the pixels of some roots of a sector."""
         batch = slice(first, min(first + self.plan.roots_at_once, len(sector.roots)))
-        parts = [self._part(root) for root in sector.roots[batch]]
-        if all(tables.strides):
-            for level in range(len(self.levels)):
-                self._stage(tables, level, batch)
-            ready = self._backproject(sector, tables, batch, pixels, parts)
-        else:
-            ready = []
-            for part in parts:
-                pixels[part] = 0
-        return sum(pixels[part].size for part in parts), ready
-
-    @staticmethod
-    def _finished(formed: int, ready: list[cl.Event]) -> int:
-        """Wait for the pixels of roots that were started; return how many they are."""
-        for event in ready:
-            event.wait()
-        return formed
-
-    def _part(self, root: NDArray[np.int64]) -> tuple[slice, slice]:
-        """Return which pixels of the image a root has."""
-        ends = np.minimum(root + self.plan.sides[0], self.grid.shape)
-        rows, columns = (slice(int(a), int(b)) for a, b in zip(root, ends, strict=True))
-        return rows, columns
+        if not all(tables.strides):
+            return self.leaves.blank(sector, batch, pixels)
+        for level in range(len(self.levels)):
+            self._stage(tables, level, batch)
+        lines = self.slot[f"lines{len(self.levels) - 1}"]
+        return self.leaves.form(tables.slot, sector, batch, lines, pixels)
 
     def _upload_tables(self, sector: Sector) -> _Tables:
         """Start copying to the device all that it is told of a sector's roots."""
@@ -319,29 +246,17 @@ class _Run:
                 children[..., 2] = sector.needs[level - 1].first[:, parents]
                 position_m = sector.positions_m(level - 1).swapaxes(1, 2)
                 slot.fill(f"positions{level}", _padded(position_m.astype(np.float32)))
+                parent_m = sector.relative_m[level - 1][:, parents]
+                offsets_m = [parent_m, sector.relative_m[level] - parent_m]
+                offsets_m = np.concatenate(offsets_m, axis=-1).astype(np.float32)
+                slot.fill(f"offsets{level}", offsets_m)
             children[..., 3], children[..., 4] = need.first, need.last - need.first
             slot.fill(f"children{level}", children)
             slot.fill(f"base{level}", _padded(nodes.base.astype(np.int32)))
             slot.fill(f"between{level}", _padded(nodes.between.astype(np.float32)))
-
-        rows = [float_pairs(sector.positions_m(-1).reshape(-1, 3))]
-        if self.plan.beam is not None:
-            along = tree.interpolated_directions(
-                self.geometry.track.samples, self.geometry.along, sector.nodes[-1].place
-            )
-            rows.append((along * self.per_sine).astype(np.float32).reshape(-1, 3))
-        geometry = np.pad(np.concatenate(rows, axis=1).T, ((0, 0), (0, 16)), mode="edge")
-        slot.fill("geometry", geometry)
-        need, (roots, node_pitch) = sector.needs[-1], sector.nodes[-1].place.shape
-        root = np.arange(roots)[:, None]
-        ranges = np.empty((roots, self.per_root, 3), np.int32)
-        ranges[..., 0] = root * node_pitch + need.first[:, self.leaf_of]
-        ranges[..., 1] = root * node_pitch + need.last[:, self.leaf_of]
-        in_batch = root % self.plan.roots_at_once
-        ranges[..., 2] = (in_batch * need.first.shape[1] + self.leaf_of) * strides[-1]
-        slot.fill("ranges", ranges)
+        self.leaves.fill(slot, sector)
         pitches = [_pitch(nodes.base.shape[1]) for nodes in sector.nodes]
-        return _Tables(slot, pitches, strides, geometry.shape[1])
+        return _Tables(slot, pitches, strides)
 
     def _stage(self, tables: _Tables, level: int, batch: slice) -> None:
         """Form the lines of a stage from those of the one before, or from the raw ones."""
@@ -365,7 +280,7 @@ class _Run:
                 self.division.per_root(level - 1),
                 tables.strides[level - 1],
                 table[f"positions{level}"],
-                self.offsets[level],
+                table[f"offsets{level}"],
                 np.append(self.geometry.drift, 0).astype(np.float32),
                 self.geometry.samples_per_m,
                 self.geometry.cycles_per_m,
@@ -400,102 +315,6 @@ class _Run:
             wait_for=table.filled,
             local=(items, 1),
         )
-
-    def _backproject(
-        self,
-        sector: Sector,
-        tables: _Tables,
-        batch: slice,
-        image: NDArray[np.complex64],
-        parts: list[tuple[slice, slice]],
-    ) -> list[cl.Event]:
-        """Form the pixels of roots from their last stage, and start reading their parts."""
-        device, slot, chosen, level = self.device, self.slot, self.plan, self.levels[-1]
-        tiles, first_tile = len(parts) * self.per_root, batch.start * self.per_root
-        pitch = channel_pitch(tables.strides[-1])
-        if self.centred:
-            references = [level.centre]
-        else:
-            slot.wait()
-            values = self._leaf_references(sector, batch, pitch)
-            for name, each in values.items():
-                slot.fill(name, each)
-            references = [slot[name] for name in values]
-        steps_m = (self.grid.column_step_m, self.grid.row_step_m)
-        samples_per_m = self.geometry.samples_per_m
-        terms = 9 + (10 if chosen.beam is not None else 0)
-        expansion = slot.buffer("expansion", 4 * terms * tiles * pitch)
-        device.run(
-            self.expand,
-            (pitch // self.width, tiles),
-            tables.slot["geometry"],
-            pitch,
-            tables.geometry_pitch,
-            tables.slot["ranges"],
-            first_tile,
-            self.centres,
-            *(np.append(step, 0).astype(np.float32) for step in steps_m),
-            samples_per_m,
-            np.array([self.geometry.drift @ s * samples_per_m for s in steps_m], np.float32),
-            expansion,
-            *self.beam[1:2],
-        )
-        height, width = chosen.sides[0]
-        pixels = slot.buffer("pixels", 8 * len(parts) * height * width)
-        slot.busy = device.run(
-            self.backproject,
-            (chosen.tile[0] * chosen.tile[1] // (self.width * STACK), tiles),
-            slot[f"lines{len(self.levels) - 1}"],
-            level.pitch,
-            *references,
-            expansion,
-            pitch,
-            tables.slot["ranges"],
-            first_tile,
-            self.geometry.cycles_per_m / samples_per_m,
-            self.filters["final"],
-            pixels,
-            width,
-            0,
-            *self.beam,
-            wait_for=slot.filled,
-        )
-        ready = []
-        for index, (down, across) in enumerate(parts):
-            ready.append(
-                cl.enqueue_copy(
-                    device.queue,
-                    image,
-                    pixels,
-                    buffer_origin=(0, index * height, 0),
-                    buffer_pitches=(8 * width, 0),
-                    host_origin=(8 * across.start, down.start, 0),
-                    host_pitches=(8 * image.shape[1], 0),
-                    region=(8 * (across.stop - across.start), down.stop - down.start, 1),
-                    is_blocking=False,
-                )
-            )
-        device.queue.flush()
-        return ready
-
-    def _leaf_references(self, sector: Sector, batch: slice, pitch: int) -> dict[str, NDArray]:
-        """Return where tiles' centres lie in the lines of their leaves, [roots, tiles, pitch]."""
-        shape, centre = (batch.stop - batch.start, self.per_root, pitch), self.levels[-1].centre
-        sample = np.full(shape, centre, np.int32)
-        fraction, phase = np.zeros((2, *shape), np.float32)
-        first = sector.needs[-1].first[batch][:, self.leaf_of]
-        leaf_m = self.geometry.relative_m[-1][self.leaf_of]
-        for root, position_m in enumerate(sector.positions_m(-1)[batch]):
-            index = np.minimum(first[root][:, None] + np.arange(pitch), len(position_m) - 1)
-            node_m = position_m[index]
-            range_m = bistatic_range_m(self.tile_m[:, None], node_m, node_m)
-            range_m -= bistatic_range_m(leaf_m[:, None], node_m, node_m)
-            range_m -= (self.tile_m - leaf_m) @ self.geometry.drift[:, None]
-            place = range_m * self.geometry.samples_per_m
-            sample[root] += np.rint(place).astype(np.int32)
-            fraction[root] = place - np.rint(place)
-            phase[root] = np.remainder(self.geometry.cycles_per_m * range_m + 0.5, 1) - 0.5
-        return {"sample": sample, "fraction": fraction, "phase": phase}
 
 
 def _pitch(channels: int) -> int:

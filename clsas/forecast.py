@@ -14,6 +14,7 @@ from clsas.device import Device
 from clsas.errors import in_db, leaf_error, power
 from clsas.exact import Exact
 from clsas.filters import Filters
+from clsas.layout import STACK
 from clsas.plan import GUARD, Plan, Stage, grid_digest, lines_digest, padded_length
 from clsas.sector import OF_BEAM
 from clsas.view import View
@@ -50,7 +51,7 @@ def factorized(
     `view` is that within its roots where the aperture is interpolated; `other_error` the power of
     the errors that the filters do not account for.
     """
-    lines, grid, sides, nearest = view.lines, view.grid, way.sides, way.nearest
+    lines, sides, nearest = view.lines, way.sides, way.nearest
     align, aperture, final = way.filters.align, way.filters.aperture, way.filters.final
     resampling = interpolation.resampling(lines.length, align, view.spectrum)
     halves = view.half_lengths(sides, align, final, resampling)
@@ -59,7 +60,7 @@ def factorized(
     width = device.info.width
     used = channels * view.share_seen(sides[0])
     for level, side in enumerate(sides):
-        count = math.prod(-(-n // s) for n, s in zip(grid.shape, side, strict=True))
+        count = view.subimages(side)
         samples = -(-(2 * halves[level] + 1) // width) * width
         seen = view.seen(side)
         if nearest:
@@ -83,15 +84,18 @@ def factorized(
         stages.append(
             Stage(*side, count, round(channels), samples, operations, in_db(error), 1e-9 * cost_ns)
         )
-    pixels = math.prod(side)
+    tiled, pixels = view.surface.is_plane, view.slots(side, width)
     operations = count * pixels * channels
-    cost_ns = count * channels * costs.leaf_line_ns(pixels, final.taps, beam=view.beam is not None)
+    cost_ns = costs.leaf_line_ns(pixels, final.taps, tiled=tiled, beam=view.beam is not None)
+    cost_ns *= count * channels
+    if not tiled:
+        cost_ns += count * pixels * costs.group_ns
     stages.append(
         Stage(*side, count, round(channels), samples, operations, final.scatter_db, 1e-9 * cost_ns)
     )
     tile = _tile(view, sides[-1], device) if nearest else sides[-1]
     line_bytes = 8 * lines.channels * padded_length(resampling, halves[0])
-    root_bytes, table_bytes = _root_bytes(view, way, tile, stages)
+    root_bytes, table_bytes = _root_bytes(view, way, tile, stages, width)
     room = memory_bytes - line_bytes
     batch_bytes = _CACHED_BYTES if device.info.kind == "cpu" else _BATCH_BYTES
     # Tables come in two sets.
@@ -123,7 +127,7 @@ def factorized(
         memory_bytes=int(line_bytes + at_once * root_bytes + 2 * prepared * table_bytes),
         device=device.info.label,
         lines_digest=lines_digest(lines),
-        grid_digest=grid_digest(grid),
+        grid_digest=grid_digest(view.grid),
         beam=view.beam,
         crowding=way.crowding,
         beam_cycles=way.beam_cycles,
@@ -131,11 +135,11 @@ def factorized(
 
 
 def _root_bytes(
-    view: View, way: Way, tile: tuple[int, int], stages: Sequence[Stage]
+    view: View, way: Way, tile: tuple[int, int], stages: Sequence[Stage], width: int
 ) -> tuple[float, float]:
     """Return the device memory that a root takes while it is worked on, and that of its tables.
 
-    See `factorize`.
+    See `factorize` and `leaves`.
     """
     taps, channels, work, tables = way.filters.aperture.taps, view.lines.channels, 0.0, 0.0
     density, sides = 2 * way.filters.aperture.upsampling, way.sides
@@ -155,13 +159,20 @@ def _root_bytes(
                 most *= 1 + OF_BEAM
         subimages = _subimages(sides[0], side)
         work += 8 * subimages * most * (stages[level].samples + 2 * GUARD)
-        tables += subimages * 20 + (channels + 32) * (8 + (12 if level else 20))
+        tables += subimages * (44 if level else 20) + (channels + 32) * (8 + (12 if level else 20))
         channels = everywhere
-    terms = 9 if view.beam is None else 19
-    tiles = _subimages(sides[0], tile)
-    references = 0 if tile == sides[-1] else 12
-    work += tiles * ((most + 16) * (references + 4 * terms) + 24) + 8 * math.prod(sides[0])
-    return work, tables + tiles * 12 + 36 * channels
+    normalise = view.beam is not None and view.beam.normalise
+    tables += 40 * channels
+    if view.surface.is_plane:
+        terms = 9 if view.beam is None else 19
+        parts, slots = _subimages(sides[0], tile), math.prod(sides[0])
+        references = 0 if tile == sides[-1] else 12
+        work += parts * ((most + 16) * (references + 4 * terms) + 24)
+    else:
+        slots = view.most_slots(sides[-1], sides[0], width)
+        parts = slots / (STACK * width)
+        tables += 24 * parts + 12 * slots
+    return work + 8 * (1 + normalise) * slots, tables + 12 * parts
 
 
 def _subimages(root: tuple[int, int], side: tuple[int, int]) -> int:

@@ -214,6 +214,16 @@ class Grid:
             positions[..., 2] += self.height_m[rows, columns]
         return positions
 
+    def at(self, index: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Return the positions of some pixels, counted row by row, float64 [..., 3], metres."""
+        if self.points_m is not None:
+            return self.points_m.reshape(-1, 3)[index]
+        row, column = np.divmod(index[..., None], self.shape[1])
+        positions = self.origin_m + row * self.row_step_m + column * self.column_step_m
+        if self.height_m is not None:
+            positions[..., 2] += self.height_m.reshape(-1)[index]
+        return positions
+
     def window(self, rows: slice = _ALL, columns: slice = _ALL) -> Self:
         """Return the sub-grid of some rows and columns (the first two axes of points).
 

@@ -24,8 +24,11 @@ BLOCKS = {16: (4, 4), 8: (2, 4), 4: (2, 2), 1: (1, 1)}
 GEOMETRY_ERROR = 3.2e-5
 """Relative rms error that the geometry's rounding and expansion may add: -90 dB."""
 
+ROUNDING = 2.2e-7
+"""Rms error of a phase, radians, per cycle over a part's radius: measured."""
+
 _SIDES = (64, 32, 16)
-_FLOAT32_ERROR = 2.2e-7  # rms error, radians, per cycle over a part's radius: measured
+_AT_ONCE = 1024  # groups: what stays in a cache
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,7 +107,7 @@ class Groups:
     index : int64 [parts, part_pixels]
         Which pixel each slot computes, flat; a pixel may stand in several slots to fill a group.
     centre_m : float64 [parts, 3]
-        Mean of a group's extremes.
+        What offsets are from, near a group's points.
     offset_m : float32 [parts, part_pixels, 3]
         Positions from the centre.
     width : int
@@ -137,8 +140,10 @@ class Groups:
     def block_radius_m(self) -> float:
         """Largest distance of a pixel from the one in the middle of its work-item's block."""
         blocks = self.offset_m.reshape(-1, self.width, 3)
-        middle = 5 if self.width == 16 else 0  # the lane that cl/backproject.cl takes
-        return float(np.linalg.norm(blocks - blocks[:, middle, None], axis=-1).max())
+        middle = 5 if self.width == 16 else 0  # MIDDLE in cl/backproject.cl
+        away = blocks - blocks[:, middle, None]
+        away *= away
+        return float(np.sqrt(away.sum(axis=-1).max()))
 
     def centres_m(self, parts: slice) -> NDArray[np.float64]:
         """Return the centres of some groups, float64 [parts, 3]."""
@@ -228,7 +233,7 @@ def tiles(
         remainder_m = 0.15 * shape.radius_m**4 / (8 * nearest**3)
         remainder_m += 0.04 * shape.block_radius_m**3 / nearest**2
         remainder_m += 0.2 * speed_ratio * shape.radius_m**3 / nearest**2
-        rounding = _FLOAT32_ERROR * cycles_per_m * shape.radius_m
+        rounding = ROUNDING * cycles_per_m * shape.radius_m
         phase_error = np.hypot(2 * np.pi * cycles_per_m * remainder_m, rounding)
         block_error = 0.0
         if beam is not None:
@@ -265,7 +270,7 @@ def _nearest_m(tiles: Tiles, antennas_m: NDArray[np.float64]) -> float:
 def largest_radius_m(cycles_per_m: float) -> float:
     """Return how far from a group's centre float32 allows its pixels to lie."""
     with np.errstate(divide="ignore"):
-        return GEOMETRY_ERROR / _FLOAT32_ERROR / np.float64(cycles_per_m)
+        return GEOMETRY_ERROR / ROUNDING / np.float64(cycles_per_m)
 
 
 def _group(grid: Grid, largest_radius_m: float, width: int) -> Groups:
@@ -287,6 +292,46 @@ def _group(grid: Grid, largest_radius_m: float, width: int) -> Groups:
     centre = (positions[index].min(axis=1) + positions[index].max(axis=1)) / 2
     offset = (positions[index] - centre[:, None]).astype(np.float32)
     return Groups(grid, index, centre, offset, width)
+
+
+def groups_within(
+    grid: Grid,
+    part: NDArray[np.int64],
+    place: NDArray[np.int64],
+    middle_m: NDArray[np.float64],
+    width: int,
+) -> tuple[Groups, NDArray[np.int64]]:
+    """Return groups of points that lie within one part each, about whose middle they are.
+
+    Parameters
+    ----------
+    part, place : int64 [pixels]
+        What holds each pixel, and numbers that near ones in it have alike.
+    middle_m : float64 [parts, 3]
+
+    Returns
+    -------
+    groups : Groups
+    part : int64 [groups]
+        What holds each, ascending.
+    """
+    size = STACK * width
+    order = np.argsort(part * (place.max() + 1) + place)
+    held = np.bincount(part, minlength=len(middle_m))
+    counts = -(-held // size)
+    of_group = np.repeat(np.arange(len(middle_m)), counts)
+    first = (np.arange(len(of_group)) - (np.cumsum(counts) - counts)[of_group]) * size
+    last = held[of_group] - 1
+    before = (np.cumsum(held) - held)[of_group]
+    index = np.empty((len(of_group), size), np.int64)
+    centre_m, offset_m = middle_m[of_group], np.empty((*index.shape, 3), np.float32)
+    for start in range(0, len(index), _AT_ONCE):
+        some = slice(start, start + _AT_ONCE)
+        # The last point of a part fills up its last group.
+        slots = np.minimum(first[some, None] + np.arange(size), last[some, None])
+        index[some] = order[before[some, None] + slots]
+        offset_m[some] = grid.at(index[some]) - centre_m[some, None]
+    return Groups(grid, index, centre_m, offset_m, width), of_group
 
 
 def _neighbours(grid: Grid, positions: NDArray[np.float64], width: int) -> NDArray[np.int64]:

@@ -37,7 +37,7 @@ from clsas.plan import Plan, grid_digest
 from clsas.planner import checked_pairs, plan, tolerance_in_db
 from clsas.store import Record, Store
 from clsas.survey import Survey, files_of, has_ended, largest_gap_m, open_files, open_survey
-from clsas.window import MOST_TRACK_PINGS, BeamWindow, touches_rectangles
+from clsas.window import MOST_TRACK_PINGS, BeamWindow, touches_boxes
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -499,7 +499,7 @@ class _Sight:
         seen = self.survey.within(*self.ranges_m(grid))
         if self.beam is not None:
             centre_m, half_m = _box(grid)
-            seen &= touches_rectangles(
+            seen &= touches_boxes(
                 self.beam, centre_m[None], half_m, self.phase_centres_m, self.along
             )[0]
         return seen

@@ -13,6 +13,7 @@ from clsas.geometry import pairwise_range_m
 from clsas.grid import Grid
 from clsas.lines import RangeLines
 from clsas.plan import Plan
+from clsas.surface import surface_of
 from clsas.tree import Division
 
 Stages = Sequence[tuple[int, int]]
@@ -136,7 +137,7 @@ def plan_errors_m(
     """
     order = np.argsort(mean_track(lines).place, kind="stable")
     ends_m = lines.tx_m[order], lines.rx_m[order]
-    division = Division(grid, plan.sides)
+    division = Division(surface_of(grid), plan.sides)
     pixels = np.asarray(pixels)
     points_m = grid.origin_m + pixels[:, :1] * grid.row_step_m + pixels[:, 1:] * grid.column_step_m
     errors_m = -pairwise_range_m(points_m, *ends_m)

@@ -90,7 +90,7 @@ def plan(
     -------
     Plan
         With empty `sides`, plain backprojection, where nothing is faster: near the aperture, with
-        few channels or pixels, and off a plane.
+        few channels or pixels, or much relief.
 
     Raises
     ------
@@ -190,10 +190,7 @@ def _allowed(taps: tuple[int, int] | None, depth: int | None) -> Allowed | None:
 
 def _divisible(view: View) -> bool:
     """Return whether an image can be factorized at all."""
-    normalise = view.beam is not None and view.beam.normalise
-    if view.track is None or view.grid.size == 1 or normalise:
-        return False
-    return view.sweeps_once
+    return view.track is not None and view.grid.size > 1 and view.sweeps_once
 
 
 def _fastest(

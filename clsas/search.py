@@ -53,8 +53,10 @@ class _Sizes:
     view : View
     sides : int [sizes, 2]
         Rows and columns.
-    pixels, counts : int
-        Of a subimage, and how many there are.
+    counts : int
+        How many of them hold anything.
+    slots : int
+        Pixels of these on average, with those that fill up what is computed together.
     share : float
         Which part of the channels sees anything of one.
     reach_m : float
@@ -67,8 +69,8 @@ class _Sizes:
 
     view: View
     sides: NDArray[np.int64]
-    pixels: NDArray[np.int64]
     counts: NDArray[np.int64]
+    slots: NDArray[np.float64]
     share: NDArray[np.float64]
     reach_m: NDArray[np.float64]
     beam_turns: NDArray[np.float64]
@@ -91,8 +93,9 @@ class _Sizes:
 
         [i, j]: while a subimage of size i is seen, of phases that turn as for size j.
         """
-        per_side = self.view.cycles_in_root(root, [tuple(side) for side in self.sides[within]])
-        return per_side @ self.sides[within].T
+        sides = [tuple(side) for side in self.sides[within].tolist()]
+        extents = [self.view.extents(side, root=root if any(root) else None) for side in sides]
+        return self.view.cycles_in_root(root, sides) @ np.stack(extents).T
 
     def in_root(self, root: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         """Return the sizes inside a root's, and their `cycles` there."""
@@ -106,11 +109,10 @@ def _sizes(
     """Return all sizes of subimages that a grid may be divided into."""
     rows, columns = (
         [side for side in sides if side < 2 * max(n, min(sides))]
-        for sides, n in zip((_ROWS, _COLUMNS), view.grid.shape, strict=True)
+        for sides, n in zip((_ROWS, _COLUMNS), view.surface.plane.shape, strict=True)
     )
     pairs = list(product(rows, columns))
     sides = np.array(pairs)
-    pixels = np.prod(sides, axis=1)
     beam_turns = np.zeros(len(sides))
     if view.beam is not None:
         beam_turns[:] = [view.cycles(view.beam_rates, view.seen(side)) for side in pairs]
@@ -118,12 +120,12 @@ def _sizes(
     return _Sizes(
         view,
         sides,
-        pixels,
-        counts=np.prod(-(-np.array(view.grid.shape) // sides), axis=1),
+        counts=np.array([view.subimages(side) for side in pairs]),
+        slots=np.array([view.slots(side, device.info.width) for side in pairs]),
         share=np.array([view.share_seen(side) for side in pairs]),
         reach_m=np.array([view.reach_m(side) for side in pairs]),
         beam_turns=beam_cycles * beam_turns,
-        leaf=~curved & (pixels >= leaf_pixels),
+        leaf=~curved & (np.prod(sides, axis=1) >= leaf_pixels),
     )
 
 
@@ -169,7 +171,9 @@ def _options(sizes: _Sizes, filters_db: float, costs: Costs, allowed: Allowed) -
         samples = 2 * sizes.reach_m * choice.rate / view.lines.range_step_m
         samples += choice.final_taps + 16
         beam = view.beam is not None
-        of_leaf = costs.leaf_line_ns(sizes.pixels, choice.final_taps, beam=beam)
+        of_leaf = costs.leaf_line_ns(
+            sizes.slots, choice.final_taps, tiled=view.surface.is_plane, beam=beam
+        )
         options.append(
             _Option(
                 choice,
@@ -261,7 +265,7 @@ def root_limits(view: View, allowed: float) -> tuple[int, int] | None:
     """
     rows, columns = (
         min((side for side in sides if side >= n), default=sides[-1])
-        for sides, n in zip((_ROWS, _COLUMNS), view.grid.shape, strict=True)
+        for sides, n in zip((_ROWS, _COLUMNS), view.surface.plane.shape, strict=True)
     )
     while root_error(view, (rows, columns)) > allowed:
         smaller = [(rows // 2, columns), (rows, columns // 2)]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -9,11 +10,11 @@ from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
 from clsas import tree
-from clsas.aperture import cycles_per_pixel, drift, mean_track, stretches
+from clsas.aperture import cycles_per_extent, drift, mean_track, stretches
 from clsas.geometry import pairwise_range_m
-from clsas.grid import Grid
 from clsas.lines import RangeLines
 from clsas.plan import Plan, margin, padded_length
+from clsas.surface import Surface
 from clsas.tree import Division, Nodes, Ranges
 
 _ON_TRACK = 1e-4  # wavelengths
@@ -31,6 +32,8 @@ class Sector:
         Their first pixels.
     root_m : float64 [roots, 3]
         Middles of the roots.
+    relative_m : list of float64 [roots, subimages, 3]
+        Those of subimages from that of their root, stage by stage.
     nodes : list of Nodes
         Stage by stage.
     needs : list of Ranges
@@ -40,6 +43,7 @@ class Sector:
 
     roots: NDArray[np.int64]
     root_m: NDArray[np.float64]
+    relative_m: list[NDArray[np.float64]]
     nodes: list[Nodes]
     needs: list[Ranges]
     place: NDArray[np.float64]
@@ -63,19 +67,17 @@ class Geometry:
         Which line each is.
     division : Division
     drift : float64 [3]
-    relative_m : list of float64 [subimages, 3]
-        Middles of the subimages from that of their root, stage by stage.
     ramps : bool
         Whether channels' phases are turned along their lines.
     samples_per_m, cycles_per_m : float
         Of the upsampled lines.
     """
 
-    def __init__(self, lines: RangeLines, grid: Grid, chosen: Plan) -> None:
-        self.lines, self.grid, self.plan = lines, grid, chosen
+    def __init__(self, lines: RangeLines, surface: Surface, chosen: Plan) -> None:
+        self.lines, self.surface, self.plan = lines, surface, chosen
         self.samples_per_m = chosen.resampling.samples_per_m(lines)
         self.cycles_per_m = chosen.resampling.cycles_per_m(lines)
-        self.division = Division(grid, chosen.sides)
+        self.division = Division(surface, chosen.sides)
         track = mean_track(lines)
         self.channels = np.argsort(track.place, kind="stable")
         self.track = replace(track, place=track.place[self.channels])
@@ -92,19 +94,18 @@ class Geometry:
             lines.sound_speed_m_s,
         )
         self.drift = drift(lines)
-        self._steps_m = np.stack([grid.row_step_m, grid.column_step_m])
-        self._seen = Division(grid, (chosen.sides[0], self._together(), chosen.sides[-1]))
-        first = np.zeros((1, 2), np.int64)
-        centres_m = [
-            self.division.centres_m(level, self.division.corners(level, first))[0]
-            for level in range(len(chosen.sides))
-        ]
-        self.relative_m = [each - centres_m[0] for each in centres_m]
+        self._seen = Division(surface, (chosen.sides[0], self._together(), chosen.sides[-1]))
         # The thesis's method has none; on the track itself there is nothing to make up for.
         off_m = np.abs(self.phase_centres_m - self.track.positions_m(self.track.place)).max()
         wavelength_m = lines.sound_speed_m_s / max(lines.carrier_hz, 1.0)
         away = not np.array_equal(lines.tx_m, lines.rx_m) or off_m > _ON_TRACK * wavelength_m
         self.ramps = bool(away and not chosen.nearest)
+
+    @functools.cached_property
+    def nearest_m(self) -> float:
+        """Least distance of a channel from a root's middle."""
+        root_m = self.division.centres_m(0, self.division.roots)
+        return float(cdist(root_m, self.phase_centres_m).min())
 
     def _together(self) -> tuple[int, int]:
         """Return the size of rectangles of leaves for all of which it is decided who sees them.
@@ -114,10 +115,8 @@ class Geometry:
         leaf, parent = self.plan.sides[-1], self.plan.sides[max(len(self.plan.sides) - 2, 0)]
         if self.plan.beam is None:
             return parent
-        root_m = self.division.centres_m(0, self.division.roots)
-        nearest_m = cdist(root_m, self.phase_centres_m).min()
-        most_m = OF_BEAM * nearest_m * np.ptp(np.clip(self.plan.beam.limits, -1, 1))
-        along_m = np.abs(self._steps_m @ self.along.T)
+        most_m = OF_BEAM * self.nearest_m * np.ptp(np.clip(self.plan.beam.limits, -1, 1))
+        along_m = np.abs(self.surface.steps_m[:2] @ self.along.T)
 
         def fits(side: tuple[int, int]) -> bool:
             inside = parent[0] % side[0] == parent[1] % side[1] == 0
@@ -130,8 +129,13 @@ class Geometry:
 
     def sector(self, roots: NDArray[np.int64]) -> Sector:
         """Return the geometry of some roots, given by their first pixels [roots, 2]."""
-        division, chosen, track, last = self.division, self.plan, self.track, len(self.plan.sides)
+        division, chosen, track, surface = self.division, self.plan, self.track, self.surface
+        sides, last = chosen.sides, len(chosen.sides) - 1
         root_m = division.centres_m(0, roots)
+        corners = [division.corners(level, roots) for level in range(len(sides))]
+        relative_m = [
+            division.centres_m(level, each) - root_m[:, None] for level, each in enumerate(corners)
+        ]
         seen_at = place = track.places_seen_from(root_m, self.phase_centres_m)
         nodes = []
         if chosen.nearest:
@@ -140,31 +144,34 @@ class Geometry:
                 nodes.append(tree.nearest_nodes(place, position_m, factor))
                 place, position_m = nodes[-1].place, nodes[-1].position_m
         else:
-            rates = cycles_per_pixel(
+            rates = cycles_per_extent(
                 track,
-                self.grid,
+                surface,
                 root_m,
-                chosen.sides[0],
+                surface.extents_in(sides[0], sides[0], roots).max(axis=0),
                 chosen.highest_cycles_per_m,
-                division.radius_m(last - 1),
+                surface.radius_m(sides[-1]),
                 chosen.beam,
                 self.along,
             )
-            for level, (rows, columns) in enumerate(chosen.sides):
-                rate = chosen.crowding[level] * (rows * rates[0] + columns * rates[1])
-                if chosen.beam is not None and level == last - 1:
+            for level, side in enumerate(sides):
+                extents = chosen.crowding[level] * surface.extents_in(side, sides[0], roots)
+                rate = np.einsum("ra,ars->rs", extents, rates)
+                if chosen.beam is not None and level == last:
                     rate += chosen.beam_cycles * tree.beam_rate(
                         chosen.beam, track, self.along, root_m
                     )
                 nodes.append(tree.interpolated_nodes(track, rate, place, chosen.aperture))
                 place = nodes[-1].place
+        together = self._seen.sides[1]
         seen_m = self._seen.centres_m(1, self._seen.corners(1, roots))
-        half_m = np.array(self._seen.sides[1])[:, None] / 2 * self._steps_m
+        half_m = surface.extents_in(together, sides[0], roots).max(axis=0) / 2
+        half_m = half_m[:, None] * surface.steps_m
         seen = tree.seen_from(chosen.beam, track, self.along, seen_m, half_m)
         seen = tuple(each[:, self._seen.parents(2)] for each in seen)
-        inside = np.all(division.corners(last - 1, roots) < self.grid.shape, axis=-1)
+        inside = surface.holds(sides[-1], corners[-1])
         needs = tree.ranges(division, nodes, seen_at, seen, inside)
-        return Sector(roots, root_m, nodes, needs, seen_at)
+        return Sector(roots, root_m, relative_m, nodes, needs, seen_at)
 
     def references(self, sector: Sector) -> dict[str, NDArray]:
         """Return how roots see the raw channels, in the order of their nodes, [roots, channels].
@@ -198,7 +205,7 @@ class Geometry:
     def _ramp(self, sector: Sector) -> NDArray[np.float64]:
         """Return by how many cycles per sample the phase of channels grows beyond their place's."""
         virtual_m = self.track.positions_m(sector.place)
-        stretch = stretches(*self._path[:2], self.grid, sector.root_m, virtual_m)
+        stretch = stretches(*self._path[:2], self.surface.plane, sector.root_m, virtual_m)
         return stretch * self.cycles_per_m / self.samples_per_m
 
 

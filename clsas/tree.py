@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
 from clsas.aperture import MeanTrack, turned
-from clsas.grid import Grid
 from clsas.interpolation import Interpolator
-from clsas.window import BeamWindow, touches_rectangles
+from clsas.surface import Surface
+from clsas.window import BeamWindow, touches_boxes
 
 _EVEN_NODES = 2.5  # over how many nodes their spacing is smoothed, rms
 _LEAST_RATE = 0.3  # of the mean over the track
@@ -154,16 +154,16 @@ def nearest_nodes(
 
 @dataclass(frozen=True)
 class Division:
-    """A grid divided into subimages of several sizes, each size within the one before.
+    """A surface divided into subimages of several sizes, each size within the one before.
 
     Attributes
     ----------
-    grid : Grid
+    surface : Surface
     sides : tuple of (rows, columns)
-        Pixels along a subimage's sides, from the roots to the leaves; each divides the one before.
+        Cells along a subimage's sides, from the roots to the leaves; each divides the one before.
     """
 
-    grid: Grid
+    surface: Surface
     sides: tuple[tuple[int, int], ...]
 
     @property
@@ -173,7 +173,8 @@ class Division:
         Most grids have their rows along the track: these roots share the samples of lines.
         """
         rows, columns = (
-            np.arange(0, n, side) for n, side in zip(self.grid.shape, self.sides[0], strict=True)
+            np.arange(0, n, side)
+            for n, side in zip(self.surface.plane.shape, self.sides[0], strict=True)
         )
         down, across = np.meshgrid(rows, columns, indexing="ij")
         return np.stack([down.ravel(), across.ravel()], axis=1)
@@ -192,13 +193,8 @@ class Division:
         return roots[:, None] + inside * self.sides[level]
 
     def centres_m(self, level: int, corners: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the middles of subimages that begin at some pixels, [..., 3]."""
-        middle = corners + (np.array(self.sides[level]) - 1) / 2
-        return (
-            self.grid.origin_m
-            + middle[..., :1] * self.grid.row_step_m
-            + middle[..., 1:] * self.grid.column_step_m
-        )
+        """Return the middles of subimages that begin at some cells, [..., 3]."""
+        return self.surface.middles_m(self.sides[level], corners)
 
     def parents(self, level: int) -> NDArray[np.int64]:
         """Return which subimage of the size before holds each, within a root, [subimages]."""
@@ -216,12 +212,6 @@ class Division:
         rows, columns = self._divided(level - 1, level)
         split = values.reshape(len(values), down, rows, across, columns).swapaxes(2, 3)
         return split.reshape(len(values), down * across, rows * columns)
-
-    def radius_m(self, level: int) -> float:
-        """Half a subimage's longer diagonal."""
-        rows, columns = self.sides[level]
-        down, across = rows * self.grid.row_step_m, columns * self.grid.column_step_m
-        return max(np.linalg.norm(down + across), np.linalg.norm(down - across)) / 2
 
     def _divided(self, level: int, later: int) -> tuple[int, int]:
         """Return into how many rows and columns of smaller subimages one of a level is divided."""
@@ -266,7 +256,7 @@ def seen_from(
     centres_m: NDArray[np.float64],
     half_m: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return from where to where on the track rectangles are seen, two arrays [...].
+    """Return from where to where on the track boxes are seen, two arrays [...].
 
     Infinite where they are seen from the track's ends; -inf and -inf where from nowhere.
 
@@ -275,8 +265,8 @@ def seen_from(
     along : float64 [samples, 3]
         The track's direction at `track.samples`; not needed without a beam.
     centres_m : float64 [..., 3]
-    half_m : float64 [2, 3]
-        Half the sides, as vectors.
+    half_m : float64 [axes, 3]
+        Half their sides, as vectors.
     """
     shape = centres_m.shape[:-1]
     if beam is None:
@@ -295,7 +285,7 @@ def seen_from(
         for result, values in ((around_m, position_m), (spread, along)):
             away = np.linalg.norm(values[run] - values[middle[index]], axis=1)
             result[index] = away.max()
-    seen = touches_rectangles(
+    seen = touches_boxes(
         beam, centres_m, half_m, position_m[middle], along[middle], around_m, spread
     )
     ever = seen.any(axis=1)
@@ -307,7 +297,7 @@ def seen_from(
             mine = np.flatnonzero(ever & (of_edge == index))
             if mine.size:
                 some = position_m[run][::step], along[run][::step]
-                seen = touches_rectangles(beam, centres_m[mine], half_m, *some)
+                seen = touches_boxes(beam, centres_m[mine], half_m, *some)
                 found = np.where(seen.any(axis=1), seen.argmax(axis=1), len(some[0]))
                 edge[mine] += step * found
     # What no single place sees may be seen from between them.
@@ -354,7 +344,7 @@ def ranges(
     seen : two float64 [roots, leaves]
         From where to where on the track a leaf is seen.
     inside : bool [roots, leaves]
-        Whether it holds a pixel of the grid.
+        Whether it holds a pixel.
     """
     places = [nodes[0].ordered(place), *(each.place for each in nodes)]
     # Beyond what channels contribute to there are nodes that hold nothing.

@@ -12,12 +12,14 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import KDTree
 
 from clsas import interpolation
-from clsas.aperture import cycles_per_pixel, mean_track, turned
+from clsas.aperture import cycles_per_extent, mean_track, turned
 from clsas.grid import Grid
 from clsas.interpolation import Interpolator, Resampling
+from clsas.layout import STACK
 from clsas.lines import RangeLines
-from clsas.tree import Division, beam_directions, beam_rate
-from clsas.window import BeamWindow, touches_rectangles
+from clsas.surface import LEAST_SIDE, surface_of, within_roots
+from clsas.tree import beam_directions, beam_rate
+from clsas.window import BeamWindow, touches_boxes
 
 _SPOTS = (0.02, 0.25, 0.5, 0.75, 0.98)  # of rows and columns, where the geometry is looked at
 _COARSER = 4  # of the track's samples: where roots are compared
@@ -28,10 +30,14 @@ class View:
 
     Attributes
     ----------
+    surface : Surface
+        Where the grid's pixels lie.
     spots_m : float64 [spots, 3]
         Over the whole grid, its corners among them.
-    rates : float64 [2, spots, samples]
-        Cycles per pixel row and column and per unit of the track's parameter.
+    root : (rows, columns) or None
+        Of the roots within which `rates` hold.
+    rates : float64 [axes, spots, samples]
+        Cycles per row, column and metre of relief, and per unit of the track's parameter.
     kept : dict
         What was found out about this view before.
     """
@@ -44,10 +50,10 @@ class View:
         half_band = (occupied[-1] if len(occupied) else 0.5) / lines.range_step_m
         centre = interpolation.cycles_per_m(lines, self.spectrum.centre)
         self.highest_cycles_per_m = abs(centre) + half_band
-        self.track = mean_track(lines) if grid.is_planar else None
+        self.track = mean_track(lines)
         if self.track is None:
             return
-        self.steps_m = np.stack([grid.row_step_m, grid.column_step_m])
+        self.surface, self.root = surface_of(grid), None
         self.spots_m = self._pixels_m(_SPOTS)
         position = self.track.positions_m(self.track.samples)
         sight = self.spots_m[:, None] - position
@@ -56,8 +62,10 @@ class View:
         self.on_track = np.abs(self.track.samples - 0.5) <= 0.5
         # Between the places that are looked at a pixel may come nearer.
         dense_m = self._pixels_m(np.linspace(0, 1, 65))
-        cell_m = np.linalg.norm(self.steps_m, axis=1) @ (np.array(grid.shape) - 1) / 128
-        nearest_m = KDTree(lines.phase_centres_m).query(dense_m)[0].min() - cell_m
+        steps_m = np.linalg.norm(self.surface.steps_m[:2], axis=1)
+        between_m = steps_m @ (np.array(self.surface.plane.shape) - 1) / 128
+        between_m += self.surface.relief_m(LEAST_SIDE).max() / 2
+        nearest_m = KDTree(lines.phase_centres_m).query(dense_m)[0].min() - between_m
         self.nearest_m = max(float(nearest_m), 1e-9)
         self._seen: dict[tuple[int, int], NDArray[np.bool_]] = {}
         self._within: dict[tuple[int, int], View] = {}
@@ -67,7 +75,7 @@ class View:
             self.channels_along = beam.directions(lines)
             self.along = beam_directions(self.channels_along, self.track, self.track.samples)
             self.beam_rates = beam_rate(beam, self.track, self.along, self.spots_m)
-        self.rates = self._rates((0, 0), self.spots_m)
+        self.rates = self._rates(np.zeros(len(self.surface.steps_m)), self.spots_m)
 
     @property
     def sweeps_once(self) -> bool:
@@ -96,7 +104,35 @@ class View:
     def _pixels_m(self, places: Sequence[float]) -> NDArray[np.float64]:
         """Return positions at some parts of the rows and columns, [n, 3]."""
         index = np.stack(np.meshgrid(places, places, indexing="ij"), axis=-1).reshape(-1, 2)
-        return self.grid.origin_m + index * (np.array(self.grid.shape) - 1) @ self.steps_m
+        index = index * (np.array(self.surface.plane.shape) - 1)
+        plane_m = self.surface.plane.origin_m + index @ self.surface.steps_m[:2]
+        # As far off the plane as the pixels around.
+        around = (index // LEAST_SIDE * LEAST_SIDE).astype(np.int64)
+        middle = around + (np.array(LEAST_SIDE) - 1) / 2
+        off_m = self.surface.middles_m(LEAST_SIDE, around) - self.surface.plane.origin_m
+        return plane_m + off_m - middle @ self.surface.steps_m[:2]
+
+    def subimages(self, side: tuple[int, int]) -> int:
+        """Return how many subimages of a size hold a pixel."""
+        return int((self.surface.counts(side) > 0).sum())
+
+    def slots(self, side: tuple[int, int], width: int) -> float:
+        """Return the pixels of such a subimage, on average, filled up to what is computed together.
+
+        On a plane that is all of it; elsewhere groups of blocks of `width` pixels.
+        """
+        if self.surface.is_plane:
+            return float(math.prod(side))
+        slots = self._filled_up(side, width)
+        return float(slots.sum() / (slots > 0).sum())
+
+    def most_slots(self, side: tuple[int, int], root: tuple[int, int], width: int) -> int:
+        """Return the most of these in a root."""
+        return int(within_roots(np.add, self._filled_up(side, width), side, root).max())
+
+    def _filled_up(self, side: tuple[int, int], width: int) -> NDArray[np.int64]:
+        size = STACK * width
+        return -(-self.surface.counts(side) // size) * size
 
     def seen(self, side: tuple[int, int]) -> NDArray[np.bool_]:
         """Return from where channels see anything of subimages at the spots, [spots, samples]."""
@@ -104,10 +140,10 @@ class View:
         if self.beam is None:
             return on_track
         if side not in self._seen:
-            half_m = np.array(side)[:, None] / 2 * self.steps_m
+            half_m = self.extents(side, np.max)[:, None] / 2 * self.surface.steps_m
             origin_m = self.spots_m[0]
             track_m = self.track.positions_m(self.track.samples) - origin_m
-            self._seen[side] = on_track & touches_rectangles(
+            self._seen[side] = on_track & touches_boxes(
                 self.beam, self.spots_m - origin_m, half_m, track_m, self.along
             )
         return self._seen[side]
@@ -134,7 +170,21 @@ class View:
         over: Callable[[NDArray[np.float64]], float] = np.mean,
     ) -> float:
         """Return `cycles` of the phases of subimages of a size."""
-        return self.cycles(side[0] * self.rates[0] + side[1] * self.rates[1], seen, over)
+        rates = np.tensordot(self.extents(side, over), self.rates, 1)
+        return self.cycles(rates, seen, over)
+
+    def extents(
+        self,
+        side: tuple[int, int],
+        over: Callable[[NDArray[np.float64]], float] = np.mean,
+        root: tuple[int, int] | None = None,
+    ) -> NDArray[np.float64]:
+        """Return the extents of subimages of a size, [axes].
+
+        Their relief is the most in a root, of this view unless given, on average over the roots.
+        """
+        relief_m = self.surface.relief_m(side, root or self.root)
+        return self.surface.extents(side, float(over(relief_m)))
 
     def channels(self, taps: int, density: float, turns: ArrayLike) -> ArrayLike:
         """Return the virtual channels of a subimage while whose phase turns by some cycles.
@@ -154,31 +204,33 @@ class View:
         """Return this view with the rates of subimages in roots of a size."""
         if root not in self._within:
             view = self._within[root] = copy.copy(self)
-            view.rates, view.kept = self._rates(root, self.spots_m), {}
+            view.root, view.kept = root, {}
+            view.rates = self._rates(self.extents(root, np.max), self.spots_m)
         return self._within[root]
 
     def cycles_in_root(
         self, root: tuple[int, int], sides: Sequence[tuple[int, int]]
     ) -> NDArray[np.float64]:
-        """Return `cycles` per row and column in a root, while subimages of some sizes are seen.
+        """Return `cycles` per extent in a root, while subimages of some sizes are seen.
 
-        Roughly; [sides, 2].
+        Roughly; [sides, axes].
         """
         middle = np.arange(len(_SPOTS) ** 2).reshape(len(_SPOTS), -1)[1:-1, 1:-1].ravel()
         if root not in self._in_roots:
-            self._in_roots[root] = self._rates(root, self.spots_m[middle], _COARSER)
+            extents = self.extents(root, np.max) if any(root) else self.surface.extents(root)
+            self._in_roots[root] = self._rates(extents, self.spots_m[middle], _COARSER)
         seen = np.stack([self.seen(side)[middle, ::_COARSER] for side in sides])
         while_seen = seen * np.gradient(self.track.samples[::_COARSER])
         return np.einsum("nps,kps->nk", while_seen, self._in_roots[root]) / len(middle)
 
     def _rates(
-        self, root: tuple[int, int], centres_m: NDArray[np.float64], every: int = 1
+        self, extents: NDArray[np.float64], centres_m: NDArray[np.float64], every: int = 1
     ) -> NDArray[np.float64]:
-        return cycles_per_pixel(
+        return cycles_per_extent(
             self.track,
-            self.grid,
+            self.surface,
             centres_m,
-            root,
+            extents,
             self.highest_cycles_per_m,
             self.nearest_m,
             self.beam,
@@ -187,18 +239,19 @@ class View:
         )
 
     @functools.cached_property
-    def slopes_m(self) -> tuple[float, float]:
-        """Largest change of range per row and per column."""
+    def slopes_m(self) -> NDArray[np.float64]:
+        """Largest change of range per row, column and metre of relief, [axes]."""
         seen = self.seen((16, 16))
-        slopes = np.abs(self.sight @ self.steps_m.T)
-        slopes = slopes[seen] if seen.any() else slopes.reshape(-1, 2)
-        return tuple(1.02 * slopes.max(axis=0))
+        slopes = np.abs(self.sight @ self.surface.steps_m.T)
+        slopes = slopes[seen] if seen.any() else slopes.reshape(-1, slopes.shape[-1])
+        return 1.02 * slopes.max(axis=0)
 
     def reach_m(self, side: tuple[int, int]) -> float:
         """Return by how much a pixel's range may differ from that of its subimage's centre."""
-        radius_m = Division(self.grid, (side,)).radius_m(0)
+        radius_m = self.surface.radius_m(side)
         bend_m = radius_m**2 / (2 * max(self.nearest_m, radius_m))
-        return min(float(np.dot(side, self.slopes_m)) / 2 + bend_m, radius_m)
+        extents = self.surface.extents(side, self.surface.relief_m(side).max())
+        return min(float(extents @ self.slopes_m) / 2 + bend_m, radius_m)
 
     def half_lengths(
         self,

@@ -349,7 +349,7 @@ def channel_ranges(
     return ranges
 
 
-def touches_rectangles(
+def touches_boxes(
     window: BeamWindow,
     centres_m: NDArray[np.float64],
     half_m: NDArray[np.float64],
@@ -358,12 +358,12 @@ def touches_rectangles(
     around_m: float | NDArray[np.float64] = 0.0,
     spread: float | NDArray[np.float64] = 0.0,
 ) -> NDArray[np.bool_]:
-    """Return whether a window may touch rectangles, bool [rectangles, places].
+    """Return whether a window may touch boxes, bool [boxes, places].
 
     Parameters
     ----------
-    centres_m : float64 [rectangles, 3]
-    half_m : float64 [2, 3]
+    centres_m : float64 [boxes, 3]
+    half_m : float64 [axes, 3]
         Half their sides, as vectors.
     track_m, along : float64 [places, 3]
         Positions on the track and its unit direction there.
@@ -384,7 +384,7 @@ def touches_rectangles(
     low, high = window.limits
     if np.any(around_m) or np.any(spread):
         ratio = np.minimum(around_m * inverse, 0.5)
-        # From so much nearer the rectangle reaches further; half way to it, anywhere.
+        # From so much nearer the box reaches further; half way to it, anywhere.
         reach = (reach + ratio + ratio**3) / (1 - ratio) + spread
         reach[ratio == 0.5] = np.inf
     return (sine + reach > low) & (sine - reach < high)

@@ -4,7 +4,7 @@ from cases import along_x, beside
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from clsas.aperture import cycles_per_pixel, drift, mean_track, turned
+from clsas.aperture import cycles_per_extent, drift, mean_track, turned
 from clsas.grid import Grid
 from clsas.lines import RangeLines
 
@@ -157,7 +157,7 @@ def test_no_phase_turns_faster_than_its_bound(seed):
     side, inside = (64, 64), (16, 8)
     centre_m = grid.origin_m + 31.5 * steps.sum(axis=0)
     cycles_per_m = 2 / WAVELENGTH
-    bound = cycles_per_pixel(track, grid, centre_m[None], side, cycles_per_m, 0.1)[:, 0]
+    bound = cycles_per_extent(track, grid, centre_m[None], side, cycles_per_m, 0.1)[:, 0]
     bound = inside[0] * bound[0] + inside[1] * bound[1]
     # A subimage of 16 x 8 pixels anywhere inside, and a pixel anywhere in that.
     places = track.samples

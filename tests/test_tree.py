@@ -6,7 +6,7 @@ from cases import along_x
 from test_factorize import BEAMS, EXACT_IS_SLOW, arc, around, made, near, over, straight, swaying
 
 from clsas import interpolation, tree
-from clsas.aperture import cycles_per_pixel, mean_track
+from clsas.aperture import cycles_per_extent, mean_track
 from clsas.backproject import backproject
 from clsas.factorize import factorize
 from clsas.interpolation import Spectrum
@@ -70,7 +70,7 @@ def interpolation_error_db(case, side, aperture, root=(128, 128)):
     for corner in division.roots[:2]:
         middle_m = division.centres_m(0, corner[None])
         place = track.places_seen_from(middle_m, centres_m)
-        rates = cycles_per_pixel(track, grid, middle_m, root, cycles_per_m, division.radius_m(1))
+        rates = cycles_per_extent(track, grid, middle_m, root, cycles_per_m, division.radius_m(1))
         rate = side[0] * rates[0] + side[1] * rates[1]
         nodes = interpolated_nodes(track, rate, place, aperture)
         between = nodes.base[0][:, None] + np.arange(nodes.taps)
@@ -110,7 +110,7 @@ def any_nodes(shuffled=False):
         lines = lines.select(np.random.default_rng(0).permutation(lines.channels))
     track = mean_track(lines)
     middle_m = Division(grid, ((64, 64),)).centres_m(0, np.array([[0, 0], [64, 64]]))
-    rates = cycles_per_pixel(track, grid, middle_m, (64, 64), lines.carrier_cycles_per_m, 0.1)
+    rates = cycles_per_extent(track, grid, middle_m, (64, 64), lines.carrier_cycles_per_m, 0.1)
     place = track.places_seen_from(middle_m, lines.phase_centres_m)
     aperture = interpolation.design(6, 2.0, FLAT)
     return place, interpolated_nodes(track, 64 * rates.sum(axis=0), place, aperture)

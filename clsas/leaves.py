@@ -1,0 +1,463 @@
+"""The last stage of a factorized image: pixels from the virtual channels of the leaves."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import pyopencl as cl
+from numpy.typing import NDArray
+
+from clsas import tree
+from clsas.backproject import (
+    beam_arguments,
+    channel_pitch,
+    float_pairs,
+    lookup_room,
+    normalising,
+)
+from clsas.device import Device, Slot
+from clsas.errors import power
+from clsas.geometry import bistatic_range_m
+from clsas.layout import BLOCKS, STACK, Tiles, groups_within
+from clsas.lines import RangeLines
+from clsas.plan import GUARD
+from clsas.sector import Geometry, Sector
+from clsas.tree import Division
+from clsas.window import INTERVALS
+
+_ALL = slice(None)
+_SHARE = 0.02  # of an image's error: what neighbours' weights may be off
+_ROOM = 16  # for a vector that begins at the last channel
+
+Finish = Callable[[], int]
+"""To be called to wait for pixels, and to put them in place; returns how many they are."""
+
+
+@dataclass(frozen=True)
+class Level:
+    """The lines of one stage: `half` samples to either side of a subimage's centre."""
+
+    half: int
+    length: int
+
+    @property
+    def pitch(self) -> int:
+        """Samples of a line with the zeros around it."""
+        return self.length + 2 * GUARD
+
+    @property
+    def centre(self) -> int:
+        """Sample of the subimage's centre."""
+        return self.half + GUARD
+
+
+class Leaves:
+    """What forms pixels from leaves: of tiles on a plane, of groups of points elsewhere."""
+
+    def __init__(self, lines: RangeLines, geometry: Geometry, level: Level, device: Device) -> None:
+        chosen = geometry.plan
+        self.lines, self.geometry, self.level, self.device = lines, geometry, level, device
+        self.plan, self.surface, self.width = chosen, geometry.surface, device.info.width
+        self.normalise = chosen.beam is not None and chosen.beam.normalise
+        self.per_sine, self.beam = beam_arguments(device, chosen.beam, lines)
+        self.filter = device.upload(chosen.final.coefficients.astype(np.float32))
+        # Where tile and leaf are one, every line is aligned on its centre.
+        self.centred = chosen.tile == chosen.sides[-1]
+        self.per_sample = geometry.cycles_per_m / geometry.samples_per_m
+        self.slot = Slot(device)
+
+    def _options(self, block_radius_m: float) -> dict[str, int]:
+        reach = block_radius_m * self.geometry.samples_per_m
+        fits = reach <= lookup_room(self.plan.final.taps)
+        return {
+            "WIDTH": self.width,
+            "TAPS": self.plan.final.taps,
+            "TILE_ROWS": self.plan.tile[0],
+            "TILE_COLUMNS": self.plan.tile[1],
+            "PERMUTE": int(self.device.info.permute and fits),
+            "BISTATIC": 0,
+            "MOVING": 0,
+            "BEAM": 0 if self.plan.beam is None else INTERVALS,
+            "ONE_CUBIC": 0,
+            "NORMALISE": int(self.normalise),
+            "ALONE": 1,
+            "CENTRED": int(self.centred),
+        }
+
+    def fill(self, slot: Slot, sector: Sector) -> None:
+        """Start copying to the device what it is told of a sector's leaves."""
+        position_m = sector.positions_m(-1)
+        rows = [float_pairs(position_m.reshape(-1, 3))]
+        if self.plan.beam is not None:
+            along = tree.interpolated_directions(
+                self.geometry.track.samples, self.geometry.along, sector.nodes[-1].place
+            )
+            rows.append((along * self.per_sine).astype(np.float32).reshape(-1, 3))
+        slot.fill("geometry", _padded(np.concatenate(rows, axis=1).T))
+        if self.normalise:
+            slot.fill("shares", _padded(_shares(sector).reshape(1, -1)))
+        self._fill(slot, sector)
+
+    def form(
+        self,
+        tables: Slot,
+        sector: Sector,
+        batch: slice,
+        samples: cl.Buffer,
+        image: NDArray[np.complex64],
+    ) -> Finish:
+        """Start forming the pixels of some roots of a sector from the lines of their leaves.
+
+        Parameters
+        ----------
+        tables : Slot
+            Filled by `fill`.
+        samples : Buffer
+            The lines.
+        image : complex64
+            That is put together.
+        """
+        raise NotImplementedError
+
+    def blank(self, sector: Sector, batch: slice, image: NDArray[np.complex64]) -> Finish:
+        """Return what sets the pixels of some roots that no channel sees to 0."""
+        raise NotImplementedError
+
+    def _fill(self, slot: Slot, sector: Sector) -> None:
+        raise NotImplementedError
+
+    def _ranges(
+        self,
+        sector: Sector,
+        root: NDArray[np.int64],
+        leaf: NDArray[np.int64],
+    ) -> NDArray[np.int32]:
+        """Return the nodes of parts of some leaves, and the first one's line, [..., 3]."""
+        need = sector.needs[-1]
+        node = root * sector.nodes[-1].place.shape[1]
+        in_batch = root % self.plan.roots_at_once * need.first.shape[1] + leaf
+        ranges = [
+            node + need.first[root, leaf],
+            node + need.last[root, leaf],
+            in_batch * sector.stride(-1),
+        ]
+        return np.stack(np.broadcast_arrays(*ranges), axis=-1).astype(np.int32)
+
+    def _sums(self, tables: Slot, pixels: int) -> list[cl.Buffer]:
+        """Return what kernels take that normalise, beside the beam."""
+        if not self.normalise:
+            return []
+        return [self.slot.buffer("sums", 8 * pixels), tables["shares"]]
+
+
+class PlaneLeaves(Leaves):
+    """Leaves on a plane, in tiles."""
+
+    def __init__(self, lines: RangeLines, geometry: Geometry, level: Level, device: Device) -> None:
+        super().__init__(lines, geometry, level, device)
+        chosen, plane = self.plan, self.surface.plane
+        options = self._options(Tiles(plane, chosen.tile[0], self.width).block_radius_m)
+        self.expand = device.kernel("backproject", "expand_tiles", **options)
+        self.backproject = device.kernel("backproject", "backproject_tiles", **options)
+        self.tiles = Division(self.surface, (chosen.sides[0], chosen.sides[-1], chosen.tile))
+        self.per_root, self.leaf_of = self.tiles.per_root(2), self.tiles.parents(2)
+        first = np.zeros((1, 2), np.int64)
+        centres_m = self.tiles.centres_m(2, self.tiles.corners(2, first))[0]
+        self.tile_m = centres_m - self.tiles.centres_m(0, first)
+        self.centres = device.upload(np.tile(float_pairs(self.tile_m), (chosen.roots_at_once, 1)))
+
+    def _fill(self, slot: Slot, sector: Sector) -> None:
+        root = np.arange(len(sector.roots))[:, None]
+        slot.fill("ranges", self._ranges(sector, root, self.leaf_of))
+
+    def form(
+        self,
+        tables: Slot,
+        sector: Sector,
+        batch: slice,
+        samples: cl.Buffer,
+        image: NDArray[np.complex64],
+    ) -> Finish:
+        """Start forming the pixels of some roots; see `Leaves.form`."""
+        device, slot, chosen, level = self.device, self.slot, self.plan, self.level
+        parts = [self._part(root) for root in sector.roots[batch]]
+        tiles, first_tile = len(parts) * self.per_root, batch.start * self.per_root
+        pitch = channel_pitch(sector.stride(-1))
+        if self.centred:
+            references = [level.centre]
+        else:
+            slot.wait()
+            values = self._references(sector, batch, pitch)
+            for name, each in values.items():
+                slot.fill(name, each)
+            references = [slot[name] for name in values]
+        plane, samples_per_m = self.surface.plane, self.geometry.samples_per_m
+        steps_m = (plane.column_step_m, plane.row_step_m)
+        drift = [self.geometry.drift @ step * samples_per_m for step in steps_m]
+        terms = 9 + (10 if chosen.beam is not None else 0)
+        expansion = slot.buffer("expansion", 4 * terms * tiles * pitch)
+        device.run(
+            self.expand,
+            (pitch // self.width, tiles),
+            tables["geometry"],
+            pitch,
+            sector.nodes[-1].place.size + _ROOM,
+            tables["ranges"],
+            first_tile,
+            self.centres,
+            *(np.append(step, 0).astype(np.float32) for step in steps_m),
+            samples_per_m,
+            np.array(drift, np.float32),
+            expansion,
+            *self.beam[1:2],
+            wait_for=tables.filled,
+        )
+        height, width = chosen.sides[0]
+        pixels = slot.buffer("pixels", 8 * len(parts) * height * width)
+        sums = self._sums(tables, len(parts) * height * width)
+        slot.busy = device.run(
+            self.backproject,
+            (chosen.tile[0] * chosen.tile[1] // (self.width * STACK), tiles),
+            samples,
+            level.pitch,
+            *references,
+            expansion,
+            pitch,
+            tables["ranges"],
+            first_tile,
+            self.per_sample,
+            self.filter,
+            pixels,
+            width,
+            0,
+            *self.beam,
+            *sums,
+            wait_for=slot.filled,
+        )
+        formed = [(image, part) for part in parts]
+        ready = [self._read(pixels, n, *each) for n, each in enumerate(formed)]
+        weights = []
+        if sums:
+            weights = [np.empty(image[part].shape, np.complex64) for part in parts]
+            everything = (slice(None), slice(None))
+            ready += [self._read(sums[0], n, each, everything) for n, each in enumerate(weights)]
+        device.queue.flush()
+
+        def finish() -> int:
+            cl.wait_for_events(ready)
+            for part, each in zip(parts, weights, strict=bool(weights)):
+                image[part] *= normalising(each.real, self.lines.channels)
+            return sum(image[part].size for part in parts)
+
+        return finish
+
+    def blank(self, sector: Sector, batch: slice, image: NDArray[np.complex64]) -> Finish:
+        """Return what sets pixels to 0; see `Leaves.blank`."""
+        parts = [self._part(root) for root in sector.roots[batch]]
+
+        def finish() -> int:
+            for part in parts:
+                image[part] = 0
+            return sum(image[part].size for part in parts)
+
+        return finish
+
+    def _part(self, root: NDArray[np.int64]) -> tuple[slice, slice]:
+        """Return which pixels of the image a root has."""
+        ends = np.minimum(root + self.plan.sides[0], self.surface.plane.shape)
+        rows, columns = (slice(int(a), int(b)) for a, b in zip(root, ends, strict=True))
+        return rows, columns
+
+    def _read(
+        self,
+        pixels: cl.Buffer,
+        index: int,
+        image: NDArray[np.complex64],
+        part: tuple[slice, slice],
+    ) -> cl.Event:
+        """Start reading the pixels of a root into a part of an image."""
+        height, width = self.plan.sides[0]
+        rows, columns = image[part].shape
+        return cl.enqueue_copy(
+            self.device.queue,
+            image,
+            pixels,
+            buffer_origin=(0, index * height, 0),
+            buffer_pitches=(8 * width, 0),
+            host_origin=(8 * (part[1].start or 0), part[0].start or 0, 0),
+            host_pitches=(8 * image.shape[1], 0),
+            region=(8 * columns, rows, 1),
+            is_blocking=False,
+        )
+
+    def _references(self, sector: Sector, batch: slice, pitch: int) -> dict[str, NDArray]:
+        """Return where tiles' centres lie in the lines of their leaves, [roots, tiles, pitch]."""
+        shape, centre = (batch.stop - batch.start, self.per_root, pitch), self.level.centre
+        sample = np.full(shape, centre, np.int32)
+        fraction, phase = np.zeros((2, *shape), np.float32)
+        first = sector.needs[-1].first[batch][:, self.leaf_of]
+        leaves_m = sector.relative_m[-1][batch][:, self.leaf_of]
+        for root, position_m in enumerate(sector.positions_m(-1)[batch]):
+            index = np.minimum(first[root][:, None] + np.arange(pitch), len(position_m) - 1)
+            node_m, leaf_m = position_m[index], leaves_m[root]
+            range_m = bistatic_range_m(self.tile_m[:, None], node_m, node_m)
+            range_m -= bistatic_range_m(leaf_m[:, None], node_m, node_m)
+            range_m -= (self.tile_m - leaf_m) @ self.geometry.drift[:, None]
+            place = range_m * self.geometry.samples_per_m
+            sample[root] += np.rint(place).astype(np.int32)
+            fraction[root] = place - np.rint(place)
+            phase[root] = np.remainder(self.geometry.cycles_per_m * range_m + 0.5, 1) - 0.5
+        return {"sample": sample, "fraction": fraction, "phase": phase}
+
+
+class SurfaceLeaves(Leaves):
+    """Leaves off a plane, in groups of points about their centres."""
+
+    def __init__(self, lines: RangeLines, geometry: Geometry, level: Level, device: Device) -> None:
+        super().__init__(lines, geometry, level, device)
+        division = geometry.division
+        roots, last = division.roots, len(division.sides) - 1
+        corners = division.corners(last, roots)
+        middles_m = division.centres_m(last, corners).reshape(-1, 3)
+        leaf, place = (each.ravel()[self.surface.cell] for each in self._cells(corners))
+        self.groups, self.leaf = groups_within(
+            self.surface.grid, leaf, place, middles_m, self.width
+        )
+        self.ends = np.searchsorted(self.leaf, np.arange(len(roots) + 1) * corners.shape[1])
+        held = np.bincount(leaf // corners.shape[1], minlength=len(roots))
+        self.pixels_before = np.concatenate([[0], np.cumsum(held)])
+        block_m = self.groups.block_radius_m
+        options = self._options(block_m)
+        if self.plan.beam is not None:
+            nearest_m = max(
+                self.geometry.nearest_m - self.surface.radius_m(division.sides[0]), 1e-6
+            )
+            error = self.plan.beam.block_error(block_m / nearest_m)
+            options["ONE_CUBIC"] = int(error**2 < _SHARE * power(self.plan.predicted_error_db))
+        self.backproject = device.kernel("backproject", "backproject_points", **options)
+
+    def _cells(self, corners: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Return of every cell, [rows, columns], which leaf holds it and where there it lies.
+
+        The leaves are numbered as their corners come, [roots, leaves, 2], the cells block by block.
+        """
+        side = self.geometry.division.sides[-1]
+        number = np.empty(corners.max(axis=(0, 1)) // side + 1, np.int64)
+        count = corners[..., 0].size
+        number[tuple(np.moveaxis(corners // side, -1, 0))] = np.arange(count).reshape(
+            corners.shape[:-1]
+        )
+        row, column = (np.arange(n) for n in self.surface.plane.shape)
+        height, width = BLOCKS[self.width]
+        down = row % side[0] // height * side[1] * height + row % height * width
+        across = column % side[1] // width * height * width + column % width
+        leaf = number[np.ix_(row // side[0], column // side[1])]
+        return leaf, down[:, None] + across
+
+    def _roots(self, sector: Sector, batch: slice = _ALL) -> slice:
+        """Return which of all roots those of a sector, or some of these, are."""
+        across = -(-self.surface.plane.shape[1] // self.plan.sides[0][1])
+        row, column = sector.roots[0] // np.array(self.plan.sides[0])
+        first = int(row * across + column)
+        some = range(first, first + len(sector.roots))[batch]
+        return slice(some.start, some.stop)
+
+    def _groups(self, roots: slice) -> slice:
+        """Return which groups some roots have."""
+        return slice(int(self.ends[roots.start]), int(self.ends[roots.stop]))
+
+    def _fill(self, slot: Slot, sector: Sector) -> None:
+        roots = self._roots(sector)
+        groups = self._groups(roots)
+        root, leaf = np.divmod(self.leaf[groups], sector.relative_m[-1].shape[1])
+        root -= roots.start
+        slot.fill("ranges", self._ranges(sector, root, leaf))
+        slot.fill("centres", float_pairs(sector.relative_m[-1][root, leaf]))
+        slot.fill("offsets", self.groups.offset_m[groups].reshape(-1, 3).T)
+
+    def form(
+        self,
+        tables: Slot,
+        sector: Sector,
+        batch: slice,
+        samples: cl.Buffer,
+        image: NDArray[np.complex64],
+    ) -> Finish:
+        """Start forming the pixels of some roots; see `Leaves.form`."""
+        first = self._groups(self._roots(sector)).start
+        roots = self._roots(sector, batch)
+        groups = self._groups(roots)
+        count, size = self.groups.index[groups].shape
+        formed = [np.empty((count, size), np.complex64) for _ in range(1 + self.normalise)]
+        ready = []
+        if count:
+            buffers = [self.slot.buffer("pixels", 8 * count * size)]
+            buffers += self._sums(tables, count * size)
+            self.device.run(
+                self.backproject,
+                (count,),
+                samples,
+                self.level.pitch,
+                self.level.centre,
+                np.append(self.geometry.drift, 0).astype(np.float32),
+                tables["geometry"],
+                sector.nodes[-1].place.size + _ROOM,
+                0,
+                tables["ranges"],
+                groups.start - first,
+                self.per_sample,
+                self.filter,
+                buffers[0],
+                0,
+                tables["centres"],
+                tables["offsets"],
+                size * (self._groups(self._roots(sector)).stop - first),
+                self.geometry.samples_per_m,
+                *self.beam,
+                *buffers[1:],
+                wait_for=tables.filled,
+            )
+            ready = [
+                cl.enqueue_copy(self.device.queue, each, buffer, is_blocking=False)
+                for each, buffer in zip(formed, buffers, strict=False)
+            ]
+            self.device.queue.flush()
+
+        def finish() -> int:
+            for event in ready:
+                event.wait()
+            for sums in formed[1:]:
+                formed[0] *= normalising(sums.real, self.lines.channels)
+            return self._put(roots, formed[0], image)
+
+        return finish
+
+    def blank(self, sector: Sector, batch: slice, image: NDArray[np.complex64]) -> Finish:
+        """Return what sets pixels to 0; see `Leaves.blank`."""
+        return lambda: self._put(self._roots(sector, batch), np.complex64(0), image)
+
+    def _put(
+        self, roots: slice, pixels: NDArray[np.complex64], image: NDArray[np.complex64]
+    ) -> int:
+        """Set the pixels of some roots; return how many they are."""
+        image.reshape(-1)[self.groups.index[self._groups(roots)]] = pixels
+        return int(self.pixels_before[roots.stop] - self.pixels_before[roots.start])
+
+
+def _shares(sector: Sector) -> NDArray[np.float32]:
+    """Return how many raw channels each of the last stage's virtual ones stands for, [roots, n]."""
+    shares = np.ones(sector.place.shape)
+    for nodes in sector.nodes:
+        roots, count = nodes.place.shape
+        index = nodes.base[..., None] + np.arange(nodes.taps)
+        index += np.arange(roots)[:, None, None] * count
+        weighted = nodes.ordered(shares)[..., None] * nodes.weights
+        shares = np.bincount(index.ravel(), weighted.ravel(), roots * count).reshape(roots, count)
+    return shares.astype(np.float32)
+
+
+def _padded(rows: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return rows in which a vector may begin at any channel."""
+    return np.pad(rows, ((0, 0), (0, _ROOM)), mode="edge")
