@@ -35,7 +35,7 @@ _SMALL_SIZES = ((100, 128), (400, 256))
 """Those of what is backprojected only."""
 _TOLERANCES_DB = (-25.0, -45.0, -60.0)
 # Plans differ with what they are told that things cost: these have shallow trees and deep ones.
-_TOLD = (Costs(pixel_ns=1e3), Costs(pixel_ns=1e3, leaf_ns=10.0))
+_TOLD = (Costs(pixel_ns=1e3, point_ns=1e3), Costs(pixel_ns=1e3, leaf_ns=10.0))
 _EXACT_DB = -50.0
 _WIDE = BeamWindow(120.0, "hann")  # every channel sees every pixel
 _PIXEL_M = 0.02
@@ -52,6 +52,7 @@ class _Image:
     form: Callable[[], object]
     channels: int
     expected: Plan | Exact
+    tiled: bool
     seconds: list[float] = field(default_factory=list)
     kernels: list[dict[str, float]] = field(default_factory=list)
 
@@ -84,13 +85,15 @@ class _Image:
         """How often it takes what `_HOST` costs."""
         e = self.expected
         if isinstance(e, Exact):
-            grouped = 0.0 if e.tiled else e.parts * e.part_pixels
+            grouped = 0.0 if self.tiled else e.parts * e.part_pixels
             lines = self.channels * e.samples
             return [1.0, lines, 0.0, 0.0, grouped, e.parts * self.channels]
         roots = e.stages[0].subimages
         batches = -(-roots // e.roots_at_once)
         lines = self.channels * e.resampling.length
-        return [1.0, lines, roots * self.channels, batches * len(e.sides), 0.0, 0.0]
+        last = e.stages[-1]
+        grouped = 0.0 if self.tiled else last.operations / last.channels
+        return [1.0, lines, roots * self.channels, batches * len(e.sides), grouped, 0.0]
 
     @property
     def stage_work(self) -> list[float]:
@@ -186,17 +189,22 @@ def _images(device: Device) -> list[_Image]:
     def backprojected(lines: RangeLines, grid: Grid, beam: BeamWindow | None = None) -> None:
         expected = expect(View(lines, grid, beam), _EXACT_DB, device)
         form = partial(backproject, lines, grid, device=device, accuracy_db=_EXACT_DB, beam=beam)
-        images.append(_Image(form, lines.channels, expected))
+        images.append(_Image(form, lines.channels, expected, expected.tiled))
+
+    def factorized(lines: RangeLines, grid: Grid, tolerance_db: float, told: Costs) -> None:
+        chosen = plan(lines, grid, tolerance_db=tolerance_db, device=device, costs=told)
+        if not chosen.is_exact:
+            form = partial(factorize, lines, grid, chosen, device=device)
+            images.append(_Image(form, lines.channels, chosen, grid.is_planar))
 
     for channels, pixels in _SIZES:
         lines, grid = _scene(channels, pixels)
         backprojected(lines, grid)
         backprojected(lines, grid, _WIDE)
         for tolerance_db, told in product(_TOLERANCES_DB, _TOLD):
-            chosen = plan(lines, grid, tolerance_db=tolerance_db, device=device, costs=told)
-            if not chosen.is_exact:
-                form = partial(factorize, lines, grid, chosen, device=device)
-                images.append(_Image(form, channels, chosen))
+            factorized(lines, grid, tolerance_db, told)
+            if told is _TOLD[0]:
+                factorized(lines, grid.with_height(np.zeros(grid.shape)), tolerance_db, told)
     for channels, pixels in _SMALL_SIZES:
         lines, grid = _scene(channels, pixels)
         backprojected(lines, grid)
@@ -234,7 +242,7 @@ def _fitted(images: list[_Image]) -> Costs:
     of_host = [
         max(min(image.seconds) - image.in_stages - image.in_pixels, 1e-6) for image in images
     ]
-    pixel_ns = per_pixel([i for i in exact if i.expected.tiled and not i.expected.weighted])
+    pixel_ns = per_pixel([i for i in exact if i.tiled and not i.expected.weighted])
     weighted = [i for i in exact if i.expected.weighted]
     of_beam = [1e9 * image.in_pixels - pixel_ns * image.pixel_work for image in weighted]
     pairs = [image.pixel_work / COST[image.expected.taps] for image in weighted]
@@ -245,9 +253,10 @@ def _fitted(images: list[_Image]) -> Costs:
             [image.stage_work for image in plans],
             [image.in_stages for image in plans],
         ),
-        leaf_ns=per_pixel(plans),
+        leaf_ns=per_pixel([i for i in plans if i.tiled]),
+        leaf_point_ns=per_pixel([i for i in plans if not i.tiled]),
         pixel_ns=pixel_ns,
-        point_ns=per_pixel([i for i in exact if not i.expected.tiled]),
+        point_ns=per_pixel([i for i in exact if not i.tiled]),
         beam_ns=max(float(np.median(np.divide(of_beam, pairs))), 0.0),
     )
 
@@ -268,7 +277,8 @@ def _expected_s(image: _Image, costs: Costs) -> float:
     if isinstance(image.expected, Exact):
         return image.expected.seconds(costs)
     work = zip((*_HOST, *_STAGES), (*image.host_work, *image.stage_work), strict=True)
-    in_pixels_ns = costs.leaf_ns * image.pixel_work
+    leaf_ns = costs.leaf_ns if image.tiled else costs.leaf_point_ns
+    in_pixels_ns = leaf_ns * image.pixel_work
     return 1e-9 * (sum(getattr(costs, name) * amount for name, amount in work) + in_pixels_ns)
 
 

@@ -32,8 +32,8 @@ class Costs:
         Per subimage and channel in a stage: geometry and weights.
     sample_ns, sample_tap_ns : float
         Per aligned sample in a stage, and per tap of either filter.
-    leaf_ns : float
-        Per pixel and virtual channel of the last stage, with 4 taps.
+    leaf_ns, leaf_point_ns : float
+        Per pixel and virtual channel of the last stage, with 4 taps, on a plane and off it.
     group_ns : float
         Per pixel off a plane: to put it into a group, on the host.
     part_ns : float
@@ -52,6 +52,7 @@ class Costs:
     sample_ns: float = 0.28
     sample_tap_ns: float = 0.03
     leaf_ns: float = 0.8
+    leaf_point_ns: float = 1.5
     group_ns: float = 300.0
     part_ns: float = 30.0
     pixel_ns: float = 0.68
@@ -69,7 +70,7 @@ class Costs:
 
     def leaf_line_ns(self, pixels: ArrayLike, taps: int, *, tiled: bool, beam: bool) -> ArrayLike:
         """Return the cost of a virtual channel of a leaf that is backprojected."""
-        leaf_ns = self.leaf_ns if tiled else max(self.leaf_ns, self.point_ns)
+        leaf_ns = self.leaf_ns if tiled else self.leaf_point_ns
         return pixels * (leaf_ns * COST[taps] + self.beam_ns * beam) + self.channel_ns
 
     def pair_ns(self, taps: int, *, tiled: bool, beam: bool) -> float:

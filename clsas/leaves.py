@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import permutations
 
 import numpy as np
 import pyopencl as cl
@@ -447,14 +448,21 @@ class SurfaceLeaves(Leaves):
 
 
 def _shares(sector: Sector) -> NDArray[np.float32]:
-    """Return how many raw channels each of the last stage's virtual ones stands for, [roots, n]."""
-    shares = np.ones(sector.place.shape)
-    for nodes in sector.nodes:
-        roots, count = nodes.place.shape
-        index = nodes.base[..., None] + np.arange(nodes.taps)
-        index += np.arange(roots)[:, None, None] * count
-        weighted = nodes.ordered(shares)[..., None] * nodes.weights
-        shares = np.bincount(index.ravel(), weighted.ravel(), roots * count).reshape(roots, count)
+    """Return how many raw channels each of the last stage's virtual ones stands for, [roots, n].
+
+    Their weights by the beam, a smooth function along the track, are interpolated by cubics: the
+    stages' filters, which err as little on average, all err alike on something so smooth.
+    """
+    nodes = sector.nodes[-1].place
+    shares = np.empty(nodes.shape)
+    for root, (at, place) in enumerate(zip(nodes, sector.place, strict=True)):
+        first = np.clip(np.searchsorted(at, place) - 2, 0, len(at) - 4)
+        index = first[:, None] + np.arange(4)
+        near = at[index]
+        weights = np.ones(near.shape)
+        for one, other in permutations(range(4), 2):
+            weights[:, one] *= (place - near[:, other]) / (near[:, one] - near[:, other])
+        shares[root] = np.bincount(index.ravel(), weights.ravel(), len(at))
     return shares.astype(np.float32)
 
 

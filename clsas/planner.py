@@ -35,6 +35,7 @@ NEAREST_UPSAMPLING = 8.0
 
 _ROOTS_SHARE, _NODES_SHARE = 0.25, 0.2  # of the error allowed
 _MOST_CROWDING = 2.0
+_LEAST_COVERED = 0.25
 _LEAST_BEAM_CYCLES, _MOST_BEAM_CYCLES = 0.5, 64.0
 
 
@@ -190,7 +191,11 @@ def _allowed(taps: tuple[int, int] | None, depth: int | None) -> Allowed | None:
 
 def _divisible(view: View) -> bool:
     """Return whether an image can be factorized at all."""
-    return view.track is not None and view.grid.size > 1 and view.sweeps_once
+    if view.track is None or view.grid.size == 1 or not view.sweeps_once:
+        return False
+    # What is normalised is amplified with its errors where hardly anything is seen.
+    normalise = view.beam is not None and view.beam.normalise
+    return not normalise or view.least_covered >= _LEAST_COVERED
 
 
 def _fastest(

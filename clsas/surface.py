@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import math
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -100,9 +101,9 @@ class Surface:
 
     def radius_m(self, side: tuple[int, int]) -> float:
         """Return the largest distance of a pixel from the middle of its subimage of a size."""
-        down, across = np.array(side)[:, None] * self.steps_m[:2]
-        diagonal_m = max(np.linalg.norm(down + across), np.linalg.norm(down - across))
-        return float(np.hypot(diagonal_m, self.relief_m(side).max())) / 2
+        extents = self.extents(side, float(self.relief_m(side).max()))
+        corners = np.array(list(product((-0.5, 0.5), repeat=len(extents)))) * extents
+        return float(np.linalg.norm(corners @ self.steps_m, axis=1).max())
 
     @functools.cached_property
     def _smallest(self) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:

@@ -13,13 +13,14 @@ from scipy.spatial import KDTree
 
 from clsas import interpolation
 from clsas.aperture import cycles_per_extent, mean_track, turned
+from clsas.backproject import wavelength_m
 from clsas.grid import Grid
 from clsas.interpolation import Interpolator, Resampling
 from clsas.layout import STACK
 from clsas.lines import RangeLines
 from clsas.surface import LEAST_SIDE, surface_of, within_roots
 from clsas.tree import beam_directions, beam_rate
-from clsas.window import BeamWindow, touches_boxes
+from clsas.window import BeamWindow, sines, touches_boxes
 
 _SPOTS = (0.02, 0.25, 0.5, 0.75, 0.98)  # of rows and columns, where the geometry is looked at
 _COARSER = 4  # of the track's samples: where roots are compared
@@ -100,6 +101,16 @@ class View:
             if seen.size and np.ptp(seen) > abs(seen.mean()):
                 return False
         return True
+
+    @property
+    def least_covered(self) -> float:
+        """Least sum of the beam's weights at a pixel, over the largest."""
+        points_m = self._pixels_m(np.linspace(0, 1, 33))
+        on_track = self.on_track
+        position_m = self.track.positions_m(self.track.samples[on_track])
+        sine = sines(points_m, position_m, self.along[on_track])
+        sums = self.beam.weights(sine, wavelength_m(self.lines)).sum(axis=0)
+        return float(sums.min() / max(sums.max(), 1e-30))
 
     def _pixels_m(self, places: Sequence[float]) -> NDArray[np.float64]:
         """Return positions at some parts of the rows and columns, [n, 3]."""

@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 from clsas.aperture import cycles_per_extent, drift, mean_track, turned
 from clsas.grid import Grid
 from clsas.lines import RangeLines
+from clsas.surface import surface_of
 
 CARRIER = 120e3
 WAVELENGTH = 1500.0 / CARRIER
@@ -157,7 +158,9 @@ def test_no_phase_turns_faster_than_its_bound(seed):
     side, inside = (64, 64), (16, 8)
     centre_m = grid.origin_m + 31.5 * steps.sum(axis=0)
     cycles_per_m = 2 / WAVELENGTH
-    bound = cycles_per_extent(track, grid, centre_m[None], side, cycles_per_m, 0.1)[:, 0]
+    surface = surface_of(grid)
+    extents = surface.extents(side)
+    bound = cycles_per_extent(track, surface, centre_m[None], extents, cycles_per_m, 0.1)[:, 0]
     bound = inside[0] * bound[0] + inside[1] * bound[1]
     # A subimage of 16 x 8 pixels anywhere inside, and a pixel anywhere in that.
     places = track.samples

@@ -6,6 +6,7 @@ from clsas import bench, tree
 from clsas.geometry import bistatic_range_m
 from clsas.planner import plan
 from clsas.sector import Geometry
+from clsas.surface import surface_of
 from clsas.window import BeamWindow
 
 HANN = BEAMS[0]
@@ -17,7 +18,7 @@ def wide():
     case = bench.scaled(512)
     lines, grid = case.lines(), case.grid
     chosen = plan(lines, grid, tolerance_db=-40, beam=case.beam, costs=EXACT_IS_SLOW)
-    return Geometry(lines, grid, chosen)
+    return Geometry(lines, surface_of(grid), chosen)
 
 
 def beside():
@@ -33,8 +34,8 @@ def any_track(request, wide):
         return wide
     lines = wide.lines.select(np.flatnonzero(np.abs(wide.lines.tx_m[:, 0] - 2) > 8))
     beam = BeamWindow(3.0, "hann")
-    chosen = plan(lines, wide.grid, tolerance_db=-40, beam=beam, costs=EXACT_IS_SLOW)
-    return Geometry(lines, wide.grid, chosen)
+    chosen = plan(lines, wide.surface.grid, tolerance_db=-40, beam=beam, costs=EXACT_IS_SLOW)
+    return Geometry(lines, surface_of(wide.surface.grid), chosen)
 
 
 # What is formed
@@ -84,7 +85,7 @@ def test_subimages_use_what_their_parents_have(any_track):
 def test_roots_do_not_depend_on_those_prepared_beside_them(case):
     lines, grid = case()
     chosen = plan(lines, grid, tolerance_db=-40, costs=EXACT_IS_SLOW)
-    geometry = Geometry(lines, grid, chosen)
+    geometry = Geometry(lines, surface_of(grid), chosen)
     roots = geometry.division.roots
     together = geometry.sector(roots)
     for index in range(len(roots)):
@@ -104,12 +105,12 @@ def test_roots_do_not_depend_on_those_prepared_beside_them(case):
 def test_leaves_are_seen_from_wherever_they_are_seen_alone():
     lines, grid = beside()
     chosen = plan(lines, grid, tolerance_db=-40, beam=HANN, costs=EXACT_IS_SLOW)
-    geometry = Geometry(lines, grid, chosen)
+    geometry = Geometry(lines, surface_of(grid), chosen)
     sector = geometry.sector(geometry.division.roots)
     last = len(geometry.plan.sides) - 1
     leaves = geometry.division.corners(last, sector.roots)
     half_m = np.array(geometry.plan.sides[-1])[:, None] / 2
-    half_m = half_m * [geometry.grid.row_step_m, geometry.grid.column_step_m]
+    half_m = half_m * [grid.row_step_m, grid.column_step_m]
     start, stop = tree.seen_from(
         HANN, geometry.track, geometry.along, geometry.division.centres_m(last, leaves), half_m
     )
@@ -117,7 +118,7 @@ def test_leaves_are_seen_from_wherever_they_are_seen_alone():
     counts = np.full(len(sector.roots), sector.place.shape[1])
     for nodes in sector.nodes:  # as far as channels reach
         counts = nodes.base[np.arange(len(counts)), counts - 1] + nodes.taps
-    inside = np.all(leaves < geometry.grid.shape, axis=-1)
+    inside = np.all(leaves < grid.shape, axis=-1)
     for root, leaf in np.argwhere(inside & (stop > start)):
         mine = np.flatnonzero(
             (place[root] >= start[root, leaf]) & (place[root] <= stop[root, leaf])

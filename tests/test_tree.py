@@ -12,6 +12,7 @@ from clsas.factorize import factorize
 from clsas.interpolation import Spectrum
 from clsas.planner import plan
 from clsas.quality import relative_error_db
+from clsas.surface import surface_of
 from clsas.tree import Division, interpolated_nodes, nearest_nodes
 
 FLAT = Spectrum(0.0, (np.arange(64) + 0.5) / 128, np.full(64, 1 / 64))
@@ -25,7 +26,7 @@ SIDES = ((64, 48), (32, 16), (16, 4))
 
 @pytest.mark.parametrize("shape", [(1, 1), (64, 48), (65, 49), (200, 100)])
 def test_roots_hold_every_pixel_once(shape):
-    division = Division(around(0, 40, shape=shape), SIDES)
+    division = Division(surface_of(around(0, 40, shape=shape)), SIDES)
     count = np.zeros((384, 384), int)
     for row, column in division.roots:
         count[row : row + 64, column : column + 48] += 1
@@ -35,7 +36,7 @@ def test_roots_hold_every_pixel_once(shape):
 
 @pytest.mark.parametrize("level", [1, 2])
 def test_subimages_fill_their_parents(level):
-    division = Division(around(0, 40, shape=(150, 100)), SIDES)
+    division = Division(surface_of(around(0, 40, shape=(150, 100))), SIDES)
     parents = division.corners(level - 1, division.roots)
     children = division.corners(level, division.roots)
     inside = children - parents[:, division.parents(level)]
@@ -47,13 +48,14 @@ def test_subimages_fill_their_parents(level):
 
 def test_a_centre_is_the_mean_of_pixels():
     grid = around(3, 40, shape=(150, 100))
-    division = Division(grid, SIDES)
+    surface = surface_of(grid)
+    division = Division(surface, SIDES)
     corners = division.corners(1, division.roots[:1])
     positions_m = grid.positions_m()
     for (row, column), centre_m in zip(corners[0], division.centres_m(1, corners)[0], strict=True):
         pixels_m = positions_m[row : row + 32, column : column + 16].reshape(-1, 3)
         np.testing.assert_allclose(centre_m, pixels_m.mean(axis=0), atol=1e-12)
-        assert np.linalg.norm(pixels_m - centre_m, axis=1).max() <= division.radius_m(1)
+        assert np.linalg.norm(pixels_m - centre_m, axis=1).max() <= surface.radius_m(SIDES[1])
 
 
 # Nodes
@@ -64,13 +66,15 @@ def interpolation_error_db(case, side, aperture, root=(128, 128)):
     lines, grid = made(case)
     rng = np.random.default_rng(0)
     track, centres_m = mean_track(lines), lines.phase_centres_m
-    division = Division(grid, (root, side))
+    surface = surface_of(grid)
+    division = Division(surface, (root, side))
     cycles_per_m = lines.carrier_cycles_per_m
     wrong = total = 0.0
     for corner in division.roots[:2]:
         middle_m = division.centres_m(0, corner[None])
         place = track.places_seen_from(middle_m, centres_m)
-        rates = cycles_per_extent(track, grid, middle_m, root, cycles_per_m, division.radius_m(1))
+        extents, nearest_m = surface.extents(root), surface.radius_m(side)
+        rates = cycles_per_extent(track, surface, middle_m, extents, cycles_per_m, nearest_m)
         rate = side[0] * rates[0] + side[1] * rates[1]
         nodes = interpolated_nodes(track, rate, place, aperture)
         between = nodes.base[0][:, None] + np.arange(nodes.taps)
@@ -109,8 +113,10 @@ def any_nodes(shuffled=False):
     if shuffled:
         lines = lines.select(np.random.default_rng(0).permutation(lines.channels))
     track = mean_track(lines)
-    middle_m = Division(grid, ((64, 64),)).centres_m(0, np.array([[0, 0], [64, 64]]))
-    rates = cycles_per_extent(track, grid, middle_m, (64, 64), lines.carrier_cycles_per_m, 0.1)
+    surface, side = surface_of(grid), (64, 64)
+    middle_m = surface.middles_m(side, np.array([[0, 0], [64, 64]]))
+    extents, cycles_per_m = surface.extents(side), lines.carrier_cycles_per_m
+    rates = cycles_per_extent(track, surface, middle_m, extents, cycles_per_m, 0.1)
     place = track.places_seen_from(middle_m, lines.phase_centres_m)
     aperture = interpolation.design(6, 2.0, FLAT)
     return place, interpolated_nodes(track, 64 * rates.sum(axis=0), place, aperture)
@@ -199,7 +205,7 @@ def test_places_from_where_leaves_are_seen_hold_all_that_weigh():
     lines, grid = made(near)
     beam, track = BEAMS[0], mean_track(lines)
     along = tree.beam_directions(beam.directions(lines), track, track.samples)
-    division = Division(grid, ((16, 16),))
+    division = Division(surface_of(grid), ((16, 16),))
     corners = division.roots[:, None]
     half_m = 8 * np.stack([grid.row_step_m, grid.column_step_m])
     begin, end = tree.seen_from(beam, track, along, division.centres_m(0, corners), half_m)
