@@ -19,7 +19,7 @@ from clsas.device import Device, Slot, aligned, open_device
 from clsas.geometry import bistatic_range_m, pairwise_range_m
 from clsas.grid import Grid
 from clsas.image import Image
-from clsas.interpolation import Interpolator, Resampling, Spectrum
+from clsas.interpolation import Gain, Interpolator, Resampling, Spectrum
 from clsas.layout import GEOMETRY_ERROR, STACK, Groups, Tiles, allowed, lay_out
 from clsas.lines import RangeLines
 from clsas.window import INTERVALS, BeamWindow, channel_ranges, sines
@@ -627,7 +627,7 @@ def upsampled_lines(
     width: int,
     margin: int,
     pitch: int,
-    gain: NDArray[np.float32] | None = None,
+    gain: Gain | None = None,
 ) -> NDArray[np.float32]:
     """Return lines upsampled as the kernels want them: `pitch` samples each, zeros around.
 

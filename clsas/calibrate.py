@@ -87,13 +87,15 @@ class _Image:
         if isinstance(e, Exact):
             grouped = 0.0 if self.tiled else e.parts * e.part_pixels
             lines = self.channels * e.samples
-            return [1.0, lines, 0.0, 0.0, grouped, e.parts * self.channels]
+            return [1.0, lines, 0.0, 0.0, 0.0, grouped, e.parts * self.channels]
         roots = e.stages[0].subimages
         batches = -(-roots // e.roots_at_once)
         lines = self.channels * e.resampling.length
         last = e.stages[-1]
         grouped = 0.0 if self.tiled else last.operations / last.channels
-        return [1.0, lines, roots * self.channels, batches * len(e.sides), grouped, 0.0]
+        by_fft, filtered = (lines, 0.0) if e.upsampler is None else (0.0, lines)
+        stages = batches * len(e.sides)
+        return [1.0, by_fft, filtered, roots * self.channels, stages, grouped, 0.0]
 
     @property
     def stage_work(self) -> list[float]:
@@ -115,7 +117,15 @@ class _Image:
         return e.stages[-1].operations * COST[e.final.taps]
 
 
-_HOST = ("call_ns", "upsampled_sample_ns", "reference_ns", "batch_ns", "group_ns", "part_ns")
+_HOST = (
+    "call_ns",
+    "upsampled_sample_ns",
+    "filtered_sample_ns",
+    "reference_ns",
+    "batch_ns",
+    "group_ns",
+    "part_ns",
+)
 _STAGES = ("channel_ns", "sample_ns", "sample_tap_ns")
 
 

@@ -22,8 +22,8 @@ class Costs:
     ----------
     call_ns : float
         Per image, however it is formed: what is decided first, buffers, launches.
-    upsampled_sample_ns : float
-        Per sample of the upsampled lines, on the host.
+    upsampled_sample_ns, filtered_sample_ns : float
+        Per sample of the upsampled lines, by FFT on the host and by filters.
     reference_ns : float
         Per root subimage and channel, on the host.
     batch_ns : float
@@ -46,6 +46,7 @@ class Costs:
 
     call_ns: float = 2e7
     upsampled_sample_ns: float = 8.0
+    filtered_sample_ns: float = 2.0
     reference_ns: float = 450.0
     batch_ns: float = 5e4
     channel_ns: float = 12.0

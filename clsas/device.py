@@ -197,7 +197,8 @@ class Device:
         Both are to be kept, and the array left alone, until the device is done with them.
         """
         how = cl.mem_flags.USE_HOST_PTR if self.info.kind == "cpu" else cl.mem_flags.COPY_HOST_PTR
-        return cl.Buffer(self.context, cl.mem_flags.READ_WRITE | how, hostbuf=array)
+        access = cl.mem_flags.READ_WRITE if array.flags.writeable else cl.mem_flags.READ_ONLY
+        return cl.Buffer(self.context, access | how, hostbuf=array)
 
     def upload(self, array: np.ndarray) -> cl.Buffer:
         """Return a buffer that holds a copy of `array`; one of anything where that is empty."""
@@ -208,6 +209,8 @@ class Device:
 
     def zeros(self, bytes_: int) -> cl.Buffer:
         """Return a buffer of zeros."""
+        if self.info.kind == "cpu":
+            return self.share(aligned(np.zeros, (max(int(bytes_), 4),), np.uint8))
         buffer = self.buffer(bytes_)
         cl.enqueue_fill_buffer(self.queue, buffer, np.uint32(0), 0, buffer.size)
         return buffer

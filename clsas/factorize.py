@@ -20,6 +20,7 @@ from clsas.backproject import (
     warn_unseen,
 )
 from clsas.device import Device, Slot, open_device
+from clsas.filters import edges_gain
 from clsas.grid import Grid
 from clsas.image import Image
 from clsas.leaves import Finish, Level, PlaneLeaves, SurfaceLeaves
@@ -28,11 +29,11 @@ from clsas.plan import GUARD, Plan, margin, padded_length
 from clsas.planner import BEST_TOLERANCE_DB, WORST_TOLERANCE_DB, plan
 from clsas.sector import Geometry, Sector
 from clsas.surface import surface_of
+from clsas.upsample import upsample
 from clsas.window import BeamWindow
 
 _GROUP = 64  # work-items that share a subimage where each has one lane
 _GROUPS_PER_UNIT = 3  # at least, of compute units: so that they end together
-_MOST_GAIN = 3.0  # of frequencies, which are amplified where lines hold next to nothing
 
 
 def factorize(
@@ -181,7 +182,8 @@ class _Run:
 
     def _upload_lines(self) -> cl.Buffer:
         """Return all lines on the device, upsampled."""
-        device, resampling, count = self.device, self.plan.resampling, self.lines.channels
+        device, chosen, count = self.device, self.plan, self.lines.channels
+        resampling = chosen.resampling
         line_bytes = 8 * self.pitch
         if count * line_bytes > device.info.max_buffer_bytes:
             raise ValueError(
@@ -190,14 +192,14 @@ class _Run:
                 f"{device.info.label}, {device.info.max_buffer_bytes / 2**20:.0f} MiB: image "
                 f"a part of them, or backproject exactly"
             )
-        gain = None
-        if not self.plan.nearest:
-            # Range interpolation weakens the band's edges a little in every stage.
-            frequency = resampling.frequency / resampling.ratio
-            response = self.plan.align.response(frequency) ** len(self.levels)
-            response *= self.plan.final.response(frequency)
-            gain = np.clip(1 / response, 1 / _MOST_GAIN, _MOST_GAIN).astype(np.float32)
         zeros = margin(self.levels[0].half)
+        if chosen.upsampler is not None:
+            return upsample(
+                self.lines.samples, resampling, chosen.upsampler, zeros, self.pitch, device
+            )
+        gain = None
+        if not chosen.nearest:
+            gain = edges_gain(chosen.align, chosen.final, len(self.levels), resampling.ratio)
         return device.share(
             upsampled_lines(self.lines.samples, resampling, self.width, zeros, self.pitch, gain)
         )

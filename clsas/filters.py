@@ -10,10 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsas import interpolation
-from clsas.interpolation import Interpolator, Spectrum
+from clsas.interpolation import Gain, Interpolator, Spectrum
 
 ALIGN_TAPS = APERTURE_TAPS = (4, 6, 8)
 _FINAL_TAPS = (2, 4, 6, 8)
+_MOST_GAIN = 3.0  # of frequencies, which are amplified where lines hold next to nothing
 _RATES = tuple(np.geomspace(1, 12, 16))  # where errors are looked at
 _FLAT = Spectrum(0.0, (np.arange(64) + 0.5) / 128, np.full(64, 1 / 64))
 
@@ -25,6 +26,19 @@ class Filters:
     align: Interpolator
     aperture: Interpolator
     final: Interpolator
+
+
+def edges_gain(align: Interpolator, final: Interpolator, stages: int, ratio: float) -> Gain:
+    """Return what makes up for all that range interpolation takes from lines upsampled by a ratio.
+
+    It weakens the band's edges a little in every stage.
+    """
+
+    def gain(frequency: NDArray[np.float64]) -> NDArray[np.float64]:
+        response = align.response(frequency / ratio) ** stages * final.response(frequency / ratio)
+        return np.clip(1 / response, 1 / _MOST_GAIN, _MOST_GAIN)
+
+    return gain
 
 
 @dataclass(frozen=True)

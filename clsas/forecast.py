@@ -13,9 +13,10 @@ from clsas.costs import Costs
 from clsas.device import Device
 from clsas.errors import in_db, leaf_error, power
 from clsas.exact import Exact
-from clsas.filters import Filters
+from clsas.filters import Filters, edges_gain
+from clsas.interpolation import PHASES
 from clsas.layout import STACK
-from clsas.plan import GUARD, Plan, Stage, grid_digest, lines_digest, padded_length
+from clsas.plan import GIVEN_BYTES, GUARD, Plan, Stage, grid_digest, lines_digest, padded_length
 from clsas.sector import OF_BEAM
 from clsas.view import View
 
@@ -23,6 +24,7 @@ MARGIN_DB = 1.0  # between prediction and tolerance, for what measured errors sc
 _CACHED_BYTES, _BATCH_BYTES = 16 << 20, 256 << 20  # of a batch, on CPUs and elsewhere
 _MOST_TABLE_BYTES = 64 << 20
 _ROOTS_PREPARED = 16  # enough for few and large arrays
+_UPSAMPLING_SHARE = 0.03  # of the power of an image's error, for upsampling
 
 
 @dataclass(frozen=True)
@@ -53,7 +55,18 @@ def factorized(
     """
     lines, sides, nearest = view.lines, way.sides, way.nearest
     align, aperture, final = way.filters.align, way.filters.aperture, way.filters.final
-    resampling = interpolation.resampling(lines.length, align, view.spectrum)
+    error = other_error + _power_of_filters(way)
+    upsampler = None
+    if not nearest:
+        step = max(int(PHASES / align.upsampling), 1)
+        gain = edges_gain(align, final, len(sides), PHASES / step)
+        most_db = in_db(_UPSAMPLING_SHARE * error)
+        upsampler = interpolation.upsampler(view.spectrum, step, gain, most_db)
+    if upsampler is None:
+        resampling = interpolation.resampling(lines.length, align, view.spectrum)
+    else:
+        resampling = upsampler.resampling(lines.length, align.taps // 2, view.spectrum)
+        error += power(upsampler.error_db)
     halves = view.half_lengths(sides, align, final, resampling)
     of_aperture = aperture.taps, 2 * aperture.upsampling
     stages, channels = [], float(lines.channels)
@@ -76,13 +89,11 @@ def factorized(
         cost_ns = count * used * costs.line_ns(samples, align.taps + aperture.taps)
         if not level:
             cost_ns += count * lines.channels * costs.reference_ns
-            cost_ns += costs.upsampled_sample_ns * lines.channels * resampling.length
-        error = power(align.error_db)
-        if not nearest:
-            error = power(align.scatter_db) + power(aperture.error_db)
-        operations = count * used * samples
+            sample_ns = costs.upsampled_sample_ns if upsampler is None else costs.filtered_sample_ns
+            cost_ns += sample_ns * lines.channels * resampling.length
+        operations, error_db = count * used * samples, in_db(_power_of_stage(way))
         stages.append(
-            Stage(*side, count, round(channels), samples, operations, in_db(error), 1e-9 * cost_ns)
+            Stage(*side, count, round(channels), samples, operations, error_db, 1e-9 * cost_ns)
         )
     tiled, pixels = view.surface.is_plane, view.slots(side, width)
     operations = count * pixels * channels
@@ -95,6 +106,8 @@ def factorized(
     )
     tile = _tile(view, sides[-1], device) if nearest else sides[-1]
     line_bytes = 8 * lines.channels * padded_length(resampling, halves[0])
+    if upsampler is not None:
+        line_bytes += min(lines.samples.nbytes, GIVEN_BYTES)
     root_bytes, table_bytes = _root_bytes(view, way, tile, stages, width)
     room = memory_bytes - line_bytes
     batch_bytes = _CACHED_BYTES if device.info.kind == "cpu" else _BATCH_BYTES
@@ -106,7 +119,6 @@ def factorized(
     prepared = at_once * min(max(int(room // of_batch), 1), -(-_ROOTS_PREPARED // at_once))
     batches = -(-stages[0].subimages // at_once)
     besides = 1e-9 * (costs.call_ns + costs.batch_ns * batches * len(sides))
-    error = other_error + sum(power(stage.error_db) for stage in stages)
     return Plan(
         tolerance_db=tolerance_db,
         sides=sides,
@@ -116,6 +128,7 @@ def factorized(
         aperture=aperture,
         final=final,
         resampling=resampling,
+        upsampler=upsampler,
         half_lengths=halves,
         highest_cycles_per_m=view.highest_cycles_per_m,
         roots_at_once=at_once,
@@ -132,6 +145,18 @@ def factorized(
         crowding=way.crowding,
         beam_cycles=way.beam_cycles,
     )
+
+
+def _power_of_stage(way: Way) -> float:
+    """Return the power of the errors that the filters of one stage add."""
+    if way.nearest:
+        return power(way.filters.align.error_db)
+    return power(way.filters.align.scatter_db) + power(way.filters.aperture.error_db)
+
+
+def _power_of_filters(way: Way) -> float:
+    """Return the power of the errors that all filters add."""
+    return len(way.sides) * _power_of_stage(way) + power(way.filters.final.scatter_db)
 
 
 def _root_bytes(
@@ -205,6 +230,7 @@ def plain(
         aperture=None,
         final=None,
         resampling=None,
+        upsampler=None,
         half_lengths=(),
         highest_cycles_per_m=view.highest_cycles_per_m,
         roots_at_once=1,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,6 +22,8 @@ COST = {2: 0.75, 4: 1.0, 6: 1.3, 8: 1.55}
 # The same for one upsampled sample: an FFT on the host.
 _UPSAMPLINGCOST = 40.0
 _FREQUENCIES = 128
+Gain = Callable[[NDArray[np.float64]], NDArray[np.float64]]
+"""A factor of spectra, by the distance from their centre in cycles per sample."""
 _POSITIONS = 17
 _BLOCK_ROWS = 256
 
@@ -257,28 +259,35 @@ def choose(
 
 @dataclass(frozen=True)
 class Resampling:
-    """Where samples go when a line is shifted to its spectral centre and upsampled by FFT.
+    """Where samples go when a line is shifted to its spectral centre and upsampled.
 
     A line is zero beyond its ends. Upsampled sample m lies at index (m + first) / ratio - lead of
     the line it came from, and has been turned by -centre_cycles_per_sample (index + lead) cycles.
+
+    Attributes
+    ----------
+    period, upsampled_period : int
+        Samples that become so many. With an FFT these are its lengths.
+    shift : int
+        Cycles per period by which lines are turned.
     """
 
     lead: int
-    fft_length: int
-    upsampled_length: int
-    shift_bins: int
+    period: int
+    upsampled_period: int
+    shift: int
     first: int
     length: int
 
     @property
     def ratio(self) -> float:
         """Upsampled samples per sample."""
-        return self.upsampled_length / self.fft_length
+        return self.upsampled_period / self.period
 
     @property
     def centre_cycles_per_sample(self) -> float:
         """Frequency made zero, cycles per (given) sample."""
-        return self.shift_bins / self.fft_length
+        return self.shift / self.period
 
     def samples_per_m(self, lines: RangeLines) -> float:
         """Return the upsampled samples per metre of range."""
@@ -288,31 +297,26 @@ class Resampling:
         """Return the phase per metre of range at the spectral centre, cycles."""
         return cycles_per_m(lines, self.centre_cycles_per_sample)
 
-    @property
-    def frequency(self) -> NDArray[np.float64]:
-        """Distance of every frequency of the FFT from the spectral centre, cycles per sample."""
-        return np.abs(scipy.fft.fftfreq(self.fft_length))
-
     def apply(
         self,
         samples: NDArray[np.complexfloating],
-        gain: NDArray[np.float32] | None = None,
+        gain: Gain | None = None,
     ) -> NDArray[np.complexfloating]:
-        """Return lines [channels, n] upsampled, [channels, length], in their own precision.
+        """Return lines [channels, n] upsampled by FFT, [channels, length], in their own precision.
 
-        `gain` multiplies the spectrum at every `frequency`.
+        `gain` multiplies the spectrum, by the distance from its centre.
         """
-        padded = np.zeros((len(samples), self.fft_length), samples.dtype)
+        padded = np.zeros((len(samples), self.period), samples.dtype)
         padded[:, self.lead : self.lead + samples.shape[1]] = samples
         spectrum = scipy.fft.fft(padded, axis=1, overwrite_x=True)
-        if self.shift_bins:
-            spectrum = np.roll(spectrum, -self.shift_bins, axis=1)
-        factor = np.full(self.fft_length, self.ratio, samples.real.dtype)
+        if self.shift:
+            spectrum = np.roll(spectrum, -self.shift, axis=1)
+        factor = np.full(self.period, self.ratio, samples.real.dtype)
         if gain is not None:
-            factor *= gain
-        upper = self.fft_length // 2  # bins of negative frequency, at the end
-        lower, beyond = self.fft_length - upper, self.upsampled_length - upper
-        wide = np.empty((len(samples), self.upsampled_length), samples.dtype)
+            factor *= gain(np.abs(scipy.fft.fftfreq(self.period)))
+        upper = self.period // 2  # bins of negative frequency, at the end
+        lower, beyond = self.period - upper, self.upsampled_period - upper
+        wide = np.empty((len(samples), self.upsampled_period), samples.dtype)
         np.multiply(spectrum[:, :lower], factor[:lower], out=wide[:, :lower])
         wide[:, lower:beyond] = 0
         np.multiply(spectrum[:, lower:], factor[lower:], out=wide[:, beyond:])
@@ -326,7 +330,7 @@ _GUARD = 64
 
 
 def resampling(length: int, interpolator: Interpolator, spectrum: Spectrum) -> Resampling:
-    """Return how lines of `length` samples are upsampled for an interpolator."""
+    """Return how lines of `length` samples are upsampled by FFT for an interpolator."""
     fft_length = scipy.fft.next_fast_len(length + 2 * _GUARD)
     upsampled_length = scipy.fft.next_fast_len(round(np.ceil(fft_length * interpolator.upsampling)))
     ratio = upsampled_length / fft_length
@@ -335,3 +339,76 @@ def resampling(length: int, interpolator: Interpolator, spectrum: Spectrum) -> R
     last = int(np.floor((_GUARD + length - 1) * ratio)) + beyond
     shift = round(spectrum.centre * fft_length)
     return Resampling(_GUARD, fft_length, upsampled_length, shift, first, last - first + 1)
+
+
+PHASES = 32
+"""By how many filters lines are upsampled."""
+UPSAMPLING_TAPS = (8, 12, 16, 20, 24, 28, 32)
+_FINE = 4096  # of a filtered line's period: how finely it may be turned
+_SAME = 0.5 / 256  # cycles per sample: half of what a measured spectrum resolves
+
+
+@dataclass(frozen=True, eq=False)
+class Upsampler:
+    """Filters that upsample lines by a ratio of whole numbers, and shape their spectrum.
+
+    Attributes
+    ----------
+    step : int
+        Upsampled samples lie 1 / PHASES of it apart.
+    coefficients : float64 [PHASES, taps]
+        Of filters for places p/PHASES beyond a sample. Their taps are the taps/2 samples up to
+        that one, and as many after it.
+    error_db : float
+        Relative rms error of upsampled lines, dB.
+    """
+
+    step: int
+    coefficients: NDArray[np.float64]
+    error_db: float
+
+    def __post_init__(self) -> None:
+        """Keep the coefficients from being changed."""
+        self.coefficients.flags.writeable = False
+
+    @property
+    def taps(self) -> int:
+        """Samples that one upsampled sample is made of."""
+        return self.coefficients.shape[1]
+
+    def resampling(self, length: int, beyond: int, spectrum: Spectrum) -> Resampling:
+        """Return where samples of lines of some length go, with so many beyond either end."""
+        period, upsampled = self.step * _FINE, PHASES * _FINE
+        last = (length - 1) * PHASES // self.step + beyond
+        shift = 0 if abs(spectrum.centre) <= _SAME else round(spectrum.centre * period)
+        return Resampling(0, period, upsampled, shift, -beyond, last + beyond + 1)
+
+
+def upsampler(
+    spectrum: Spectrum, step: int, gain: Gain, most_db: float
+) -> Upsampler | None:
+    """Return the shortest filters that upsample by PHASES / step and err by no more than some dB.
+
+    None where none do: where lines fill their whole band.
+
+    Notes
+    -----
+    Least squares for every phase: sum_t h_t exp(j 2 pi f x_t) ~ gain(f), with x_t the place of a
+    tap from the upsampled sample, weighted by the power at f.
+    """
+    frequency = spectrum.frequency
+    aim = gain(frequency)
+    weight = np.sqrt(spectrum.power + 1e-13)[:, None]
+    place = np.arange(PHASES)[:, None, None] / PHASES
+    for taps in UPSAMPLING_TAPS:
+        turns = 2 * np.pi * frequency[:, None] * (np.arange(taps) + 1 - taps // 2 - place)
+        matrix = np.concatenate([weight * np.cos(turns), weight * np.sin(turns)], axis=1)
+        wanted = np.concatenate([weight[:, 0] * aim, np.zeros(len(aim))])
+        q, r = np.linalg.qr(matrix)
+        coefficients = np.linalg.solve(r, np.einsum("pft,f->pt", q, wanted)[..., None])[..., 0]
+        residual = np.einsum("pft,pt->pf", matrix, coefficients) - wanted
+        power = np.mean(np.sum(residual**2, axis=1)) / (spectrum.power @ aim**2)
+        error_db = 10 * np.log10(max(float(power), 1e-30))
+        if error_db <= most_db:
+            return Upsampler(step, coefficients, error_db)
+    return None

@@ -11,10 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsas.grid import Grid
-from clsas.interpolation import Interpolator, Resampling
+from clsas.interpolation import PHASES, UPSAMPLING_TAPS, Interpolator, Resampling, Upsampler
 from clsas.lines import RangeLines
 from clsas.window import BeamWindow
 
+GIVEN_BYTES = 64 << 20
+"""Of lines as they come, at most, that are on a device at once to be upsampled."""
 GUARD = 16
 """Zeros on either side of a virtual channel's line, which the last stage's lookup may touch."""
 
@@ -74,7 +76,9 @@ class Plan:
         Filters in range, of the aperture (its `upsampling` is the density of virtual channels over
         the least), and in range for the last stage.
     resampling : Resampling or None
-        How the lines are upsampled first.
+        Where samples go when lines are upsampled first.
+    upsampler : Upsampler or None
+        What does that; None by FFT.
     half_lengths : tuple of int
         Samples to either side of a subimage's centre that its lines hold, stage by stage.
     highest_cycles_per_m : float
@@ -109,6 +113,7 @@ class Plan:
     aperture: Interpolator | None
     final: Interpolator | None
     resampling: Resampling | None
+    upsampler: Upsampler | None
     half_lengths: tuple[int, ...]
     highest_cycles_per_m: float
     roots_at_once: int
@@ -181,8 +186,15 @@ class Plan:
         good = isinstance(self.resampling, Resampling) and all(
             type(n) is int for n in asdict(self.resampling).values()
         )
-        good = good and self.resampling.length > 0 and self.resampling.fft_length > 0
+        good = good and min(self.resampling.length, self.resampling.period) > 0
         check(good, "resampling", "made of whole numbers")
+        if self.upsampler is not None:
+            good = isinstance(self.upsampler, Upsampler) and whole(self.upsampler.step, 1)
+            good = good and self.upsampler.coefficients.shape in [
+                (PHASES, taps) for taps in UPSAMPLING_TAPS
+            ]
+            good = good and bool(np.isfinite(self.upsampler.coefficients).all())
+            check(good and self.upsampler.step <= PHASES, "upsampler", "filters")
 
     @property
     def is_exact(self) -> bool:
@@ -269,6 +281,9 @@ class Plan:
                     values[name] = Interpolator(coefficients=coefficients, **values[name])
             if values["resampling"] is not None:
                 values["resampling"] = Resampling(**values["resampling"])
+            if values["upsampler"] is not None:
+                coefficients = np.array(values["upsampler"].pop("coefficients"), np.float64)
+                values["upsampler"] = Upsampler(coefficients=coefficients, **values["upsampler"])
             if values["beam"] is not None:
                 values["beam"] = BeamWindow(**values["beam"])
             values["sides"] = tuple(map(tuple, values["sides"]))

@@ -196,7 +196,7 @@ def test_resampling_gives_the_closed_form(centre, upsampling, dtype, error_db):
     assert got.dtype == dtype
     assert got.shape == (1, r.length)
     assert r.ratio >= upsampling
-    assert r.centre_cycles_per_sample == pytest.approx(centre, abs=0.5 / r.fft_length)
+    assert r.centre_cycles_per_sample == pytest.approx(centre, abs=0.5 / r.period)
     index = (np.arange(r.length) + r.first) / r.ratio - r.lead
     turn = np.exp(-2j * np.pi * r.centre_cycles_per_sample * (index + r.lead))
     assert relative_error_db(got, (burst(index, centre) * turn)[None]) <= error_db
@@ -211,7 +211,7 @@ def test_resampled_lines_hold_every_tap(length, taps):
     assert first >= taps // 2 - 1
     assert last <= r.length - taps // 2
     assert r.lead * r.ratio >= r.first >= 0
-    assert r.first + r.length <= r.upsampled_length
+    assert r.first + r.length <= r.upsampled_period
 
 
 def test_channels_are_resampled_alone():
