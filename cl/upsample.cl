@@ -16,8 +16,9 @@
  *   samples  float2 [lines at work][count].
  *   filter   float [PHASES / WIDTH][TAPS][WIDTH]: lane by lane the filters of samples m, m + 1, ... from
  *            multiples of WIDTH on.
- *   lines    [lines][2][pitch] of float, real parts and imaginary ones; with WIDTH 1 interleaved. Samples `margin` to
- *            margin + length - 1 of lines from number first_line on are written, the zeros around them up to a vector.
+ *   lines    [lines][2][pitch] of float, real parts and imaginary ones; with WIDTH 1 interleaved, from number
+ *            first_line on: y in `length` samples from number `margin` on, zeros in the others. `margin` and
+ *            `pitch` are multiples of WIDTH.
  *   turn     2^-32 cycles per sample of x.
  *
  * Global size: (work-items that share a line, lines at work).
@@ -82,13 +83,25 @@ INLINE void load_turned(__global const float2 *samples, int count, int index, in
 }
 #endif
 
+#if WIDTH == 1
+#define PUT(re, im) lines[2 * at] = (re), lines[2 * at + 1] = (im)
+#else
+#define PUT(re, im) STORE(re, lines + at), STORE(im, lines + at + pitch)
+#endif
+
 __kernel void upsample_lines(__global const float2 *samples, int count, __global const float *filter, int first, int step,
                        int turn, __global float *lines, int first_line, int pitch, int margin, int length)
 {
     samples += (size_t)get_global_id(1) * count;
-    lines += (size_t)(first_line + get_global_id(1)) * 2 * pitch + (WIDTH == 1 ? 2 : 1) * margin;
-    const int vectors = (length + WIDTH - 1) / WIDTH, items = get_global_size(0);
-    for (int vector = get_global_id(0); vector < vectors; vector += items) {
+    lines += (size_t)(first_line + get_global_id(1)) * 2 * pitch;
+    const int items = get_global_size(0);
+    for (int at = get_global_id(0) * WIDTH; at < pitch; at += items * WIDTH) {
+        const int m = at - margin;
+        if (m < 0 || m >= length) {
+            PUT(0.0f, 0.0f);
+            continue;
+        }
+        const int vector = m / WIDTH;
         const int phase = vector % (PHASES / WIDTH) * WIDTH;
         /* Rounded down; (first + m) step + far is not negative. */
         const int far = 1 << 20;
@@ -123,14 +136,11 @@ __kernel void upsample_lines(__global const float2 *samples, int count, __global
             ((float *)&im)[lane] = sum.y;
         }
 #endif
-        const int m = vector * WIDTH;
 #if WIDTH == 1
-        lines[2 * m] = re;
-        lines[2 * m + 1] = im;
+        PUT(re, im);
 #else
         const vfloat last = length - 1 - m;
-        STORE(LANES <= last ? re : (vfloat)0.0f, lines + m);
-        STORE(LANES <= last ? im : (vfloat)0.0f, lines + m + pitch);
+        PUT(LANES <= last ? re : (vfloat)0.0f, LANES <= last ? im : (vfloat)0.0f);
 #endif
     }
 }

@@ -25,7 +25,7 @@ from clsas.grid import Grid
 from clsas.image import Image
 from clsas.leaves import Finish, Level, PlaneLeaves, SurfaceLeaves
 from clsas.lines import RangeLines
-from clsas.plan import GUARD, Plan, margin, padded_length
+from clsas.plan import GUARD, MARGIN, Plan, padded_length
 from clsas.planner import BEST_TOLERANCE_DB, WORST_TOLERANCE_DB, plan
 from clsas.sector import Geometry, Sector
 from clsas.surface import surface_of
@@ -33,6 +33,8 @@ from clsas.upsample import upsample
 from clsas.window import BeamWindow
 
 _GROUP = 64  # work-items that share a subimage where each has one lane
+_STARTED_AHEAD = 2  # batches: few, so that an interruption need not wait long
+_PREPARED_FIRST, _PREPARED_AHEAD = 4, 4  # batches
 _GROUPS_PER_UNIT = 3  # at least, of compute units: so that they end together
 
 
@@ -168,7 +170,7 @@ class _Run:
         ramp = int(self.geometry.ramps)
         self.first_stage = device.kernel("stage", "stage", GIVEN=1, RAMP=ramp, **options)
         self.later_stage = device.kernel("stage", "stage", GIVEN=0, RAMP=0, **options)
-        self.pitch = padded_length(chosen.resampling, self.levels[0].half)
+        self.pitch = padded_length(chosen.resampling)
         self.samples = self._upload_lines()
         kind = PlaneLeaves if surface.is_plane else SurfaceLeaves
         self.leaves = kind(lines, self.geometry, self.levels[-1], device)
@@ -192,16 +194,13 @@ class _Run:
                 f"{device.info.label}, {device.info.max_buffer_bytes / 2**20:.0f} MiB: image "
                 f"a part of them, or backproject exactly"
             )
-        zeros = margin(self.levels[0].half)
         if chosen.upsampler is not None:
-            return upsample(
-                self.lines.samples, resampling, chosen.upsampler, zeros, self.pitch, device
-            )
+            return upsample(self.lines.samples, resampling, chosen.upsampler, self.pitch, device)
         gain = None
         if not chosen.nearest:
             gain = edges_gain(chosen.align, chosen.final, len(self.levels), resampling.ratio)
         return device.share(
-            upsampled_lines(self.lines.samples, resampling, self.width, zeros, self.pitch, gain)
+            upsampled_lines(self.lines.samples, resampling, self.width, MARGIN, self.pitch, gain)
         )
 
     def into(self, pixels: NDArray[np.complex64]) -> Iterator[int]:
@@ -209,17 +208,33 @@ class _Run:
 
         The geometry of a sector is prepared while the device works on the one before.
         """
-        roots, at_once, under_way = self.division.roots, self.plan.roots_at_once, deque()
-        for start in range(0, len(roots), self.plan.roots_prepared):
-            sector = self.geometry.sector(roots[start : start + self.plan.roots_prepared])
-            tables = self._upload_tables(sector)
-            for first in range(0, len(sector.roots), at_once):
+        under_way = deque()
+        sectors = self._sectors()
+        following = next(sectors, None)
+        while following is not None:
+            (sector, tables), following = following, None
+            starts = range(0, len(sector.roots), self.plan.roots_at_once)
+            for left, first in zip(reversed(range(len(starts))), starts, strict=True):
                 under_way.append(self._start(sector, tables, first, pixels))
-                if len(under_way) > 2:  # so that an interruption need not wait long
+                if left == _PREPARED_AHEAD:
+                    following = next(sectors, None)
+                if len(under_way) > _STARTED_AHEAD:
                     yield under_way.popleft()()
             tables.slot.busy = cl.enqueue_marker(self.device.queue)
+            following = following or next(sectors, None)
         while under_way:
             yield under_way.popleft()()
+
+    def _sectors(self) -> Iterator[tuple[Sector, _Tables]]:
+        """Prepare the roots, some together; few at first, for the device to begin with."""
+        roots, at_once, start = self.division.roots, self.plan.roots_at_once, 0
+        while start < len(roots):
+            count = self.plan.roots_prepared if start else at_once * _PREPARED_FIRST
+            sector = self.geometry.sector(
+                roots[start : start + min(count, self.plan.roots_prepared)]
+            )
+            yield sector, self._upload_tables(sector)
+            start += len(sector.roots)
 
     def _start(
         self, sector: Sector, tables: _Tables, first: int, pixels: NDArray[np.complex64]

@@ -105,7 +105,7 @@ def factorized(
         Stage(*side, count, round(channels), samples, operations, final.scatter_db, 1e-9 * cost_ns)
     )
     tile = _tile(view, sides[-1], device) if nearest else sides[-1]
-    line_bytes = 8 * lines.channels * padded_length(resampling, halves[0])
+    line_bytes = 8 * lines.channels * padded_length(resampling)
     if upsampler is not None:
         line_bytes += min(lines.samples.nbytes, GIVEN_BYTES)
     root_bytes, table_bytes = _root_bytes(view, way, tile, stages, width)

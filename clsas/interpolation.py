@@ -384,9 +384,7 @@ class Upsampler:
         return Resampling(0, period, upsampled, shift, -beyond, last + beyond + 1)
 
 
-def upsampler(
-    spectrum: Spectrum, step: int, gain: Gain, most_db: float
-) -> Upsampler | None:
+def upsampler(spectrum: Spectrum, step: int, gain: Gain, most_db: float) -> Upsampler | None:
     """Return the shortest filters that upsample by PHASES / step and err by no more than some dB.
 
     None where none do: where lines fill their whole band.

@@ -17,6 +17,8 @@ from clsas.window import BeamWindow
 
 GIVEN_BYTES = 64 << 20
 """Of lines as they come, at most, that are on a device at once to be upsampled."""
+MARGIN = 32
+"""Zeros on either side of an upsampled line: what lies further out is moved into them."""
 GUARD = 16
 """Zeros on either side of a virtual channel's line, which the last stage's lookup may touch."""
 
@@ -309,19 +311,13 @@ class Plan:
                 )
 
 
-def padded_length(resampling: Resampling, half_length: int) -> int:
+def padded_length(resampling: Resampling) -> int:
     """Return the samples of an upsampled line on the device, with zeros around it.
 
-    A subimage may reach beyond the line's end by `half_length`, or lie outside it. Lines at equal
-    places in a cache's sets would evict each other.
+    Lines at equal places in a cache's sets would evict each other.
     """
-    length = -(-(resampling.length + 2 * margin(half_length)) // 16) * 16
+    length = -(-(resampling.length + 2 * MARGIN) // 16) * 16
     return length + 16 * (length % 256 == 0)
-
-
-def margin(half_length: int) -> int:
-    """Return the zeros before an upsampled line on the device."""
-    return 2 * half_length + 64
 
 
 def lines_digest(lines: RangeLines) -> str:

@@ -13,11 +13,12 @@ from clsas import tree
 from clsas.aperture import cycles_per_extent, drift, mean_track, stretches
 from clsas.geometry import pairwise_range_m
 from clsas.lines import RangeLines
-from clsas.plan import Plan, margin, padded_length
+from clsas.plan import MARGIN, Plan
 from clsas.surface import Surface
 from clsas.tree import Division, Nodes, Ranges
 
 _ON_TRACK = 1e-4  # wavelengths
+_FAR = 1 << 28  # samples: off any line, and within int32
 OF_BEAM = 1 / 16
 """Of what a beam covers: by how much it may be taken to cover more."""
 
@@ -187,10 +188,9 @@ class Geometry:
         cycles += place * resampling.centre_cycles_per_sample
         cycles -= np.rint(cycles)
         place *= resampling.ratio
-        place += margin(half) - resampling.first - half
+        place += MARGIN - resampling.first - half
         lower = np.floor(place)
-        pitch = padded_length(resampling, half)
-        start = np.clip(lower + 1 - self.plan.align.taps // 2, -half, pitch)
+        start = np.clip(lower + 1 - self.plan.align.taps // 2, -_FAR, _FAR)
         channel = np.broadcast_to(self.channels, place.shape)
         references = {
             "order": nodes.ordered(channel).astype(np.int32),

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from clsas.device import Device
 from clsas.interpolation import PHASES, Resampling, Upsampler
-from clsas.plan import GIVEN_BYTES
+from clsas.plan import GIVEN_BYTES, MARGIN
 
 _GROUP = 64  # work-items that share a line where each has one lane
 
@@ -17,13 +17,12 @@ def upsample(
     samples: NDArray[np.complex64],
     resampling: Resampling,
     upsampler: Upsampler,
-    margin: int,
     pitch: int,
     device: Device,
 ) -> cl.Buffer:
     """Return lines [channels, n] upsampled on a device as its kernels want them.
 
-    `pitch` samples each, with so many zeros before them: interleaved, [channels, pitch, 2], with
+    `pitch` samples each, with zeros around them: interleaved, [channels, pitch, 2], with
     one lane per work-item, else [channels, 2, pitch].
     """
     width, taps, step = device.info.width, upsampler.taps, upsampler.step
@@ -41,7 +40,7 @@ def upsample(
     filters = device.upload(filters.astype(np.float32))
     turn = int(np.int32(np.uint32(round(resampling.centre_cycles_per_sample * 2**32) % 2**32)))
     channels, count = samples.shape
-    lines = device.zeros(8 * channels * pitch)
+    lines = device.buffer(8 * channels * pitch)
     at_once = max(GIVEN_BYTES // (8 * count), 1)
     for start in range(0, channels, at_once):
         some = samples[start : start + at_once]
@@ -58,7 +57,7 @@ def upsample(
             lines,
             start,
             pitch,
-            margin,
+            MARGIN,
             resampling.length,
         )
         if start + at_once < channels:
