@@ -50,7 +50,7 @@
 #define KEEP(x, low, high) ((x) < (low) ? (low) : (x) > (high) ? (high) : (x))
 
 #define CHUNK 32 /* channels whose weights are kept at a time */
-#define BLOCK (WIDTH > 1 ? 8 * WIDTH : 1)
+#define BLOCK (WIDTH > 1 ? (GIVEN ? 16 : 8) * WIDTH : 1) /* long lines are fetched in long pieces */
 
 #if WIDTH == 1
 #define LOAD_RE(line, k, pitch) (line)[2 * (k)]

@@ -13,7 +13,6 @@ from scipy.interpolate import BSpline, make_lsq_spline
 from clsas.grid import Grid
 from clsas.lines import RangeLines
 from clsas.surface import Surface
-from clsas.window import BeamWindow
 
 _POINTS = 257  # along the track, where rates are evaluated
 _BEYOND = 12  # points past either end, each twice as far as the one before
@@ -184,7 +183,7 @@ def cycles_per_extent(
     extents: NDArray[np.float64],
     cycles_per_m: float,
     nearest_m: float,
-    beam: BeamWindow | None = None,
+    limits: tuple[float, float] | None = None,
     along: NDArray[np.float64] | None = None,
     every: int = 1,
 ) -> NDArray[np.float64]:
@@ -205,10 +204,10 @@ def cycles_per_extent(
         Phase per metre of range.
     nearest_m : float
         Distance below which the track is taken not to come.
-    beam : BeamWindow, optional
-        What it does not see does not count.
+    limits : (low, high), optional
+        Sines of the aspect angle beyond which nothing counts.
     along : float64 [samples, 3]
-        With a beam, the track's unit direction at `track.samples`.
+        With limits, the track's unit direction at `track.samples`.
     every : int
         Of the track's samples only one in so many.
 
@@ -230,7 +229,7 @@ def cycles_per_extent(
     square = np.einsum("psi,psi->ps", sight, sight)
     ahead = np.einsum("psi,si->ps", sight, tangent)
     leaning = [sight @ step for step in steps]
-    sideways = None if beam is None else np.einsum("psi,si->ps", sight, along)
+    sideways = None if limits is None else np.einsum("psi,si->ps", sight, along)
     within = [across if axis < 2 or extent else (0.0,) for axis, extent in enumerate(extents)]
     for parts in product(*within):
         offset_m = parts @ sides_m
@@ -240,8 +239,8 @@ def cycles_per_extent(
         distance = np.maximum(np.sqrt(np.maximum(distance, 0, out=distance)), nearest_m)
         inverse = 1 / distance
         turn = (ahead + tangent @ offset_m) * inverse**2
-        if beam is not None:
-            low, high = beam.limits
+        if limits is not None:
+            low, high = limits
             sine, reach = (sideways + along @ offset_m) * inverse, between_m * inverse
             inverse[(sine + reach < low) | (sine - reach > high)] = 0  # as if far away
         for rate, step, lean in zip(rates, steps, leaning, strict=True):

@@ -155,7 +155,7 @@ def root_error(view: View, side: tuple[int, int]) -> float:
         powers.append(np.sum(wrong**2))
         total += np.sum(weights**2)
     off_track = sum(powers) / max(total, 1e-30)
-    sides_m = view.extents(side, np.max) * np.linalg.norm(view.surface.steps_m, axis=1)
+    sides_m = view.extents(side, most=True) * np.linalg.norm(view.surface.steps_m, axis=1)
     radius_m = np.linalg.norm(sides_m) / 2
     rounding = (2 * np.pi * _FLOAT32 * view.highest_cycles_per_m * radius_m) ** 2
     return float(off_track + rounding)

@@ -96,7 +96,7 @@ def expect(view: View, accuracy_db: float, device: Device) -> Exact:
     resampling = interpolation.resampling(lines.length, interpolator, view.spectrum)
     share = most = 1.0
     if beam is not None and view.track is not None:
-        share, most = view.share_seen((16, 16)), view.share_seen((64, 64), np.max)
+        share, most = view.share_seen((16, 16)), view.share_seen((64, 64), most=True)
     blocks = blocks_of(
         device,
         lines,

@@ -142,6 +142,7 @@ def factorized(
         lines_digest=lines_digest(lines),
         grid_digest=grid_digest(view.grid),
         beam=view.beam,
+        limits=view.limits,
         crowding=way.crowding,
         beam_cycles=way.beam_cycles,
     )
@@ -175,12 +176,14 @@ def _root_bytes(
             # Virtual channels of the whole aperture, and those of the subimage that sees most.
             seen = view.seen(side)
             everywhere, most = (
-                density * way.crowding[level] * view.turns(side, where, np.max) + taps + 2
+                density * way.crowding[level] * view.turns(side, where, most=True) + taps + 2
                 for where in (np.ones_like(seen), seen)
             )
             if view.beam is not None:
                 if level == len(sides) - 1:
-                    most += density * way.beam_cycles * view.cycles(view.beam_rates, seen, np.max)
+                    most += (
+                        density * way.beam_cycles * view.cycles(view.beam_rates, seen, most=True)
+                    )
                 most *= 1 + OF_BEAM
         subimages = _subimages(sides[0], side)
         work += 8 * subimages * most * (stages[level].samples + 2 * GUARD)
@@ -244,4 +247,5 @@ def plain(
         lines_digest=lines_digest(view.lines),
         grid_digest=grid_digest(view.grid),
         beam=view.beam,
+        limits=view.limits,
     )

@@ -500,7 +500,7 @@ class _Sight:
         if self.beam is not None:
             centre_m, half_m = _box(grid)
             seen &= touches_boxes(
-                self.beam, centre_m[None], half_m, self.phase_centres_m, self.along
+                self.beam.limits, centre_m[None], half_m, self.phase_centres_m, self.along
             )[0]
         return seen
 

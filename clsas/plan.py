@@ -100,6 +100,9 @@ class Plan:
     lines_digest, grid_digest : str
         Of the geometry that this plan was made for.
     beam : BeamWindow or None
+    limits : (low, high) or None
+        Sines of the aspect angle between which channels are used: where the beam weighs anything
+        to speak of.
     crowding : tuple of float
         By how much virtual channels are denser than band-limited steering functions need, stage by
         stage: where their spacing changes along the track filters err.
@@ -129,6 +132,7 @@ class Plan:
     lines_digest: str
     grid_digest: str
     beam: BeamWindow | None = None
+    limits: tuple[float, float] | None = None
     crowding: tuple[float, ...] = ()
     beam_cycles: float = 0.0
 
@@ -173,6 +177,10 @@ class Plan:
         check(fits, "half_lengths", "a whole number for every stage")
         for name in ("highest_cycles_per_m", "beam_cycles"):
             check(numbers((getattr(self, name),), 1, 0), name, "a number from 0")
+        fits = (self.limits is None) == (self.beam is None)
+        if fits and self.limits is not None:
+            fits = numbers(self.limits, 2, -3.0)
+        check(fits, "limits", "two sines, with a beam")
         if self.nearest:
             fits = numbers(self.nearest, levels, 1) and all(whole(n, 1) for n in self.nearest)
             check(fits, "nearest", "a whole number for every stage")
@@ -290,6 +298,8 @@ class Plan:
                 values["beam"] = BeamWindow(**values["beam"])
             values["sides"] = tuple(map(tuple, values["sides"]))
             values["tile"] = tuple(values["tile"])
+            if values["limits"] is not None:
+                values["limits"] = tuple(values["limits"])
             values["half_lengths"] = tuple(values["half_lengths"])
             values["nearest"] = tuple(values["nearest"])
             values["crowding"] = tuple(values["crowding"])

@@ -33,7 +33,7 @@ EXACT_DB = -60.0
 NEAREST_UPSAMPLING = 8.0
 """By how much lines are upsampled before the linear interpolation of given stages."""
 
-_ROOTS_SHARE, _NODES_SHARE = 0.25, 0.2  # of the error allowed
+_ROOTS_SHARE, _NODES_SHARE, _EDGES_SHARE = 0.25, 0.2, 0.03  # of the error allowed
 _MOST_CROWDING = 2.0
 _LEAST_COVERED = 0.25
 _LEAST_BEAM_CYCLES, _MOST_BEAM_CYCLES = 0.5, 64.0
@@ -213,9 +213,13 @@ def _fastest(
     Beside it, where there is none, the least memory of those that did not fit.
     """
     allowed = power(tolerance_db)
+    view, trimmed = view.trimmed(_EDGES_SHARE * allowed), 0.0
+    if view.beam is not None:
+        trimmed = _EDGES_SHARE * allowed
     most = root_limits(view, _ROOTS_SHARE * allowed)
     beam_cycles = 0.0 if view.beam is None else _LEAST_BEAM_CYCLES
-    needed, spared = math.inf, 0.0 if most is None else root_error(view, most) + 0.05 * allowed
+    needed = math.inf
+    spared = 0.0 if most is None else root_error(view, most) + trimmed + 0.05 * allowed
     tree: Tree | None = None
     designed: Choice | None = None
     leaf_pixels = 1
@@ -233,7 +237,7 @@ def _fastest(
         within = view.within(tree.sides[0])
         others = other_errors(within, way.sides, filters.aperture, crowding, beam_cycles, device)
         found = forecast.factorized(
-            within, way, others.total, tolerance_db, exact, device, costs, memory_bytes
+            within, way, others.total + trimmed, tolerance_db, exact, device, costs, memory_bytes
         )
         if found.predicted_seconds >= seconds:
             break
@@ -261,7 +265,7 @@ def _fastest(
             elif others.nodes[-1] > share:  # smaller leaves have fewer nodes, less evenly spaced
                 leaf_pixels, tree = 2 * math.prod(found.sides[-1]), None
             else:
-                spared += max(others.total - spared, 0.1 * allowed)
+                spared += max(others.total + trimmed - spared, 0.1 * allowed)
     return None, needed
 
 

@@ -116,7 +116,7 @@ class Geometry:
         leaf, parent = self.plan.sides[-1], self.plan.sides[max(len(self.plan.sides) - 2, 0)]
         if self.plan.beam is None:
             return parent
-        most_m = OF_BEAM * self.nearest_m * np.ptp(np.clip(self.plan.beam.limits, -1, 1))
+        most_m = OF_BEAM * self.nearest_m * np.ptp(np.clip(self.plan.limits, -1, 1))
         along_m = np.abs(self.surface.steps_m[:2] @ self.along.T)
 
         def fits(side: tuple[int, int]) -> bool:
@@ -152,7 +152,7 @@ class Geometry:
                 surface.extents_in(sides[0], sides[0], roots).max(axis=0),
                 chosen.highest_cycles_per_m,
                 surface.radius_m(sides[-1]),
-                chosen.beam,
+                chosen.limits,
                 self.along,
             )
             for level, side in enumerate(sides):
@@ -168,7 +168,7 @@ class Geometry:
         seen_m = self._seen.centres_m(1, self._seen.corners(1, roots))
         half_m = surface.extents_in(together, sides[0], roots).max(axis=0) / 2
         half_m = half_m[:, None] * surface.steps_m
-        seen = tree.seen_from(chosen.beam, track, self.along, seen_m, half_m)
+        seen = tree.seen_from(chosen.limits, track, self.along, seen_m, half_m)
         seen = tuple(each[:, self._seen.parents(2)] for each in seen)
         inside = surface.holds(sides[-1], corners[-1])
         needs = tree.ranges(division, nodes, seen_at, seen, inside)

@@ -250,7 +250,7 @@ def beam_rate(
 
 
 def seen_from(
-    beam: BeamWindow | None,
+    limits: tuple[float, float] | None,
     track: MeanTrack,
     along: NDArray[np.float64] | None,
     centres_m: NDArray[np.float64],
@@ -262,14 +262,16 @@ def seen_from(
 
     Parameters
     ----------
+    limits : (low, high), optional
+        Sines of the aspect angle between which anything is seen; without them everything is.
     along : float64 [samples, 3]
-        The track's direction at `track.samples`; not needed without a beam.
+        The track's direction at `track.samples`; not needed without limits.
     centres_m : float64 [..., 3]
     half_m : float64 [axes, 3]
         Half their sides, as vectors.
     """
     shape = centres_m.shape[:-1]
-    if beam is None:
+    if limits is None:
         return np.full(shape, -np.inf), np.full(shape, np.inf)
     samples = track.samples
     on_track = np.flatnonzero(np.abs(samples - 0.5) <= 0.5)[::_COARSER]
@@ -286,7 +288,7 @@ def seen_from(
             away = np.linalg.norm(values[run] - values[middle[index]], axis=1)
             result[index] = away.max()
     seen = touches_boxes(
-        beam, centres_m, half_m, position_m[middle], along[middle], around_m, spread
+        limits, centres_m, half_m, position_m[middle], along[middle], around_m, spread
     )
     ever = seen.any(axis=1)
     of_first, of_last = seen.argmax(axis=1), len(runs) - 1 - seen[:, ::-1].argmax(axis=1)
@@ -297,7 +299,7 @@ def seen_from(
             mine = np.flatnonzero(ever & (of_edge == index))
             if mine.size:
                 some = position_m[run][::step], along[run][::step]
-                seen = touches_boxes(beam, centres_m[mine], half_m, *some)
+                seen = touches_boxes(limits, centres_m[mine], half_m, *some)
                 found = np.where(seen.any(axis=1), seen.argmax(axis=1), len(some[0]))
                 edge[mine] += step * found
     # What no single place sees may be seen from between them.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import functools
 import math
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Hashable, Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -23,6 +23,8 @@ from clsas.tree import beam_directions, beam_rate
 from clsas.window import BeamWindow, sines, touches_boxes
 
 _SPOTS = (0.02, 0.25, 0.5, 0.75, 0.98)  # of rows and columns, where the geometry is looked at
+_OF_SPOTS = (0.135, 0.24, 0.25, 0.24, 0.135)  # what these stand for
+_BINS = 512  # of a beam
 _COARSER = 4  # of the track's samples: where roots are compared
 
 
@@ -35,6 +37,8 @@ class View:
         Where the grid's pixels lie.
     spots_m : float64 [spots, 3]
         Over the whole grid, its corners among them.
+    limits : (low, high) or None
+        Sines of the aspect angle between which anything is seen.
     root : (rows, columns) or None
         Of the roots within which `rates` hold.
     rates : float64 [axes, spots, samples]
@@ -71,8 +75,9 @@ class View:
         self._seen: dict[tuple[int, int], NDArray[np.bool_]] = {}
         self._within: dict[tuple[int, int], View] = {}
         self._in_roots: dict[tuple[int, int], NDArray[np.float64]] = {}
-        self.along = self.channels_along = None
+        self.along = self.channels_along = self.limits = None
         if beam is not None:
+            self.limits = beam.limits
             self.channels_along = beam.directions(lines)
             self.along = beam_directions(self.channels_along, self.track, self.track.samples)
             self.beam_rates = beam_rate(beam, self.track, self.along, self.spots_m)
@@ -102,6 +107,28 @@ class View:
                 return False
         return True
 
+    def trimmed(self, share: float) -> View:
+        """Return this view without the edges of the beam, where weights are next to nothing.
+
+        At both edges as much is left out as takes `share` of the power of an image of noise.
+        """
+        if self.beam is None:
+            return self
+        on_track, (low, high) = self.on_track, np.clip(self.limits, -1, 1)
+        sine = np.einsum("psi,si->ps", self.sight[:, on_track], self.along[on_track])
+        weights = self.beam.weights(sine, wavelength_m(self.lines))
+        edges = np.linspace(low, high, _BINS + 1)
+        power = np.histogram(sine, edges, weights=weights**2)[0].cumsum()
+        first = np.searchsorted(power, share / 2 * power[-1])
+        last = np.searchsorted(power, (1 - share / 2) * power[-1])
+        if not 0 < first <= last:
+            return self
+        view = copy.copy(self)
+        view._seen, view._within, view._in_roots, view.kept = {}, {}, {}, {}
+        view.limits = float(edges[first]), float(edges[min(last + 1, _BINS)])
+        view.rates = view._rates(np.zeros(len(self.surface.steps_m)), self.spots_m)
+        return view
+
     @property
     def least_covered(self) -> float:
         """Least sum of the beam's weights at a pixel, over the largest."""
@@ -125,6 +152,9 @@ class View:
 
     def subimages(self, side: tuple[int, int]) -> int:
         """Return how many subimages of a size hold a pixel."""
+        if self.surface.is_plane:
+            shape = self.surface.plane.shape
+            return math.prod(-(-n // s) for n, s in zip(shape, side, strict=True))
         return int((self.surface.counts(side) > 0).sum())
 
     def slots(self, side: tuple[int, int], width: int) -> float:
@@ -148,54 +178,42 @@ class View:
     def seen(self, side: tuple[int, int]) -> NDArray[np.bool_]:
         """Return from where channels see anything of subimages at the spots, [spots, samples]."""
         on_track = np.broadcast_to(self.on_track, self.distance_m.shape)
-        if self.beam is None:
+        if self.limits is None:
             return on_track
         if side not in self._seen:
-            half_m = self.extents(side, np.max)[:, None] / 2 * self.surface.steps_m
+            half_m = self.extents(side, most=True)[:, None] / 2 * self.surface.steps_m
             origin_m = self.spots_m[0]
             track_m = self.track.positions_m(self.track.samples) - origin_m
             self._seen[side] = on_track & touches_boxes(
-                self.beam, self.spots_m - origin_m, half_m, track_m, self.along
+                self.limits, self.spots_m - origin_m, half_m, track_m, self.along
             )
         return self._seen[side]
 
-    def share_seen(
-        self, side: tuple[int, int], over: Callable[[NDArray[np.float64]], float] = np.mean
-    ) -> float:
-        """Return which part of the channels sees anything of a subimage, on average."""
-        return float(over(self.seen(side)[:, self.on_track].mean(axis=1)))
+    def share_seen(self, side: tuple[int, int], *, most: bool = False) -> float:
+        """Return which part of the channels sees anything of a subimage, on average or at most."""
+        return _over_spots(self.seen(side)[:, self.on_track].mean(axis=1), most)
 
     def cycles(
-        self,
-        rates: NDArray[np.float64],
-        seen: NDArray[np.bool_],
-        over: Callable[[NDArray[np.float64]], float] = np.mean,
+        self, rates: NDArray[np.float64], seen: NDArray[np.bool_], *, most: bool = False
     ) -> float:
-        """Return how far a phase turns while it is seen, on average over the spots."""
-        return float(over(turned(self.track, np.where(seen, rates, 0.0))[:, -1]))
+        """Return how far a phase turns while it is seen, on average over the grid or at most."""
+        return _over_spots(turned(self.track, np.where(seen, rates, 0.0))[:, -1], most)
 
-    def turns(
-        self,
-        side: tuple[int, int],
-        seen: NDArray[np.bool_],
-        over: Callable[[NDArray[np.float64]], float] = np.mean,
-    ) -> float:
+    def turns(self, side: tuple[int, int], seen: NDArray[np.bool_], *, most: bool = False) -> float:
         """Return `cycles` of the phases of subimages of a size."""
-        rates = np.tensordot(self.extents(side, over), self.rates, 1)
-        return self.cycles(rates, seen, over)
+        rates = np.tensordot(self.extents(side, most=most), self.rates, 1)
+        return self.cycles(rates, seen, most=most)
 
     def extents(
-        self,
-        side: tuple[int, int],
-        over: Callable[[NDArray[np.float64]], float] = np.mean,
-        root: tuple[int, int] | None = None,
+        self, side: tuple[int, int], root: tuple[int, int] | None = None, *, most: bool = False
     ) -> NDArray[np.float64]:
         """Return the extents of subimages of a size, [axes].
 
-        Their relief is the most in a root, of this view unless given, on average over the roots.
+        Their relief is the most in a root, of this view unless given, on average over the roots or
+        at most.
         """
         relief_m = self.surface.relief_m(side, root or self.root)
-        return self.surface.extents(side, float(over(relief_m)))
+        return self.surface.extents(side, float(relief_m.max() if most else relief_m.mean()))
 
     def channels(self, taps: int, density: float, turns: ArrayLike) -> ArrayLike:
         """Return the virtual channels of a subimage while whose phase turns by some cycles.
@@ -216,7 +234,7 @@ class View:
         if root not in self._within:
             view = self._within[root] = copy.copy(self)
             view.root, view.kept = root, {}
-            view.rates = self._rates(self.extents(root, np.max), self.spots_m)
+            view.rates = self._rates(self.extents(root, most=True), self.spots_m)
         return self._within[root]
 
     def cycles_in_root(
@@ -228,7 +246,7 @@ class View:
         """
         middle = np.arange(len(_SPOTS) ** 2).reshape(len(_SPOTS), -1)[1:-1, 1:-1].ravel()
         if root not in self._in_roots:
-            extents = self.extents(root, np.max) if any(root) else self.surface.extents(root)
+            extents = self.extents(root, most=True) if any(root) else self.surface.extents(root)
             self._in_roots[root] = self._rates(extents, self.spots_m[middle], _COARSER)
         seen = np.stack([self.seen(side)[middle, ::_COARSER] for side in sides])
         while_seen = seen * np.gradient(self.track.samples[::_COARSER])
@@ -244,7 +262,7 @@ class View:
             extents,
             self.highest_cycles_per_m,
             self.nearest_m,
-            self.beam,
+            self.limits,
             self.along,
             every,
         )
@@ -280,3 +298,10 @@ class View:
             + 1
             for level, side in enumerate(sides)
         )
+
+
+def _over_spots(values: NDArray[np.float64], most: bool) -> float:
+    """Return the largest of values at the spots, or their mean over the grid."""
+    if most:
+        return float(values.max())
+    return float(np.average(values, weights=np.outer(_OF_SPOTS, _OF_SPOTS).ravel()))

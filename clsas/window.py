@@ -350,7 +350,7 @@ def channel_ranges(
 
 
 def touches_boxes(
-    window: BeamWindow,
+    limits: tuple[float, float],
     centres_m: NDArray[np.float64],
     half_m: NDArray[np.float64],
     track_m: NDArray[np.float64],
@@ -362,6 +362,8 @@ def touches_boxes(
 
     Parameters
     ----------
+    limits : (low, high)
+        Sines of the aspect angle between which the window lies.
     centres_m : float64 [boxes, 3]
     half_m : float64 [axes, 3]
         Half their sides, as vectors.
@@ -381,7 +383,7 @@ def touches_boxes(
         np.subtract(along @ half, ahead, out=ahead)
         ahead *= inverse
         reach += np.abs(ahead, out=ahead)
-    low, high = window.limits
+    low, high = limits
     if np.any(around_m) or np.any(spread):
         ratio = np.minimum(around_m * inverse, 0.5)
         # From so much nearer the box reaches further; half way to it, anywhere.
