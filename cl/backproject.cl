@@ -39,7 +39,7 @@
  *   reference  per (part, channel): nearest sample (int, counted from the line's first margin
  *              sample), the fraction to the tile centre's range (samples) and phase (cycles in
  *              [-0.5, 0.5]), each [parts][channel_pitch].
- *   pixels     float2 [rows][columns], padded to whole tiles.
+ *   pixels     float2 [rows][columns], whole tiles.
  *   beam       float [BEAM][4]: the weight as cubics of a place in this table, constant terms first,
  *              from 0 to 1 each. A pixel's place is along.e - lowest, with e the unit vector to it
  *              from the middle of transmitter and receiver; beyond low and high the weight is 0.
@@ -397,7 +397,9 @@ __kernel void expand_tiles(__global const float *geometry, int channel_pitch,
 }
 
 /* Planar grids: pixels of a tile by the expansion of expand_tiles.
- * Global size (TILE_ROWS TILE_COLUMNS / (4 WIDTH), tiles), tiles counted from first_tile, row by row over the image. */
+ * Global size (TILE_ROWS TILE_COLUMNS / (4 WIDTH), tiles). Tiles are counted from first_tile, row by row over parts of
+ * the image of `down` x `across` tiles each; corners: int [parts][2], a part's first row and column in `pixels`, whose
+ * rows hold `columns`. */
 __kernel void backproject_tiles(__global const float *samples, int pitch,
 #if CENTRED
                                 int centre_sample,
@@ -409,7 +411,7 @@ __kernel void backproject_tiles(__global const float *samples, int pitch,
                                 __global const float *expansion, int channel_pitch,
                                 __global const int *ranges, int first_range, float cycles_per_sample,
                                 __global const float *weights, __global float2 *pixels, int columns,
-                                int first_tile BEAM_ARGUMENTS)
+                                __global const int *corners, int down, int across, int first_tile BEAM_ARGUMENTS)
 {
     const int item = get_global_id(0);
     const int tile = get_global_id(1);
@@ -419,7 +421,6 @@ __kernel void backproject_tiles(__global const float *samples, int pitch,
     if (begin >= end)
         return;
 #endif
-    const int tiles_across = columns / TILE_COLUMNS;
     const int block_column = item % BLOCKS_ACROSS * BLOCK_COLUMNS;
     const int block_row = item / BLOCKS_ACROSS * ITEM_ROWS;
     const size_t first = (size_t)tile * channel_pitch;
@@ -528,11 +529,12 @@ __kernel void backproject_tiles(__global const float *samples, int pitch,
             im[block] += line_re * sine + line_im * cosine;
         }
     }
-    put(re, im, pixels, columns, ((first_tile + tile) / tiles_across) * TILE_ROWS + block_row,
-        ((first_tile + tile) % tiles_across) * TILE_COLUMNS + block_column);
+    corners += (first_tile + tile) / (down * across) * 2;
+    const int row = corners[0] + (first_tile + tile) / across % down * TILE_ROWS + block_row;
+    const int column = corners[1] + (first_tile + tile) % across * TILE_COLUMNS + block_column;
+    put(re, im, pixels, columns, row, column);
 #if BEAM && NORMALISE
-    put(sum, sum, sums, columns, ((first_tile + tile) / tiles_across) * TILE_ROWS + block_row,
-        ((first_tile + tile) % tiles_across) * TILE_COLUMNS + block_column);
+    put(sum, sum, sums, columns, row, column);
 #endif
 }
 

@@ -398,6 +398,7 @@ class _Run:
         self.part_slots = itertools.cycle([Slot(device), Slot(device)])
         self.weights = device.upload(p.interpolator.coefficients.astype(np.float32))
         self.per_sine, self.beam = beam_arguments(device, p.beam, p.lines)
+        self.corner = device.upload(np.zeros(2, np.int32))
         self.progress = progress
         self.done = 0
 
@@ -491,7 +492,13 @@ class _Run:
             )
             size = (layout.part_pixels // (device.info.width * STACK), count)
             pitches, ranges = (pitch,), (slot["ranges"], 0)
-            rest = (layout.across * layout.side, first_part)
+            rest = (
+                layout.across * layout.side,
+                self.corner,
+                layout.down,
+                layout.across,
+                first_part,
+            )
         else:
             geometry = line_slot["geometry"]
             slot.fill("offsets", layout.offset_m[parts].reshape(-1, 3).T)

@@ -19,7 +19,7 @@ from clsas.backproject import (
     upsampled_lines,
     warn_unseen,
 )
-from clsas.device import Device, Slot, open_device
+from clsas.device import Device, Slot, aligned, open_device
 from clsas.filters import edges_gain
 from clsas.grid import Grid
 from clsas.image import Image
@@ -113,10 +113,10 @@ def factorize(
             progress=progress,
         )
     check_numbers(lines, chosen.beam)
-    pixels, done = np.empty(grid.shape, np.complex64), 0
+    pixels, done = aligned(np.empty, grid.shape, np.complex64), 0
     try:
-        run = _Run(lines, grid, chosen, device)
-        for formed in run.into(pixels):
+        run = _Run(lines, grid, chosen, device, pixels)
+        for formed in run.parts():
             done += formed
             if progress is not None:
                 progress(done, grid.size)
@@ -152,7 +152,14 @@ class _Tables:
 class _Run:
     """A plan at work on a device."""
 
-    def __init__(self, lines: RangeLines, grid: Grid, chosen: Plan, device: Device) -> None:
+    def __init__(
+        self,
+        lines: RangeLines,
+        grid: Grid,
+        chosen: Plan,
+        device: Device,
+        pixels: NDArray[np.complex64],
+    ) -> None:
         self.lines, self.grid, self.plan, self.device = lines, grid, chosen, device
         self.width, surface = device.info.width, surface_of(grid)
         self.geometry = Geometry(lines, surface, chosen)
@@ -173,7 +180,7 @@ class _Run:
         self.pitch = padded_length(chosen.resampling)
         self.samples = self._upload_lines()
         kind = PlaneLeaves if surface.is_plane else SurfaceLeaves
-        self.leaves = kind(lines, self.geometry, self.levels[-1], device)
+        self.leaves = kind(lines, self.geometry, self.levels[-1], device, pixels)
         later = range(1, len(self.levels))
         self.parents = {
             level: device.upload(self.division.parents(level).astype(np.int32)) for level in later
@@ -203,8 +210,8 @@ class _Run:
             upsampled_lines(self.lines.samples, resampling, self.width, MARGIN, self.pitch, gain)
         )
 
-    def into(self, pixels: NDArray[np.complex64]) -> Iterator[int]:
-        """Form all pixels, [rows, columns]; yield how many each time that some are finished.
+    def parts(self) -> Iterator[int]:
+        """Form all pixels; yield how many each time that some are finished.
 
         The geometry of a sector is prepared while the device works on the one before.
         """
@@ -215,7 +222,7 @@ class _Run:
             (sector, tables), following = following, None
             starts = range(0, len(sector.roots), self.plan.roots_at_once)
             for left, first in zip(reversed(range(len(starts))), starts, strict=True):
-                under_way.append(self._start(sector, tables, first, pixels))
+                under_way.append(self._start(sector, tables, first))
                 if left == _PREPARED_AHEAD:
                     following = next(sectors, None)
                 if len(under_way) > _STARTED_AHEAD:
@@ -224,6 +231,7 @@ class _Run:
             following = following or next(sectors, None)
         while under_way:
             yield under_way.popleft()()
+        self.leaves.complete()
 
     def _sectors(self) -> Iterator[tuple[Sector, _Tables]]:
         """Prepare the roots, some together; few at first, for the device to begin with."""
@@ -236,17 +244,15 @@ class _Run:
             yield sector, self._upload_tables(sector)
             start += len(sector.roots)
 
-    def _start(
-        self, sector: Sector, tables: _Tables, first: int, pixels: NDArray[np.complex64]
-    ) -> Finish:
+    def _start(self, sector: Sector, tables: _Tables, first: int) -> Finish:
         """Start forming the pixels of some roots of a sector."""
         batch = slice(first, min(first + self.plan.roots_at_once, len(sector.roots)))
         if not all(tables.strides):
-            return self.leaves.blank(sector, batch, pixels)
+            return self.leaves.blank(sector, batch)
         for level in range(len(self.levels)):
             self._stage(tables, level, batch)
         lines = self.slot[f"lines{len(self.levels) - 1}"]
-        return self.leaves.form(tables.slot, sector, batch, lines, pixels)
+        return self.leaves.form(tables.slot, sector, batch, lines)
 
     def _upload_tables(self, sector: Sector) -> _Tables:
         """Start copying to the device all that it is told of a sector's roots."""

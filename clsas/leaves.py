@@ -57,7 +57,14 @@ class Level:
 class Leaves:
     """What forms pixels from leaves: of tiles on a plane, of groups of points elsewhere."""
 
-    def __init__(self, lines: RangeLines, geometry: Geometry, level: Level, device: Device) -> None:
+    def __init__(
+        self,
+        lines: RangeLines,
+        geometry: Geometry,
+        level: Level,
+        device: Device,
+        image: NDArray[np.complex64],
+    ) -> None:
         chosen = geometry.plan
         self.lines, self.geometry, self.level, self.device = lines, geometry, level, device
         self.plan, self.surface, self.width = chosen, geometry.surface, device.info.width
@@ -67,7 +74,7 @@ class Leaves:
         # Where tile and leaf are one, every line is aligned on its centre.
         self.centred = chosen.tile == chosen.sides[-1]
         self.per_sample = geometry.cycles_per_m / geometry.samples_per_m
-        self.slot = Slot(device)
+        self.slot, self.image = Slot(device), image
 
     def _options(self, block_radius_m: float) -> dict[str, int]:
         reach = block_radius_m * self.geometry.samples_per_m
@@ -107,7 +114,6 @@ class Leaves:
         sector: Sector,
         batch: slice,
         samples: cl.Buffer,
-        image: NDArray[np.complex64],
     ) -> Finish:
         """Start forming the pixels of some roots of a sector from the lines of their leaves.
 
@@ -117,12 +123,13 @@ class Leaves:
             Filled by `fill`.
         samples : Buffer
             The lines.
-        image : complex64
-            That is put together.
         """
         raise NotImplementedError
 
-    def blank(self, sector: Sector, batch: slice, image: NDArray[np.complex64]) -> Finish:
+    def complete(self) -> None:
+        """Make sure that the image holds all pixels, once they are finished."""
+
+    def blank(self, sector: Sector, batch: slice) -> Finish:
         """Return what sets the pixels of some roots that no channel sees to 0."""
         raise NotImplementedError
 
@@ -156,9 +163,19 @@ class Leaves:
 class PlaneLeaves(Leaves):
     """Leaves on a plane, in tiles."""
 
-    def __init__(self, lines: RangeLines, geometry: Geometry, level: Level, device: Device) -> None:
-        super().__init__(lines, geometry, level, device)
+    def __init__(
+        self,
+        lines: RangeLines,
+        geometry: Geometry,
+        level: Level,
+        device: Device,
+        image: NDArray[np.complex64],
+    ) -> None:
+        super().__init__(lines, geometry, level, device, image)
         chosen, plane = self.plan, self.surface.plane
+        # A CPU sets the pixels where they belong.
+        on_cpu = device.info.kind == "cpu" and not self.normalise
+        self.shared = device.share(image) if on_cpu else None
         options = self._options(Tiles(plane, chosen.tile[0], self.width).block_radius_m)
         self.expand = device.kernel("backproject", "expand_tiles", **options)
         self.backproject = device.kernel("backproject", "backproject_tiles", **options)
@@ -179,7 +196,6 @@ class PlaneLeaves(Leaves):
         sector: Sector,
         batch: slice,
         samples: cl.Buffer,
-        image: NDArray[np.complex64],
     ) -> Finish:
         """Start forming the pixels of some roots; see `Leaves.form`."""
         device, slot, chosen, level = self.device, self.slot, self.plan, self.level
@@ -215,9 +231,14 @@ class PlaneLeaves(Leaves):
             *self.beam[1:2],
             wait_for=tables.filled,
         )
-        height, width = chosen.sides[0]
-        pixels = slot.buffer("pixels", 8 * len(parts) * height * width)
-        sums = self._sums(tables, len(parts) * height * width)
+        (height, width), corners = chosen.sides[0], sector.roots[batch]
+        direct = self.shared is not None and bool(np.all(corners + (height, width) <= plane.shape))
+        if direct:
+            pixels, columns, sums = self.shared, plane.shape[1], []
+        else:
+            corners = np.arange(len(parts))[:, None] * [height, 0]
+            pixels, columns = slot.buffer("pixels", 8 * len(parts) * height * width), width
+            sums = self._sums(tables, len(parts) * height * width)
         slot.busy = device.run(
             self.backproject,
             (chosen.tile[0] * chosen.tile[1] // (self.width * STACK), tiles),
@@ -231,17 +252,20 @@ class PlaneLeaves(Leaves):
             self.per_sample,
             self.filter,
             pixels,
-            width,
+            columns,
+            device.upload(corners.astype(np.int32)),
+            height // chosen.tile[0],
+            width // chosen.tile[1],
             0,
             *self.beam,
             *sums,
             wait_for=slot.filled,
         )
-        formed = [(image, part) for part in parts]
-        ready = [self._read(pixels, n, *each) for n, each in enumerate(formed)]
-        weights = []
+        ready, weights = [slot.busy], []
+        if not direct:
+            ready = [self._read(pixels, n, self.image, part) for n, part in enumerate(parts)]
         if sums:
-            weights = [np.empty(image[part].shape, np.complex64) for part in parts]
+            weights = [np.empty(self.image[part].shape, np.complex64) for part in parts]
             everything = (slice(None), slice(None))
             ready += [self._read(sums[0], n, each, everything) for n, each in enumerate(weights)]
         device.queue.flush()
@@ -249,21 +273,30 @@ class PlaneLeaves(Leaves):
         def finish() -> int:
             cl.wait_for_events(ready)
             for part, each in zip(parts, weights, strict=bool(weights)):
-                image[part] *= normalising(each.real, self.lines.channels)
-            return sum(image[part].size for part in parts)
+                self.image[part] *= normalising(each.real, self.lines.channels)
+            return sum(self.image[part].size for part in parts)
 
         return finish
 
-    def blank(self, sector: Sector, batch: slice, image: NDArray[np.complex64]) -> Finish:
+    def blank(self, sector: Sector, batch: slice) -> Finish:
         """Return what sets pixels to 0; see `Leaves.blank`."""
         parts = [self._part(root) for root in sector.roots[batch]]
 
         def finish() -> int:
             for part in parts:
-                image[part] = 0
-            return sum(image[part].size for part in parts)
+                self.image[part] = 0
+            return sum(self.image[part].size for part in parts)
 
         return finish
+
+    def complete(self) -> None:
+        """Hand the image back to the host; see `Leaves.complete`."""
+        if self.shared is not None:
+            flags, shape = cl.map_flags.READ, self.image.shape
+            mapped, _ = cl.enqueue_map_buffer(
+                self.device.queue, self.shared, flags, 0, shape, np.complex64
+            )
+            mapped.base.release()
 
     def _part(self, root: NDArray[np.int64]) -> tuple[slice, slice]:
         """Return which pixels of the image a root has."""
@@ -316,8 +349,15 @@ class PlaneLeaves(Leaves):
 class SurfaceLeaves(Leaves):
     """Leaves off a plane, in groups of points about their centres."""
 
-    def __init__(self, lines: RangeLines, geometry: Geometry, level: Level, device: Device) -> None:
-        super().__init__(lines, geometry, level, device)
+    def __init__(
+        self,
+        lines: RangeLines,
+        geometry: Geometry,
+        level: Level,
+        device: Device,
+        image: NDArray[np.complex64],
+    ) -> None:
+        super().__init__(lines, geometry, level, device, image)
         division = geometry.division
         roots, last = division.roots, len(division.sides) - 1
         corners = division.corners(last, roots)
@@ -384,7 +424,6 @@ class SurfaceLeaves(Leaves):
         sector: Sector,
         batch: slice,
         samples: cl.Buffer,
-        image: NDArray[np.complex64],
     ) -> Finish:
         """Start forming the pixels of some roots; see `Leaves.form`."""
         first = self._groups(self._roots(sector)).start
@@ -431,19 +470,17 @@ class SurfaceLeaves(Leaves):
                 event.wait()
             for sums in formed[1:]:
                 formed[0] *= normalising(sums.real, self.lines.channels)
-            return self._put(roots, formed[0], image)
+            return self._put(roots, formed[0])
 
         return finish
 
-    def blank(self, sector: Sector, batch: slice, image: NDArray[np.complex64]) -> Finish:
+    def blank(self, sector: Sector, batch: slice) -> Finish:
         """Return what sets pixels to 0; see `Leaves.blank`."""
-        return lambda: self._put(self._roots(sector, batch), np.complex64(0), image)
+        return lambda: self._put(self._roots(sector, batch), np.complex64(0))
 
-    def _put(
-        self, roots: slice, pixels: NDArray[np.complex64], image: NDArray[np.complex64]
-    ) -> int:
+    def _put(self, roots: slice, pixels: NDArray[np.complex64]) -> int:
         """Set the pixels of some roots; return how many they are."""
-        image.reshape(-1)[self.groups.index[self._groups(roots)]] = pixels
+        self.image.reshape(-1)[self.groups.index[self._groups(roots)]] = pixels
         return int(self.pixels_before[roots.stop] - self.pixels_before[roots.start])
 
 
