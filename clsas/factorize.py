@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -33,8 +34,8 @@ from clsas.upsample import upsample
 from clsas.window import BeamWindow
 
 _GROUP = 64  # work-items that share a subimage where each has one lane
-_STARTED_AHEAD = 2  # batches: few, so that an interruption need not wait long
-_PREPARED_FIRST, _PREPARED_AHEAD = 4, 4  # batches
+_AHEAD_S = 0.1  # of work that is started: roots are prepared meanwhile, an interruption waits
+_PREPARED_FIRST = 4  # batches
 _GROUPS_PER_UNIT = 3  # at least, of compute units: so that they end together
 
 
@@ -216,33 +217,26 @@ class _Run:
         The geometry of a sector is prepared while the device works on the one before.
         """
         under_way = deque()
-        sectors = self._sectors()
-        following = next(sectors, None)
-        while following is not None:
-            (sector, tables), following = following, None
-            starts = range(0, len(sector.roots), self.plan.roots_at_once)
-            for left, first in zip(reversed(range(len(starts))), starts, strict=True):
+        batches = -(-len(self.division.roots) // self.plan.roots_at_once)
+        most = max(math.ceil(_AHEAD_S * batches / max(self.plan.predicted_seconds, 1e-9)), 2)
+        for sector, tables in self._sectors():
+            for first in range(0, len(sector.roots), self.plan.roots_at_once):
                 under_way.append(self._start(sector, tables, first))
-                if left == _PREPARED_AHEAD:
-                    following = next(sectors, None)
-                if len(under_way) > _STARTED_AHEAD:
+                if len(under_way) > most:
                     yield under_way.popleft()()
             tables.slot.busy = cl.enqueue_marker(self.device.queue)
-            following = following or next(sectors, None)
         while under_way:
             yield under_way.popleft()()
         self.leaves.complete()
 
     def _sectors(self) -> Iterator[tuple[Sector, _Tables]]:
         """Prepare the roots, some together; few at first, for the device to begin with."""
-        roots, at_once, start = self.division.roots, self.plan.roots_at_once, 0
+        roots, start, most = self.division.roots, 0, self.plan.roots_prepared
+        count = min(_PREPARED_FIRST * self.plan.roots_at_once, most)
         while start < len(roots):
-            count = self.plan.roots_prepared if start else at_once * _PREPARED_FIRST
-            sector = self.geometry.sector(
-                roots[start : start + min(count, self.plan.roots_prepared)]
-            )
+            sector = self.geometry.sector(roots[start : start + count])
             yield sector, self._upload_tables(sector)
-            start += len(sector.roots)
+            start, count = start + count, min(2 * count, most)
 
     def _start(self, sector: Sector, tables: _Tables, first: int) -> Finish:
         """Start forming the pixels of some roots of a sector."""

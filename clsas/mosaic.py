@@ -216,10 +216,15 @@ class Mosaic:
             with its place.
         """
         validate.memory("the mosaic", 8 * self.grid.size)
-        pixels = np.empty(self.grid.shape, np.complex64)
         stored = (self._finished(place, record, None) for place, record in self.finished.items())
+        pixels: NDArray[np.complex64] | None = None
         for patch in chain(stored, self):
-            pixels[patch.rows, patch.columns] = patch.image.pixels
+            if patch.image.pixels.shape == self.grid.shape:
+                pixels = patch.image.pixels  # to copy these takes as long as to form some
+            else:
+                if pixels is None:
+                    pixels = np.empty(self.grid.shape, np.complex64)
+                pixels[patch.rows, patch.columns] = patch.image.pixels
             if tell is not None:
                 tell(patch)
         return Image(pixels, self.grid)
