@@ -22,7 +22,8 @@ def upsample(
 ) -> cl.Buffer:
     """Return lines [channels, n] upsampled on a device as its kernels want them.
 
-    `pitch` samples each, with zeros around them: interleaved, [channels, pitch, 2], with
+    The samples are to be kept, and left alone, until the device is done with them. The result has
+    `pitch` samples per line, with zeros around them: interleaved, [channels, pitch, 2], with
     one lane per work-item, else [channels, 2, pitch].
     """
     width, taps, step = device.info.width, upsampler.taps, upsampler.step

@@ -50,7 +50,7 @@ def test_text_gives_the_same_plan(any_plan):
     again = Plan.from_json(any_plan.to_json())
     assert again.to_json() == any_plan.to_json()
     for field in dataclasses.fields(Plan):
-        if field.name not in ("align", "aperture", "final", "beam"):
+        if field.name not in ("align", "aperture", "final", "upsampler", "beam"):
             assert getattr(again, field.name) == getattr(any_plan, field.name), field.name
 
 
@@ -90,6 +90,12 @@ def test_text_that_is_no_plan_is_refused(text):
         ("final", None),
         ("resampling", None),
         ("resampling", {}),
+        ("upsampler", 3),
+        ("upsampler", {}),
+        ("upsampler", {"step": 0, "coefficients": [[0.0] * 16] * 32, "error_db": -60.0}),
+        ("upsampler", {"step": 20, "coefficients": [[0.0] * 16] * 31, "error_db": -60.0}),
+        ("upsampler", {"step": 20, "coefficients": [[float("nan")] * 16] * 32, "error_db": 0.0}),
+        ("limits", [0.1, 0.2]),
         ("half_lengths", []),
         ("half_lengths", "ab"),
         ("half_lengths", [-5, -5, -5]),
