@@ -231,7 +231,7 @@ class _Run:
 
     def _sectors(self) -> Iterator[tuple[Sector, _Tables]]:
         """Prepare the roots, some together; few at first, for the device to begin with."""
-        roots, start, most = self.division.roots, 0, self.plan.roots_prepared
+        roots, start, most = self.geometry.roots, 0, self.plan.roots_prepared
         count = min(_PREPARED_FIRST * self.plan.roots_at_once, most)
         while start < len(roots):
             sector = self.geometry.sector(roots[start : start + count])

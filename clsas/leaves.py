@@ -359,13 +359,14 @@ class SurfaceLeaves(Leaves):
     ) -> None:
         super().__init__(lines, geometry, level, device, image)
         division = geometry.division
-        roots, last = division.roots, len(division.sides) - 1
+        roots, last = geometry.roots, len(division.sides) - 1
         corners = division.corners(last, roots)
         middles_m = division.centres_m(last, corners).reshape(-1, 3)
         leaf, place = (each.ravel()[self.surface.cell] for each in self._cells(corners))
         self.groups, self.leaf = groups_within(
             self.surface.grid, leaf, place, middles_m, self.width
         )
+        self.number = {tuple(root): n for n, root in enumerate(roots)}
         self.ends = np.searchsorted(self.leaf, np.arange(len(roots) + 1) * corners.shape[1])
         held = np.bincount(leaf // corners.shape[1], minlength=len(roots))
         self.pixels_before = np.concatenate([[0], np.cumsum(held)])
@@ -399,9 +400,7 @@ class SurfaceLeaves(Leaves):
 
     def _roots(self, sector: Sector, batch: slice = _ALL) -> slice:
         """Return which of all roots those of a sector, or some of these, are."""
-        across = -(-self.surface.plane.shape[1] // self.plan.sides[0][1])
-        row, column = sector.roots[0] // np.array(self.plan.sides[0])
-        first = int(row * across + column)
+        first = self.number[tuple(sector.roots[0])]
         some = range(first, first + len(sector.roots))[batch]
         return slice(some.start, some.stop)
 

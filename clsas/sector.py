@@ -33,17 +33,20 @@ class Sector:
         Their first pixels.
     root_m : float64 [roots, 3]
         Middles of the roots.
+    channels : slice
+        Which of the raw channels, in the order of the track, see any of them.
     relative_m : list of float64 [roots, subimages, 3]
         Those of subimages from that of their root, stage by stage.
     nodes : list of Nodes
         Stage by stage.
     needs : list of Ranges
     place : float64 [roots, channels]
-        Where the raw channels appear on the track.
+        Where these raw channels appear on the track.
     """
 
     roots: NDArray[np.int64]
     root_m: NDArray[np.float64]
+    channels: slice
     relative_m: list[NDArray[np.float64]]
     nodes: list[Nodes]
     needs: list[Ranges]
@@ -87,13 +90,6 @@ class Geometry:
             along = chosen.beam.directions(lines)[self.channels]
             self.along = tree.beam_directions(along, self.track, track.samples)
         self.phase_centres_m = lines.phase_centres_m[self.channels]
-        velocity = lines.rx_velocity_m_s
-        self._path = (
-            lines.tx_m[self.channels],
-            lines.rx_m[self.channels],
-            velocity if velocity is None else velocity[self.channels],
-            lines.sound_speed_m_s,
-        )
         self.drift = drift(lines)
         self._seen = Division(surface, (chosen.sides[0], self._together(), chosen.sides[-1]))
         # The thesis's method has none; on the track itself there is nothing to make up for.
@@ -101,6 +97,22 @@ class Geometry:
         wavelength_m = lines.sound_speed_m_s / max(lines.carrier_hz, 1.0)
         away = not np.array_equal(lines.tx_m, lines.rx_m) or off_m > _ON_TRACK * wavelength_m
         self.ramps = bool(away and not chosen.nearest)
+        # From elsewhere a channel off the track appears at another place.
+        way_m = np.linalg.norm(self.track.tangents_m(self.track.samples), axis=1)
+        self._slack = 2 * off_m / max(way_m.min(), 1e-9)
+
+    @property
+    def roots(self) -> NDArray[np.int64]:
+        """Roots in the order in which they are formed, [roots, 2].
+
+        With a beam, so that those come together which the same channels see.
+        """
+        roots = self.division.roots
+        if self.plan.limits is None:
+            return roots
+        along = np.abs(self.surface.steps_m[:2] @ self.along.mean(axis=0))
+        slow = int(np.argmax(along * self.plan.sides[0]))
+        return roots[np.lexsort((roots[:, 1 - slow], roots[:, slow]))]
 
     @functools.cached_property
     def nearest_m(self) -> float:
@@ -137,10 +149,20 @@ class Geometry:
         relative_m = [
             division.centres_m(level, each) - root_m[:, None] for level, each in enumerate(corners)
         ]
-        seen_at = place = track.places_seen_from(root_m, self.phase_centres_m)
+        together = self._seen.sides[1]
+        seen_m = self._seen.centres_m(1, self._seen.corners(1, roots))
+        half_m = surface.extents_in(together, sides[0], roots).max(axis=0) / 2
+        half_m = half_m[:, None] * surface.steps_m
+        seen = tree.seen_from(chosen.limits, track, self.along, seen_m, half_m)
+        seen = tuple(each[:, self._seen.parents(2)] for each in seen)
+        inside = surface.holds(sides[-1], corners[-1])
+        channels = self._used(*(each[inside] for each in seen))
+        centres_m = self.phase_centres_m[channels]
+        some = replace(track, place=track.place[channels])
+        seen_at = place = some.places_seen_from(root_m, centres_m)
         nodes = []
         if chosen.nearest:
-            position_m = np.broadcast_to(self.phase_centres_m, (*place.shape, 3))
+            position_m = np.broadcast_to(centres_m, (*place.shape, 3))
             for factor in chosen.nearest:
                 nodes.append(tree.nearest_nodes(place, position_m, factor))
                 place, position_m = nodes[-1].place, nodes[-1].position_m
@@ -164,15 +186,17 @@ class Geometry:
                     )
                 nodes.append(tree.interpolated_nodes(track, rate, place, chosen.aperture))
                 place = nodes[-1].place
-        together = self._seen.sides[1]
-        seen_m = self._seen.centres_m(1, self._seen.corners(1, roots))
-        half_m = surface.extents_in(together, sides[0], roots).max(axis=0) / 2
-        half_m = half_m[:, None] * surface.steps_m
-        seen = tree.seen_from(chosen.limits, track, self.along, seen_m, half_m)
-        seen = tuple(each[:, self._seen.parents(2)] for each in seen)
-        inside = surface.holds(sides[-1], corners[-1])
         needs = tree.ranges(division, nodes, seen_at, seen, inside)
-        return Sector(roots, root_m, relative_m, nodes, needs, seen_at)
+        return Sector(roots, root_m, channels, relative_m, nodes, needs, seen_at)
+
+    def _used(self, start: NDArray[np.float64], stop: NDArray[np.float64]) -> slice:
+        """Return the channels at places on the track from where leaves are seen; one at least."""
+        seen, place = stop > start, self.track.place
+        if self.plan.nearest or not seen.any():
+            return slice(0, len(place) if self.plan.nearest else 1)
+        first = np.searchsorted(place, start[seen].min() - self._slack, "left")
+        last = np.searchsorted(place, stop[seen].max() + self._slack, "right")
+        return slice(int(min(first, len(place) - 1)), int(max(last, first + 1)))
 
     def references(self, sector: Sector) -> dict[str, NDArray]:
         """Return how roots see the raw channels, in the order of their nodes, [roots, channels].
@@ -181,8 +205,9 @@ class Geometry:
         """
         lines, resampling, half = self.lines, self.plan.resampling, self.plan.half_lengths[0]
         nodes = sector.nodes[0]
-        range_m = pairwise_range_m(sector.root_m, *self._path)
-        place = (range_m - lines.first_range_m[self.channels]) / lines.range_step_m
+        channels = self.channels[sector.channels]
+        range_m = pairwise_range_m(sector.root_m, *self._antennas(sector))
+        place = (range_m - lines.first_range_m[channels]) / lines.range_step_m
         place += resampling.lead
         cycles = lines.carrier_cycles_per_m * range_m
         cycles += place * resampling.centre_cycles_per_sample
@@ -191,7 +216,7 @@ class Geometry:
         place += MARGIN - resampling.first - half
         lower = np.floor(place)
         start = np.clip(lower + 1 - self.plan.align.taps // 2, -_FAR, _FAR)
-        channel = np.broadcast_to(self.channels, place.shape)
+        channel = np.broadcast_to(channels, place.shape)
         references = {
             "order": nodes.ordered(channel).astype(np.int32),
             "start": nodes.ordered(start).astype(np.int32),
@@ -202,10 +227,19 @@ class Geometry:
             references["ramp"] = nodes.ordered(self._ramp(sector)).astype(np.float32)
         return references
 
+    def _antennas(self, sector: Sector) -> tuple:
+        """Return what `pairwise_range_m` takes of the channels of a sector."""
+        lines, channels = self.lines, self.channels[sector.channels]
+        velocity = lines.rx_velocity_m_s
+        moving = velocity if velocity is None else velocity[channels]
+        return lines.tx_m[channels], lines.rx_m[channels], moving, lines.sound_speed_m_s
+
     def _ramp(self, sector: Sector) -> NDArray[np.float64]:
         """Return by how many cycles per sample the phase of channels grows beyond their place's."""
         virtual_m = self.track.positions_m(sector.place)
-        stretch = stretches(*self._path[:2], self.surface.plane, sector.root_m, virtual_m)
+        stretch = stretches(
+            *self._antennas(sector)[:2], self.surface.plane, sector.root_m, virtual_m
+        )
         return stretch * self.cycles_per_m / self.samples_per_m
 
 

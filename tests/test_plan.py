@@ -203,7 +203,7 @@ def test_device_memory_of_plain_backprojection(monkeypatch, case, beam):
         lines = lines.select(slice(100, 220)) if case == "few channels" else lines
     planned = plan(lines, grid, stages=[], beam=beam).memory_bytes
     peak = peak_device_bytes(
-        monkeypatch, lambda: backproject(lines, grid, accuracy_db=-60, beam=beam)
+        monkeypatch, lambda: backproject(lines, grid, accuracy_db=-60, beam=beam), None
     )
     assert 0.5 * planned <= peak <= 1.01 * planned
 

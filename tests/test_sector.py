@@ -112,7 +112,11 @@ def test_leaves_are_seen_from_wherever_they_are_seen_alone():
     half_m = np.array(geometry.plan.sides[-1])[:, None] / 2
     half_m = half_m * [grid.row_step_m, grid.column_step_m]
     start, stop = tree.seen_from(
-        HANN, geometry.track, geometry.along, geometry.division.centres_m(last, leaves), half_m
+        chosen.limits,
+        geometry.track,
+        geometry.along,
+        geometry.division.centres_m(last, leaves),
+        half_m,
     )
     need, place = sector.needs[-1], sector.nodes[-1].place
     counts = np.full(len(sector.roots), sector.place.shape[1])

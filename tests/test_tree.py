@@ -208,7 +208,7 @@ def test_places_from_where_leaves_are_seen_hold_all_that_weigh():
     division = Division(surface_of(grid), ((16, 16),))
     corners = division.roots[:, None]
     half_m = 8 * np.stack([grid.row_step_m, grid.column_step_m])
-    begin, end = tree.seen_from(beam, track, along, division.centres_m(0, corners), half_m)
+    begin, end = tree.seen_from(beam.limits, track, along, division.centres_m(0, corners), half_m)
     place = np.linspace(0, 1, 2001)
     position_m = track.positions_m(place)
     direction = tree.beam_directions(beam.directions(lines), track, place)
