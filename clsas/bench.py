@@ -10,6 +10,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from clsas import reference, validate, wreck
 from clsas.backproject import backproject, execute, prepare
@@ -29,6 +30,7 @@ from clsas.window import BeamWindow
 
 _PIXELS = 300  # random pixels at which errors are measured
 _POINTS = 1000
+_DUNES_M = 8.0
 
 
 @dataclass(frozen=True)
@@ -49,6 +51,8 @@ class Case:
         Along either side.
     beam : BeamWindow, optional
         Weights of the channels.
+    relief_m : float
+        From the troughs to the crests of dunes, 8 m long and wide, on which points and pixels lie.
     """
 
     channels: int
@@ -59,11 +63,20 @@ class Case:
     y_m: tuple[float, float]
     pixels: int
     beam: BeamWindow | None = None
+    relief_m: float = 0.0
 
     @property
     def grid(self) -> Grid:
         """The image's grid."""
-        return Grid.plane((*self.x_m, self.pixels), (*self.y_m, self.pixels))
+        plane = Grid.plane((*self.x_m, self.pixels), (*self.y_m, self.pixels))
+        if not self.relief_m:
+            return plane
+        x_m, y_m = plane.axes_m
+        return plane.with_height(self._height_m(x_m, y_m[:, None]))
+
+    def _height_m(self, x_m: NDArray[np.float64], y_m: NDArray[np.float64]) -> NDArray[np.float64]:
+        dunes = np.sin(2 * np.pi * x_m / _DUNES_M) * np.sin(2 * np.pi * y_m / _DUNES_M)
+        return self.relief_m / 2 * dunes
 
     def lines(self, seed: int = 1) -> RangeLines:
         """Return range lines of random points of complex amplitude all over the image."""
@@ -73,6 +86,7 @@ class Case:
         positions = np.zeros((_POINTS, 3))
         positions[:, 0] = random.uniform(*self.x_m, _POINTS)
         positions[:, 1] = random.uniform(*self.y_m, _POINTS)
+        positions[:, 2] = self._height_m(*positions[:, :2].T)
         amplitudes = random.standard_normal(_POINTS) + 1j * random.standard_normal(_POINTS)
         return simulate_lines(
             tx_m,
@@ -96,6 +110,9 @@ _BEAM = BeamWindow(20.0, "hann")
 FACTORIZED = {
     "ffbp-thesis": CASES["bp-thesis"],
     "ffbp-2k": Case(2000, 15e-3, 120e3, 30e3, (-20.48, 20.46), (40.0, 80.0), 2048, _BEAM),
+    "ffbp-relief": Case(
+        2000, 15e-3, 120e3, 30e3, (-20.48, 20.46), (40.0, 80.0), 2048, _BEAM, relief_m=1.0
+    ),
     # The same pixels and spacing, over a longer track and further out.
     "ffbp-8k": Case(8192, 15e-3, 120e3, 30e3, (-40.96, 40.94), (40.0, 121.9), 4096, _BEAM),
 }
