@@ -14,6 +14,8 @@ from clsas.interpolation import Gain, Interpolator, Spectrum
 
 ALIGN_TAPS = APERTURE_TAPS = (4, 6, 8)
 _FINAL_TAPS = (2, 4, 6, 8)
+UPSAMPLING_SHARE = 0.03
+"""Of the power of an image's error: what filters that upsample may add."""
 _MOST_GAIN = 3.0  # of frequencies, which are amplified where lines hold next to nothing
 _RATES = tuple(np.geomspace(1, 12, 16))  # where errors are looked at
 _FLAT = Spectrum(0.0, (np.arange(64) + 0.5) / 128, np.full(64, 1 / 64))

@@ -13,7 +13,7 @@ from clsas.costs import Costs
 from clsas.device import Device
 from clsas.errors import in_db, leaf_error, power
 from clsas.exact import Exact
-from clsas.filters import Filters, edges_gain
+from clsas.filters import UPSAMPLING_SHARE, Filters, edges_gain
 from clsas.interpolation import PHASES
 from clsas.layout import STACK
 from clsas.plan import GIVEN_BYTES, GUARD, Plan, Stage, grid_digest, lines_digest, padded_length
@@ -24,7 +24,6 @@ MARGIN_DB = 1.0  # between prediction and tolerance, for what measured errors sc
 _CACHED_BYTES, _BATCH_BYTES = 16 << 20, 256 << 20  # of a batch, on CPUs and elsewhere
 _MOST_TABLE_BYTES = 64 << 20
 _ROOTS_PREPARED = 16  # enough for few and large arrays
-_UPSAMPLING_SHARE = 0.03  # of the power of an image's error, for upsampling
 
 
 @dataclass(frozen=True)
@@ -60,7 +59,7 @@ def factorized(
     if not nearest:
         step = max(int(PHASES / align.upsampling), 1)
         gain = edges_gain(align, final, len(sides), PHASES / step)
-        most_db = in_db(_UPSAMPLING_SHARE * error)
+        most_db = in_db(UPSAMPLING_SHARE * error)
         upsampler = interpolation.upsampler(view.spectrum, step, gain, most_db)
     if upsampler is None:
         resampling = interpolation.resampling(lines.length, align, view.spectrum)

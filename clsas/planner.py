@@ -34,6 +34,7 @@ NEAREST_UPSAMPLING = 8.0
 """By how much lines are upsampled before the linear interpolation of given stages."""
 
 _ROOTS_SHARE, _NODES_SHARE, _EDGES_SHARE = 0.25, 0.2, 0.03  # of the error allowed
+_WORTH = 0.95  # of the time of an exact image
 _MOST_CROWDING = 2.0
 _LEAST_COVERED = 0.25
 _LEAST_BEAM_CYCLES, _MOST_BEAM_CYCLES = 0.5, 64.0
@@ -139,7 +140,8 @@ def plan(
             return found
         exact_fits, least = False, found.memory_bytes
     elif stages is None and _divisible(view):
-        to_beat = exact.seconds(costs) if exact_fits and allowed is None else math.inf
+        # What is gained must be worth an error, and more than predictions scatter.
+        to_beat = _WORTH * exact.seconds(costs) if exact_fits and allowed is None else math.inf
         found, needed = _fastest(
             view, tolerance_db, exact, to_beat, device, costs, room, allowed or Allowed()
         )

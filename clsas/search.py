@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from clsas.costs import Costs
 from clsas.device import Device
-from clsas.errors import leaf_error, power, root_error
-from clsas.filters import ALIGN_TAPS, APERTURE_TAPS, Choice, choose
-from clsas.interpolation import Spectrum
+from clsas.errors import in_db, leaf_error, power, root_error
+from clsas.filters import ALIGN_TAPS, APERTURE_TAPS, UPSAMPLING_SHARE, Choice, choose
+from clsas.interpolation import PHASES, Spectrum, upsampler
 from clsas.view import View
 
 _ROWS = (16, 32, 64, 128, 256, 512, 1024, 2048)  # of subimages
@@ -164,6 +164,10 @@ class _Option:
 def _options(sizes: _Sizes, filters_db: float, costs: Costs, allowed: Allowed) -> list[_Option]:
     """Return all ways to filter, and their costs."""
     view, options = sizes.view, []
+    sample_ns = costs.filtered_sample_ns
+    most_db = filters_db + in_db(UPSAMPLING_SHARE)
+    if upsampler(view.spectrum, PHASES // 2, np.ones_like, most_db) is None:
+        sample_ns = costs.upsampled_sample_ns
     for stages, *taps in product(allowed.stages, allowed.align_taps, allowed.aperture_taps):
         choice = choose(view.spectrum, *taps, stages, filters_db)
         if choice is None:
@@ -180,8 +184,7 @@ def _options(sizes: _Sizes, filters_db: float, costs: Costs, allowed: Allowed) -
                 stages,
                 channel_ns=sizes.counts * costs.line_ns(samples, sum(taps)),
                 pixels_ns=np.where(sizes.leaf, sizes.counts * of_leaf, np.inf),
-                once_ns=costs.upsampled_sample_ns * view.lines.samples.size * choice.rate
-                + stages * costs.batch_ns,
+                once_ns=sample_ns * view.lines.samples.size * choice.rate + stages * costs.batch_ns,
             )
         )
     return options

@@ -55,7 +55,7 @@ class View:
         half_band = (occupied[-1] if len(occupied) else 0.5) / lines.range_step_m
         centre = interpolation.cycles_per_m(lines, self.spectrum.centre)
         self.highest_cycles_per_m = abs(centre) + half_band
-        self.track = mean_track(lines)
+        self.track, self.limits = mean_track(lines), None if beam is None else beam.limits
         if self.track is None:
             return
         self.surface, self.root = surface_of(grid), None
@@ -75,9 +75,8 @@ class View:
         self._seen: dict[tuple[int, int], NDArray[np.bool_]] = {}
         self._within: dict[tuple[int, int], View] = {}
         self._in_roots: dict[tuple[int, int], NDArray[np.float64]] = {}
-        self.along = self.channels_along = self.limits = None
+        self.along = self.channels_along = None
         if beam is not None:
-            self.limits = beam.limits
             self.channels_along = beam.directions(lines)
             self.along = beam_directions(self.channels_along, self.track, self.track.samples)
             self.beam_rates = beam_rate(beam, self.track, self.along, self.spots_m)

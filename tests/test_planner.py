@@ -143,7 +143,7 @@ def test_given_stages_are_those_given():
 @pytest.mark.parametrize("depth", [1, 2])
 def test_taps_and_depth_for_study(taps, depth):
     """Filters and stages are those told, also where the exact image is faster."""
-    costs = Costs(pixel_ns=1e-3, part_ns=0.0)
+    costs = Costs(pixel_ns=1e-3, part_ns=0.0, upsampled_sample_ns=0.0)
     assert plan(*made(straight), tolerance_db=-30, costs=costs).is_exact
     chosen = plan(*made(straight), tolerance_db=-30, taps=taps, depth=depth, costs=costs)
     assert (chosen.align.taps, chosen.aperture.taps) == taps

@@ -121,7 +121,9 @@ class Scene:
         half_m = (np.array(grid.shape)[:, None] - 1) / 2 * [grid.row_step_m, grid.column_step_m]
         # What the patch was formed from.
         centre_m = grid.origin_m + half_m.sum(axis=0)
-        seen = touches_boxes(BEAM, centre_m[None], half_m, self.lines.phase_centres_m, along)[0]
+        seen = touches_boxes(
+            BEAM.limits, centre_m[None], half_m, self.lines.phase_centres_m, along
+        )[0]
         lines, along = self.lines.select(seen), along[seen]
         plan = clsas.Plan.from_json(json.dumps(patch.record.plan))
         random = np.random.default_rng(1)
