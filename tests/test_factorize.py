@@ -375,6 +375,23 @@ def test_a_point_keeps_its_amplitude_and_phase(platform, amplitude):
     assert abs(pixel / (len(TRACK) * amplitude) - 1) <= 3e-3
 
 
+def test_a_point_on_a_hill_keeps_its_amplitude_and_phase(platform):
+    """Only where the height map has it does every line agree on it."""
+    row, column = np.indices((65, 65))
+    grid = around(0.3, 40.6, shape=(65, 65), z=-13.0)
+    grid = grid.with_height(0.2 * np.sin(row / 9) * np.cos(column / 7))
+    target = grid.positions_m()[32, 32]
+    lines = simulate_lines(
+        TRACK, beside(TRACK, 0.05, 0, 0), PointTargets([target], [-2j]),
+        carrier_hz=CARRIER, bandwidth_hz=BAND * CARRIER,
+    )  # fmt: skip
+    chosen = plan(lines, grid, tolerance_db=-55, costs=EXACT_IS_SLOW)
+    assert not chosen.is_exact
+    pixels = factorize(lines, grid, chosen, device=platform).pixels
+    assert abs(pixels[32, 32] / (len(TRACK) * -2j) - 1) <= 3e-3
+    assert np.unravel_index(np.abs(pixels).argmax(), pixels.shape) == (32, 32)
+
+
 def test_it_is_linear(platform):
     one, grid = made(straight)
     chosen = planned(straight, -50)
