@@ -13,6 +13,7 @@ import numpy as np
 import pyopencl as cl
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
+from scipy.spatial import KDTree
 
 from clsas import interpolation, validate
 from clsas.device import Device, Slot, aligned, open_device
@@ -54,6 +55,8 @@ class Preparation:
     beam: BeamWindow | None = None
     along: NDArray[np.float64] | None = None
     """The track's unit direction for every channel, [channels, 3]; None without a beam."""
+    one_cubic: bool = False
+    """Whether the beam's weights may be taken as one cubic over a block of points."""
 
     @property
     def samples_per_m(self) -> float:
@@ -199,7 +202,14 @@ def prepare(
         most_upsampling=most_upsampling(lines, layout.block_radius_m),
     )
     resampling = interpolation.resampling(lines.length, interpolator, spectrum)
-    return Preparation(device, lines, grid, layout, interpolator, resampling, beam, along)
+    one_cubic = False
+    if beam is not None and isinstance(layout, Groups):
+        nearest_m = KDTree(lines.phase_centres_m).query(layout.centre_m)[0].min() - layout.radius_m
+        reach = layout.block_radius_m / max(nearest_m, 1e-30)
+        one_cubic = bool(beam.block_error(min(reach, 2.0)) <= geometry_error)
+    return Preparation(
+        device, lines, grid, layout, interpolator, resampling, beam, along, one_cubic
+    )
 
 
 def antennas_and_phase(
@@ -384,7 +394,7 @@ class _Run:
             "BISTATIC": int(self.bistatic),
             "MOVING": int(self.moving),
             "BEAM": 0 if p.beam is None else INTERVALS,
-            "ONE_CUBIC": 0,
+            "ONE_CUBIC": int(p.one_cubic),
             "NORMALISE": int(p.beam is not None and p.beam.normalise),
             "ALONE": 0,
             "CENTRED": 0,

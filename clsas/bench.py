@@ -51,8 +51,9 @@ class Case:
         Along either side.
     beam : BeamWindow, optional
         Weights of the channels.
-    relief_m : float
-        From the troughs to the crests of dunes, 8 m long and wide, on which points and pixels lie.
+    depth_m, relief_m : float
+        Of the plane in which points and pixels lie, below the track; and from the troughs to the
+        crests of dunes, 8 m long and wide, on it.
     """
 
     channels: int
@@ -63,12 +64,13 @@ class Case:
     y_m: tuple[float, float]
     pixels: int
     beam: BeamWindow | None = None
+    depth_m: float = 0.0
     relief_m: float = 0.0
 
     @property
     def grid(self) -> Grid:
         """The image's grid."""
-        plane = Grid.plane((*self.x_m, self.pixels), (*self.y_m, self.pixels))
+        plane = Grid.plane((*self.x_m, self.pixels), (*self.y_m, self.pixels), -self.depth_m)
         if not self.relief_m:
             return plane
         x_m, y_m = plane.axes_m
@@ -86,7 +88,7 @@ class Case:
         positions = np.zeros((_POINTS, 3))
         positions[:, 0] = random.uniform(*self.x_m, _POINTS)
         positions[:, 1] = random.uniform(*self.y_m, _POINTS)
-        positions[:, 2] = self._height_m(*positions[:, :2].T)
+        positions[:, 2] = self._height_m(*positions[:, :2].T) - self.depth_m
         amplitudes = random.standard_normal(_POINTS) + 1j * random.standard_normal(_POINTS)
         return simulate_lines(
             tx_m,
@@ -111,7 +113,16 @@ FACTORIZED = {
     "ffbp-thesis": CASES["bp-thesis"],
     "ffbp-2k": Case(2000, 15e-3, 120e3, 30e3, (-20.48, 20.46), (40.0, 80.0), 2048, _BEAM),
     "ffbp-relief": Case(
-        2000, 15e-3, 120e3, 30e3, (-20.48, 20.46), (40.0, 80.0), 2048, _BEAM, relief_m=1.0
+        channels=2000,
+        spacing_m=15e-3,
+        carrier_hz=120e3,
+        bandwidth_hz=30e3,
+        x_m=(-20.48, 20.46),
+        y_m=(40.0, 80.0),
+        pixels=2048,
+        beam=_BEAM,
+        depth_m=20.0,
+        relief_m=1.0,
     ),
     # The same pixels and spacing, over a longer track and further out.
     "ffbp-8k": Case(8192, 15e-3, 120e3, 30e3, (-40.96, 40.94), (40.0, 121.9), 4096, _BEAM),

@@ -54,7 +54,7 @@ class Costs:
     sample_tap_ns: float = 0.03
     leaf_ns: float = 0.8
     leaf_point_ns: float = 1.5
-    group_ns: float = 300.0
+    group_ns: float = 150.0
     part_ns: float = 30.0
     pixel_ns: float = 0.68
     point_ns: float = 1.0
