@@ -15,6 +15,7 @@ from clsas.lines import RangeLines
 from clsas.surface import Surface
 
 _POINTS = 257  # along the track, where rates are evaluated
+_MOST_PLACES = 9  # along a side of a box, where rates are evaluated
 _BEYOND = 12  # points past either end, each twice as far as the one before
 _CHANNELS_PER_KNOT = 16
 _MOST_INTERVALS = 64
@@ -220,9 +221,7 @@ def cycles_per_extent(
     along = along if along is None else along[::every]
     position, tangent = track.positions_m(place), track.tangents_m(place)
     steps = surface.steps_m
-    across = np.linspace(-0.5, 0.5, 3)
     sides_m = extents[:, None] * steps
-    between_m = np.linalg.norm(np.abs(sides_m).sum(axis=0)) * (across[1] - across[0]) / 2
     rates = np.zeros((len(steps), len(centres_m), len(place)))
     # Products of the sight to a place in a box follow from those of that to its middle.
     sight = centres_m[:, None] - position
@@ -230,7 +229,15 @@ def cycles_per_extent(
     ahead = np.einsum("psi,si->ps", sight, tangent)
     leaning = [sight @ step for step in steps]
     sideways = None if limits is None else np.einsum("psi,si->ps", sight, along)
-    within = [across if axis < 2 or extent else (0.0,) for axis, extent in enumerate(extents)]
+    # Places in a box lie closer where it is large against its distance.
+    closest_m = np.sqrt(square.min()) + nearest_m
+    counts = 3 + 2 * np.clip(
+        np.linalg.norm(sides_m, axis=1) / closest_m, 0, _MOST_PLACES // 2 - 1
+    ).astype(int)
+    counts[extents == 0] = 1
+    within = [np.linspace(-0.5, 0.5, n) if n > 1 else np.zeros(1) for n in counts]
+    apart = 1 / np.maximum(counts - 1, 1)
+    between_m = np.linalg.norm(apart @ np.abs(sides_m)) / 2
     for parts in product(*within):
         offset_m = parts @ sides_m
         distance = square + offset_m @ offset_m

@@ -109,11 +109,41 @@ def other_errors(
     )
 
 
+def _over_relief(
+    view: View, side: tuple[int, int], error: Callable[[NDArray[np.float64]], float]
+) -> float:
+    """Return the mean over the grid of an error that depends on the extents of subimages.
+
+    It grows with the relief's square at least: of as much as the highest root adds, others add no
+    more than by the squares of their relief.
+    """
+    surface = view.surface
+    plane = error(surface.extents(side))
+    relief_m = surface.relief_m(side, view.root)
+    most_m = float(relief_m.max())
+    if most_m <= 0:
+        return plane
+    share = np.average((relief_m / most_m) ** 2, weights=surface.counts(view.root or side))
+    return plane + max(error(surface.extents(side, most_m)) - plane, 0.0) * float(share)
+
+
 @_kept
 def root_error(view: View, side: tuple[int, int]) -> float:
     """Return the power of the error of roots: of rounding, and of channels put on the mean track.
 
-    The latter is evaluated as it is: over channels, roots and pixels of these at random, how a
+    The latter is `_off_track`.
+    """
+    off_track = _over_relief(view, side, functools.partial(_off_track, view, side))
+    sides_m = view.extents(side, most=True) * np.linalg.norm(view.surface.steps_m, axis=1)
+    radius_m = np.linalg.norm(sides_m) / 2
+    rounding = (2 * np.pi * _FLOAT32 * view.highest_cycles_per_m * radius_m) ** 2
+    return float(off_track + rounding)
+
+
+def _off_track(view: View, side: tuple[int, int], extents: NDArray[np.float64]) -> float:
+    """Return the power of the error that channels put on the mean track make.
+
+    It is evaluated as it is: over channels, roots and pixels of these at random, how a
     range changes from a root's centre to a pixel for the channel, less the same for the place on
     the track that stands for it, stretched as the first stage does. That holds what the track does
     not follow, transmitters and receivers apart, and motion during flight; and with a beam by how
@@ -133,7 +163,7 @@ def root_error(view: View, side: tuple[int, int]) -> float:
         near_index = index[some]
         velocity = lines.rx_velocity_m_s
         near = replace(track, place=part.place[some])
-        points_m = view.spots_m[spot] + _pixels_m(view, side, random)
+        points_m = view.spots_m[spot] + _pixels_m(view, extents, random)
         antennas_m = lines.tx_m[near_index], lines.rx_m[near_index]
         moving = velocity if velocity is None else velocity[near_index]
         range_m = pairwise_range_m(points_m, *antennas_m, moving, lines.sound_speed_m_s)
@@ -154,11 +184,7 @@ def root_error(view: View, side: tuple[int, int]) -> float:
             wrong = np.hypot(weights * wrong, weights - of_virtual)
         powers.append(np.sum(wrong**2))
         total += np.sum(weights**2)
-    off_track = sum(powers) / max(total, 1e-30)
-    sides_m = view.extents(side, most=True) * np.linalg.norm(view.surface.steps_m, axis=1)
-    radius_m = np.linalg.norm(sides_m) / 2
-    rounding = (2 * np.pi * _FLOAT32 * view.highest_cycles_per_m * radius_m) ** 2
-    return float(off_track + rounding)
+    return float(sum(powers) / max(total, 1e-30))
 
 
 @_kept
@@ -171,6 +197,22 @@ def excess_error(
 ) -> float:
     """Return the power of the error that a stage's nodes add to that of the aperture's filter.
 
+    See `_between_nodes`.
+    """
+    error = functools.partial(_between_nodes, view, side, aperture, crowding, beam_cycles)
+    return _over_relief(view, side, error)
+
+
+def _between_nodes(
+    view: View,
+    side: tuple[int, int],
+    aperture: Interpolator,
+    crowding: float,
+    beam_cycles: float | None,
+    extents: NDArray[np.float64],
+) -> float:
+    """Return the power of the error between nodes beside that of the aperture's filter.
+
     The filter takes nodes as equally spaced and weights as constant. Evaluated as it is, for
     subimages and pixels of them at random: steering functions between nodes against what
     interpolation makes of them; unless `beam_cycles` is None, weighted by the beam.
@@ -182,11 +224,11 @@ def excess_error(
     for spot in np.flatnonzero(seen.any(axis=1))[::_SOME_SPOTS]:
         places = track.samples[seen[spot]]
         place = np.linspace(places[0], places[-1], _PLACES)
-        rate = crowding * (view.extents(side) @ view.rates[:, spot])
+        rate = crowding * (extents @ view.rates[:, spot])
         if weighted:
             rate = rate + beam_cycles * view.beam_rates[spot]
         nodes = interpolated_nodes(track, rate[None], place[None], aperture)
-        points_m = view.spots_m[spot] + _pixels_m(view, side, random)
+        points_m = view.spots_m[spot] + _pixels_m(view, extents, random)
 
         def steering(at: NDArray[np.float64], points_m: NDArray[np.float64] = points_m) -> NDArray:
             sight = points_m[:, None] - track.positions_m(at)
@@ -209,10 +251,9 @@ def excess_error(
 
 
 def _pixels_m(
-    view: View, side: tuple[int, int], random: np.random.Generator
+    view: View, extents: NDArray[np.float64], random: np.random.Generator
 ) -> NDArray[np.float64]:
     """Return pixels of a subimage at random from its middle, and that before them, [n, 3]."""
-    extents = view.extents(side)
     places = random.uniform(-0.5, 0.5, (_PIXELS, len(extents))) * extents
     return np.concatenate([np.zeros((1, 3)), places @ view.surface.steps_m])
 

@@ -85,6 +85,8 @@ class Plan:
         Samples to either side of a subimage's centre that its lines hold, stage by stage.
     highest_cycles_per_m : float
         Phase per metre of range at the upper end of the lines' band.
+    closest_m : float
+        Distance from the track that no pixel is nearer than.
     roots_at_once, roots_prepared : int
         Root subimages that are worked on together, and whose geometry is prepared together.
     stages : tuple of Stage
@@ -121,6 +123,7 @@ class Plan:
     upsampler: Upsampler | None
     half_lengths: tuple[int, ...]
     highest_cycles_per_m: float
+    closest_m: float
     roots_at_once: int
     roots_prepared: int
     stages: tuple[Stage, ...]
@@ -175,17 +178,27 @@ class Plan:
         fits = isinstance(self.half_lengths, tuple) and len(self.half_lengths) == levels
         fits = fits and all(whole(n, 0) for n in self.half_lengths)
         check(fits, "half_lengths", "a whole number for every stage")
-        for name in ("highest_cycles_per_m", "beam_cycles"):
-            check(numbers((getattr(self, name),), 1, 0), name, "a number from 0")
+        for name, most in (
+            ("highest_cycles_per_m", 1e9),
+            ("beam_cycles", 1e3),
+            ("closest_m", 1e12),
+        ):
+            check(
+                numbers((getattr(self, name),), 1, 0) and getattr(self, name) <= most,
+                name,
+                f"a number from 0 to {most:g}",
+            )
         fits = (self.limits is None) == (self.beam is None)
         if fits and self.limits is not None:
-            fits = numbers(self.limits, 2, -3.0)
-        check(fits, "limits", "two sines, with a beam")
+            fits = numbers(self.limits, 2, -3.0) and self.limits[0] < self.limits[1]
+        check(fits, "limits", "two ascending sines, with a beam")
         if self.nearest:
             fits = numbers(self.nearest, levels, 1) and all(whole(n, 1) for n in self.nearest)
             check(fits, "nearest", "a whole number for every stage")
         else:
-            check(numbers(self.crowding, levels, 1), "crowding", "a number from 1 for every stage")
+            fits = numbers(self.crowding, levels, 1) and max(self.crowding) <= 100
+            check(fits, "crowding", "a number from 1 to 100 for every stage")
+            check(self.tile == self.sides[-1], "tile", "the last of sides")
         for name, allowed in (("align", (2, 4, 6, 8)), ("final", (2, 4, 6, 8)), ("aperture", ())):
             filter_ = getattr(self, name)
             allowed = allowed or ((1,) if self.nearest else (2, 4, 6, 8))
@@ -196,15 +209,20 @@ class Plan:
         good = isinstance(self.resampling, Resampling) and all(
             type(n) is int for n in asdict(self.resampling).values()
         )
-        good = good and min(self.resampling.length, self.resampling.period) > 0
-        check(good, "resampling", "made of whole numbers")
+        r = self.resampling
+        good = good and all(0 < n < 2**30 for n in (r.length, r.period, r.upsampled_period))
+        good = good and abs(r.shift) <= r.period and abs(r.first) < 2**20 and 0 <= r.lead < 2**20
+        if good and self.upsampler is None:
+            good = 0 <= r.first <= r.upsampled_period - r.length
+        check(good, "resampling", "made of whole numbers that fit each other")
         if self.upsampler is not None:
             good = isinstance(self.upsampler, Upsampler) and whole(self.upsampler.step, 1)
             good = good and self.upsampler.coefficients.shape in [
                 (PHASES, taps) for taps in UPSAMPLING_TAPS
             ]
             good = good and bool(np.isfinite(self.upsampler.coefficients).all())
-            check(good and self.upsampler.step <= PHASES, "upsampler", "filters")
+            good = good and r.period * PHASES == r.upsampled_period * self.upsampler.step
+            check(good, "upsampler", "filters for the ratio of resampling")
 
     @property
     def is_exact(self) -> bool:

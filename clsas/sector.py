@@ -173,7 +173,7 @@ class Geometry:
                 root_m,
                 surface.extents_in(sides[0], sides[0], roots).max(axis=0),
                 chosen.highest_cycles_per_m,
-                surface.radius_m(sides[-1]),
+                min(surface.radius_m(sides[-1]), chosen.closest_m),
                 chosen.limits,
                 self.along,
             )
