@@ -309,6 +309,37 @@ def test_off_a_plane_with_a_beam(case, tolerance_db):
     check(case, tolerance_db, None, HANN)
 
 
+def spiked(shape, pixel_m, depth_m, spike_m, tracks):
+    grid = around(0, 0 if depth_m else 40, shape=shape, pixel_m=pixel_m, z=-depth_m)
+    height_m = np.zeros(shape)
+    height_m[shape[0] // 3, shape[1] // 3] = spike_m
+    return over(grid.with_height(height_m), *tracks)
+
+
+def off_track():
+    turn = np.linspace(0, 3 * np.pi, len(TRACK))
+    return (TRACK + 0.1 * np.stack([0 * turn, np.sin(turn), 0.5 * np.cos(turn)], axis=1),)
+
+
+@pytest.mark.parametrize(
+    "wild",
+    [
+        lambda: spiked((200, 100), (0.03, 0.03), 0.5, -2.0, (along_x(300, 0.01),)),
+        lambda: spiked((300, 3), (0.08, 0.01), 0.5, -3.0, (along_x(300, 0.01),)),
+        lambda: spiked((150, 160), (0.015, 0.015), 0, 4.0, off_track()),
+        lambda: spiked((150, 160), (0.015, 0.015), 0, 4.0, (TRACK, beside(TRACK, 0.2, 0, 0))),
+    ],
+    ids=["below the track", "a strip below it", "off the track", "apart"],
+)
+@pytest.mark.parametrize("tolerance_db", [-30, -50])
+def test_spikes_keep_the_promise(wild, tolerance_db):
+    """Boxes of more relief than they are away, or than all others have, are still accounted for."""
+    lines, grid = wild()
+    chosen = plan(lines, grid, tolerance_db=tolerance_db, costs=EXACT_IS_SLOW)
+    reference = backproject(lines, grid, accuracy_db=-85)
+    assert relative_error_db(factorize(lines, grid, chosen), reference) <= tolerance_db
+
+
 def test_a_height_map_is_its_points(platform):
     lines, grid = made(hills)
     points = Grid.points(np.random.default_rng(0).permutation(grid.positions_m().reshape(-1, 3)))
