@@ -649,14 +649,16 @@ def upsampled_lines(
     """Return lines upsampled as the kernels want them: `pitch` samples each, zeros around.
 
     With one lane per work-item they are interleaved, [channels, pitch, 2]; with more, real and
-    imaginary parts are planes, [channels, 2, pitch]. `gain` is as in `Resampling.apply`.
+    imaginary parts are planes, [channels, 2, pitch]. `gain` multiplies their spectrum.
     """
     of_line = (pitch, 2) if width == 1 else (2, pitch)
     padded = aligned(np.zeros, (len(samples), *of_line), np.float32)
     inside = slice(margin, margin + resampling.length)
 
+    factor = None if gain is None else gain(resampling.frequency)
+
     def fill(some: slice) -> None:
-        upsampled = resampling.apply(samples[some], gain)
+        upsampled = resampling.apply(samples[some], factor)
         for part, values in enumerate((upsampled.real, upsampled.imag)):
             if width == 1:
                 padded[some, inside, part] = values

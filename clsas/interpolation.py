@@ -297,14 +297,19 @@ class Resampling:
         """Return the phase per metre of range at the spectral centre, cycles."""
         return cycles_per_m(lines, self.centre_cycles_per_sample)
 
+    @property
+    def frequency(self) -> NDArray[np.float64]:
+        """Distance of every frequency of the FFT from the spectral centre, cycles per sample."""
+        return np.abs(scipy.fft.fftfreq(self.period))
+
     def apply(
         self,
         samples: NDArray[np.complexfloating],
-        gain: Gain | None = None,
+        gain: NDArray[np.float64] | None = None,
     ) -> NDArray[np.complexfloating]:
         """Return lines [channels, n] upsampled by FFT, [channels, length], in their own precision.
 
-        `gain` multiplies the spectrum, by the distance from its centre.
+        `gain` multiplies the spectrum at every `frequency`.
         """
         padded = np.zeros((len(samples), self.period), samples.dtype)
         padded[:, self.lead : self.lead + samples.shape[1]] = samples
@@ -313,7 +318,7 @@ class Resampling:
             spectrum = np.roll(spectrum, -self.shift, axis=1)
         factor = np.full(self.period, self.ratio, samples.real.dtype)
         if gain is not None:
-            factor *= gain(np.abs(scipy.fft.fftfreq(self.period)))
+            factor *= gain
         upper = self.period // 2  # bins of negative frequency, at the end
         lower, beyond = self.period - upper, self.upsampled_period - upper
         wide = np.empty((len(samples), self.upsampled_period), samples.dtype)
