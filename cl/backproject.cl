@@ -47,10 +47,6 @@
  *   sums       float2, as pixels: the sum of the weights, twice.
  */
 
-#if PERMUTE && defined(__AVX512F__)
-#define WINDOW
-#endif
-
 #if WIDTH == 16
 #define BLOCK_COLUMNS 4
 #define BLOCK_ROWS 4
@@ -77,16 +73,6 @@
 #define ITEM_ROWS (BLOCK_ROWS * STACK)
 #define BLOCKS_ACROSS (TILE_COLUMNS / BLOCK_COLUMNS)
 
-/* The TAPS samples around a position: indices lower, lower + 1, ... of one component. */
-#ifdef WINDOW
-typedef float m512 __attribute__((vector_size(64)));
-typedef int m512i __attribute__((vector_size(64)));
-#define PICK(low, high, index)                                                                     \
-    __builtin_astype(                                                                              \
-        __builtin_ia32_vpermi2varps512(__builtin_astype(low, m512), __builtin_astype(index, m512i), \
-                                       __builtin_astype(high, m512)),                              \
-        vfloat)
-#endif
 
 /* Interpolates one line at t - 0.5 samples from `centre` (the -0.5 makes rounding find the lower of the two
  * middle taps). `centre` is the sample nearest to the block's middle, counted from the line's first margin
@@ -174,6 +160,17 @@ INLINE void put(const vfloat *re, const vfloat *im, __global float2 *pixels, int
 #endif
     }
 }
+
+/* Where the centre's echo lies in an entry's line, and its phase. */
+#if CENTRED
+#define REFERENCE                             \
+    const int nearest_sample = centre_sample; \
+    const float fraction = 0.0f, turn = 0.0f;
+#else
+#define REFERENCE                                       \
+    const int nearest_sample = reference_sample[entry]; \
+    const float fraction = reference_fraction[entry], turn = reference_phase[entry];
+#endif
 
 /* Element k, a constant once loops are unrolled, of a float4 or int4. */
 #define AT(v, k) ((k) == 0 ? (v).s0 : (k) == 1 ? (v).s1 : (k) == 2 ? (v).s2 : (v).s3)
@@ -492,13 +489,7 @@ __kernel void backproject_tiles(__global const float *samples, int pitch,
             + lane_j * lane_j * (h2 + k2 * i);
         const vfloat bend = lane_i * (lane_i * k1 + lane_j * (2.0f * k2)) + lane_j * lane_j * (3.0f * k3);
 
-#if CENTRED
-        const int nearest_sample = centre_sample;
-        const float fraction = 0.0f, turn = 0.0f;
-#else
-        const int nearest_sample = reference_sample[entry];
-        const float fraction = reference_fraction[entry], turn = reference_phase[entry];
-#endif
+        REFERENCE
         const float4 position = move + fraction;
         const float4 shifted = position + ROUNDER;
         const float4 start = position - (shifted - ROUNDER) - 0.5f;
@@ -618,13 +609,7 @@ __kernel void backproject_points(__global const float *samples, int pitch,
 #if BEAM
         const float ux = ROW(ALONG, 0), uy = ROW(ALONG, 1), uz = ROW(ALONG, 2);
 #endif
-#if CENTRED
-        const int nearest_sample = centre_sample;
-        const float fraction = 0.0f, turn = 0.0f;
-#else
-        const int nearest_sample = reference_sample[entry];
-        const float fraction = reference_fraction[entry], turn = reference_phase[entry];
-#endif
+        REFERENCE
         __global const float *line = samples + (size_t)entry * 2 * pitch;
 #pragma unroll
         for (int block = 0; block < STACK; block++) {

@@ -90,3 +90,16 @@ INLINE void filter_weights(__global const float *filter, const int taps, vfloat 
         weight[taps / 2 - 1 - pair] = even - nu * odd;
     }
 }
+
+/* With the build option PERMUTE, where the compiler can: the elements of two vectors of 16 by their indices, of which
+ * only the lowest five bits count. */
+#if PERMUTE && defined(__AVX512F__)
+#define WINDOW
+typedef float m512 __attribute__((vector_size(64)));
+typedef int m512i __attribute__((vector_size(64)));
+#define PICK(low, high, index)                                                                     \
+    __builtin_astype(                                                                              \
+        __builtin_ia32_vpermi2varps512(__builtin_astype(low, m512), __builtin_astype(index, m512i), \
+                                       __builtin_astype(high, m512)),                              \
+        vfloat)
+#endif

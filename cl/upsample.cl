@@ -24,15 +24,7 @@
  * Global size: (work-items that share a line, lines at work).
  */
 
-#if PERMUTE && defined(__AVX512F__)
-#define WINDOW
-typedef float m512 __attribute__((vector_size(64)));
-typedef int m512i __attribute__((vector_size(64)));
-#define PICK(low, high, index)                                                                     \
-    __builtin_astype(                                                                              \
-        __builtin_ia32_vpermi2varps512(__builtin_astype(low, m512), __builtin_astype(index, m512i), \
-                                       __builtin_astype(high, m512)),                              \
-        vfloat)
+#ifdef WINDOW
 #define INT_LANES ((vint)(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15))
 #define EVEN 0, 2, 4, 6, 8, 10, 12, 14, 16, 18, 20, 22, 24, 26, 28, 30
 #define ODD 1, 3, 5, 7, 9, 11, 13, 15, 17, 19, 21, 23, 25, 27, 29, 31

@@ -75,6 +75,11 @@ class Leaves:
         self.centred = chosen.tile == chosen.sides[-1]
         self.per_sample = geometry.cycles_per_m / geometry.samples_per_m
         self.slot, self.image = Slot(device), image
+        self._prepare()
+
+    def _prepare(self) -> None:
+        """Build the kernels, and lay out what they work on."""
+        raise NotImplementedError
 
     def _options(self, block_radius_m: float) -> dict[str, int]:
         reach = block_radius_m * self.geometry.samples_per_m
@@ -108,13 +113,7 @@ class Leaves:
             slot.fill("shares", _padded(_shares(sector).reshape(1, -1)))
         self._fill(slot, sector)
 
-    def form(
-        self,
-        tables: Slot,
-        sector: Sector,
-        batch: slice,
-        samples: cl.Buffer,
-    ) -> Finish:
+    def form(self, tables: Slot, sector: Sector, batch: slice, samples: cl.Buffer) -> Finish:
         """Start forming the pixels of some roots of a sector from the lines of their leaves.
 
         Parameters
@@ -163,15 +162,8 @@ class Leaves:
 class PlaneLeaves(Leaves):
     """Leaves on a plane, in tiles."""
 
-    def __init__(
-        self,
-        lines: RangeLines,
-        geometry: Geometry,
-        level: Level,
-        device: Device,
-        image: NDArray[np.complex64],
-    ) -> None:
-        super().__init__(lines, geometry, level, device, image)
+    def _prepare(self) -> None:
+        device, image = self.device, self.image
         chosen, plane = self.plan, self.surface.plane
         # A CPU sets the pixels where they belong.
         on_cpu = device.info.kind == "cpu" and not self.normalise
@@ -190,13 +182,7 @@ class PlaneLeaves(Leaves):
         root = np.arange(len(sector.roots))[:, None]
         slot.fill("ranges", self._ranges(sector, root, self.leaf_of))
 
-    def form(
-        self,
-        tables: Slot,
-        sector: Sector,
-        batch: slice,
-        samples: cl.Buffer,
-    ) -> Finish:
+    def form(self, tables: Slot, sector: Sector, batch: slice, samples: cl.Buffer) -> Finish:
         """Start forming the pixels of some roots; see `Leaves.form`."""
         device, slot, chosen, level = self.device, self.slot, self.plan, self.level
         parts = [self._part(root) for root in sector.roots[batch]]
@@ -349,15 +335,8 @@ class PlaneLeaves(Leaves):
 class SurfaceLeaves(Leaves):
     """Leaves off a plane, in groups of points about their centres."""
 
-    def __init__(
-        self,
-        lines: RangeLines,
-        geometry: Geometry,
-        level: Level,
-        device: Device,
-        image: NDArray[np.complex64],
-    ) -> None:
-        super().__init__(lines, geometry, level, device, image)
+    def _prepare(self) -> None:
+        device, geometry = self.device, self.geometry
         division = geometry.division
         roots, last = geometry.roots, len(division.sides) - 1
         corners = division.corners(last, roots)
@@ -417,13 +396,7 @@ class SurfaceLeaves(Leaves):
         slot.fill("centres", float_pairs(sector.relative_m[-1][root, leaf]))
         slot.fill("offsets", self.groups.offset_m[groups].reshape(-1, 3).T)
 
-    def form(
-        self,
-        tables: Slot,
-        sector: Sector,
-        batch: slice,
-        samples: cl.Buffer,
-    ) -> Finish:
+    def form(self, tables: Slot, sector: Sector, batch: slice, samples: cl.Buffer) -> Finish:
         """Start forming the pixels of some roots; see `Leaves.form`."""
         first = self._groups(self._roots(sector)).start
         roots = self._roots(sector, batch)
