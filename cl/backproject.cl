@@ -20,11 +20,12 @@
  *   ONE_CUBIC  for points with BEAM: those of a block lie so close that the cubic of one serves all.
  *   NORMALISE  with BEAM: sum the weights too.
  *   ALONE      these sums are all of the pixels, which are set; 0: they are added to them.
+ *   HALF       1: lines are of half in place of float (common.h).
  *   CENTRED    every line is aligned on its part's centre, at one sample: there are no references. Lines stand
  *              for `shares` others each.
  *
  * Buffers
- *   samples    float, each line with `pitch` samples including its zero margins: WIDTH > 1 a plane
+ *   samples    of `held`, each line with `pitch` samples including its zero margins: WIDTH > 1 a plane
  *              of real parts, then one of imaginary parts, [channels][2][pitch]; WIDTH == 1
  *              interleaved [channels][pitch][2].
  *   geometry   float [18][geometry_pitch]: transmitter x y z and what float32 leaves of them, the
@@ -74,6 +75,8 @@
 #define BLOCKS_ACROSS (TILE_COLUMNS / BLOCK_COLUMNS)
 
 
+#define MAGNITUDE(v) as_float4(as_int4(v) & 0x7fffffff)
+
 /* Interpolates one line at t - 0.5 samples from `centre` (the -0.5 makes rounding find the lower of the two
  * middle taps). `centre` is the sample nearest to the block's middle, counted from the line's first margin
  * sample; it is kept inside the line, so no number can make a read leave the buffer.
@@ -81,7 +84,7 @@
  * The weight of the tap at distance a + 0.5 is E(nu^2) + nu O(nu^2) and its mirror image's
  * E(nu^2) - nu O(nu^2), nu in [-0.5, 0.5] the position between the middle taps; `weights` holds, per
  * pair of taps from the innermost, the coefficients of E then of O, highest power first. */
-INLINE void interpolate(__global const float *line, int pitch, int centre, vfloat t,
+INLINE void interpolate(__global const held *line, int pitch, int centre, vfloat t,
                                __global const float *weights, vfloat *re, vfloat *im)
 {
     const vfloat shifted = t + ROUNDER;
@@ -91,27 +94,30 @@ INLINE void interpolate(__global const float *line, int pitch, int centre, vfloa
     vint index = ROUNDED_VINT(shifted) + (centre + 1 - TAPS / 2);
     index = min(max(index, 0), pitch - TAPS);
 #if WIDTH == 1
-    __global const float2 *sample = (__global const float2 *)line + index;
-#define RE(k) sample[k].x
-#define IM(k) sample[k].y
+    float2 samples[TAPS];
+#pragma unroll
+    for (int k = 0; k < TAPS; k++)
+        samples[k] = PAIR_HELD(line + 2 * (index + k));
+#define RE(k) samples[k].x
+#define IM(k) samples[k].y
 #else
     vfloat re_taps[TAPS], im_taps[TAPS];
 #pragma unroll
     for (int lane = 0; lane < WIDTH; lane++) {
-        __global const float *sample = line + ((const int *)&index)[lane];
+        __global const held *sample = line + ((const int *)&index)[lane];
 #pragma unroll
         for (int k = 0; k < TAPS; k++) {
-            ((float *)&re_taps[k])[lane] = sample[k];
-            ((float *)&im_taps[k])[lane] = sample[k + pitch];
+            ((float *)&re_taps[k])[lane] = ONE_HELD(sample + k);
+            ((float *)&im_taps[k])[lane] = ONE_HELD(sample + k + pitch);
         }
     }
 #define RE(k) re_taps[k]
 #define IM(k) im_taps[k]
 #endif
 #else
-    __global const float *window = line + clamp(centre - 16, 0, pitch - 32);
-    const vfloat re_low = LOAD(window), re_high = LOAD(window + 16);
-    const vfloat im_low = LOAD(window + pitch), im_high = LOAD(window + pitch + 16);
+    __global const held *window = line + KEEP(centre - 16, 0, pitch - 32);
+    const vfloat re_low = LOAD_HELD(window), re_high = LOAD_HELD(window + 16);
+    const vfloat im_low = LOAD_HELD(window + pitch), im_high = LOAD_HELD(window + pitch + 16);
     /* The permutation uses an index's lowest five bits only: it cannot leave the window. */
     const vint index = AS_VINT(shifted) + (16 + 1 - TAPS / 2);
 #define RE(k) PICK(re_low, re_high, index + (k))
@@ -130,8 +136,11 @@ INLINE void interpolate(__global const float *line, int pitch, int centre, vfloa
         }
         const vfloat upper = odd * nu + even;
         const vfloat lower = even - odd * nu;
-        sum_re += upper * RE(TAPS / 2 + pair) + lower * RE(TAPS / 2 - 1 - pair);
-        sum_im += upper * IM(TAPS / 2 + pair) + lower * IM(TAPS / 2 - 1 - pair);
+        /* One after the other, since a sum of two products is not fused with what it is added to. */
+        sum_re += upper * RE(TAPS / 2 + pair);
+        sum_re += lower * RE(TAPS / 2 - 1 - pair);
+        sum_im += upper * IM(TAPS / 2 + pair);
+        sum_im += lower * IM(TAPS / 2 - 1 - pair);
     }
     *re = sum_re;
     *im = sum_im;
@@ -397,7 +406,7 @@ __kernel void expand_tiles(__global const float *geometry, int channel_pitch,
  * Global size (TILE_ROWS TILE_COLUMNS / (4 WIDTH), tiles). Tiles are counted from first_tile, row by row over parts of
  * the image of `down` x `across` tiles each; corners: int [parts][2], a part's first row and column in `pixels`, whose
  * rows hold `columns`. */
-__kernel void backproject_tiles(__global const float *samples, int pitch,
+__kernel void backproject_tiles(__global const held *samples, int pitch,
 #if CENTRED
                                 int centre_sample,
 #else
@@ -463,7 +472,7 @@ __kernel void backproject_tiles(__global const float *samples, int pitch,
             + j * ((q_01 + i * (2.0f * q_001)) + j * q_011);
         const float4 q_slope_j = q_j + j * (2.0f * q_jj + j * (3.0f * q_111));
         /* Half a pixel more than the lanes reach leaves room for the curvature. */
-        const float4 q_reach = 0.5f * BLOCK_COLUMNS * fabs(q_slope_i) + 0.5f * BLOCK_ROWS * fabs(q_slope_j);
+        const float4 q_reach = 0.5f * BLOCK_COLUMNS * MAGNITUDE(q_slope_i) + 0.5f * BLOCK_ROWS * MAGNITUDE(q_slope_j);
         const int4 seen = (place + q_reach > low) & (place - q_reach < high);
         if (!(seen.s0 | seen.s1 | seen.s2 | seen.s3))
             continue;
@@ -497,7 +506,7 @@ __kernel void backproject_tiles(__global const float *samples, int pitch,
         const float4 cycles = move * cycles_per_sample + turn;
         const float4 phase = cycles - ((cycles + ROUNDER) - ROUNDER);
 
-        __global const float *line = samples + (size_t)entry * 2 * pitch;
+        __global const held *line = samples + (size_t)entry * 2 * pitch;
 #pragma unroll
         for (int block = 0; block < STACK; block++) {
             const vfloat d = lane_i * AT(slope_i, block)
@@ -516,8 +525,10 @@ __kernel void backproject_tiles(__global const float *samples, int pitch,
             sum[block] += SHARE(channel) * weight;
 #endif
 #endif
-            re[block] += line_re * cosine - line_im * sine;
-            im[block] += line_re * sine + line_im * cosine;
+            re[block] += line_re * cosine;
+            re[block] -= line_im * sine;
+            im[block] += line_re * sine;
+            im[block] += line_im * cosine;
         }
     }
     corners += (first_tile + tile) / (down * across) * 2;
@@ -541,7 +552,7 @@ INLINE vfloat distance_change(float x, float y, float z, vfloat dx, vfloat dy, v
  * are computed without cancellation. Global size: groups.
  * offsets: float [3][points], m from the group's centre, from number first_range on as centres and ranges; these and
  * reference_* per group as per tile; drift: as for expand_tiles, per metre; pixels: float2 [groups * WIDTH * STACK]. */
-__kernel void backproject_points(__global const float *samples, int pitch,
+__kernel void backproject_points(__global const held *samples, int pitch,
 #if CENTRED
                                  int centre_sample, float4 drift,
 #else
@@ -610,7 +621,7 @@ __kernel void backproject_points(__global const float *samples, int pitch,
         const float ux = ROW(ALONG, 0), uy = ROW(ALONG, 1), uz = ROW(ALONG, 2);
 #endif
         REFERENCE
-        __global const float *line = samples + (size_t)entry * 2 * pitch;
+        __global const held *line = samples + (size_t)entry * 2 * pitch;
 #pragma unroll
         for (int block = 0; block < STACK; block++) {
             const vfloat dx = LOAD(offsets + block * WIDTH);
@@ -653,8 +664,10 @@ __kernel void backproject_points(__global const float *samples, int pitch,
             sine *= weight;
             cosine *= weight;
 #endif
-            re[block] += line_re * cosine - line_im * sine;
-            im[block] += line_re * sine + line_im * cosine;
+            re[block] += line_re * cosine;
+            re[block] -= line_im * sine;
+            im[block] += line_re * sine;
+            im[block] += line_im * cosine;
         }
     }
     put(re, im, pixels, BLOCK_COLUMNS, (first_group + group) * ITEM_ROWS, 0);

@@ -16,9 +16,10 @@
  *   GIVEN          1: shifts and phases come from the host (the first stage, whose channels may be
  *                  anything); 0: from the positions of virtual channels.
  *   RAMP           1: phases vary along the lines (with GIVEN only); 0: every ramp is 0.
+ *   HALF           1: lines are of half in place of float, in and out (common.h).
  *
  * Buffers
- *   parent      lines of float, `parent_pitch` samples each: [...][2][parent_pitch], real parts and
+ *   parent      lines of `held`, `parent_pitch` samples each: [...][2][parent_pitch], real parts and
  *               imaginary ones; with WIDTH 1 interleaved.
  *   children    int [roots][children_per_root][5]: the channels [begin, end) that the child uses; what to subtract
  *               from a channel to find its line among the parent's; the child's first virtual channel and how
@@ -46,24 +47,21 @@
  * Samples outside the parent's line are never read: the place is moved inside, where the host has put zeros.
  */
 
-/* clamp() in the inner loops: as a call that is not inlined it would spill every open sum. */
-#define KEEP(x, low, high) ((x) < (low) ? (low) : (x) > (high) ? (high) : (x))
-
 #define CHUNK 32 /* channels whose weights are kept at a time */
 #define BLOCK (WIDTH > 1 ? (GIVEN ? 16 : 8) * WIDTH : 1) /* long lines are fetched in long pieces */
 
 #if WIDTH == 1
-#define LOAD_RE(line, k, pitch) (line)[2 * (k)]
-#define LOAD_IM(line, k, pitch) (line)[2 * (k) + 1]
-#define STORE_RE(value, line, k, pitch) (line)[2 * (k)] = (value)
-#define STORE_IM(value, line, k, pitch) (line)[2 * (k) + 1] = (value)
+#define LOAD_RE(line, k, pitch) LOAD_HELD((line) + 2 * (k))
+#define LOAD_IM(line, k, pitch) LOAD_HELD((line) + 2 * (k) + 1)
+#define STORE_RE(value, line, k, pitch) STORE_HELD(value, (line) + 2 * (k))
+#define STORE_IM(value, line, k, pitch) STORE_HELD(value, (line) + 2 * (k) + 1)
 #define STORE_LOCAL(value, p) (*(p) = (value))
 #define TOGETHER barrier(CLK_LOCAL_MEM_FENCE)
 #else
-#define LOAD_RE(line, k, pitch) LOAD((line) + (k))
-#define LOAD_IM(line, k, pitch) LOAD((line) + (k) + (pitch))
-#define STORE_RE(value, line, k, pitch) STORE(value, (line) + (k))
-#define STORE_IM(value, line, k, pitch) STORE(value, (line) + (k) + (pitch))
+#define LOAD_RE(line, k, pitch) LOAD_HELD((line) + (k))
+#define LOAD_IM(line, k, pitch) LOAD_HELD((line) + (k) + (pitch))
+#define STORE_RE(value, line, k, pitch) STORE_HELD(value, (line) + (k))
+#define STORE_IM(value, line, k, pitch) STORE_HELD(value, (line) + (k) + (pitch))
 #ifdef __clang__
 #define STORE_LOCAL(value, p) (*(__local vfloat_anywhere *)(p) = (value))
 #else
@@ -86,15 +84,20 @@
 #endif
 INLINE vfloat filtered(const float *weight, vfloat low, vfloat high)
 {
-    vfloat sum = weight[0] * low + weight[1] * SHIFTED(low, high, 1);
+    /* One after the other, since a sum of two products is not fused with what it is added to. */
+    vfloat sum = weight[0] * low;
+    sum += weight[1] * SHIFTED(low, high, 1);
 #if TAPS > 2
-    sum += weight[2] * SHIFTED(low, high, 2) + weight[3] * SHIFTED(low, high, 3);
+    sum += weight[2] * SHIFTED(low, high, 2);
+    sum += weight[3] * SHIFTED(low, high, 3);
 #endif
 #if TAPS > 4
-    sum += weight[4] * SHIFTED(low, high, 4) + weight[5] * SHIFTED(low, high, 5);
+    sum += weight[4] * SHIFTED(low, high, 4);
+    sum += weight[5] * SHIFTED(low, high, 5);
 #endif
 #if TAPS > 6
-    sum += weight[6] * SHIFTED(low, high, 6) + weight[7] * SHIFTED(low, high, 7);
+    sum += weight[6] * SHIFTED(low, high, 6);
+    sum += weight[7] * SHIFTED(low, high, 7);
 #endif
     return sum;
 }
@@ -116,7 +119,7 @@ INLINE vfloat filtered(const float *weight, vfloat low, vfloat high)
 #define NODE_LINE(node) (lines + (size_t)((node) - first_node) * 2 * pitch + (WIDTH == 1 ? 2 : 1) * guard)
 #define HAS(node) ((node) >= first_node && (node) < end_node)
 
-__kernel void stage(__global const float *parent, int parent_pitch, __global const int *children, int first_child,
+__kernel void stage(__global const held *parent, int parent_pitch, __global const int *children, int first_child,
                     int children_per_root, __global const int *base, __global const float *between, int channel_pitch,
 #if GIVEN
                     __global const int *order, __global const int *start, __global const float *nu,
@@ -130,7 +133,7 @@ __kernel void stage(__global const float *parent, int parent_pitch, __global con
                     float samples_per_m, float cycles_per_m, int parent_centre,
 #endif
                     int half_length,
-                    __global const float *filter, __global const float *aperture_filter, __global float *lines, int lines_per_child, int pitch,
+                    __global const float *filter, __global const float *aperture_filter, __global held *lines, int lines_per_child, int pitch,
                     int length, int part_length, int guard)
 {
     __local float taps[TAPS][CHUNK], aperture[APERTURE_TAPS][CHUNK], cosine[CHUNK], sine[CHUNK];
@@ -226,10 +229,10 @@ __kernel void stage(__global const float *parent, int parent_pitch, __global con
         for (int block = from + item * BLOCK; block < to; block += items * BLOCK) {
             const int block_end = to - block < BLOCK ? to : block + BLOCK;
             for (int c = 0; c < count; c++) {
-                __global const float *line = PARENT_LINE(c);
+                __global const held *line = PARENT_LINE(c);
 #ifdef PREFETCH
                 const int ahead = c + AHEAD < count ? c + AHEAD : count - 1;
-                __global const float *next =
+                __global const held *next =
                     PARENT_LINE(ahead) + KEEP(first[ahead] + block, 0, parent_pitch - BLOCK - WIDTH) - block;
 #endif
                 float weight[TAPS];

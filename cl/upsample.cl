@@ -11,12 +11,13 @@
  *   PHASES   a multiple of WIDTH.
  *   PERMUTE  take lanes' samples from two registers (WIDTH 16 with AVX-512 only; the compiler decides whether it can).
  *   TURN     0: turn is 0.
+ *   HALF     1: y is of half in place of float (common.h).
  *
  * Buffers
  *   samples  float2 [lines at work][count].
  *   filter   float [PHASES / WIDTH][TAPS][WIDTH]: lane by lane the filters of samples m, m + 1, ... from
  *            multiples of WIDTH on.
- *   lines    [lines][2][pitch] of float, real parts and imaginary ones; with WIDTH 1 interleaved, from number
+ *   lines    [lines][2][pitch] of `held`, real parts and imaginary ones; with WIDTH 1 interleaved, from number
  *            first_line on: y in `length` samples from number `margin` on, zeros in the others. `margin` and
  *            `pitch` are multiples of WIDTH.
  *   turn     2^-32 cycles per sample of x.
@@ -76,13 +77,13 @@ INLINE void load_turned(__global const float2 *samples, int count, int index, in
 #endif
 
 #if WIDTH == 1
-#define PUT(re, im) lines[2 * at] = (re), lines[2 * at + 1] = (im)
+#define PUT(re, im) STORE_HELD(re, lines + 2 * at), STORE_HELD(im, lines + 2 * at + 1)
 #else
-#define PUT(re, im) STORE(re, lines + at), STORE(im, lines + at + pitch)
+#define PUT(re, im) STORE_HELD(re, lines + at), STORE_HELD(im, lines + at + pitch)
 #endif
 
 __kernel void upsample_lines(__global const float2 *samples, int count, __global const float *filter, int first, int step,
-                       int turn, __global float *lines, int first_line, int pitch, int margin, int length)
+                       int turn, __global held *lines, int first_line, int pitch, int margin, int length)
 {
     samples += (size_t)get_global_id(1) * count;
     lines += (size_t)(first_line + get_global_id(1)) * 2 * pitch;

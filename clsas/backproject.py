@@ -708,8 +708,11 @@ def _check_same_grid(image: Image, grid: Grid) -> None:
         raise ValueError("accumulate must be an image on the same grid")
 
 
-def check_numbers(lines: RangeLines, beam: BeamWindow | None) -> None:
-    """Refuse lines whose numbers would leave what float32 sums or float64 phases can hold."""
+def check_numbers(lines: RangeLines, beam: BeamWindow | None) -> float:
+    """Refuse lines whose numbers would leave what float32 sums or float64 phases can hold.
+
+    Return the largest part of a sample.
+    """
     heaviest = 1.0
     if beam is not None:
         if beam.shape == "inverse" and not lines.carrier_hz:
@@ -737,6 +740,7 @@ def check_numbers(lines: RangeLines, beam: BeamWindow | None) -> None:
     speed_m_s = fastest(lines) * lines.sound_speed_m_s
     most_m_s = _FASTEST * lines.sound_speed_m_s
     validate.number("the speed of rx_velocity_m_s", speed_m_s, "m/s", most=most_m_s * (1 + 1e-9))
+    return largest
 
 
 def fastest(lines: RangeLines) -> float:

@@ -50,15 +50,15 @@ class Costs:
     reference_ns: float = 450.0
     batch_ns: float = 5e4
     channel_ns: float = 12.0
-    sample_ns: float = 0.28
-    sample_tap_ns: float = 0.03
-    leaf_ns: float = 0.8
-    leaf_point_ns: float = 1.5
+    sample_ns: float = 0.2
+    sample_tap_ns: float = 0.022
+    leaf_ns: float = 0.7
+    leaf_point_ns: float = 1.2
     group_ns: float = 150.0
     part_ns: float = 30.0
-    pixel_ns: float = 0.68
-    point_ns: float = 1.0
-    beam_ns: float = 0.2
+    pixel_ns: float = 0.58
+    point_ns: float = 0.9
+    beam_ns: float = 0.17
 
     def __post_init__(self) -> None:
         """Check every cost."""

@@ -74,6 +74,11 @@ class DeviceInfo:
     permute: bool
 
     @property
+    def half(self) -> bool:
+        """Whether kernels take half-precision numbers in and out as fast as others."""
+        return self.kind == "gpu" or self.permute
+
+    @property
     def label(self) -> str:
         """Platform and name in one string; what a name is matched against."""
         return f"{self.platform}: {self.name}"

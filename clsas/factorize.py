@@ -36,6 +36,8 @@ from clsas.window import BeamWindow
 _GROUP = 64  # work-items that share a subimage where each has one lane
 _AHEAD_S = 0.1  # of work that is started: roots are prepared meanwhile, an interruption waits
 _PREPARED_FIRST = 4  # batches
+_LARGEST_HALF, _FILTERS_SUM = 65504.0, 16.0
+_MOST_EXPONENT = 100  # of a gain: float32 holds filters times it, and over it
 _GROUPS_PER_UNIT = 3  # at least, of compute units: so that they end together
 
 
@@ -113,10 +115,10 @@ def factorize(
             beam=chosen.beam,
             progress=progress,
         )
-    check_numbers(lines, chosen.beam)
+    largest = check_numbers(lines, chosen.beam)
     pixels, done = aligned(np.empty, grid.shape, np.complex64), 0
     try:
-        run = _Run(lines, grid, chosen, device, pixels)
+        run = _Run(lines, grid, chosen, device, pixels, largest)
         for formed in run.parts():
             done += formed
             if progress is not None:
@@ -160,8 +162,10 @@ class _Run:
         chosen: Plan,
         device: Device,
         pixels: NDArray[np.complex64],
+        largest: float,
     ) -> None:
         self.lines, self.grid, self.plan, self.device = lines, grid, chosen, device
+        self.gain = _gain(largest, lines.channels) if chosen.half else 1.0
         self.width, surface = device.info.width, surface_of(grid)
         self.geometry = Geometry(lines, surface, chosen)
         self.division = self.geometry.division
@@ -174,14 +178,14 @@ class _Run:
             for name in ("align", "aperture")
         }
         options = {"WIDTH": self.width, "TAPS": chosen.align.taps}
-        options["APERTURE_TAPS"] = chosen.aperture.taps
+        options |= {"APERTURE_TAPS": chosen.aperture.taps, "HALF": int(chosen.half)}
         ramp = int(self.geometry.ramps)
         self.first_stage = device.kernel("stage", "stage", GIVEN=1, RAMP=ramp, **options)
         self.later_stage = device.kernel("stage", "stage", GIVEN=0, RAMP=0, **options)
         self.pitch = padded_length(chosen.resampling)
         self.samples = self._upload_lines()
         kind = PlaneLeaves if surface.is_plane else SurfaceLeaves
-        self.leaves = kind(lines, self.geometry, self.levels[-1], device, pixels)
+        self.leaves = kind(lines, self.geometry, self.levels[-1], device, pixels, self.gain)
         later = range(1, len(self.levels))
         self.parents = {
             level: device.upload(self.division.parents(level).astype(np.int32)) for level in later
@@ -194,7 +198,7 @@ class _Run:
         """Return all lines on the device, upsampled."""
         device, chosen, count = self.device, self.plan, self.lines.channels
         resampling = chosen.resampling
-        line_bytes = 8 * self.pitch
+        line_bytes = chosen.sample_bytes * self.pitch
         if count * line_bytes > device.info.max_buffer_bytes:
             raise ValueError(
                 f"{count} lines of {self.lines.length} samples need "
@@ -203,7 +207,15 @@ class _Run:
                 f"a part of them, or backproject exactly"
             )
         if chosen.upsampler is not None:
-            return upsample(self.lines.samples, resampling, chosen.upsampler, self.pitch, device)
+            return upsample(
+                self.lines.samples,
+                resampling,
+                chosen.upsampler,
+                self.pitch,
+                device,
+                half=chosen.half,
+                gain=self.gain,
+            )
         gain = None
         if not chosen.nearest:
             gain = edges_gain(chosen.align, chosen.final, len(self.levels), resampling.ratio)
@@ -323,7 +335,9 @@ class _Run:
             shape.half,
             self.filters["align"],
             self.filters["aperture"],
-            self.slot.zeros(f"lines{level}", 8 * children * stride * shape.pitch),
+            self.slot.zeros(
+                f"lines{level}", self.plan.sample_bytes * children * stride * shape.pitch
+            ),
             stride,
             shape.pitch,
             shape.length,
@@ -332,6 +346,17 @@ class _Run:
             wait_for=table.filled,
             local=(items, 1),
         )
+
+
+def _gain(largest: float, channels: int) -> float:
+    """Return a power of 2 that brings lines, and sums of them all, within half precision.
+
+    Filters' weights, of both signs, add up to a few times their sum.
+    """
+    if not largest:
+        return 1.0
+    exponent = math.floor(math.log2(_LARGEST_HALF / (_FILTERS_SUM * channels * largest)))
+    return 2.0 ** min(max(exponent, -_MOST_EXPONENT), _MOST_EXPONENT)
 
 
 def _pitch(channels: int) -> int:

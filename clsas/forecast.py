@@ -16,10 +16,22 @@ from clsas.exact import Exact
 from clsas.filters import UPSAMPLING_SHARE, Filters, edges_gain
 from clsas.interpolation import PHASES
 from clsas.layout import STACK
-from clsas.plan import GIVEN_BYTES, GUARD, Plan, Stage, grid_digest, lines_digest, padded_length
+from clsas.plan import (
+    GIVEN_BYTES,
+    GUARD,
+    Plan,
+    Stage,
+    grid_digest,
+    lines_digest,
+    padded_length,
+    sample_bytes,
+)
 from clsas.sector import OF_BEAM
 from clsas.view import View
 
+HALF_ROUNDING = 4e-8
+"""Power of the error that rounding lines to half precision once adds: 2^-11/sqrt(6), rms."""
+_ROUNDING_SHARE = 0.1  # of an image's error
 MARGIN_DB = 1.0  # between prediction and tolerance, for what measured errors scatter
 _CACHED_BYTES, _BATCH_BYTES = 16 << 20, 256 << 20  # of a batch, on CPUs and elsewhere
 _MOST_TABLE_BYTES = 64 << 20
@@ -66,6 +78,9 @@ def factorized(
     else:
         resampling = upsampler.resampling(lines.length, align.taps // 2, view.spectrum)
         error += power(upsampler.error_db)
+    half = upsampler is not None and holds_half(tolerance_db, len(sides), device)
+    if half:
+        error += (len(sides) + 1) * HALF_ROUNDING
     halves = view.half_lengths(sides, align, final, resampling)
     of_aperture = aperture.taps, 2 * aperture.upsampling
     stages, channels = [], float(lines.channels)
@@ -104,10 +119,10 @@ def factorized(
         Stage(*side, count, round(channels), samples, operations, final.scatter_db, 1e-9 * cost_ns)
     )
     tile = _tile(view, sides[-1], device) if nearest else sides[-1]
-    line_bytes = 8 * lines.channels * padded_length(resampling)
+    line_bytes = sample_bytes(half) * lines.channels * padded_length(resampling)
     if upsampler is not None:
         line_bytes += min(lines.samples.nbytes, GIVEN_BYTES)
-    root_bytes, table_bytes = _root_bytes(view, way, tile, stages, width)
+    root_bytes, table_bytes = _root_bytes(view, way, tile, stages, width, sample_bytes(half))
     room = memory_bytes - line_bytes
     batch_bytes = _CACHED_BYTES if device.info.kind == "cpu" else _BATCH_BYTES
     # Tables come in two sets.
@@ -128,6 +143,7 @@ def factorized(
         final=final,
         resampling=resampling,
         upsampler=upsampler,
+        half=half,
         half_lengths=halves,
         highest_cycles_per_m=view.highest_cycles_per_m,
         closest_m=view.nearest_m,
@@ -148,6 +164,13 @@ def factorized(
     )
 
 
+def holds_half(tolerance_db: float | None, stages: int, device: Device) -> bool:
+    """Return whether lines may be rounded to half precision after every stage."""
+    if tolerance_db is None or not device.info.half:
+        return False
+    return (stages + 1) * HALF_ROUNDING <= _ROUNDING_SHARE * power(tolerance_db)
+
+
 def _power_of_stage(way: Way) -> float:
     """Return the power of the errors that the filters of one stage add."""
     if way.nearest:
@@ -161,7 +184,7 @@ def _power_of_filters(way: Way) -> float:
 
 
 def _root_bytes(
-    view: View, way: Way, tile: tuple[int, int], stages: Sequence[Stage], width: int
+    view: View, way: Way, tile: tuple[int, int], stages: Sequence[Stage], width: int, of_sample: int
 ) -> tuple[float, float]:
     """Return the device memory that a root takes while it is worked on, and that of its tables.
 
@@ -186,7 +209,7 @@ def _root_bytes(
                     )
                 most *= 1 + OF_BEAM
         subimages = _subimages(sides[0], side)
-        work += 8 * subimages * most * (stages[level].samples + 2 * GUARD)
+        work += of_sample * subimages * most * (stages[level].samples + 2 * GUARD)
         tables += subimages * (44 if level else 20) + (channels + 32) * (8 + (12 if level else 20))
         channels = everywhere
     normalise = view.beam is not None and view.beam.normalise
@@ -234,6 +257,7 @@ def plain(
         final=None,
         resampling=None,
         upsampler=None,
+        half=False,
         half_lengths=(),
         highest_cycles_per_m=view.highest_cycles_per_m,
         closest_m=0.0,

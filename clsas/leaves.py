@@ -55,7 +55,10 @@ class Level:
 
 
 class Leaves:
-    """What forms pixels from leaves: of tiles on a plane, of groups of points elsewhere."""
+    """What forms pixels from leaves: of tiles on a plane, of groups of points elsewhere.
+
+    Lines are `gain` times what they stand for.
+    """
 
     def __init__(
         self,
@@ -64,13 +67,14 @@ class Leaves:
         level: Level,
         device: Device,
         image: NDArray[np.complex64],
+        gain: float,
     ) -> None:
         chosen = geometry.plan
         self.lines, self.geometry, self.level, self.device = lines, geometry, level, device
         self.plan, self.surface, self.width = chosen, geometry.surface, device.info.width
         self.normalise = chosen.beam is not None and chosen.beam.normalise
         self.per_sine, self.beam = beam_arguments(device, chosen.beam, lines)
-        self.filter = device.upload(chosen.final.coefficients.astype(np.float32))
+        self.filter = device.upload((chosen.final.coefficients / gain).astype(np.float32))
         # Where tile and leaf are one, every line is aligned on its centre.
         self.centred = chosen.tile == chosen.sides[-1]
         self.per_sample = geometry.cycles_per_m / geometry.samples_per_m
@@ -97,6 +101,7 @@ class Leaves:
             "NORMALISE": int(self.normalise),
             "ALONE": 1,
             "CENTRED": int(self.centred),
+            "HALF": int(self.plan.half),
         }
 
     def fill(self, slot: Slot, sector: Sector) -> None:

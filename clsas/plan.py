@@ -81,6 +81,8 @@ class Plan:
         Where samples go when lines are upsampled first.
     upsampler : Upsampler or None
         What does that; None by FFT.
+    half : bool
+        Whether lines are handed on from stage to stage in half precision, in half the time.
     half_lengths : tuple of int
         Samples to either side of a subimage's centre that its lines hold, stage by stage.
     highest_cycles_per_m : float
@@ -121,6 +123,7 @@ class Plan:
     final: Interpolator | None
     resampling: Resampling | None
     upsampler: Upsampler | None
+    half: bool
     half_lengths: tuple[int, ...]
     highest_cycles_per_m: float
     closest_m: float
@@ -175,6 +178,8 @@ class Plan:
             return
         whole_items = self.tile[0] % 16 == 0 and self.tile[1] % 4 == 0
         check(whole_items, "tile", "a multiple of 16 rows and 4 columns")
+        fits = isinstance(self.half, bool) and not (self.half and self.upsampler is None)
+        check(fits, "half", "true or false, false without an upsampler")
         fits = isinstance(self.half_lengths, tuple) and len(self.half_lengths) == levels
         fits = fits and all(whole(n, 0) for n in self.half_lengths)
         check(fits, "half_lengths", "a whole number for every stage")
@@ -229,6 +234,11 @@ class Plan:
         """Whether this is plain backprojection."""
         return not self.sides
 
+    @property
+    def sample_bytes(self) -> int:
+        """Bytes of a complex sample that stages hand on."""
+        return sample_bytes(self.half)
+
     def describe(self) -> str:
         """Return a table of what is expected, stage by stage."""
         if self.tolerance_db is None:
@@ -244,13 +254,14 @@ class Plan:
             reason = "" if self.tolerance_db is None else ": no factorization is faster within it"
             return f"{lines[0]}\nPlain backprojection{reason}."
         taps = f"{self.align.taps} taps in range at {self.resampling.ratio:.2f} x the lines' rate"
+        end = f"{self.final.taps} taps at the end, {'half' if self.half else 'single'} precision"
         if self.nearest:
             beams = f"sums of {', '.join(map(str, self.nearest))} neighbours"
         else:
             beams = (
                 f"{self.aperture.taps} taps along the aperture at {self.aperture.upsampling:.2f} x"
             )
-        lines.append(f"{taps}, {beams}, {self.final.taps} taps at the end")
+        lines.append(f"{taps}, {beams}, {end}")
         names = (
             "subimages",
             "rows x columns",
@@ -337,6 +348,11 @@ class Plan:
                     f"the plan was made for another {name.removesuffix('s')} geometry than that "
                     f"of {name}; plan anew with clsas.plan"
                 )
+
+
+def sample_bytes(half: bool) -> int:
+    """Return the bytes of a complex sample."""
+    return 4 if half else 8
 
 
 def padded_length(resampling: Resampling) -> int:
