@@ -35,6 +35,7 @@ _LARGEST_DISTANCE_M = 1e9
 _SMALLEST_STEP_M = 1e-9
 _MOST_CYCLES = 1e10  # float64 leaves 1e-6 of a cycle
 _LARGEST_SUM = 1e37
+_LOOKED_AT = 1 << 18  # numbers of lines at a time
 _FASTEST = 0.05  # of a receiver, in sound speeds: cl/backproject.cl iterates on it
 _CHANNELS_AT_ONCE = 512  # bounds a float32 partial sum; lines that stay in a CPU's cache
 _LINES_AT_ONCE = 32  # upsampled together: what stays in a core's cache
@@ -729,8 +730,10 @@ def check_numbers(lines: RangeLines, beam: BeamWindow | None) -> float:
             f"carrier_hz = {lines.carrier_hz:g} Hz makes {cycles:.3g} cycles over {farthest_m:g} m "
             f"at {lines.sound_speed_m_s:g} m/s; float64 holds the phase of {_MOST_CYCLES:g}"
         )
-    parts = lines.samples.view(np.float32)  # contiguous, as every RangeLines
-    largest = float(max(parts.max(), -parts.min()))
+    parts = lines.samples.reshape(-1).view(np.float32)  # contiguous, as every RangeLines
+    # Part by part, so that a cache holds them for the second look.
+    spans = [parts[i : i + _LOOKED_AT] for i in range(0, parts.size, _LOOKED_AT)]
+    largest = float(max(max(span.max(), -span.min()) for span in spans))
     most = _LARGEST_SUM / heaviest / lines.channels
     if largest > most:
         raise ValueError(

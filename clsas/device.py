@@ -224,7 +224,8 @@ class Device:
 class Slot:
     """Named buffers of one job, filled anew once the job that used them last is done.
 
-    With two slots in turn the host fills one while the device works on the other.
+    With two slots in turn the host fills one while the device works on the other. `busy` is to be
+    set to the last event that uses any of them.
     """
 
     def __init__(self, device: Device) -> None:
@@ -239,8 +240,7 @@ class Slot:
 
     def wait(self) -> None:
         """Wait until the buffers are free; to be called before they are filled."""
-        if self.busy is not None:
-            self.busy.wait()
+        self._wait_for_job()
         self.filled.clear()
 
     def buffer(self, name: str, bytes_: int) -> cl.Buffer:
@@ -251,11 +251,15 @@ class Slot:
         """Return a buffer of at least so many bytes, that held zeros when it was made."""
         return self._at_least(name, bytes_, self.device.zeros)
 
+    def _wait_for_job(self) -> None:
+        if self.busy is not None:
+            self.busy.wait()
+
     def _at_least(self, name: str, bytes_: int, make: Callable[[int], cl.Buffer]) -> cl.Buffer:
         if name not in self._buffers:
             self._buffers[name] = make(bytes_)
         elif self._buffers[name].size < bytes_:
-            self.device.finish()  # the smaller one may be in use
+            self._wait_for_job()
             del self._buffers[name]
             self._buffers[name] = make(bytes_)
         return self._buffers[name]

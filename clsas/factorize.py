@@ -258,7 +258,9 @@ class _Run:
         for level in range(len(self.levels)):
             self._stage(tables, level, batch)
         lines = self.slot[f"lines{len(self.levels) - 1}"]
-        return self.leaves.form(tables.slot, sector, batch, lines)
+        finish = self.leaves.form(tables.slot, sector, batch, lines)
+        self.slot.busy = cl.enqueue_marker(self.device.queue)
+        return finish
 
     def _upload_tables(self, sector: Sector) -> _Tables:
         """Start copying to the device all that it is told of a sector's roots."""

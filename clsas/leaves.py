@@ -230,7 +230,7 @@ class PlaneLeaves(Leaves):
             corners = np.arange(len(parts))[:, None] * [height, 0]
             pixels, columns = slot.buffer("pixels", 8 * len(parts) * height * width), width
             sums = self._sums(tables, len(parts) * height * width)
-        slot.busy = device.run(
+        event = device.run(
             self.backproject,
             (chosen.tile[0] * chosen.tile[1] // (self.width * STACK), tiles),
             samples,
@@ -252,13 +252,14 @@ class PlaneLeaves(Leaves):
             *sums,
             wait_for=slot.filled,
         )
-        ready, weights = [slot.busy], []
+        ready, weights = [event], []
         if not direct:
             ready = [self._read(pixels, n, self.image, part) for n, part in enumerate(parts)]
         if sums:
             weights = [np.empty(self.image[part].shape, np.complex64) for part in parts]
             everything = (slice(None), slice(None))
             ready += [self._read(sums[0], n, each, everything) for n, each in enumerate(weights)]
+        slot.busy = ready[-1]
         device.queue.flush()
 
         def finish() -> int:
@@ -440,6 +441,7 @@ class SurfaceLeaves(Leaves):
                 cl.enqueue_copy(self.device.queue, each, buffer, is_blocking=False)
                 for each, buffer in zip(formed, buffers, strict=False)
             ]
+            self.slot.busy = ready[-1]
             self.device.queue.flush()
 
         def finish() -> int:
