@@ -146,6 +146,6 @@ INLINE void STORE_HELD(vfloat value, __global half *p)
 }
 #else
 #define LOAD_HELD(p) JOIN(vload_half, WIDTH)(0, p)
-#define STORE_HELD(value, p) JOIN(vstore_half, WIDTH)(value, 0, p)
+#define STORE_HELD(value, p) JOIN(vstore_half, WIDTH)((vfloat)(value), 0, p)
 #endif
 #endif

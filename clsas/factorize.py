@@ -26,7 +26,7 @@ from clsas.grid import Grid
 from clsas.image import Image
 from clsas.leaves import Finish, Level, PlaneLeaves, SurfaceLeaves
 from clsas.lines import RangeLines
-from clsas.plan import GUARD, MARGIN, Plan, padded_length
+from clsas.plan import GUARD, MARGIN, Plan, padded_length, sample_bytes
 from clsas.planner import BEST_TOLERANCE_DB, WORST_TOLERANCE_DB, plan
 from clsas.sector import Geometry, Sector
 from clsas.surface import surface_of
@@ -36,7 +36,7 @@ from clsas.window import BeamWindow
 _GROUP = 64  # work-items that share a subimage where each has one lane
 _AHEAD_S = 0.1  # of work that is started: roots are prepared meanwhile, an interruption waits
 _PREPARED_FIRST = 4  # batches
-_LARGEST_HALF, _FILTERS_SUM = 65504.0, 16.0
+_LARGEST_HALF, _FILTERS_SUM = 65504.0, 4.0
 _MOST_EXPONENT = 100  # of a gain: float32 holds filters times it, and over it
 _GROUPS_PER_UNIT = 3  # at least, of compute units: so that they end together
 
@@ -165,8 +165,11 @@ class _Run:
         largest: float,
     ) -> None:
         self.lines, self.grid, self.plan, self.device = lines, grid, chosen, device
-        self.gain = _gain(largest, lines.channels) if chosen.half else 1.0
-        self.width, surface = device.info.width, surface_of(grid)
+        gain = _gain(largest, lines.channels) if chosen.half else None
+        self.half, self.gain = gain is not None, gain or 1.0
+        self.width, self.pitch = device.info.width, padded_length(chosen.resampling)
+        self.samples = self._upload_lines()  # first: a device upsamples them beside what follows
+        surface = surface_of(grid)
         self.geometry = Geometry(lines, surface, chosen)
         self.division = self.geometry.division
         self.levels = [
@@ -178,14 +181,14 @@ class _Run:
             for name in ("align", "aperture")
         }
         options = {"WIDTH": self.width, "TAPS": chosen.align.taps}
-        options |= {"APERTURE_TAPS": chosen.aperture.taps, "HALF": int(chosen.half)}
+        options |= {"APERTURE_TAPS": chosen.aperture.taps, "HALF": int(self.half)}
         ramp = int(self.geometry.ramps)
         self.first_stage = device.kernel("stage", "stage", GIVEN=1, RAMP=ramp, **options)
         self.later_stage = device.kernel("stage", "stage", GIVEN=0, RAMP=0, **options)
-        self.pitch = padded_length(chosen.resampling)
-        self.samples = self._upload_lines()
         kind = PlaneLeaves if surface.is_plane else SurfaceLeaves
-        self.leaves = kind(lines, self.geometry, self.levels[-1], device, pixels, self.gain)
+        self.leaves = kind(
+            lines, self.geometry, self.levels[-1], device, pixels, self.half, self.gain
+        )
         later = range(1, len(self.levels))
         self.parents = {
             level: device.upload(self.division.parents(level).astype(np.int32)) for level in later
@@ -198,7 +201,7 @@ class _Run:
         """Return all lines on the device, upsampled."""
         device, chosen, count = self.device, self.plan, self.lines.channels
         resampling = chosen.resampling
-        line_bytes = chosen.sample_bytes * self.pitch
+        line_bytes = sample_bytes(self.half) * self.pitch
         if count * line_bytes > device.info.max_buffer_bytes:
             raise ValueError(
                 f"{count} lines of {self.lines.length} samples need "
@@ -213,12 +216,12 @@ class _Run:
                 chosen.upsampler,
                 self.pitch,
                 device,
-                half=chosen.half,
+                half=self.half,
                 gain=self.gain,
             )
         gain = None
         if not chosen.nearest:
-            gain = edges_gain(chosen.align, chosen.final, len(self.levels), resampling.ratio)
+            gain = edges_gain(chosen.align, chosen.final, len(chosen.sides), resampling.ratio)
         return device.share(
             upsampled_lines(self.lines.samples, resampling, self.width, MARGIN, self.pitch, gain)
         )
@@ -338,7 +341,7 @@ class _Run:
             self.filters["align"],
             self.filters["aperture"],
             self.slot.zeros(
-                f"lines{level}", self.plan.sample_bytes * children * stride * shape.pitch
+                f"lines{level}", sample_bytes(self.half) * children * stride * shape.pitch
             ),
             stride,
             shape.pitch,
@@ -350,15 +353,16 @@ class _Run:
         )
 
 
-def _gain(largest: float, channels: int) -> float:
+def _gain(largest: float, channels: int) -> float | None:
     """Return a power of 2 that brings lines, and sums of them all, within half precision.
 
-    Filters' weights, of both signs, add up to a few times their sum.
+    Filters' weights, of both signs, add up to more than their sum. None where filters would not
+    hold it.
     """
     if not largest:
-        return 1.0
+        return None
     exponent = math.floor(math.log2(_LARGEST_HALF / (_FILTERS_SUM * channels * largest)))
-    return 2.0 ** min(max(exponent, -_MOST_EXPONENT), _MOST_EXPONENT)
+    return 2.0**exponent if abs(exponent) <= _MOST_EXPONENT else None
 
 
 def _pitch(channels: int) -> int:

@@ -29,8 +29,11 @@ from clsas.plan import (
 from clsas.sector import OF_BEAM
 from clsas.view import View
 
-HALF_ROUNDING = 4e-8
-"""Power of the error that rounding lines to half precision once adds: 2^-11/sqrt(6), rms."""
+HALF_ROUNDING = 5e-8
+"""Power of the error that rounding lines to half precision once adds: 2^-11/sqrt(6) rms, and some.
+
+Sums that stages hand on are rounded again where more channels are added to them.
+"""
 _ROUNDING_SHARE = 0.1  # of an image's error
 MARGIN_DB = 1.0  # between prediction and tolerance, for what measured errors scatter
 _CACHED_BYTES, _BATCH_BYTES = 16 << 20, 256 << 20  # of a batch, on CPUs and elsewhere

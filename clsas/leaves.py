@@ -57,7 +57,7 @@ class Level:
 class Leaves:
     """What forms pixels from leaves: of tiles on a plane, of groups of points elsewhere.
 
-    Lines are `gain` times what they stand for.
+    Lines are of half precision or single, and `gain` times what they stand for.
     """
 
     def __init__(
@@ -67,6 +67,7 @@ class Leaves:
         level: Level,
         device: Device,
         image: NDArray[np.complex64],
+        half: bool,
         gain: float,
     ) -> None:
         chosen = geometry.plan
@@ -78,7 +79,7 @@ class Leaves:
         # Where tile and leaf are one, every line is aligned on its centre.
         self.centred = chosen.tile == chosen.sides[-1]
         self.per_sample = geometry.cycles_per_m / geometry.samples_per_m
-        self.slot, self.image = Slot(device), image
+        self.slot, self.image, self.half = Slot(device), image, half
         self._prepare()
 
     def _prepare(self) -> None:
@@ -101,7 +102,7 @@ class Leaves:
             "NORMALISE": int(self.normalise),
             "ALONE": 1,
             "CENTRED": int(self.centred),
-            "HALF": int(self.plan.half),
+            "HALF": int(self.half),
         }
 
     def fill(self, slot: Slot, sector: Sector) -> None:

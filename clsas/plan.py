@@ -234,11 +234,6 @@ class Plan:
         """Whether this is plain backprojection."""
         return not self.sides
 
-    @property
-    def sample_bytes(self) -> int:
-        """Bytes of a complex sample that stages hand on."""
-        return sample_bytes(self.half)
-
     def describe(self) -> str:
         """Return a table of what is expected, stage by stage."""
         if self.tolerance_db is None:
@@ -316,7 +311,9 @@ class Plan:
                 if values[name] is not None:
                     half = values[name]["taps"] // 2
                     coefficients = np.array(values[name].pop("coefficients"), np.float64)
-                    coefficients = coefficients.reshape(half, 2, half)
+                    coefficients = coefficients.reshape(
+                        half, 2, coefficients.size // max(2 * half, 1)
+                    )
                     values[name] = Interpolator(coefficients=coefficients, **values[name])
             if values["resampling"] is not None:
                 values["resampling"] = Resampling(**values["resampling"])

@@ -68,4 +68,5 @@ def upsample(
         )
         if start + at_once < channels:
             event.wait()
+    device.queue.flush()
     return lines

@@ -11,7 +11,9 @@ from clsas import plan
 from clsas.backproject import backproject
 from clsas.costs import Costs
 from clsas.device import open_device
+from clsas.errors import in_db
 from clsas.factorize import factorize
+from clsas.forecast import HALF_ROUNDING
 from clsas.grid import Grid
 from clsas.image import Image
 from clsas.plan import Plan
@@ -561,6 +563,47 @@ def test_a_grid_that_no_line_reaches_warns_and_is_zero():
     assert not image.pixels.any()
 
 
+# Half precision
+
+
+def halved(case, tolerance_db):
+    """A plan whose lines are of half precision, whatever the device."""
+    return dataclasses.replace(planned(case, tolerance_db), half=True)
+
+
+def test_half_precision_adds_what_is_predicted(device):
+    chosen = halved(swaying, -50)
+    single = dataclasses.replace(chosen, half=False)
+    image, better = (factorize(*made(swaying), each, device=device) for each in (chosen, single))
+    expected_db = in_db(HALF_ROUNDING * (len(chosen.sides) + 1))
+    assert expected_db - 3 <= relative_error_db(image, better) <= expected_db
+
+
+@pytest.mark.parametrize("scale", [1e-36, 1e-25, 7e4, 1e25, 1e32])
+def test_the_scale_of_samples_does_not_matter(scale, platform):
+    lines, grid = made(straight)
+    largest = np.abs(lines.samples).max()
+    scaled = dataclasses.replace(lines, samples=np.complex64(scale / largest) * lines.samples)
+    image = factorize(scaled, grid, halved(straight, -50), device=platform).pixels
+    assert relative_error_db(image / np.float32(scale) * largest, exact(straight)) <= -50
+
+
+def test_what_is_faint_beside_what_is_strong_is_kept(platform):
+    """Half precision rounds by what it rounds, not by the largest: here 80 dB more."""
+    lines, grid = made(straight)
+    range_m = lines.first_range_m[:, None] + np.arange(lines.length) * lines.range_step_m
+    fades = 10.0 ** (-4 * np.clip(range_m - 39.5, 0, 1))
+    fading = dataclasses.replace(lines, samples=(lines.samples * fades).astype(np.complex64))
+    chosen = halved(straight, -50)
+    single = dataclasses.replace(chosen, half=False)
+    image, better = (
+        factorize(fading, grid, each, device=platform).pixels for each in (chosen, single)
+    )
+    faint = grid.positions_m()[..., 1] > 40.6
+    assert np.abs(better[faint]).max() < 1e-3 * np.abs(better).max()
+    assert relative_error_db(image[faint], better[faint]) <= -64
+
+
 # Plans in other places
 
 
@@ -583,10 +626,10 @@ def test_a_plan_holds_its_beam():
 
 def test_a_plan_serves_other_samples():
     lines, grid = made(straight)
-    louder = dataclasses.replace(lines, samples=1e3 * lines.samples)
+    louder = dataclasses.replace(lines, samples=1024 * lines.samples)
     chosen = planned(straight, -50)
     image, loud = (factorize(each, grid, chosen).pixels for each in (lines, louder))
-    assert relative_error_db(loud / 1e3, image) <= -100
+    assert relative_error_db(loud / 1024, image) <= -100
 
 
 def test_a_plan_serves_another_device(device):

@@ -95,6 +95,8 @@ def test_text_that_is_no_plan_is_refused(text):
         ("upsampler", {"step": 0, "coefficients": [[0.0] * 16] * 32, "error_db": -60.0}),
         ("upsampler", {"step": 20, "coefficients": [[0.0] * 16] * 31, "error_db": -60.0}),
         ("upsampler", {"step": 20, "coefficients": [[float("nan")] * 16] * 32, "error_db": 0.0}),
+        ("half", 1),
+        ("half", None),
         ("limits", [0.1, 0.2]),
         ("crowding", [1e9, 1e9, 1e9]),
         ("beam_cycles", 1e9),
