@@ -311,9 +311,7 @@ class Plan:
                 if values[name] is not None:
                     half = values[name]["taps"] // 2
                     coefficients = np.array(values[name].pop("coefficients"), np.float64)
-                    coefficients = coefficients.reshape(
-                        half, 2, coefficients.size // max(2 * half, 1)
-                    )
+                    coefficients = coefficients.reshape(half, 2, half)
                     values[name] = Interpolator(coefficients=coefficients, **values[name])
             if values["resampling"] is not None:
                 values["resampling"] = Resampling(**values["resampling"])
