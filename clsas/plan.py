@@ -248,15 +248,15 @@ class Plan:
         if self.is_exact:
             reason = "" if self.tolerance_db is None else ": no factorization is faster within it"
             return f"{lines[0]}\nPlain backprojection{reason}."
+        lines[0] += f", {'half' if self.half else 'single'} precision"
         taps = f"{self.align.taps} taps in range at {self.resampling.ratio:.2f} x the lines' rate"
-        end = f"{self.final.taps} taps at the end, {'half' if self.half else 'single'} precision"
         if self.nearest:
             beams = f"sums of {', '.join(map(str, self.nearest))} neighbours"
         else:
             beams = (
                 f"{self.aperture.taps} taps along the aperture at {self.aperture.upsampling:.2f} x"
             )
-        lines.append(f"{taps}, {beams}, {end}")
+        lines.append(f"{taps}, {beams}, {self.final.taps} taps at the end")
         names = (
             "subimages",
             "rows x columns",
