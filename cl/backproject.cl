@@ -525,10 +525,8 @@ __kernel void backproject_tiles(__global const held *samples, int pitch,
             sum[block] += SHARE(channel) * weight;
 #endif
 #endif
-            re[block] += line_re * cosine;
-            re[block] -= line_im * sine;
-            im[block] += line_re * sine;
-            im[block] += line_im * cosine;
+            re[block] += line_re * cosine - line_im * sine;
+            im[block] += line_re * sine + line_im * cosine;
         }
     }
     corners += (first_tile + tile) / (down * across) * 2;
@@ -664,10 +662,8 @@ __kernel void backproject_points(__global const held *samples, int pitch,
             sine *= weight;
             cosine *= weight;
 #endif
-            re[block] += line_re * cosine;
-            re[block] -= line_im * sine;
-            im[block] += line_re * sine;
-            im[block] += line_im * cosine;
+            re[block] += line_re * cosine - line_im * sine;
+            im[block] += line_re * sine + line_im * cosine;
         }
     }
     put(re, im, pixels, BLOCK_COLUMNS, (first_group + group) * ITEM_ROWS, 0);
