@@ -16,6 +16,8 @@
  *   GIVEN          1: shifts and phases come from the host (the first stage, whose channels may be
  *                  anything); 0: from the positions of virtual channels.
  *   RAMP           1: phases vary along the lines (with GIVEN only); 0: every ramp is 0.
+ *   CHUNK          channels whose weights are kept at a time; sums still open after them are handed on as well,
+ *                  and taken up again.
  *   HALF           1: lines are of half in place of float, in and out (common.h).
  *
  * Buffers
@@ -47,7 +49,6 @@
  * Samples outside the parent's line are never read: the place is moved inside, where the host has put zeros.
  */
 
-#define CHUNK 32 /* channels whose weights are kept at a time */
 #define BLOCK (WIDTH > 1 ? (GIVEN ? 16 : 8) * WIDTH : 1) /* long lines are fetched in long pieces */
 
 #if WIDTH == 1

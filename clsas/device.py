@@ -74,8 +74,11 @@ class DeviceInfo:
     permute: bool
 
     @property
-    def half(self) -> bool:
-        """Whether kernels take half-precision numbers in and out as fast as others."""
+    def half_precision(self) -> bool:
+        """Whether kernels take half-precision numbers in and out as fast as others.
+
+        Of CPUs those with AVX-512 do, as they permute.
+        """
         return self.kind == "gpu" or self.permute
 
     @property
@@ -252,8 +255,9 @@ class Slot:
         return self._at_least(name, bytes_, self.device.zeros)
 
     def _wait_for_job(self) -> None:
-        if self.busy is not None:
-            self.busy.wait()
+        # A job of which nothing was seen has not waited for what was filled for it.
+        for event in [*self.filled, *([] if self.busy is None else [self.busy])]:
+            event.wait()
 
     def _at_least(self, name: str, bytes_: int, make: Callable[[int], cl.Buffer]) -> cl.Buffer:
         if name not in self._buffers:

@@ -26,7 +26,7 @@ from clsas.grid import Grid
 from clsas.image import Image
 from clsas.leaves import Finish, Level, PlaneLeaves, SurfaceLeaves
 from clsas.lines import RangeLines
-from clsas.plan import GUARD, MARGIN, Plan, padded_length, sample_bytes
+from clsas.plan import CHUNK, GUARD, MARGIN, Plan, padded_length, sample_bytes
 from clsas.planner import BEST_TOLERANCE_DB, WORST_TOLERANCE_DB, plan
 from clsas.sector import Geometry, Sector
 from clsas.surface import surface_of
@@ -36,7 +36,8 @@ from clsas.window import BeamWindow
 _GROUP = 64  # work-items that share a subimage where each has one lane
 _AHEAD_S = 0.1  # of work that is started: roots are prepared meanwhile, an interruption waits
 _PREPARED_FIRST = 4  # batches
-_LARGEST_HALF, _FILTERS_SUM = 65504.0, 4.0
+_LARGEST_HALF, _LEAST_HALF = 65504.0, 2.0**-13  # with a margin of 2 to what is rounded coarser
+_FILTERS_SUM = 8.0  # of the absolute values of upsampling and aligning filters, with a margin
 _MOST_EXPONENT = 100  # of a gain: float32 holds filters times it, and over it
 _GROUPS_PER_UNIT = 3  # at least, of compute units: so that they end together
 
@@ -166,13 +167,22 @@ class _Run:
         largest: float,
     ) -> None:
         self.lines, self.grid, self.plan, self.device = lines, grid, chosen, device
-        gain = _gain(largest, lines.channels) if chosen.half else None
-        self.half, self.gain = gain is not None, gain or 1.0
         self.width, self.pitch = device.info.width, padded_length(chosen.resampling)
-        self.samples = self._upload_lines()  # first: a device upsamples them beside what follows
         surface = surface_of(grid)
         self.geometry = Geometry(lines, surface, chosen)
         self.division = self.geometry.division
+        self.half_precision, self.gain = chosen.half_precision, 1.0
+        if chosen.half_precision and largest > 0:
+            self.gain = _gain(largest, lines.channels)
+            self.half_precision = _holds(self.gain * self.geometry.rms)
+            if not self.half_precision:
+                self.gain = 1.0
+                validate.warn(
+                    "lines are held in single precision, not in half as planned, which takes up to "
+                    "twice the memory: what can be seen of the grid is too faint beside the "
+                    f"largest sample, {largest:.3g}, or that is too far from 1"
+                )
+        self.samples = self._upload_lines()  # early: a device upsamples them beside what follows
         self.levels = [
             Level(half, -(-(2 * half + 1) // self.width) * self.width)
             for half in chosen.half_lengths
@@ -182,13 +192,14 @@ class _Run:
             for name in ("align", "aperture")
         }
         options = {"WIDTH": self.width, "TAPS": chosen.align.taps}
-        options |= {"APERTURE_TAPS": chosen.aperture.taps, "HALF": int(self.half)}
+        options |= {"APERTURE_TAPS": chosen.aperture.taps, "HALF": int(self.half_precision)}
+        options["CHUNK"] = CHUNK
         ramp = int(self.geometry.ramps)
         self.first_stage = device.kernel("stage", "stage", GIVEN=1, RAMP=ramp, **options)
         self.later_stage = device.kernel("stage", "stage", GIVEN=0, RAMP=0, **options)
         kind = PlaneLeaves if surface.is_plane else SurfaceLeaves
         self.leaves = kind(
-            lines, self.geometry, self.levels[-1], device, pixels, self.half, self.gain
+            lines, self.geometry, self.levels[-1], device, pixels, self.half_precision, self.gain
         )
         later = range(1, len(self.levels))
         self.parents = {
@@ -202,7 +213,7 @@ class _Run:
         """Return all lines on the device, upsampled."""
         device, chosen, count = self.device, self.plan, self.lines.channels
         resampling = chosen.resampling
-        line_bytes = sample_bytes(self.half) * self.pitch
+        line_bytes = sample_bytes(self.half_precision) * self.pitch
         if count * line_bytes > device.info.max_buffer_bytes:
             raise ValueError(
                 f"{count} lines of {self.lines.length} samples need "
@@ -217,7 +228,7 @@ class _Run:
                 chosen.upsampler,
                 self.pitch,
                 device,
-                half=self.half,
+                half_precision=self.half_precision,
                 gain=self.gain,
             )
         gain = None
@@ -342,7 +353,7 @@ class _Run:
             self.filters["align"],
             self.filters["aperture"],
             self.slot.zeros(
-                f"lines{level}", sample_bytes(self.half) * children * stride * shape.pitch
+                f"lines{level}", sample_bytes(self.half_precision) * children * stride * shape.pitch
             ),
             stride,
             shape.pitch,
@@ -354,16 +365,15 @@ class _Run:
         )
 
 
-def _gain(largest: float, channels: int) -> float | None:
-    """Return a power of 2 that brings lines, and sums of them all, within half precision.
-
-    Filters' weights, of both signs, add up to more than their sum. None where filters would not
-    hold it.
-    """
-    if not largest:
-        return None
+def _gain(largest: float, channels: int) -> float:
+    """Return a power of 2 that brings lines, and sums of them all, within half precision."""
     exponent = math.floor(math.log2(_LARGEST_HALF / (_FILTERS_SUM * channels * largest)))
-    return 2.0**exponent if abs(exponent) <= _MOST_EXPONENT else None
+    return 2.0 ** min(max(exponent, -_MOST_EXPONENT), _MOST_EXPONENT)
+
+
+def _holds(rms: float) -> bool:
+    """Return whether half precision holds lines of an rms value, or there is nothing to hold."""
+    return rms == 0 or _LEAST_HALF <= rms <= _LARGEST_HALF
 
 
 def _pitch(channels: int) -> int:

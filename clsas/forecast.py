@@ -17,6 +17,7 @@ from clsas.filters import UPSAMPLING_SHARE, Filters, edges_gain
 from clsas.interpolation import PHASES
 from clsas.layout import STACK
 from clsas.plan import (
+    CHUNK,
     GIVEN_BYTES,
     GUARD,
     Plan,
@@ -29,12 +30,10 @@ from clsas.plan import (
 from clsas.sector import OF_BEAM
 from clsas.view import View
 
-HALF_ROUNDING = 5e-8
-"""Power of the error that rounding lines to half precision once adds: 2^-11/sqrt(6) rms, and some.
-
-Sums that stages hand on are rounded again where more channels are added to them.
-"""
+HALF_ROUNDING = 4e-8
+"""Power of the error that rounding lines to half precision once adds: 2^-11/sqrt(6) rms."""
 _ROUNDING_SHARE = 0.1  # of an image's error
+_MOST_CHUNKS = 16  # that a sum in half precision is made of
 MARGIN_DB = 1.0  # between prediction and tolerance, for what measured errors scatter
 _CACHED_BYTES, _BATCH_BYTES = 16 << 20, 256 << 20  # of a batch, on CPUs and elsewhere
 _MOST_TABLE_BYTES = 64 << 20
@@ -81,12 +80,9 @@ def factorized(
     else:
         resampling = upsampler.resampling(lines.length, align.taps // 2, view.spectrum)
         error += power(upsampler.error_db)
-    half = upsampler is not None and holds_half(tolerance_db, len(sides), device)
-    if half:
-        error += (len(sides) + 1) * HALF_ROUNDING
     halves = view.half_lengths(sides, align, final, resampling)
     of_aperture = aperture.taps, 2 * aperture.upsampling
-    stages, channels = [], float(lines.channels)
+    stages, channels, reach = [], float(lines.channels), []
     width = device.info.width
     used = channels * view.share_seen(sides[0])
     for level, side in enumerate(sides):
@@ -103,6 +99,7 @@ def factorized(
             if view.beam is not None and level == len(sides) - 1:
                 turns += way.beam_cycles * view.cycles(view.beam_rates, seen)
             channels = view.channels(*of_aperture, turns)
+            reach.append(aperture.taps * used / channels)
         cost_ns = count * used * costs.line_ns(samples, align.taps + aperture.taps)
         if not level:
             cost_ns += count * lines.channels * costs.reference_ns
@@ -122,10 +119,17 @@ def factorized(
         Stage(*side, count, round(channels), samples, operations, final.scatter_db, 1e-9 * cost_ns)
     )
     tile = _tile(view, sides[-1], device) if nearest else sides[-1]
-    line_bytes = sample_bytes(half) * lines.channels * padded_length(resampling)
+    half_precision = False
+    if upsampler is not None and tolerance_db is not None and device.info.half_precision:
+        rounding = _half_rounding(view, reach)
+        half_precision = rounding <= _ROUNDING_SHARE * power(tolerance_db)
+        error += rounding if half_precision else 0.0
+    line_bytes = sample_bytes(half_precision) * lines.channels * padded_length(resampling)
     if upsampler is not None:
         line_bytes += min(lines.samples.nbytes, GIVEN_BYTES)
-    root_bytes, table_bytes = _root_bytes(view, way, tile, stages, width, sample_bytes(half))
+    root_bytes, table_bytes = _root_bytes(
+        view, way, tile, stages, width, sample_bytes(half_precision)
+    )
     room = memory_bytes - line_bytes
     batch_bytes = _CACHED_BYTES if device.info.kind == "cpu" else _BATCH_BYTES
     # Tables come in two sets.
@@ -146,7 +150,7 @@ def factorized(
         final=final,
         resampling=resampling,
         upsampler=upsampler,
-        half=half,
+        half_precision=half_precision,
         half_lengths=halves,
         highest_cycles_per_m=view.highest_cycles_per_m,
         closest_m=view.nearest_m,
@@ -167,11 +171,18 @@ def factorized(
     )
 
 
-def holds_half(tolerance_db: float | None, stages: int, device: Device) -> bool:
-    """Return whether lines may be rounded to half precision after every stage."""
-    if tolerance_db is None or not device.info.half:
-        return False
-    return (stages + 1) * HALF_ROUNDING <= _ROUNDING_SHARE * power(tolerance_db)
+def _half_rounding(view: View, reach: Sequence[float]) -> float:
+    """Return the power of the error that rounding lines to half precision adds.
+
+    reach: the channels that a virtual one is the sum of, stage by stage. Upsampled lines are
+    rounded, and what a stage hands on: sums of incoherent lines so often that it counts as half of
+    their chunks, which grow. Where these are very many a sum no longer takes up what is added.
+    """
+    chunks = np.array(reach) / CHUNK
+    chunks[0] *= view.densest
+    if chunks.max() > _MOST_CHUNKS:
+        return np.inf
+    return HALF_ROUNDING * (1 + float(np.sum(1 + chunks / 2)))
 
 
 def _power_of_stage(way: Way) -> float:
@@ -260,7 +271,7 @@ def plain(
         final=None,
         resampling=None,
         upsampler=None,
-        half=False,
+        half_precision=False,
         half_lengths=(),
         highest_cycles_per_m=view.highest_cycles_per_m,
         closest_m=0.0,

@@ -67,7 +67,7 @@ class Leaves:
         level: Level,
         device: Device,
         image: NDArray[np.complex64],
-        half: bool,
+        half_precision: bool,
         gain: float,
     ) -> None:
         chosen = geometry.plan
@@ -79,7 +79,7 @@ class Leaves:
         # Where tile and leaf are one, every line is aligned on its centre.
         self.centred = chosen.tile == chosen.sides[-1]
         self.per_sample = geometry.cycles_per_m / geometry.samples_per_m
-        self.slot, self.image, self.half = Slot(device), image, half
+        self.slot, self.image, self.half_precision = Slot(device), image, half_precision
         self._prepare()
 
     def _prepare(self) -> None:
@@ -102,7 +102,7 @@ class Leaves:
             "NORMALISE": int(self.normalise),
             "ALONE": 1,
             "CENTRED": int(self.centred),
-            "HALF": int(self.half),
+            "HALF": int(self.half_precision),
         }
 
     def fill(self, slot: Slot, sector: Sector) -> None:

@@ -19,6 +19,8 @@ GIVEN_BYTES = 64 << 20
 """Of lines as they come, at most, that are on a device at once to be upsampled."""
 MARGIN = 32
 """Zeros on either side of an upsampled line: what lies further out is moved into them."""
+CHUNK = 32
+"""Channels that a stage adds up before it hands on the sums, and takes up those still open."""
 GUARD = 16
 """Zeros on either side of a virtual channel's line, which the last stage's lookup may touch."""
 
@@ -81,8 +83,8 @@ class Plan:
         Where samples go when lines are upsampled first.
     upsampler : Upsampler or None
         What does that; None by FFT.
-    half : bool
-        Whether lines are handed on from stage to stage in half precision, in half the time.
+    half_precision : bool
+        Whether lines are handed on from stage to stage in half precision: half of the memory.
     half_lengths : tuple of int
         Samples to either side of a subimage's centre that its lines hold, stage by stage.
     highest_cycles_per_m : float
@@ -123,7 +125,7 @@ class Plan:
     final: Interpolator | None
     resampling: Resampling | None
     upsampler: Upsampler | None
-    half: bool
+    half_precision: bool
     half_lengths: tuple[int, ...]
     highest_cycles_per_m: float
     closest_m: float
@@ -178,8 +180,9 @@ class Plan:
             return
         whole_items = self.tile[0] % 16 == 0 and self.tile[1] % 4 == 0
         check(whole_items, "tile", "a multiple of 16 rows and 4 columns")
-        fits = isinstance(self.half, bool) and not (self.half and self.upsampler is None)
-        check(fits, "half", "true or false, false without an upsampler")
+        fits = isinstance(self.half_precision, bool)
+        fits = fits and not (self.half_precision and self.upsampler is None)
+        check(fits, "half_precision", "true or false, false without an upsampler")
         fits = isinstance(self.half_lengths, tuple) and len(self.half_lengths) == levels
         fits = fits and all(whole(n, 0) for n in self.half_lengths)
         check(fits, "half_lengths", "a whole number for every stage")
@@ -248,7 +251,7 @@ class Plan:
         if self.is_exact:
             reason = "" if self.tolerance_db is None else ": no factorization is faster within it"
             return f"{lines[0]}\nPlain backprojection{reason}."
-        lines[0] += f", {'half' if self.half else 'single'} precision"
+        lines[0] += f", {'half' if self.half_precision else 'single'} precision"
         taps = f"{self.align.taps} taps in range at {self.resampling.ratio:.2f} x the lines' rate"
         if self.nearest:
             beams = f"sums of {', '.join(map(str, self.nearest))} neighbours"
@@ -345,9 +348,9 @@ class Plan:
                 )
 
 
-def sample_bytes(half: bool) -> int:
-    """Return the bytes of a complex sample."""
-    return 4 if half else 8
+def sample_bytes(half_precision: bool) -> int:
+    """Return the bytes of a complex sample that stages hand on."""
+    return 4 if half_precision else 8
 
 
 def padded_length(resampling: Resampling) -> int:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,6 +19,7 @@ from clsas.surface import Surface
 from clsas.tree import Division, Nodes, Ranges
 
 _ON_TRACK = 1e-4  # wavelengths
+_SOME_LINES = 64  # of which samples are looked at
 _FAR = 1 << 28  # samples: off any line, and within int32
 OF_BEAM = 1 / 16
 """Of what a beam covers: by how much it may be taken to cover more."""
@@ -119,6 +121,23 @@ class Geometry:
         """Least distance of a channel from a root's middle."""
         root_m = self.division.centres_m(0, self.division.roots)
         return float(cdist(root_m, self.phase_centres_m).min())
+
+    @functools.cached_property
+    def rms(self) -> float:
+        """Rms value of samples, of some lines, from about where pixels lie."""
+        lines, every = self.lines, -(-self.lines.channels // _SOME_LINES)
+        root_m = self.division.centres_m(0, self.division.roots)
+        away_m = cdist(root_m, lines.phase_centres_m[::every])
+        radius_m = self.surface.radius_m(self.plan.sides[0])
+        near_m, far_m = away_m.min(axis=0) - radius_m, away_m.max(axis=0) + radius_m
+        total, count = 0.0, 0
+        for i, near, far in zip(range(0, lines.channels, every), near_m, far_m, strict=True):
+            limits = (np.array([near, far]) - lines.first_range_m[i]) / lines.range_step_m
+            first, last = np.clip(limits, 0, lines.length).astype(np.int64)
+            seen = lines.samples[i, first : last + 1].astype(np.complex128)
+            total += np.vdot(seen, seen).real
+            count += last + 1 - first
+        return math.sqrt(total / max(count, 1))
 
     def _together(self) -> tuple[int, int]:
         """Return the size of rectangles of leaves for all of which it is decided who sees them.

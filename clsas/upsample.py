@@ -20,15 +20,15 @@ def upsample(
     pitch: int,
     device: Device,
     *,
-    half: bool = False,
+    half_precision: bool = False,
     gain: float = 1.0,
 ) -> cl.Buffer:
     """Return lines [channels, n] upsampled on a device as its kernels want them.
 
     The samples are to be kept, and left alone, until the device is done with them. The result has
     `pitch` samples per line, with zeros around them: interleaved, [channels, pitch, 2], with
-    one lane per work-item, else [channels, 2, pitch]. It is `gain` times the lines, and with `half`
-    of half precision.
+    one lane per work-item, else [channels, 2, pitch]. It is `gain` times the lines, and with
+    `half_precision` held so.
     """
     width, taps, step = device.info.width, upsampler.taps, upsampler.step
     kernel = device.kernel(
@@ -39,14 +39,14 @@ def upsample(
         PHASES=PHASES,
         PERMUTE=int(device.info.permute),
         TURN=int(resampling.shift != 0),
-        HALF=int(half),
+        HALF=int(half_precision),
     )
     phase = (resampling.first + np.arange(PHASES)) * step % PHASES
     filters = upsampler.coefficients[phase].reshape(-1, width, taps).swapaxes(1, 2)
     filters = device.upload((gain * filters).astype(np.float32))
     turn = int(np.int32(np.uint32(round(resampling.centre_cycles_per_sample * 2**32) % 2**32)))
     channels, count = samples.shape
-    lines = device.buffer(sample_bytes(half) * channels * pitch)
+    lines = device.buffer(sample_bytes(half_precision) * channels * pitch)
     at_once = max(GIVEN_BYTES // (8 * count), 1)
     for start in range(0, channels, at_once):
         some = samples[start : start + at_once]

@@ -22,6 +22,7 @@ from clsas.surface import LEAST_SIDE, surface_of, within_roots
 from clsas.tree import beam_directions, beam_rate
 from clsas.window import BeamWindow, sines, touches_boxes
 
+_NEIGHBOURS = 64  # channels whose density is looked at
 _SPOTS = (0.02, 0.25, 0.5, 0.75, 0.98)  # of rows and columns, where the geometry is looked at
 _OF_SPOTS = (0.135, 0.24, 0.25, 0.24, 0.135)  # what these stand for
 _BINS = 512  # of a beam
@@ -137,6 +138,15 @@ class View:
         sine = sines(points_m, position_m, self.along[on_track])
         sums = self.beam.weights(sine, wavelength_m(self.lines)).sum(axis=0)
         return float(sums.min() / max(sums.max(), 1e-30))
+
+    @functools.cached_property
+    def densest(self) -> float:
+        """By how much denser than on average channels lie where they lie densest on the track."""
+        place = np.sort(self.track.place)
+        some = min(_NEIGHBOURS, len(place) - 1)
+        closest = float((place[some:] - place[:-some]).min())
+        average = float(place[-1] - place[0]) * some / (len(place) - 1)
+        return average / closest if closest > 0 else np.inf
 
     def _pixels_m(self, places: Sequence[float]) -> NDArray[np.float64]:
         """Return positions at some parts of the rows and columns, [n, 3]."""

@@ -429,7 +429,7 @@ def test_a_point_on_a_hill_keeps_its_amplitude_and_phase(platform):
 def test_it_is_linear(half, to_db, platform):
     """But for what is rounded: three images, to half precision four times each."""
     one, grid = made(straight)
-    chosen = dataclasses.replace(planned(straight, -50), half=half)
+    chosen = dataclasses.replace(planned(straight, -50), half_precision=half)
     other = dataclasses.replace(one, samples=noise(one.channels, one.length, seed=9))
     a, b = 0.3 - 2j, 1.5j
     both = dataclasses.replace(one, samples=a * one.samples + b * other.samples)
@@ -570,24 +570,60 @@ def test_a_grid_that_no_line_reaches_warns_and_is_zero():
 
 def halved(case, tolerance_db):
     """A plan whose lines are of half precision, whatever the device."""
-    return dataclasses.replace(planned(case, tolerance_db), half=True)
+    return dataclasses.replace(planned(case, tolerance_db), half_precision=True)
 
 
 def test_half_precision_adds_what_is_predicted(device):
     chosen = halved(swaying, -50)
-    single = dataclasses.replace(chosen, half=False)
+    single = dataclasses.replace(chosen, half_precision=False)
     image, better = (factorize(*made(swaying), each, device=device) for each in (chosen, single))
-    expected_db = in_db(HALF_ROUNDING * (len(chosen.sides) + 1))
+    expected_db = in_db(1.3 * HALF_ROUNDING * (len(chosen.sides) + 1))
     assert expected_db - 3 <= relative_error_db(image, better) <= expected_db
 
 
-@pytest.mark.parametrize("scale", [1e-36, 1e-25, 7e4, 1e25, 1e32])
+@pytest.mark.parametrize("tolerance_db", [-50, -56])
+@pytest.mark.parametrize("length_m", [1.0, 0.3])
+def test_dense_channels_keep_the_promise(length_m, tolerance_db):
+    """Virtual channels are sums of hundreds of these, which half precision rounds many times."""
+    grid = around(0, 40, shape=(64, 64))
+    lines, _ = over(grid, along_x(20000, length_m / 20000))
+    chosen = plan(lines, grid, tolerance_db=tolerance_db, costs=EXACT_IS_SLOW)
+    reference = backproject(lines, grid, accuracy_db=-85)
+    error_db = relative_error_db(factorize(lines, grid, chosen), reference)
+    assert error_db <= chosen.predicted_error_db <= tolerance_db
+
+
+def test_loud_samples_that_no_pixel_sees(platform):
+    """They decide how lines are scaled: where half precision would hold too little, single does."""
+    lines, grid = made(straight)
+    loud = 1e7 * noise(lines.channels, 300)
+    longer = dataclasses.replace(
+        lines,
+        samples=np.concatenate([loud, lines.samples], axis=1),
+        first_range_m=lines.first_range_m - 300 * lines.range_step_m,
+    )
+    chosen = plan(longer, grid, tolerance_db=-50, costs=EXACT_IS_SLOW)
+    chosen = dataclasses.replace(chosen, half_precision=True)
+    with pytest.warns(ClsasWarning, match="single precision, not in half"):
+        image = factorize(longer, grid, chosen, device=platform)
+    assert relative_error_db(image, exact(straight)) <= -50
+
+
+@pytest.mark.parametrize("scale", [1e-30, 1e-20, 7e4, 1e25, 1e32])
 def test_the_scale_of_samples_does_not_matter(scale, platform):
     lines, grid = made(straight)
     largest = np.abs(lines.samples).max()
     scaled = dataclasses.replace(lines, samples=np.complex64(scale / largest) * lines.samples)
     image = factorize(scaled, grid, halved(straight, -50), device=platform).pixels
     assert relative_error_db(image / np.float32(scale) * largest, exact(straight)) <= -50
+
+
+def test_lines_too_small_for_half_precision_are_held_in_single():
+    lines, grid = made(straight)
+    tiny = dataclasses.replace(lines, samples=np.complex64(1e-37) * lines.samples)
+    with pytest.warns(ClsasWarning, match="single precision, not in half"):
+        image = factorize(tiny, grid, halved(straight, -50)).pixels
+    assert relative_error_db(image / np.float32(1e-37), exact(straight)) <= -50
 
 
 def test_what_is_faint_beside_what_is_strong_is_kept(platform):
@@ -597,7 +633,7 @@ def test_what_is_faint_beside_what_is_strong_is_kept(platform):
     fades = 10.0 ** (-4 * np.clip(range_m - 39.5, 0, 1))
     fading = dataclasses.replace(lines, samples=(lines.samples * fades).astype(np.complex64))
     chosen = halved(straight, -50)
-    single = dataclasses.replace(chosen, half=False)
+    single = dataclasses.replace(chosen, half_precision=False)
     image, better = (
         factorize(fading, grid, each, device=platform).pixels for each in (chosen, single)
     )

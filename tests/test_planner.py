@@ -166,9 +166,9 @@ def test_half_precision_is_for_tolerances_and_devices_that_allow_it(device):
         plan(lines, grid, tolerance_db=tolerance_db, device=device, costs=EXACT_IS_SLOW)
         for tolerance_db in (-50, -70)
     )
-    assert chosen.half == device.info.half
-    assert not tighter.half
-    assert not plan(lines, grid, stages=[(4, 2)], device=device).half
+    assert chosen.half_precision == device.info.half_precision
+    assert not tighter.half_precision
+    assert not plan(lines, grid, stages=[(4, 2)], device=device).half_precision
 
 
 # Memory
