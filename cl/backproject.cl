@@ -74,7 +74,7 @@
 #define ITEM_ROWS (BLOCK_ROWS * STACK)
 #define BLOCKS_ACROSS (TILE_COLUMNS / BLOCK_COLUMNS)
 
-
+/* fabs() of a float4 that is no call (see KEEP). */
 #define MAGNITUDE(v) as_float4(as_int4(v) & 0x7fffffff)
 
 /* Interpolates one line at t - 0.5 samples from `centre` (the -0.5 makes rounding find the lower of the two

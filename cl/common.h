@@ -112,8 +112,8 @@ typedef short m256i __attribute__((vector_size(32)));
         vfloat)
 #endif
 
-/* The samples of lines as kernels hand them on: `held` is float or, with the build option HALF, half, which moves in
- * half the time and errs by -74 dB. Whatever they are held as, sums are of floats. */
+/* The samples of lines as kernels hand them on: `held` is float or, with the build option HALF, half, which takes
+ * half of the memory and errs by -74 dB. Whatever they are held as, sums are of floats. */
 #if !HALF
 typedef float held;
 #define LOAD_HELD(p) LOAD(p)
