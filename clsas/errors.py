@@ -221,6 +221,7 @@ def _between_nodes(
     weighted = view.beam is not None and beam_cycles is not None
     seen = view.seen(side)
     wrong = total = 0.0
+    carriers = random.permutation(view.carriers(_PIXELS))[:, None]
     for spot in np.flatnonzero(seen.any(axis=1))[::_SOME_SPOTS]:
         places = track.samples[seen[spot]]
         place = np.linspace(places[0], places[-1], _PLACES)
@@ -233,7 +234,7 @@ def _between_nodes(
         def steering(at: NDArray[np.float64], points_m: NDArray[np.float64] = points_m) -> NDArray:
             sight = points_m[:, None] - track.positions_m(at)
             range_m = np.linalg.norm(sight, axis=-1)
-            turns = view.highest_cycles_per_m * (range_m[1:] - range_m[0])
+            turns = carriers * (range_m[1:] - range_m[0])
             result = np.exp(2j * np.pi * turns)
             if weighted:
                 along = interpolated_directions(track.samples, view.along, at)

@@ -10,15 +10,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsas import interpolation
-from clsas.interpolation import Gain, Interpolator, Spectrum
+from clsas.interpolation import PHASES, Gain, Interpolator, Spectrum
 
 ALIGN_TAPS = APERTURE_TAPS = (4, 6, 8)
 _FINAL_TAPS = (2, 4, 6, 8)
 UPSAMPLING_SHARE = 0.03
 """Of the power of an image's error: what filters that upsample may add."""
 _MOST_GAIN = 3.0  # of frequencies, which are amplified where lines hold next to nothing
+_STEPS, _SLOPE_DB, _CLOSE_DB = 3, 12.0, 0.1  # towards the sparsest virtual channels
+_WORST_DB = -22.0  # of these; beyond it next to all of the error is that of the fastest phases
 _RATES = tuple(np.geomspace(1, 12, 16))  # where errors are looked at
-_FLAT = Spectrum(0.0, (np.arange(64) + 0.5) / 128, np.full(64, 1 / 64))
+_OF_FASTEST = (np.arange(64) + 0.5) / 64
+_PHASES = 1.25 - _OF_FASTEST**2
+_STEERING = Spectrum(0.0, _OF_FASTEST / 2, _PHASES / _PHASES.sum())
+"""Of steering functions: few phases turn as fast as those at the corners of subimages."""
 
 
 @dataclass(frozen=True)
@@ -62,13 +67,30 @@ class Choice:
     density: float
     final_taps: int
 
-    def design(self, spectrum: Spectrum) -> Filters:
-        """Return the filters."""
-        return Filters(
-            interpolation.design(self.align_taps, self.rate, spectrum),
-            interpolation.design(self.aperture_taps, self.density, _FLAT),
-            interpolation.design(self.final_taps, self.rate, spectrum),
-        )
+    def design(self, spectrum: Spectrum, stages: int, most_db: float) -> Filters:
+        """Return filters that err by no more than `most_db` together, and by little less.
+
+        Lines are upsampled in whole phases; what filters in range then leave is for those along
+        the aperture.
+        """
+        rate = PHASES / max(int(PHASES / self.rate), 1)
+        align = interpolation.design(self.align_taps, rate, spectrum)
+        final = interpolation.design(self.final_taps, rate, spectrum)
+        left = _power(most_db) - stages * _power(align.scatter_db) - _power(final.scatter_db)
+        aperture = interpolation.design(self.aperture_taps, self.density, _STEERING)
+        for _ in range(_STEPS):
+            # Errors fall by less than so many dB per tap when the density grows by a factor of e.
+            spare_db = min(10 * math.log10(left / stages), _WORST_DB) - aperture.error_db - _CLOSE_DB
+            sparser = math.exp(-spare_db / (_SLOPE_DB * self.aperture_taps))
+            density = max(aperture.upsampling * sparser, _RATES[0])
+            sparser = interpolation.design(self.aperture_taps, density, _STEERING)
+            if stages * _power(sparser.error_db) <= left:
+                aperture = sparser
+        return Filters(align, aperture, final)
+
+
+def _power(error_db: float) -> float:
+    return 10 ** (error_db / 10)
 
 
 def choose(
@@ -80,7 +102,7 @@ def choose(
     """
     each_db = most_db - 10 * math.log10(2 * stages + 1)
     rate = _least(align_taps, each_db, spectrum, "scatter_db")
-    density = _least(aperture_taps, each_db, _FLAT, "error_db")
+    density = _least(aperture_taps, each_db, _STEERING, "error_db")
     if rate is None or density is None:
         return None
     needed = {taps: _least(taps, each_db, spectrum, "scatter_db") for taps in _FINAL_TAPS}

@@ -221,20 +221,28 @@ def _fastest(
     most = root_limits(view, _ROOTS_SHARE * allowed)
     beam_cycles = 0.0 if view.beam is None else _LEAST_BEAM_CYCLES
     needed = math.inf
-    spared = 0.0 if most is None else root_error(view, most) + trimmed + 0.05 * allowed
+    besides = trimmed + 0.05 * allowed  # the errors of filters and roots
     tree: Tree | None = None
-    designed: Choice | None = None
+    designed: tuple[Choice, float] | None = None
     leaf_pixels = 1
-    while most is not None and spared < 0.9 * allowed:
+    while most is not None:
+        # Roots are often smaller than they might be.
+        spared = besides + root_error(view, most if tree is None else tree.sides[0])
+        if spared >= 0.9 * allowed:
+            break
         filters_db = in_db(allowed - spared) - MARGIN_DB
         if tree is None:
             tree = search(view, filters_db, most, leaf_pixels, beam_cycles, device, costs, choices)
-            crowding = () if tree is None else (1.0,) * len(tree.sides)
-        choice = None if tree is None else tree.filters(view.spectrum, filters_db)
+            if tree is None:
+                break
+            crowding = (1.0,) * len(tree.sides)
+            continue
+        choice = tree.filters(view.spectrum, filters_db)
         if choice is None:
             break
-        if choice != designed:
-            designed, filters = choice, choice.design(view.spectrum)
+        if (choice, filters_db) != designed:
+            designed = choice, filters_db
+            filters = choice.design(view.spectrum, len(tree.sides), filters_db)
         way = Way(tree.sides, filters, crowding=crowding, beam_cycles=beam_cycles)
         within = view.within(tree.sides[0])
         others = other_errors(within, way.sides, filters.aperture, crowding, beam_cycles, device)
@@ -243,31 +251,29 @@ def _fastest(
         )
         if found.predicted_seconds >= seconds:
             break
-        if found.memory_bytes > memory_bytes:
+        if found.predicted_error_db <= tolerance_db:
+            if found.memory_bytes <= memory_bytes:
+                return found, needed
             needed, tree = min(needed, found.memory_bytes), None
             rows, columns = found.sides[0]
             most = (rows // 2, columns) if rows > columns else (rows, columns // 2)
-        elif found.predicted_error_db <= tolerance_db:
-            return found, needed
-        else:
-            uneven = partial(
-                excess_error, within, found.sides[-1], found.aperture, crowding[-1], None
+            continue
+        uneven = partial(excess_error, within, found.sides[-1], found.aperture, crowding[-1], None)
+        # What uneven spacing and a beam add falls with the density of nodes; filters must make up
+        # for the rest.
+        share = _NODES_SHARE * allowed / len(found.sides)
+        of_beam = others.nodes[-1] > share and 2 * uneven() < others.nodes[-1]
+        if of_beam and beam_cycles < _MOST_BEAM_CYCLES:
+            beam_cycles *= 2
+        elif max(others.nodes) > share and max(crowding) < _MOST_CROWDING:
+            crowding = tuple(
+                1.1 * c if excess > share else c
+                for c, excess in zip(crowding, others.nodes, strict=True)
             )
-            # What uneven spacing and a beam add falls with the density of nodes; filters must
-            # make up for the rest.
-            share = _NODES_SHARE * allowed / len(found.sides)
-            of_beam = others.nodes[-1] > share and 2 * uneven() < others.nodes[-1]
-            if of_beam and beam_cycles < _MOST_BEAM_CYCLES:
-                beam_cycles *= 2
-            elif max(others.nodes) > share and max(crowding) < _MOST_CROWDING:
-                crowding = tuple(
-                    1.1 * c if excess > share else c
-                    for c, excess in zip(crowding, others.nodes, strict=True)
-                )
-            elif others.nodes[-1] > share:  # smaller leaves have fewer nodes, less evenly spaced
-                leaf_pixels, tree = 2 * math.prod(found.sides[-1]), None
-            else:
-                spared += max(others.total + trimmed - spared, 0.1 * allowed)
+        elif others.nodes[-1] > share:  # smaller leaves have fewer nodes, less evenly spaced
+            leaf_pixels, tree = 2 * math.prod(found.sides[-1]), None
+        else:
+            besides += max(others.total + trimmed - spared, 0.1 * allowed)
     return None, needed
 
 

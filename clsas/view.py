@@ -83,6 +83,14 @@ class View:
             self.beam_rates = beam_rate(beam, self.track, self.along, self.spots_m)
         self.rates = self._rates(np.zeros(len(self.surface.steps_m)), self.spots_m)
 
+    def carriers(self, count: int) -> NDArray[np.float64]:
+        """Return so many frequencies that all hold as much of the lines' power, cycles per m."""
+        power = self.spectrum.power
+        frequency = np.concatenate([-self.spectrum.frequency[::-1], self.spectrum.frequency])
+        share = np.cumsum(np.concatenate([power[::-1], power])) / 2
+        found = np.interp((np.arange(count) + 0.5) / count, share, frequency)
+        return interpolation.cycles_per_m(self.lines, self.spectrum.centre + found)
+
     @property
     def sweeps_once(self) -> bool:
         """Whether the beam moves over every spot evenly, so that each is seen once.
