@@ -7,7 +7,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from clsas import interpolation
 from clsas.interpolation import PHASES, Gain, Interpolator, Spectrum
@@ -17,13 +17,35 @@ _FINAL_TAPS = (2, 4, 6, 8)
 UPSAMPLING_SHARE = 0.03
 """Of the power of an image's error: what filters that upsample may add."""
 _MOST_GAIN = 3.0  # of frequencies, which are amplified where lines hold next to nothing
+_CORNERS_SHARE, _CORNERS_FROM = 0.5, 0.7  # of pixels, and how fast phases turn there
 _STEPS, _SLOPE_DB, _CLOSE_DB = 3, 12.0, 0.1  # towards the sparsest virtual channels
 _WORST_DB = -22.0  # of these; beyond it next to all of the error is that of the fastest phases
 _RATES = tuple(np.geomspace(1, 12, 16))  # where errors are looked at
-_OF_FASTEST = (np.arange(64) + 0.5) / 64
-_PHASES = 1.25 - _OF_FASTEST**2
-_STEERING = Spectrum(0.0, _OF_FASTEST / 2, _PHASES / _PHASES.sum())
-"""Of steering functions: few phases turn as fast as those at the corners of subimages."""
+_FINENESS = 64
+
+
+def steering_spectrum(of_highest: ArrayLike = 1.0) -> Spectrum:
+    """Return the power spectrum of steering functions along the aperture.
+
+    Virtual channels are counted by the turns of the fastest phase that there may be: at a corner
+    of a subimage, and at the highest frequency. Most pixels' turn slower; corners are given more
+    weight than they have, since a point may lie there and there only.
+
+    Parameters
+    ----------
+    of_highest : float [n]
+        Frequencies that hold as much of the lines' power each, over the highest.
+    """
+    edges = np.linspace(0, 1, _FINENESS + 1)
+    edges = edges / np.asarray(of_highest).reshape(-1, 1)
+    inside = np.minimum(edges, 1) * (3 - np.minimum(edges, 1) ** 2) / 2
+    corners = np.clip((edges - _CORNERS_FROM) / (1 - _CORNERS_FROM), 0, 1)
+    both = (1 - _CORNERS_SHARE) * inside + _CORNERS_SHARE * corners
+    power = np.diff(both, axis=1).mean(axis=0)
+    return Spectrum(0.0, (np.arange(_FINENESS) + 0.5) / (2 * _FINENESS), power / power.sum())
+
+
+_STEERING = steering_spectrum()
 
 
 @dataclass(frozen=True)
@@ -67,24 +89,27 @@ class Choice:
     density: float
     final_taps: int
 
-    def design(self, spectrum: Spectrum, stages: int, most_db: float) -> Filters:
+    def design(
+        self, spectrum: Spectrum, steering: Spectrum, stages: int, most_db: float
+    ) -> Filters:
         """Return filters that err by no more than `most_db` together, and by little less.
 
         Lines are upsampled in whole phases; what filters in range then leave is for those along
-        the aperture.
+        the aperture, whose functions have the spectrum `steering`.
         """
         rate = PHASES / max(int(PHASES / self.rate), 1)
         align = interpolation.design(self.align_taps, rate, spectrum)
         final = interpolation.design(self.final_taps, rate, spectrum)
         left = _power(most_db) - stages * _power(align.scatter_db) - _power(final.scatter_db)
-        aperture = interpolation.design(self.aperture_taps, self.density, _STEERING)
+        wanted_db = min(10 * math.log10(left / stages), _WORST_DB)
+        aperture = interpolation.design(self.aperture_taps, self.density, steering)
         for _ in range(_STEPS):
             # Errors fall by less than so many dB per tap when the density grows by a factor of e.
-            spare_db = min(10 * math.log10(left / stages), _WORST_DB) - aperture.error_db - _CLOSE_DB
-            sparser = math.exp(-spare_db / (_SLOPE_DB * self.aperture_taps))
-            density = max(aperture.upsampling * sparser, _RATES[0])
-            sparser = interpolation.design(self.aperture_taps, density, _STEERING)
-            if stages * _power(sparser.error_db) <= left:
+            spare_db = wanted_db - _CLOSE_DB - aperture.error_db
+            fewer = math.exp(-spare_db / (_SLOPE_DB * self.aperture_taps))
+            density = max(aperture.upsampling * fewer, _RATES[0])
+            sparser = interpolation.design(self.aperture_taps, density, steering)
+            if sparser.error_db <= wanted_db:
                 aperture = sparser
         return Filters(align, aperture, final)
 

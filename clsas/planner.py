@@ -14,7 +14,7 @@ from clsas.costs import load as load_costs
 from clsas.device import Device, open_device
 from clsas.errors import excess_error, in_db, nearest_error, other_errors, power, root_error
 from clsas.exact import Exact, expect
-from clsas.filters import ALIGN_TAPS, Choice, Filters
+from clsas.filters import ALIGN_TAPS, Choice, Filters, steering_spectrum
 from clsas.forecast import MARGIN_DB, Way
 from clsas.grid import Grid
 from clsas.interpolation import Interpolator
@@ -34,6 +34,7 @@ NEAREST_UPSAMPLING = 8.0
 """By how much lines are upsampled before the linear interpolation of given stages."""
 
 _ROOTS_SHARE, _NODES_SHARE, _EDGES_SHARE = 0.25, 0.2, 0.03  # of the error allowed
+_CARRIERS = 16  # frequencies of lines
 _WORTH = 0.95  # of the time of an exact image
 _MOST_CROWDING = 2.0
 _LEAST_COVERED = 0.25
@@ -225,6 +226,7 @@ def _fastest(
     tree: Tree | None = None
     designed: tuple[Choice, float] | None = None
     leaf_pixels = 1
+    steering = steering_spectrum(view.carriers(_CARRIERS) / view.highest_cycles_per_m)
     while most is not None:
         # Roots are often smaller than they might be.
         spared = besides + root_error(view, most if tree is None else tree.sides[0])
@@ -242,7 +244,7 @@ def _fastest(
             break
         if (choice, filters_db) != designed:
             designed = choice, filters_db
-            filters = choice.design(view.spectrum, len(tree.sides), filters_db)
+            filters = choice.design(view.spectrum, steering, len(tree.sides), filters_db)
         way = Way(tree.sides, filters, crowding=crowding, beam_cycles=beam_cycles)
         within = view.within(tree.sides[0])
         others = other_errors(within, way.sides, filters.aperture, crowding, beam_cycles, device)

@@ -259,6 +259,26 @@ def test_on_every_platform(case, platform):
     check(case, -50, platform)
 
 
+@pytest.mark.parametrize("tolerance_db", [-30, -50])
+@pytest.mark.parametrize("band", [0.05, 0.3])
+def test_a_point_where_subimages_of_all_sizes_meet(band, tolerance_db):
+    """Phases turn fastest at the corners of subimages, where filters err most."""
+    grid = around(0, 40, shape=(512, 512))
+    wish = {"tolerance_db": tolerance_db, "costs": EXACT_IS_SLOW}
+    radio = {"carrier_hz": CARRIER, "bandwidth_hz": band * CARRIER}
+
+    def lines_of(row, column):
+        place_m = grid.origin_m + row * grid.row_step_m + column * grid.column_step_m
+        return simulate_lines(TRACK, TRACK, PointTargets(place_m[None], [1.0]), **radio)
+
+    rows, columns = plan(lines_of(255.5, 255.5), grid, **wish).sides[0]
+    lines = lines_of(256 // rows * rows - 0.5, 256 // columns * columns - 0.5)
+    chosen = plan(lines, grid, **wish)
+    assert chosen.sides[0] == (rows, columns)
+    formed = factorize(lines, grid, chosen)
+    assert relative_error_db(formed, backproject(lines, grid, accuracy_db=-80)) <= tolerance_db
+
+
 @pytest.mark.parametrize("tolerance_db", [-20, -40])
 def test_pixels_much_coarser_than_the_resolution(device, tolerance_db):
     check(coarse_pixels, tolerance_db, device)
