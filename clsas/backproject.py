@@ -19,7 +19,7 @@ from clsas import interpolation, validate
 from clsas.device import Device, Slot, aligned, open_device
 from clsas.geometry import bistatic_range_m, pairwise_range_m
 from clsas.grid import Grid
-from clsas.image import Image
+from clsas.image import Image, holds_any
 from clsas.interpolation import Gain, Interpolator, Resampling, Spectrum
 from clsas.layout import GEOMETRY_ERROR, STACK, Groups, Tiles, allowed, lay_out
 from clsas.lines import RangeLines
@@ -265,7 +265,7 @@ def execute(
     finally:
         device.finish()  # an interrupted run leaves nothing in use
     image = Image(layout.collect(pixels), p.grid)
-    if not image.pixels.any() and p.lines.samples.any():
+    if not holds_any(image.pixels) and p.lines.samples.any():
         warn_unseen(p.lines, layout.centres_m(slice(None)), p.beam, p.along)
     return image
 

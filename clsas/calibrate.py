@@ -101,12 +101,19 @@ class _Image:
     def stage_work(self) -> list[float]:
         """How often it takes what `_STAGES` cost."""
         if isinstance(self.expected, Exact):
-            return [0.0, 0.0, 0.0]
+            return [0.0] * len(_STAGES)
         stages = self.expected.stages[:-1]
         operations = sum(s.operations for s in stages)
         taps = self.expected.align.taps + self.expected.aperture.taps
-        of_channels = sum(s.operations / s.samples for s in stages)
-        return [of_channels, operations, operations * taps]
+        subimages = float(sum(s.subimages for s in stages))
+        return [subimages, operations, operations * taps, stages[0].operations]
+
+    @property
+    def leaf_channels(self) -> float:
+        """Virtual channels of all subimages of the last stage."""
+        if isinstance(self.expected, Exact):
+            return 0.0
+        return float(self.expected.stages[-1].subimages * self.expected.stages[-1].channels)
 
     @property
     def pixel_work(self) -> float:
@@ -126,7 +133,7 @@ _HOST = (
     "group_ns",
     "part_ns",
 )
-_STAGES = ("channel_ns", "sample_ns", "sample_tap_ns")
+_STAGES = ("subimage_ns", "sample_ns", "sample_tap_ns", "given_sample_ns")
 
 
 def calibrate(
@@ -245,6 +252,7 @@ def _fitted(images: list[_Image]) -> Costs:
     """Return the costs that make the least times of some images."""
     plans = [image for image in images if isinstance(image.expected, Plan)]
     exact = [image for image in images if isinstance(image.expected, Exact)]
+    tiled = [image for image in plans if image.tiled]
 
     def per_pixel(some: list[_Image]) -> float:
         return float(np.median([1e9 * image.in_pixels / image.pixel_work for image in some]))
@@ -263,7 +271,11 @@ def _fitted(images: list[_Image]) -> Costs:
             [image.stage_work for image in plans],
             [image.in_stages for image in plans],
         ),
-        leaf_ns=per_pixel([i for i in plans if i.tiled]),
+        **_least_squares(
+            ("leaf_channel_ns", "leaf_ns"),
+            [[image.leaf_channels, image.pixel_work] for image in tiled],
+            [image.in_pixels for image in tiled],
+        ),
         leaf_point_ns=per_pixel([i for i in plans if not i.tiled]),
         pixel_ns=pixel_ns,
         point_ns=per_pixel([i for i in exact if not i.tiled]),
@@ -288,7 +300,7 @@ def _expected_s(image: _Image, costs: Costs) -> float:
         return image.expected.seconds(costs)
     work = zip((*_HOST, *_STAGES), (*image.host_work, *image.stage_work), strict=True)
     leaf_ns = costs.leaf_ns if image.tiled else costs.leaf_point_ns
-    in_pixels_ns = leaf_ns * image.pixel_work
+    in_pixels_ns = leaf_ns * image.pixel_work + costs.leaf_channel_ns * image.leaf_channels
     return 1e-9 * (sum(getattr(costs, name) * amount for name, amount in work) + in_pixels_ns)
 
 

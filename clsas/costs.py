@@ -28,10 +28,14 @@ class Costs:
         Per root subimage and channel, on the host.
     batch_ns : float
         Per stage of a batch of roots: launches, tables, transfers.
-    channel_ns : float
-        Per subimage and channel in a stage: geometry and weights.
+    subimage_ns : float
+        Per subimage in a stage.
     sample_ns, sample_tap_ns : float
         Per aligned sample in a stage, and per tap of either filter.
+    given_sample_ns : float
+        More in the first stage, whose lines come from main memory.
+    leaf_channel_ns : float
+        Per subimage and virtual channel of the last stage.
     leaf_ns, leaf_point_ns : float
         Per pixel and virtual channel of the last stage, with 4 taps, on a plane and off it.
     group_ns : float
@@ -44,14 +48,16 @@ class Costs:
         Per pixel and channel of either, where a beam weighs it.
     """
 
-    call_ns: float = 2e7
+    call_ns: float = 1.2e7
     upsampled_sample_ns: float = 8.0
-    filtered_sample_ns: float = 2.0
-    reference_ns: float = 450.0
-    batch_ns: float = 5e4
-    channel_ns: float = 12.0
-    sample_ns: float = 0.2
-    sample_tap_ns: float = 0.022
+    filtered_sample_ns: float = 1.7
+    reference_ns: float = 100.0
+    batch_ns: float = 1.5e5
+    subimage_ns: float = 300.0
+    sample_ns: float = 0.0
+    sample_tap_ns: float = 0.0365
+    given_sample_ns: float = 0.3
+    leaf_channel_ns: float = 20.0
     leaf_ns: float = 0.7
     leaf_point_ns: float = 1.2
     group_ns: float = 150.0
@@ -65,14 +71,18 @@ class Costs:
         for field in fields(self):
             validate.number(field.name, getattr(self, field.name), "ns", least=0.0)
 
-    def line_ns(self, samples: ArrayLike, taps: int) -> ArrayLike:
-        """Return the cost of a channel of a subimage in a stage, by the taps of both filters."""
-        return samples * (self.sample_ns + self.sample_tap_ns * taps) + self.channel_ns
+    def line_ns(self, samples: ArrayLike, taps: int, *, given: bool) -> ArrayLike:
+        """Return the cost of a channel of a subimage in a stage, by the taps of both filters.
+
+        `given` is whether that is the first.
+        """
+        of_sample = self.sample_ns + self.sample_tap_ns * taps + self.given_sample_ns * given
+        return samples * of_sample
 
     def leaf_line_ns(self, pixels: ArrayLike, taps: int, *, tiled: bool, beam: bool) -> ArrayLike:
         """Return the cost of a virtual channel of a leaf that is backprojected."""
         leaf_ns = self.leaf_ns if tiled else self.leaf_point_ns
-        return pixels * (leaf_ns * COST[taps] + self.beam_ns * beam) + self.channel_ns
+        return pixels * (leaf_ns * COST[taps] + self.beam_ns * beam) + self.leaf_channel_ns
 
     def pair_ns(self, taps: int, *, tiled: bool, beam: bool) -> float:
         """Return the cost of a pixel and channel of an exact image."""

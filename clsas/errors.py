@@ -22,7 +22,7 @@ from clsas.view import View
 from clsas.window import sines
 
 _FLOAT32 = 4.5e-8  # rms error of a phase in the stages over the phase across a root: measured
-_CHANNELS, _PLACES, _PIXELS = 256, 300, 24  # at which errors are evaluated
+_CHANNELS, _PLACES, _PIXELS = 128, 160, 24  # at which errors are evaluated
 _SOME_SPOTS = 6  # one in so many of the spots, there
 
 
@@ -154,7 +154,6 @@ def _off_track(view: View, side: tuple[int, int], extents: NDArray[np.float64]) 
     part = replace(track, place=track.place[index])
     middle_m = lines.phase_centres_m
     seen = view.seen(side)
-    random = np.random.default_rng(0)
     powers, total = [], 0.0
     for spot in range(0, len(view.spots_m), _SOME_SPOTS):
         some = np.interp(part.place, track.samples, seen[spot]) > 0
@@ -163,7 +162,7 @@ def _off_track(view: View, side: tuple[int, int], extents: NDArray[np.float64]) 
         near_index = index[some]
         velocity = lines.rx_velocity_m_s
         near = replace(track, place=part.place[some])
-        points_m = view.spots_m[spot] + _pixels_m(view, extents, random)
+        points_m = view.spots_m[spot] + _pixels_m(view, extents, spot)[0]
         antennas_m = lines.tx_m[near_index], lines.rx_m[near_index]
         moving = velocity if velocity is None else velocity[near_index]
         range_m = pairwise_range_m(points_m, *antennas_m, moving, lines.sound_speed_m_s)
@@ -217,46 +216,76 @@ def _between_nodes(
     subimages and pixels of them at random: steering functions between nodes against what
     interpolation makes of them; unless `beam_cycles` is None, weighted by the beam.
     """
-    track, random = view.track, np.random.default_rng(0)
+    track, seen = view.track, view.seen(side)
+    spots = np.flatnonzero(seen.any(axis=1))[::_SOME_SPOTS]
+    if not spots.size:
+        return 0.0
     weighted = view.beam is not None and beam_cycles is not None
-    seen = view.seen(side)
+    rates = crowding * np.tensordot(extents, view.rates[:, spots], 1)
+    if weighted:
+        rates = rates + beam_cycles * view.beam_rates[spots]
+    ends = [track.samples[each][[0, -1]] for each in seen[spots]]
+    place = np.linspace(*np.transpose(ends), _PLACES, axis=1)
+    nodes = interpolated_nodes(track, rates, place, aperture)
+    steering = functools.partial(_steering, view, spots, extents, weighted)
+    exact, of_nodes = steering(nodes.ordered(place)), steering(nodes.place)
+    index = nodes.base[..., None] + np.arange(nodes.taps)
     wrong = total = 0.0
-    carriers = random.permutation(view.carriers(_PIXELS))[:, None]
-    for spot in np.flatnonzero(seen.any(axis=1))[::_SOME_SPOTS]:
-        places = track.samples[seen[spot]]
-        place = np.linspace(places[0], places[-1], _PLACES)
-        rate = crowding * (extents @ view.rates[:, spot])
-        if weighted:
-            rate = rate + beam_cycles * view.beam_rates[spot]
-        nodes = interpolated_nodes(track, rate[None], place[None], aperture)
-        points_m = view.spots_m[spot] + _pixels_m(view, extents, random)
-
-        def steering(at: NDArray[np.float64], points_m: NDArray[np.float64] = points_m) -> NDArray:
-            sight = points_m[:, None] - track.positions_m(at)
-            range_m = np.linalg.norm(sight, axis=-1)
-            turns = carriers * (range_m[1:] - range_m[0])
-            result = np.exp(2j * np.pi * turns)
-            if weighted:
-                along = interpolated_directions(track.samples, view.along, at)
-                sine = np.einsum("psi,si->ps", sight[1:], along) / range_m[1:]
-                result *= view.beam.weights(sine, wavelength_m(view.lines))
-            return result
-
-        of_nodes = steering(nodes.place[0])
-        index = nodes.base[0][:, None] + np.arange(nodes.taps)
-        between = np.einsum("pct,ct->pc", of_nodes[:, index], nodes.weights[0])
-        exact = steering(nodes.ordered(place[None])[0])
-        wrong += np.sum(np.abs(between - exact) ** 2)
-        total += np.sum(np.abs(exact) ** 2)
+    for each, sampled, taps, weights in zip(exact, of_nodes, index, nodes.weights, strict=True):
+        between = np.einsum("pct,ct->pc", sampled[:, taps], weights.astype(np.float32))
+        wrong += float(np.sum(np.abs(between - each) ** 2))
+        total += float(np.sum(np.abs(each) ** 2))
     return max(wrong / max(total, 1e-30) - power(aperture.error_db), 0.0)
 
 
+def _steering(
+    view: View,
+    spots: NDArray[np.int64],
+    extents: NDArray[np.float64],
+    weighted: bool,
+    at: NDArray[np.float64],
+) -> NDArray[np.complex64]:
+    """Return steering functions at places on the track, [spots, places], for pixels of subimages.
+
+    These are some about each spot, each at a frequency of its own: [spots, pixels, places].
+    """
+    carriers, places = view.carriers(_PIXELS), [_pixels_m(view, extents, spot) for spot in spots]
+    pixels_m = np.stack([pixels_m for pixels_m, _ in places])
+    carrier = np.stack([carriers[(share * _PIXELS).astype(int)] for _, share in places])
+    sight = view.spots_m[spots, None] - view.track.positions_m(at)
+    square = np.einsum("nsi,nsi->ns", sight, sight)[:, None]
+    square = square + 2 * pixels_m @ sight.swapaxes(1, 2)
+    square += np.einsum("npi,npi->np", pixels_m, pixels_m)[..., None]
+    range_m = np.sqrt(np.maximum(square, 1e-18))
+    turns = carrier[..., None] * (range_m[:, 1:] - range_m[:, :1])
+    angle = (2 * np.pi * (turns - np.rint(turns))).astype(np.float32)
+    result = np.empty(angle.shape, np.complex64)
+    np.cos(angle, out=result.real)
+    np.sin(angle, out=result.imag)
+    if weighted:
+        along = interpolated_directions(view.track.samples, view.along, at)
+        sine = np.einsum("nsi,nsi->ns", sight, along)[:, None]
+        sine = (sine + pixels_m[:, 1:] @ along.swapaxes(1, 2)) / range_m[:, 1:]
+        result *= view.beam.weights(sine, wavelength_m(view.lines)).astype(np.float32)
+    return result
+
+
 def _pixels_m(
-    view: View, extents: NDArray[np.float64], random: np.random.Generator
-) -> NDArray[np.float64]:
-    """Return pixels of a subimage at random from its middle, and that before them, [n, 3]."""
-    places = random.uniform(-0.5, 0.5, (_PIXELS, len(extents))) * extents
-    return np.concatenate([np.zeros((1, 3)), places @ view.surface.steps_m])
+    view: View, extents: NDArray[np.float64], spot: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return pixels of a subimage at a spot from its middle, and that before them, [n + 1, 3].
+
+    Beside them one more number each, from 0 to 1. All are spread evenly by multiples of powers of
+    an irrational number (a Kronecker sequence), others at every spot.
+    """
+    dimensions = len(extents) + 1
+    ratio = 1.0
+    for _ in range(20):  # towards x^(dimensions + 1) = x + 1
+        ratio = (1 + ratio) ** (1 / (dimensions + 1))
+    index = spot * _PIXELS + np.arange(_PIXELS)[:, None]
+    places = (0.5 + index * ratio ** -np.arange(1.0, dimensions + 1)) % 1
+    pixels_m = ((places[:, :-1] - 0.5) * extents) @ view.surface.steps_m
+    return np.concatenate([np.zeros((1, 3)), pixels_m]), places[:, -1]
 
 
 def nearest_error(view: View, stages: Sequence[tuple[int, int]]) -> float:

@@ -23,7 +23,7 @@ from clsas.backproject import (
 from clsas.device import Device, Slot, aligned, open_device
 from clsas.filters import edges_gain
 from clsas.grid import Grid
-from clsas.image import Image
+from clsas.image import Image, holds_any
 from clsas.leaves import Finish, Level, PlaneLeaves, SurfaceLeaves
 from clsas.lines import RangeLines
 from clsas.plan import CHUNK, GUARD, MARGIN, Plan, padded_length, sample_bytes
@@ -128,7 +128,7 @@ def factorize(
     finally:
         device.finish()  # an interrupted run leaves nothing in use
     image = Image(pixels, grid)
-    if not pixels.any() and lines.samples.any():
+    if not holds_any(pixels) and lines.samples.any():
         corners_m = run.division.centres_m(0, run.division.roots)
         along = None if chosen.beam is None else chosen.beam.directions(lines)
         warn_unseen(lines, corners_m, chosen.beam, along)

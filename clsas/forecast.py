@@ -20,6 +20,7 @@ from clsas.plan import (
     CHUNK,
     GIVEN_BYTES,
     GUARD,
+    LEAST_BATCH,
     Plan,
     Stage,
     grid_digest,
@@ -100,7 +101,9 @@ def factorized(
                 turns += way.beam_cycles * view.cycles(view.beam_rates, seen)
             channels = view.channels(*of_aperture, turns)
             reach.append(aperture.taps * used / channels)
-        cost_ns = count * used * costs.line_ns(samples, align.taps + aperture.taps)
+        taps = align.taps + aperture.taps
+        line_ns = costs.line_ns(samples, taps, given=level == 0)
+        cost_ns = count * (used * line_ns + costs.subimage_ns)
         if not level:
             cost_ns += count * lines.channels * costs.reference_ns
             sample_ns = costs.upsampled_sample_ns if upsampler is None else costs.filtered_sample_ns
@@ -133,7 +136,8 @@ def factorized(
     room = memory_bytes - line_bytes
     batch_bytes = _CACHED_BYTES if device.info.kind == "cpu" else _BATCH_BYTES
     # Tables come in two sets.
-    at_once = int(min(room // (root_bytes + 2 * table_bytes), batch_bytes // root_bytes))
+    at_once = max(batch_bytes // root_bytes, LEAST_BATCH)
+    at_once = int(min(room // (root_bytes + 2 * table_bytes), at_once))
     at_once = min(max(at_once, 1), stages[0].subimages)
     room = min(room - at_once * root_bytes, _MOST_TABLE_BYTES)
     of_batch = 2 * at_once * table_bytes

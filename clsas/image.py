@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 from clsas import validate
 from clsas.grid import Grid
 
+_AT_ONCE = 1 << 16  # pixels that are looked at
+
 
 @dataclass(frozen=True, eq=False)
 class Image:
@@ -43,3 +45,9 @@ class Image:
         validate.instance("grid", self.grid, Grid)
         pixels = validate.array("pixels", self.pixels, np.complex64, self.grid.shape)
         object.__setattr__(self, "pixels", pixels)
+
+
+def holds_any(pixels: NDArray[np.complex64]) -> bool:
+    """Return whether any pixel is not 0, as soon as one is found."""
+    flat = pixels.reshape(-1)
+    return any(flat[first : first + _AT_ONCE].any() for first in range(0, flat.size, _AT_ONCE))

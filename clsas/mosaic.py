@@ -31,7 +31,7 @@ from clsas.device import Device, list_devices, open_device
 from clsas.factorize import factorize
 from clsas.geometry import bistatic_range_m
 from clsas.grid import Grid
-from clsas.image import Image
+from clsas.image import Image, holds_any
 from clsas.lines import RangeLines
 from clsas.plan import Plan, grid_digest
 from clsas.planner import checked_pairs, plan, tolerance_in_db
@@ -400,8 +400,8 @@ def mosaic(
     if folder and beam is not None and beam.along is None and beam.track_pings is None:
         beam = replace(beam, track_pings=MOST_TRACK_PINGS)
     sight = _Sight.of(survey, beam)
-    inputs = _inputs(survey, grid, wish, beam)
     opened = None if store is None else Store.at(store)
+    inputs = {} if opened is None else _inputs(survey, grid, wish, beam)
     if patches is None:
         stored = None if opened is None else opened.patch_shape
         patch_shape = stored or _choose_shape(sight, grid, memory_bytes)
@@ -588,7 +588,7 @@ def _image(
         }
         image = factorize(lines, grid, chosen, device=device)
     pixels = image.pixels if scale == 1 else np.float32(scale) * image.pixels
-    known |= {"has_pixels": bool(pixels.any()), "seconds": time.perf_counter() - start}
+    known |= {"has_pixels": holds_any(pixels), "seconds": time.perf_counter() - start}
     return Record(**known), pixels
 
 

@@ -21,6 +21,8 @@ MARGIN = 32
 """Zeros on either side of an upsampled line: what lies further out is moved into them."""
 CHUNK = 32
 """Channels that a stage adds up before it hands on the sums, and takes up those still open."""
+LEAST_BATCH = 2
+"""Roots that are worked on together at least, if they fit the memory: fewer commands."""
 GUARD = 16
 """Zeros on either side of a virtual channel's line, which the last stage's lookup may touch."""
 

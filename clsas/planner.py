@@ -36,7 +36,8 @@ NEAREST_UPSAMPLING = 8.0
 _ROOTS_SHARE, _NODES_SHARE, _EDGES_SHARE = 0.25, 0.2, 0.03  # of the error allowed
 _CARRIERS = 16  # frequencies of lines
 _WORTH = 0.95  # of the time of an exact image
-_MOST_CROWDING = 2.0
+_MOST_CROWDING, _CROWDING_POWER = 2.0, 0.08  # errors fall by a high power of the density
+_LEAST_STEP = 0.02  # of the error allowed
 _LEAST_COVERED = 0.25
 _LEAST_BEAM_CYCLES, _MOST_BEAM_CYCLES = 0.5, 64.0
 
@@ -222,7 +223,7 @@ def _fastest(
     most = root_limits(view, _ROOTS_SHARE * allowed)
     beam_cycles = 0.0 if view.beam is None else _LEAST_BEAM_CYCLES
     needed = math.inf
-    besides = trimmed + 0.05 * allowed  # the errors of filters and roots
+    besides = trimmed + 0.08 * allowed  # the errors of filters and roots
     tree: Tree | None = None
     designed: tuple[Choice, float] | None = None
     leaf_pixels = 1
@@ -260,22 +261,25 @@ def _fastest(
             rows, columns = found.sides[0]
             most = (rows // 2, columns) if rows > columns else (rows, columns // 2)
             continue
-        uneven = partial(excess_error, within, found.sides[-1], found.aperture, crowding[-1], None)
         # What uneven spacing and a beam add falls with the density of nodes; filters must make up
         # for the rest.
         share = _NODES_SHARE * allowed / len(found.sides)
-        of_beam = others.nodes[-1] > share and 2 * uneven() < others.nodes[-1]
-        if of_beam and beam_cycles < _MOST_BEAM_CYCLES:
-            beam_cycles *= 2
-        elif max(others.nodes) > share and max(crowding) < _MOST_CROWDING:
-            crowding = tuple(
-                1.1 * c if excess > share else c
-                for c, excess in zip(crowding, others.nodes, strict=True)
-            )
-        elif others.nodes[-1] > share:  # smaller leaves have fewer nodes, less evenly spaced
+        excess = [max(of_stage - share, 0.0) for of_stage in others.nodes]
+        if not any(excess):
+            too_much = power(found.predicted_error_db - MARGIN_DB) - power(-MARGIN_DB) * allowed
+            besides += 1.3 * too_much + _LEAST_STEP * allowed
+            continue
+        uneven = partial(excess_error, within, found.sides[-1], found.aperture, crowding[-1], None)
+        if excess[-1] and beam_cycles < _MOST_BEAM_CYCLES and 2 * uneven() < others.nodes[-1]:
+            beam_cycles, excess[-1] = 2 * beam_cycles, 0.0
+        elif excess[-1] and crowding[-1] == _MOST_CROWDING:
+            # Smaller leaves have fewer nodes, less evenly spaced.
             leaf_pixels, tree = 2 * math.prod(found.sides[-1]), None
-        else:
-            besides += max(others.total + trimmed - spared, 0.1 * allowed)
+            continue
+        crowding = tuple(
+            float(min(density * (1 + each / share) ** _CROWDING_POWER, _MOST_CROWDING))
+            for density, each in zip(crowding, excess, strict=True)
+        )
     return None, needed
 
 

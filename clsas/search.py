@@ -15,6 +15,7 @@ from clsas.device import Device
 from clsas.errors import in_db, leaf_error, power, root_error
 from clsas.filters import ALIGN_TAPS, APERTURE_TAPS, UPSAMPLING_SHARE, Choice, choose
 from clsas.interpolation import PHASES, Spectrum, upsampler
+from clsas.plan import LEAST_BATCH
 from clsas.view import View
 
 _ROWS = (16, 32, 64, 128, 256, 512, 1024, 2048)  # of subimages
@@ -137,8 +138,10 @@ class _Option:
     ----------
     choice : Choice
     stages : int
-    channel_ns : float [sizes]
-        Of every channel of all subimages of a size, in a stage.
+    given_ns, channel_ns : float [sizes]
+        Of every channel of all subimages of a size, in the first stage and in others.
+    subimages_ns : float [sizes]
+        Of these subimages besides.
     pixels_ns : float [sizes]
         Of every virtual channel of all leaves of a size, in the last.
     once_ns : float
@@ -147,7 +150,9 @@ class _Option:
 
     choice: Choice
     stages: int
+    given_ns: NDArray[np.float64]
     channel_ns: NDArray[np.float64]
+    subimages_ns: NDArray[np.float64]
     pixels_ns: NDArray[np.float64]
     once_ns: float
 
@@ -157,8 +162,11 @@ class _Option:
 
     def roots_ns(self, sizes: _Sizes, costs: Costs) -> NDArray[np.float64]:
         """Return the cost of the first stage, [sizes]."""
-        per_channel = sizes.share * self.channel_ns + sizes.counts * costs.reference_ns
-        return sizes.view.lines.channels * per_channel + self.once_ns
+        per_channel = sizes.share * self.given_ns + sizes.counts * costs.reference_ns
+        batches = np.maximum(sizes.counts / LEAST_BATCH, 1.0)
+        commands_ns = batches * self.stages * costs.batch_ns
+        besides_ns = self.subimages_ns + commands_ns + self.once_ns
+        return sizes.view.lines.channels * per_channel + besides_ns
 
 
 def _options(sizes: _Sizes, filters_db: float, costs: Costs, allowed: Allowed) -> list[_Option]:
@@ -182,9 +190,11 @@ def _options(sizes: _Sizes, filters_db: float, costs: Costs, allowed: Allowed) -
             _Option(
                 choice,
                 stages,
-                channel_ns=sizes.counts * costs.line_ns(samples, sum(taps)),
+                given_ns=sizes.counts * costs.line_ns(samples, sum(taps), given=True),
+                channel_ns=sizes.counts * costs.line_ns(samples, sum(taps), given=False),
+                subimages_ns=sizes.counts * costs.subimage_ns,
                 pixels_ns=np.where(sizes.leaf, sizes.counts * of_leaf, np.inf),
-                once_ns=sample_ns * view.lines.samples.size * choice.rate + stages * costs.batch_ns,
+                once_ns=sample_ns * view.lines.samples.size * choice.rate,
             )
         )
     return options
@@ -249,6 +259,7 @@ def _onward(
     """
     # To a child of size i from a parent of size j: the channels of the parent that it uses.
     step_ns = option.channels(sizes.view, turns) * option.channel_ns[within, None]
+    step_ns += option.subimages_ns[within, None]
     smaller = sizes.inside[np.ix_(within, within)].T & (within[:, None] != within)
     step_ns[~smaller] = np.inf
     onward_ns = option.channels(sizes.view, np.diag(turns) + sizes.beam_turns[within])

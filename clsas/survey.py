@@ -132,19 +132,20 @@ class Survey:
             begin = self.begins[part]
             wanted = seen[rows]
             block = self._samples(part, slice(rows.start - begin, rows.stop - begin), columns)
-            block = np.array(block[wanted], np.complex64)  # a copy: it fades
-            before, after = columns.start > 0, columns.stop < self.lengths[part]
+            here = slice(place, place + np.count_nonzero(wanted))
+            lines = samples[here, : block.shape[1]]
+            lines[:] = block if wanted.all() else block[wanted]
             fade = np.sin(np.pi / 2 * (np.arange(_TAPER) + 0.5) / _TAPER) ** 2
-            if before:
-                block[:, :_TAPER] *= fade.astype(np.float32)
-            if after:
-                block[:, -_TAPER:] *= fade[::-1].astype(np.float32)
-            here = slice(place, place + len(block))
-            samples[here, : block.shape[1]] = block
+            if columns.start > 0:
+                lines[:, :_TAPER] *= fade.astype(np.float32)
+            if columns.stop < self.lengths[part]:
+                lines[:, -_TAPER:] *= fade[::-1].astype(np.float32)
             first_m[here] = geometry.first_range_m[rows][wanted]
             first_m[here] += columns.start * geometry.range_step_m
             place = here.stop
-        missing = ~np.isfinite(samples).all(axis=1)
+        with np.errstate(over="ignore", invalid="ignore"):
+            missing = ~np.isfinite(np.add.reduce(samples, axis=1))
+        missing[missing] = ~np.isfinite(samples[missing]).all(axis=1)  # or sums were too large
         samples[missing] = 0
         missing |= ~samples.any(axis=1)
         velocity = geometry.rx_velocity_m_s

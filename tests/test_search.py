@@ -43,7 +43,7 @@ def cost_of(tree, view, filters_db, most, leaf_pixels, beam_cycles, device, cost
     total = option.roots_ns(sizes, costs)[path[0]]
     for parent, child in pairwise(path):
         used = option.channels(view, turns[place[child], place[parent]])
-        total += used * option.channel_ns[child]
+        total += used * option.channel_ns[child] + option.subimages_ns[child]
     leaf = path[-1]
     turned = turns[place[leaf], place[leaf]] + sizes.beam_turns[leaf]
     return total + option.channels(view, turned) * option.pixels_ns[leaf]
