@@ -168,21 +168,21 @@ class _Run:
     ) -> None:
         self.lines, self.grid, self.plan, self.device = lines, grid, chosen, device
         self.width, self.pitch = device.info.width, padded_length(chosen.resampling)
+        self.half_precision = chosen.half_precision
+        self.gain = _gain(largest, lines.channels) if self.half_precision and largest > 0 else 1.0
+        self.samples = self._upload_lines()  # early: a device upsamples them beside what follows
         surface = surface_of(grid)
         self.geometry = Geometry(lines, surface, chosen)
         self.division = self.geometry.division
-        self.half_precision, self.gain = chosen.half_precision, 1.0
-        if chosen.half_precision and largest > 0:
-            self.gain = _gain(largest, lines.channels)
-            self.half_precision = _holds(self.gain * self.geometry.rms)
-            if not self.half_precision:
-                self.gain = 1.0
-                validate.warn(
-                    "lines are held in single precision, not in half as planned, which takes up to "
-                    "twice the memory: what can be seen of the grid is too faint beside the "
-                    f"largest sample, {largest:.3g}, or that is too far from 1"
-                )
-        self.samples = self._upload_lines()  # early: a device upsamples them beside what follows
+        if self.half_precision and not _holds(self.gain * self.geometry.rms):
+            device.finish()  # the buffer given up may still be written
+            self.half_precision, self.gain = False, 1.0
+            self.samples = self._upload_lines()
+            validate.warn(
+                "lines are held in single precision, not in half as planned, which takes up to "
+                "twice the memory: what can be seen of the grid is too faint beside the "
+                f"largest sample, {largest:.3g}, or that is too far from 1"
+            )
         self.levels = [
             Level(half, -(-(2 * half + 1) // self.width) * self.width)
             for half in chosen.half_lengths

@@ -219,15 +219,16 @@ class Mosaic:
         stored = (self._finished(place, record, None) for place, record in self.finished.items())
         pixels: NDArray[np.complex64] | None = None
         for patch in chain(stored, self):
-            if patch.image.pixels.shape == self.grid.shape:
-                pixels = patch.image.pixels  # to copy these takes as long as to form some
+            image = patch.image
+            if image.pixels.shape == self.grid.shape:
+                whole = image  # to copy its pixels takes as long as to form some
             else:
                 if pixels is None:
                     pixels = np.empty(self.grid.shape, np.complex64)
-                pixels[patch.rows, patch.columns] = patch.image.pixels
+                pixels[patch.rows, patch.columns] = image.pixels
             if tell is not None:
                 tell(patch)
-        return Image(pixels, self.grid)
+        return whole if pixels is None else Image(pixels, self.grid)
 
     def _grow(self, survey: Survey, first: int) -> None:
         """Keep in the store what the survey has grown by."""
