@@ -171,10 +171,9 @@ class _Run:
         self.half_precision = chosen.half_precision
         self.gain = _gain(largest, lines.channels) if self.half_precision and largest > 0 else 1.0
         self.samples = self._upload_lines()  # early: a device upsamples them beside what follows
-        surface = surface_of(grid)
-        self.geometry = Geometry(lines, surface, chosen)
+        self.geometry = _geometry(lines, grid, chosen)
         self.division = self.geometry.division
-        if self.half_precision and not _holds(self.gain * self.geometry.rms):
+        if self.half_precision and not _holds(self.gain * self.geometry.rms(lines)):
             device.finish()  # the buffer given up may still be written
             self.half_precision, self.gain = False, 1.0
             self.samples = self._upload_lines()
@@ -197,7 +196,7 @@ class _Run:
         ramp = int(self.geometry.ramps)
         self.first_stage = device.kernel("stage", "stage", GIVEN=1, RAMP=ramp, **options)
         self.later_stage = device.kernel("stage", "stage", GIVEN=0, RAMP=0, **options)
-        kind = PlaneLeaves if surface.is_plane else SurfaceLeaves
+        kind = PlaneLeaves if self.geometry.surface.is_plane else SurfaceLeaves
         self.leaves = kind(
             lines, self.geometry, self.levels[-1], device, pixels, self.half_precision, self.gain
         )
@@ -258,12 +257,9 @@ class _Run:
 
     def _sectors(self) -> Iterator[tuple[Sector, _Tables]]:
         """Prepare the roots, some together; few at first, for the device to begin with."""
-        roots, start, most = self.geometry.roots, 0, self.plan.roots_prepared
-        count = min(_PREPARED_FIRST * self.plan.roots_at_once, most)
-        while start < len(roots):
-            sector = self.geometry.sector(roots[start : start + count])
+        first = _PREPARED_FIRST * self.plan.roots_at_once
+        for sector in self.geometry.sectors(first, self.plan.roots_prepared):
             yield sector, self._upload_tables(sector)
-            start, count = start + count, min(2 * count, most)
 
     def _start(self, sector: Sector, tables: _Tables, first: int) -> Finish:
         """Start forming the pixels of some roots of a sector."""
@@ -363,6 +359,13 @@ class _Run:
             wait_for=table.filled,
             local=(items, 1),
         )
+
+
+def _geometry(lines: RangeLines, grid: Grid, chosen: Plan) -> Geometry:
+    """Return how lines see the roots of a plan, as the image before has left it."""
+    if "geometry" not in chosen.kept:
+        chosen.kept["geometry"] = Geometry(lines, surface_of(grid), chosen)
+    return chosen.kept["geometry"]
 
 
 def _gain(largest: float, channels: int) -> float:

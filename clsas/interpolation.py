@@ -105,9 +105,10 @@ def measure_spectrum(lines: RangeLines, most_channels: int = 256) -> Spectrum:
     samples = lines.samples[:: -(-lines.channels // most_channels)]
     length = scipy.fft.next_fast_len(2 * lines.length)
     power = np.zeros(length)
-    largest = max(float(np.abs(samples.view(samples.real.dtype)).max(initial=0.0)), 1e-45)
-    for block in np.array_split(samples, -(-len(samples) // 64)):
-        amplitude = np.abs(scipy.fft.fft(block / largest, length))
+    parts = samples.view(samples.real.dtype)  # real and imaginary, neither of which may overflow
+    parts = parts / (np.abs(parts).max(initial=0.0) or 1.0)
+    for block in np.array_split(parts.view(samples.dtype), -(-len(samples) // 64)):
+        amplitude = np.abs(scipy.fft.fft(block, length))
         power += np.sum(amplitude**2, axis=0, dtype=np.float64)
     frequency = scipy.fft.fftfreq(length)
     if not power.any():

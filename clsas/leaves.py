@@ -24,7 +24,7 @@ from clsas.geometry import bistatic_range_m
 from clsas.layout import BLOCKS, STACK, Tiles, groups_within
 from clsas.lines import RangeLines
 from clsas.plan import GUARD
-from clsas.sector import Geometry, Sector
+from clsas.sector import MOST_KEPT_BYTES, Geometry, Sector
 from clsas.tree import Division
 from clsas.window import INTERVALS
 
@@ -347,14 +347,19 @@ class SurfaceLeaves(Leaves):
         division = geometry.division
         roots, last = geometry.roots, len(division.sides) - 1
         corners = division.corners(last, roots)
-        middles_m = division.centres_m(last, corners).reshape(-1, 3)
-        leaf, place = (each.ravel()[self.surface.cell] for each in self._cells(corners))
-        self.groups, self.leaf = groups_within(
-            self.surface.grid, leaf, place, middles_m, self.width
-        )
+        key = "groups", self.width
+        if key in geometry.kept:
+            self.groups, self.leaf, held = geometry.kept[key]
+        else:
+            middles_m = division.centres_m(last, corners).reshape(-1, 3)
+            leaf, place = (each.ravel()[self.surface.cell] for each in self._cells(corners))
+            grid = self.surface.grid
+            self.groups, self.leaf = groups_within(grid, leaf, place, middles_m, self.width)
+            held = np.bincount(leaf // corners.shape[1], minlength=len(roots))
+            if self.groups.index.nbytes + self.groups.offset_m.nbytes <= MOST_KEPT_BYTES:
+                geometry.kept[key] = self.groups, self.leaf, held
         self.number = {tuple(root): n for n, root in enumerate(roots)}
         self.ends = np.searchsorted(self.leaf, np.arange(len(roots) + 1) * corners.shape[1])
-        held = np.bincount(leaf // corners.shape[1], minlength=len(roots))
         self.pixels_before = np.concatenate([[0], np.cumsum(held)])
         block_m = self.groups.block_radius_m
         options = self._options(block_m)

@@ -159,3 +159,7 @@ class RangeLines:
             rx_m=self.rx_m[index],
             rx_velocity_m_s=None if velocity is None else velocity[index],
         )
+
+    def without_samples(self) -> RangeLines:
+        """Return everything about these lines but their samples: of each there is one, 0."""
+        return replace(self, samples=np.zeros((self.channels, 1), np.complex64))

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import json
 from dataclasses import asdict, dataclass
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -233,6 +235,15 @@ class Plan:
             good = good and bool(np.isfinite(self.upsampler.coefficients).all())
             good = good and r.period * PHASES == r.upsampled_period * self.upsampler.step
             check(good, "upsampler", "filters for the ratio of resampling")
+
+    @functools.cached_property
+    def kept(self) -> dict[str, Any]:
+        """What an image formed by this plan leaves for the next; see `factorize`."""
+        return {}
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return the fields: what is kept for other images is not sent to other processes."""
+        return {name: value for name, value in self.__dict__.items() if name != "kept"}
 
     @property
     def is_exact(self) -> bool:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import functools
 import math
+from collections.abc import Hashable, Iterator
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +23,8 @@ from clsas.tree import Division, Nodes, Ranges
 _ON_TRACK = 1e-4  # wavelengths
 _SOME_LINES = 64  # of which samples are looked at
 _FAR = 1 << 28  # samples: off any line, and within int32
+MOST_KEPT_BYTES = 128 << 20
+"""Of what one image leaves for the next by the same plan, at most, each of sectors and groups."""
 OF_BEAM = 1 / 16
 """Of what a beam covers: by how much it may be taken to cover more."""
 
@@ -54,6 +58,13 @@ class Sector:
     needs: list[Ranges]
     place: NDArray[np.float64]
 
+    @property
+    def nbytes(self) -> int:
+        """Memory of all arrays, about."""
+        parts = [self, *self.nodes, *self.needs]
+        arrays = [value for part in parts for value in vars(part).values()] + self.relative_m
+        return sum(array.nbytes for array in arrays if isinstance(array, np.ndarray))
+
     def stride(self, level: int) -> int:
         """Return how many lines a subimage of a stage has at most."""
         need = self.needs[level]
@@ -67,8 +78,12 @@ class Sector:
 class Geometry:
     """How lines see the roots of a plan, in float64; channels are in the order of the track.
 
+    It serves any number of images, and holds no samples.
+
     Attributes
     ----------
+    kept : dict
+        What else was found out that does not depend on samples.
     channels : int [channels]
         Which line each is.
     division : Division
@@ -80,7 +95,8 @@ class Geometry:
     """
 
     def __init__(self, lines: RangeLines, surface: Surface, chosen: Plan) -> None:
-        self.lines, self.surface, self.plan = lines, surface, chosen
+        self.lines, self.surface, self.plan = lines.without_samples(), surface, chosen
+        self.kept: dict[Hashable, Any] = {}
         self.samples_per_m = chosen.resampling.samples_per_m(lines)
         self.cycles_per_m = chosen.resampling.cycles_per_m(lines)
         self.division = Division(surface, chosen.sides)
@@ -122,10 +138,9 @@ class Geometry:
         root_m = self.division.centres_m(0, self.division.roots)
         return float(cdist(root_m, self.phase_centres_m).min())
 
-    @functools.cached_property
-    def rms(self) -> float:
-        """Rms value of samples, of some lines, from about where pixels lie."""
-        lines, every = self.lines, -(-self.lines.channels // _SOME_LINES)
+    def rms(self, lines: RangeLines) -> float:
+        """Return the rms value of lines' samples, of some of them, from about where pixels lie."""
+        every = -(-lines.channels // _SOME_LINES)
         root_m = self.division.centres_m(0, self.division.roots)
         away_m = cdist(root_m, lines.phase_centres_m[::every])
         radius_m = self.surface.radius_m(self.plan.sides[0])
@@ -158,6 +173,27 @@ class Geometry:
         while wider := [each for each in _doubled(side) if fits(each)]:
             side = min(wider, key=lambda each: (each @ along_m).max())
         return side
+
+    def sectors(self, first: int, most: int) -> Iterator[Sector]:
+        """Yield all roots, some together: `first`, for a device to begin with, then more.
+
+        They are kept for the next image, unless they take much memory.
+        """
+        if "sectors" in self.kept:
+            yield from self.kept["sectors"]
+            return
+        roots, start, count = self.roots, 0, min(first, most)
+        found: list[Sector] | None = []
+        while start < len(roots):
+            sector = self.sector(roots[start : start + count])
+            yield sector
+            start, count = start + count, min(2 * count, most)
+            if found is not None:
+                found.append(sector)
+                if sum(each.nbytes for each in found) > MOST_KEPT_BYTES:
+                    found = None
+        if found is not None:
+            self.kept["sectors"] = found
 
     def sector(self, roots: NDArray[np.int64]) -> Sector:
         """Return the geometry of some roots, given by their first pixels [roots, 2]."""

@@ -191,7 +191,7 @@ class Survey:
 
     def _part_geometry(self, index: int) -> RangeLines:
         channels = self.geometry.select(slice(*self.begins[index : index + 2]))
-        return replace(channels, samples=_no_samples(channels.channels))
+        return channels.without_samples()
 
 
 def open_survey(source: RangeLines | str | os.PathLike) -> Survey:
@@ -210,7 +210,7 @@ def open_survey(source: RangeLines | str | os.PathLike) -> Survey:
         If a file cannot be read.
     """
     if isinstance(source, RangeLines):
-        geometry = replace(source, samples=_no_samples(source.channels))
+        geometry = source.without_samples()
         return Survey(geometry, (source,), (0, source.channels), (source.length,), ((0, 0),))
     paths = files_of(source)
     if not paths:
@@ -268,7 +268,7 @@ def open_files(paths: tuple[Path, ...], before: Survey | None = None) -> Survey:
     names = ["first_range_m", "tx_m", "rx_m"]
     names += [] if found[0].rx_velocity_m_s is None else ["rx_velocity_m_s"]
     joined = {name: np.concatenate([getattr(each, name) for each in found]) for name in names}
-    geometry = replace(found[0], samples=_no_samples(begins[-1]), **joined)
+    geometry = replace(found[0], samples=np.zeros((begins[-1], 1), np.complex64), **joined)
     return Survey(geometry, tuple(paths), tuple(begins), tuple(lengths), tuple(stamps))
 
 
@@ -293,7 +293,3 @@ def largest_gap_m(lines: RangeLines, missing: NDArray[np.bool_]) -> float:
 def _stamp(path: Path) -> tuple[int, int]:
     status = path.stat()
     return status.st_size, status.st_mtime_ns
-
-
-def _no_samples(channels: int) -> NDArray[np.complex64]:
-    return np.zeros((channels, 1), np.complex64)
