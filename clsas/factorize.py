@@ -89,6 +89,8 @@ def factorize(
     f_n ~ sum_m a_nm f_m. Hence sum_n s_n f_n ~ sum_m (sum_n a_nm s_n) f_m: the virtual channels'
     lines are weighted sums of aligned lines, and so again from stage to stage. Where the plan says
     so, these lines are held in half precision; what is added up is single.
+
+    A plan keeps the geometry that its first image found out, in `Plan.kept`, for those after it.
     """
     validate.instance("lines", lines, RangeLines)
     validate.instance("grid", grid, Grid)
