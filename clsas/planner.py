@@ -36,7 +36,8 @@ NEAREST_UPSAMPLING = 8.0
 _ROOTS_SHARE, _NODES_SHARE, _EDGES_SHARE = 0.25, 0.2, 0.03  # of the error allowed
 _CARRIERS = 16  # frequencies of lines
 _WORTH = 0.95  # of the time of an exact image
-_MOST_CROWDING, _CROWDING_POWER = 2.0, 0.08  # errors fall by a high power of the density
+_LEAST_CROWDED, _MOST_CROWDING = 1.05, 2.0  # more nodes at a time, and altogether
+_CROWDING_POWER = 0.08  # of an error that more nodes are to mend
 _LEAST_STEP = 0.02  # of the error allowed
 _LEAST_COVERED = 0.25
 _LEAST_BEAM_CYCLES, _MOST_BEAM_CYCLES = 0.5, 64.0
@@ -265,10 +266,6 @@ def _fastest(
         # for the rest.
         share = _NODES_SHARE * allowed / len(found.sides)
         excess = [max(of_stage - share, 0.0) for of_stage in others.nodes]
-        if not any(excess):
-            too_much = power(found.predicted_error_db - MARGIN_DB) - power(-MARGIN_DB) * allowed
-            besides += 1.3 * too_much + _LEAST_STEP * allowed
-            continue
         uneven = partial(excess_error, within, found.sides[-1], found.aperture, crowding[-1], None)
         if excess[-1] and beam_cycles < _MOST_BEAM_CYCLES and 2 * uneven() < others.nodes[-1]:
             beam_cycles, excess[-1] = 2 * beam_cycles, 0.0
@@ -276,9 +273,14 @@ def _fastest(
             # Smaller leaves have fewer nodes, less evenly spaced.
             leaf_pixels, tree = 2 * math.prod(found.sides[-1]), None
             continue
+        elif not any(excess) or max(crowding) == _MOST_CROWDING:
+            too_much = power(found.predicted_error_db - MARGIN_DB) - power(-MARGIN_DB) * allowed
+            besides += 1.3 * too_much + _LEAST_STEP * allowed
+            continue
+        more = (max((1 + each / share) ** _CROWDING_POWER, _LEAST_CROWDED) for each in excess)
         crowding = tuple(
-            float(min(density * (1 + each / share) ** _CROWDING_POWER, _MOST_CROWDING))
-            for density, each in zip(crowding, excess, strict=True)
+            float(min(density * factor, _MOST_CROWDING)) if each else density
+            for density, factor, each in zip(crowding, more, excess, strict=True)
         )
     return None, needed
 
