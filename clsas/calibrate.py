@@ -260,6 +260,16 @@ def _fitted(images: list[_Image]) -> Costs:
     of_host = [
         max(min(image.seconds) - image.in_stages - image.in_pixels, 1e-6) for image in images
     ]
+    leaves = _least_squares(
+        ("leaf_channel_ns", "leaf_ns"),
+        [[image.leaf_channels, image.pixel_work] for image in tiled],
+        [image.in_pixels for image in tiled],
+    )
+    of_points = [
+        (1e9 * image.in_pixels - leaves["leaf_channel_ns"] * image.leaf_channels) / image.pixel_work
+        for image in plans
+        if not image.tiled
+    ]
     pixel_ns = per_pixel([i for i in exact if i.tiled and not i.expected.weighted])
     weighted = [i for i in exact if i.expected.weighted]
     of_beam = [1e9 * image.in_pixels - pixel_ns * image.pixel_work for image in weighted]
@@ -271,12 +281,8 @@ def _fitted(images: list[_Image]) -> Costs:
             [image.stage_work for image in plans],
             [image.in_stages for image in plans],
         ),
-        **_least_squares(
-            ("leaf_channel_ns", "leaf_ns"),
-            [[image.leaf_channels, image.pixel_work] for image in tiled],
-            [image.in_pixels for image in tiled],
-        ),
-        leaf_point_ns=per_pixel([i for i in plans if not i.tiled]),
+        **leaves,
+        leaf_point_ns=max(float(np.median(of_points)), 0.0),
         pixel_ns=pixel_ns,
         point_ns=per_pixel([i for i in exact if not i.tiled]),
         beam_ns=max(float(np.median(np.divide(of_beam, pairs))), 0.0),

@@ -23,7 +23,8 @@ from clsas.window import sines
 
 _FLOAT32 = 4.5e-8  # rms error of a phase in the stages over the phase across a root: measured
 _CHANNELS, _PLACES, _PIXELS = 128, 160, 24  # at which errors are evaluated
-_SOME_SPOTS = 6  # one in so many of the spots, there
+_GOLDEN = (np.sqrt(5) - 1) / 2
+_SOME_SPOTS = (0, 7, 14, 16, 23)  # of 5 by 5, in every row and column one
 
 
 def _kept(function: Callable[..., float]) -> Callable[..., float]:
@@ -143,19 +144,19 @@ def root_error(view: View, side: tuple[int, int]) -> float:
 def _off_track(view: View, side: tuple[int, int], extents: NDArray[np.float64]) -> float:
     """Return the power of the error that channels put on the mean track make.
 
-    It is evaluated as it is: over channels, roots and pixels of these at random, how a
+    It is evaluated as it is: over some channels, roots and pixels of these, how a
     range changes from a root's centre to a pixel for the channel, less the same for the place on
     the track that stands for it, stretched as the first stage does. That holds what the track does
     not follow, transmitters and receivers apart, and motion during flight; and with a beam by how
     much the weights of the two differ.
     """
     lines, track = view.lines, view.track
-    index = np.arange(0, lines.channels, -(-lines.channels // _CHANNELS))
+    index = _some_channels(lines.channels)
     part = replace(track, place=track.place[index])
     middle_m = lines.phase_centres_m
     seen = view.seen(side)
     powers, total = [], 0.0
-    for spot in range(0, len(view.spots_m), _SOME_SPOTS):
+    for spot in _SOME_SPOTS:
         some = np.interp(part.place, track.samples, seen[spot]) > 0
         if not some.any():
             continue
@@ -172,6 +173,9 @@ def _off_track(view: View, side: tuple[int, int], extents: NDArray[np.float64]) 
         stretch = 1 + stretches(*antennas_m, view.surface.plane, points_m[:1], virtual_m[None])
         away_m = (range_m - range_m[0]) - (on_track_m - on_track_m[0]) * stretch
         wrong = 2 * np.pi * view.highest_cycles_per_m * away_m[1:]
+        # Lines are stretched by turning their phase; their envelope stays.
+        stretched_m = ((on_track_m - on_track_m[0]) * (stretch - 1))[1:]
+        wrong = np.hypot(wrong, 2 * np.pi * view.rms_cycles_per_m * stretched_m)
         weights = np.ones_like(wrong)
         if view.beam is not None:
             directions = interpolated_directions(track.samples, view.along, near.place)
@@ -212,14 +216,16 @@ def _between_nodes(
 ) -> float:
     """Return the power of the error between nodes beside that of the aperture's filter.
 
-    The filter takes nodes as equally spaced and weights as constant. Evaluated as it is, for
-    subimages and pixels of them at random: steering functions between nodes against what
+    The filter takes nodes as equally spaced and weights as constant. Evaluated as it is, for some
+    subimages and pixels of them: steering functions between nodes against what
     interpolation makes of them; unless `beam_cycles` is None, weighted by the beam.
     """
     track, seen = view.track, view.seen(side)
-    spots = np.flatnonzero(seen.any(axis=1))[::_SOME_SPOTS]
-    if not spots.size:
+    somewhere = seen.any(axis=1)
+    if not somewhere.any():
         return 0.0
+    spots = np.array([spot for spot in _SOME_SPOTS if somewhere[spot]], np.int64)
+    spots = spots if spots.size else np.flatnonzero(somewhere)[:1]
     weighted = view.beam is not None and beam_cycles is not None
     rates = crowding * np.tensordot(extents, view.rates[:, spots], 1)
     if weighted:
@@ -268,6 +274,14 @@ def _steering(
         sine = (sine + pixels_m[:, 1:] @ along.swapaxes(1, 2)) / range_m[:, 1:]
         result *= view.beam.weights(sine, wavelength_m(view.lines)).astype(np.float32)
     return result
+
+
+def _some_channels(count: int) -> NDArray[np.int64]:
+    """Return about _CHANNELS of so many, evenly but not regularly: arrays come in regular steps."""
+    if count <= _CHANNELS:
+        return np.arange(count)
+    number = np.arange(_CHANNELS)
+    return ((number + number * _GOLDEN % 1) * count / _CHANNELS).astype(np.int64)
 
 
 def _pixels_m(

@@ -102,15 +102,15 @@ class Choice:
         final = interpolation.design(self.final_taps, rate, spectrum)
         left = _power(most_db) - stages * _power(align.scatter_db) - _power(final.scatter_db)
         wanted_db = min(10 * math.log10(left / stages), _WORST_DB)
-        aperture = interpolation.design(self.aperture_taps, self.density, steering)
+        aperture = tried = interpolation.design(self.aperture_taps, self.density, steering)
         for _ in range(_STEPS):
             # Errors fall by less than so many dB per tap when the density grows by a factor of e.
-            spare_db = wanted_db - _CLOSE_DB - aperture.error_db
+            spare_db = wanted_db - _CLOSE_DB - tried.error_db
             fewer = math.exp(-spare_db / (_SLOPE_DB * self.aperture_taps))
-            density = max(aperture.upsampling * fewer, _RATES[0])
-            sparser = interpolation.design(self.aperture_taps, density, steering)
-            if sparser.error_db <= wanted_db:
-                aperture = sparser
+            density = max(tried.upsampling * fewer, _RATES[0])
+            tried = interpolation.design(self.aperture_taps, density, steering)
+            if tried.error_db <= wanted_db and density < aperture.upsampling:
+                aperture = tried
         return Filters(align, aperture, final)
 
 

@@ -245,6 +245,8 @@ class Grid:
         row, column = (range(n)[s] for n, s in zip(self.shape, (rows, columns), strict=True))
         if not row or not column:
             raise ValueError(f"window must hold a pixel, got rows {rows} and columns {columns}")
+        if (row, column) == tuple(map(range, self.shape)):
+            return self
         return type(self)(
             self.origin_m + row[0] * self.row_step_m + column[0] * self.column_step_m,
             self.row_step_m * row.step,

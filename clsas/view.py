@@ -25,6 +25,7 @@ from clsas.window import BeamWindow, sines, touches_boxes
 _NEIGHBOURS = 64  # channels whose density is looked at
 _SPOTS = (0.02, 0.25, 0.5, 0.75, 0.98)  # of rows and columns, where the geometry is looked at
 _OF_SPOTS = (0.135, 0.24, 0.25, 0.24, 0.135)  # what these stand for
+_EVERYWHERE = np.linspace(0, 1, 17)  # parts of rows and columns
 _BINS = 512  # of a beam
 _COARSER = 4  # of the track's samples: where roots are compared
 
@@ -56,6 +57,8 @@ class View:
         half_band = (occupied[-1] if len(occupied) else 0.5) / lines.range_step_m
         centre = interpolation.cycles_per_m(lines, self.spectrum.centre)
         self.highest_cycles_per_m = abs(centre) + half_band
+        mean_square = self.spectrum.power @ self.spectrum.frequency**2
+        self.rms_cycles_per_m = float(np.sqrt(mean_square)) / lines.range_step_m  # of the band
         self.track, self.limits = mean_track(lines), None if beam is None else beam.limits
         if self.track is None:
             return
@@ -84,12 +87,16 @@ class View:
         self.rates = self._rates(np.zeros(len(self.surface.steps_m)), self.spots_m)
 
     def carriers(self, count: int) -> NDArray[np.float64]:
-        """Return so many frequencies that all hold as much of the lines' power, cycles per m."""
+        """Return so many frequencies that all hold as much of the lines' power, cycles per m.
+
+        That is phase per metre of range, whatever its sign, and above 0.
+        """
         power = self.spectrum.power
         frequency = np.concatenate([-self.spectrum.frequency[::-1], self.spectrum.frequency])
         share = np.cumsum(np.concatenate([power[::-1], power])) / 2
         found = np.interp((np.arange(count) + 0.5) / count, share, frequency)
-        return interpolation.cycles_per_m(self.lines, self.spectrum.centre + found)
+        carriers = interpolation.cycles_per_m(self.lines, self.spectrum.centre + found)
+        return np.maximum(np.abs(carriers), 1e-3 * self.highest_cycles_per_m)
 
     @property
     def sweeps_once(self) -> bool:
@@ -123,7 +130,9 @@ class View:
         if self.beam is None:
             return self
         on_track, (low, high) = self.on_track, np.clip(self.limits, -1, 1)
-        sine = np.einsum("psi,si->ps", self.sight[:, on_track], self.along[on_track])
+        # Everywhere: of a short aperture a pixel sees a small part of the beam only.
+        position_m = self.track.positions_m(self.track.samples[on_track])
+        sine = sines(self._pixels_m(_EVERYWHERE), position_m, self.along[on_track])
         weights = self.beam.weights(sine, wavelength_m(self.lines))
         edges = np.linspace(low, high, _BINS + 1)
         power = np.histogram(sine, edges, weights=weights**2)[0].cumsum()

@@ -284,6 +284,36 @@ def test_pixels_much_coarser_than_the_resolution(device, tolerance_db):
     check(coarse_pixels, tolerance_db, device)
 
 
+def wide_image():
+    """Much wider than the aperture: every pixel sees little of the beam."""
+    grid = around(0, 40, pixel_m=(0.015, 0.06), shape=(100, 240))
+    return over(grid, along_x(200, 0.014))
+
+
+def few_arrays():
+    """168 channels in steps of four, seen from all around."""
+    angle = np.repeat(np.linspace(0, 2 * np.pi, 42, endpoint=False), 4)[:, None]
+    radius = 20 * np.concatenate([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
+    along = np.concatenate([-np.sin(angle), np.cos(angle), 0 * angle], axis=1)
+    tx = radius + [0, 40, 0]
+    return over(around(0, 40), tx, tx + along * np.tile(0.1 * np.arange(4), 42)[:, None])
+
+
+@pytest.mark.parametrize("tolerance_db", [-30, -50])
+def test_a_beam_that_hides_most_of_the_image(tolerance_db):
+    lines, grid = made(wide_image)
+    beam = BeamWindow(9, "hann")
+    image = factorize(lines, grid, planned(wide_image, tolerance_db, beam))
+    assert relative_error_db(image, exact(wide_image, beam)) <= tolerance_db
+
+
+@pytest.mark.parametrize("tolerance_db", [-20, -35, -50])
+def test_arrays_whose_channels_come_in_regular_steps(tolerance_db):
+    lines, grid = made(few_arrays)
+    chosen = planned(few_arrays, tolerance_db)
+    assert relative_error_db(factorize(lines, grid, chosen), exact(few_arrays)) <= tolerance_db
+
+
 HANN = BeamWindow(12, "hann")
 BEAMS = (HANN, BeamWindow(25, "hann"), BeamWindow(10, "hann", squint_deg=3.0))
 KINKED = BeamWindow(8, "tukey", squint_deg=2.0, taper=0.2)

@@ -19,9 +19,12 @@ from test_factorize import (
     swaying,
 )
 
+from clsas import planner
 from clsas.costs import Costs
 from clsas.grid import Grid
 from clsas.planner import plan
+from clsas.view import View
+from clsas.window import BeamWindow, sines
 
 # What is chosen
 
@@ -170,6 +173,57 @@ def test_half_precision_is_for_tolerances_and_devices_that_allow_it(device):
     assert chosen.half_precision == device.info.half_precision
     assert not tighter.half_precision
     assert not plan(lines, grid, stages=[(4, 2)], device=device).half_precision
+
+
+def test_planning_ends_whatever_is_tried_in_vain(monkeypatch):
+    """A stage's nodes may not follow, however many there are."""
+    lines, grid = over(around(0, 40))
+    measured = planner.other_errors
+
+    def hopeless(*arguments):
+        found = measured(*arguments)
+        return dataclasses.replace(found, nodes=(1e-2, *found.nodes[1:]))
+
+    monkeypatch.setattr(planner, "other_errors", hopeless)
+    wish = {"tolerance_db": -40, "costs": EXACT_IS_SLOW}
+    assert plan(lines, grid, **wish).is_exact
+
+
+@pytest.mark.parametrize("tolerance_db", [-30, -50])
+def test_what_may_be_lost_is_made_use_of(tolerance_db):
+    lines, grid = over(around(0, 40, shape=(512, 512)))
+    chosen = plan(lines, grid, tolerance_db=tolerance_db, costs=EXACT_IS_SLOW)
+    assert tolerance_db - 0.8 <= chosen.predicted_error_db <= tolerance_db
+
+
+@pytest.mark.parametrize("factor", [0.0, 1e-44, 1e-40, 1e-30, 1e30])
+def test_samples_of_any_size_are_planned_for(factor):
+    lines, grid = over(around(0, 40))
+    samples = (lines.samples / np.abs(lines.samples).max() * factor).astype(np.complex64)
+    lines = dataclasses.replace(lines, samples=samples)
+    assert not plan(lines, grid, tolerance_db=-40, costs=EXACT_IS_SLOW).is_exact
+
+
+@pytest.mark.parametrize("carrier_hz", [0.0, 5e3])
+def test_bands_about_0_are_planned_for(carrier_hz):
+    """Half of them, or some, are negative frequencies."""
+    lines, grid = over(around(0, 40))
+    lines = dataclasses.replace(lines, carrier_hz=carrier_hz)
+    assert plan(lines, grid, tolerance_db=-40, costs=EXACT_IS_SLOW).predicted_error_db <= -40
+
+
+@pytest.mark.parametrize("beam_deg", [2, 9, 30])
+@pytest.mark.parametrize("share", [1e-2, 1e-4])
+def test_next_to_nothing_of_a_beam_is_left_out(beam_deg, share):
+    """Also where no pixel sees more than a small part of it: the image is wider than the track."""
+    grid = around(0, 40, pixel_m=(0.03, 0.3), shape=(50, 60))
+    lines, _ = over(grid, along_x(200, 0.014))
+    beam = BeamWindow(beam_deg, "hann")
+    low, high = View(lines, grid, beam).trimmed(share).limits
+    sine = sines(grid.positions_m().reshape(-1, 3), lines.phase_centres_m, beam.directions(lines))
+    weights = beam.weights(sine) ** 2
+    left_out = weights[(sine < low) | (sine > high)].sum() / weights.sum()
+    assert left_out <= 2 * share
 
 
 # Memory
