@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from clsas import interpolation
+from clsas.errors import in_db, power
 from clsas.interpolation import PHASES, Gain, Interpolator, Spectrum
 
 ALIGN_TAPS = APERTURE_TAPS = (4, 6, 8)
@@ -36,13 +37,13 @@ def steering_spectrum(of_highest: ArrayLike = 1.0) -> Spectrum:
     of_highest : float [n]
         Frequencies that hold as much of the lines' power each, over the highest.
     """
-    edges = np.linspace(0, 1, _FINENESS + 1)
-    edges = edges / np.asarray(of_highest).reshape(-1, 1)
+    edges = np.linspace(0, 1, _FINENESS + 1) / np.asarray(of_highest).reshape(-1, 1)
+    # What lies below: of a density like 1 - x^2 up to the fastest phase, and of an even one.
     inside = np.minimum(edges, 1) * (3 - np.minimum(edges, 1) ** 2) / 2
     corners = np.clip((edges - _CORNERS_FROM) / (1 - _CORNERS_FROM), 0, 1)
     both = (1 - _CORNERS_SHARE) * inside + _CORNERS_SHARE * corners
-    power = np.diff(both, axis=1).mean(axis=0)
-    return Spectrum(0.0, (np.arange(_FINENESS) + 0.5) / (2 * _FINENESS), power / power.sum())
+    share = np.diff(both, axis=1).mean(axis=0)
+    return Spectrum(0.0, (np.arange(_FINENESS) + 0.5) / (2 * _FINENESS), share / share.sum())
 
 
 _STEERING = steering_spectrum()
@@ -100,8 +101,9 @@ class Choice:
         rate = PHASES / max(int(PHASES / self.rate), 1)
         align = interpolation.design(self.align_taps, rate, spectrum)
         final = interpolation.design(self.final_taps, rate, spectrum)
-        left = _power(most_db) - stages * _power(align.scatter_db) - _power(final.scatter_db)
-        wanted_db = min(10 * math.log10(left / stages), _WORST_DB)
+        in_range = stages * power(align.scatter_db) + power(final.scatter_db)
+        left = power(most_db) - in_range
+        wanted_db = min(in_db(left / stages), _WORST_DB)
         aperture = tried = interpolation.design(self.aperture_taps, self.density, steering)
         for _ in range(_STEPS):
             # Errors fall by less than so many dB per tap when the density grows by a factor of e.
@@ -112,10 +114,6 @@ class Choice:
             if tried.error_db <= wanted_db and density < aperture.upsampling:
                 aperture = tried
         return Filters(align, aperture, final)
-
-
-def _power(error_db: float) -> float:
-    return 10 ** (error_db / 10)
 
 
 def choose(
