@@ -54,10 +54,10 @@ class Costs:
     reference_ns: float = 100.0
     batch_ns: float = 1.5e5
     subimage_ns: float = 300.0
-    sample_ns: float = 0.0
-    sample_tap_ns: float = 0.0365
+    sample_ns: float = 0.18
+    sample_tap_ns: float = 0.0225
     given_sample_ns: float = 0.3
-    leaf_channel_ns: float = 20.0
+    leaf_channel_ns: float = 30.0
     leaf_ns: float = 0.7
     leaf_point_ns: float = 1.2
     group_ns: float = 150.0
