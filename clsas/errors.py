@@ -233,7 +233,12 @@ def _between_nodes(
     ends = [track.samples[each][[0, -1]] for each in seen[spots]]
     place = np.linspace(*np.transpose(ends), _PLACES, axis=1)
     nodes = interpolated_nodes(track, rates, place, aperture)
-    steering = functools.partial(_steering, view, spots, extents, weighted)
+    frequencies = view.carriers(_PIXELS)
+    pixels = [_pixels_m(view, extents, spot) for spot in spots]
+    pixels_m = np.stack([each_m for each_m, _ in pixels])
+    carriers = np.stack([frequencies[(share * _PIXELS).astype(int)] for _, share in pixels])
+    centres_m = view.spots_m[spots]
+    steering = functools.partial(_steering, view, centres_m, pixels_m, carriers, weighted)
     exact, of_nodes = steering(nodes.ordered(place)), steering(nodes.place)
     index = nodes.base[..., None] + np.arange(nodes.taps)
     wrong = total = 0.0
@@ -246,24 +251,32 @@ def _between_nodes(
 
 def _steering(
     view: View,
-    spots: NDArray[np.int64],
-    extents: NDArray[np.float64],
+    centres_m: NDArray[np.float64],
+    pixels_m: NDArray[np.float64],
+    carriers: NDArray[np.float64],
     weighted: bool,
     at: NDArray[np.float64],
 ) -> NDArray[np.complex64]:
-    """Return steering functions at places on the track, [spots, places], for pixels of subimages.
+    """Return steering functions at places on the track, [n, pixels, places].
 
-    These are some about each spot, each at a frequency of its own: [spots, pixels, places].
+    Parameters
+    ----------
+    centres_m : float64 [n, 3]
+        Middles of subimages.
+    pixels_m : float64 [n, pixels + 1, 3]
+        From these: the point of reference, and pixels.
+    carriers : float64 [n, pixels]
+        The frequency of each, cycles per m.
+    weighted : bool
+        Whether the beam weighs them.
+    at : float64 [n, places]
     """
-    carriers, places = view.carriers(_PIXELS), [_pixels_m(view, extents, spot) for spot in spots]
-    pixels_m = np.stack([pixels_m for pixels_m, _ in places])
-    carrier = np.stack([carriers[(share * _PIXELS).astype(int)] for _, share in places])
-    sight = view.spots_m[spots, None] - view.track.positions_m(at)
+    sight = centres_m[:, None] - view.track.positions_m(at)
     square = np.einsum("nsi,nsi->ns", sight, sight)[:, None]
     square = square + 2 * pixels_m @ sight.swapaxes(1, 2)
     square += np.einsum("npi,npi->np", pixels_m, pixels_m)[..., None]
     range_m = np.sqrt(np.maximum(square, 1e-18))
-    turns = carrier[..., None] * (range_m[:, 1:] - range_m[:, :1])
+    turns = carriers[..., None] * (range_m[:, 1:] - range_m[:, :1])
     angle = (2 * np.pi * (turns - np.rint(turns))).astype(np.float32)
     result = np.empty(angle.shape, np.complex64)
     np.cos(angle, out=result.real)
