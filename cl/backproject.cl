@@ -14,10 +14,11 @@
  *   PERMUTE    fetch samples from a window of 32 per component held in two AVX-512 registers, five
  *              times as fast as a gather. The host asks for it where all lanes' samples lie
  *              within 32, and the compiler decides whether it can (WIDTH 16 only).
+ *   ONE_WINDOW the samples of a work-item's four blocks lie within 32 too: they are fetched once.
  *   BISTATIC   receiver positions differ from the transmitter's.
  *   MOVING     receivers move at `velocity` (in units of the sound speed) during the echo's flight.
  *   BEAM       intervals of the table of the channels' weights by aspect angle; 0 is no weights.
- *   ONE_CUBIC  for points with BEAM: those of a block lie so close that the cubic of one serves all.
+ *   ONE_CUBIC  with BEAM: the points of a block, or the pixels of a tile, lie so close that one cubic serves all.
  *   NORMALISE  with BEAM: sum the weights too.
  *   ALONE      these sums are all of the pixels, which are set; 0: they are added to them.
  *   HALF       1: lines are of half in place of float (common.h).
@@ -77,51 +78,74 @@
 /* fabs() of a float4 that is no call (see KEEP). */
 #define MAGNITUDE(v) as_float4(as_int4(v) & 0x7fffffff)
 
-/* Interpolates one line at t - 0.5 samples from `centre` (the -0.5 makes rounding find the lower of the two
- * middle taps). `centre` is the sample nearest to the block's middle, counted from the line's first margin
- * sample; it is kept inside the line, so no number can make a read leave the buffer.
+/* Where the samples of a line are taken from: those at `offset` and after, counted from `line`; no number leads out
+ * of the line. With WINDOW 32 samples in registers about the one at nearest + whole, where nearest is counted from the
+ * line's first margin sample. */
+typedef struct {
+#ifdef WINDOW
+    vfloat re_low, re_high, im_low, im_high;
+#else
+    __global const held *line;
+    int pitch;
+#endif
+    int offset;
+} Source;
+
+#ifdef WINDOW
+#define WHOLE(t) ROUNDED_INT((t) + ROUNDER)
+INLINE Source source(__global const held *line, int pitch, int nearest, int whole)
+{
+    __global const held *window = line + KEEP(nearest + whole - 16, 0, pitch - 32);
+    return (Source){LOAD_HELD(window), LOAD_HELD(window + 16), LOAD_HELD(window + pitch), LOAD_HELD(window + pitch + 16),
+                    16 + 1 - TAPS / 2 - whole};
+}
+#else
+#define WHOLE(t) 0
+INLINE Source source(__global const held *line, int pitch, int nearest, int whole)
+{
+    return (Source){line, pitch, nearest + 1 - TAPS / 2};
+}
+#endif
+
+/* Interpolates one line at t + 0.5 samples from `nearest` (the 0.5 makes rounding find the lower of the two
+ * middle taps).
  *
  * The weight of the tap at distance a + 0.5 is E(nu^2) + nu O(nu^2) and its mirror image's
  * E(nu^2) - nu O(nu^2), nu in [-0.5, 0.5] the position between the middle taps; `weights` holds, per
  * pair of taps from the innermost, the coefficients of E then of O, highest power first. */
-INLINE void interpolate(__global const held *line, int pitch, int centre, vfloat t,
-                               __global const float *weights, vfloat *re, vfloat *im)
+INLINE void interpolate(const Source *from, vfloat t, __global const float *weights, vfloat *re, vfloat *im)
 {
     const vfloat shifted = t + ROUNDER;
     const vfloat nu = t - (shifted - ROUNDER);
     const vfloat nu2 = nu * nu;
 #ifndef WINDOW
-    vint index = ROUNDED_VINT(shifted) + (centre + 1 - TAPS / 2);
-    index = min(max(index, 0), pitch - TAPS);
+    const vint index = min(max(ROUNDED_VINT(shifted) + from->offset, 0), from->pitch - TAPS);
 #if WIDTH == 1
     float2 samples[TAPS];
 #pragma unroll
     for (int k = 0; k < TAPS; k++)
-        samples[k] = PAIR_HELD(line + 2 * (index + k));
+        samples[k] = PAIR_HELD(from->line + 2 * (index + k));
 #define RE(k) samples[k].x
 #define IM(k) samples[k].y
 #else
     vfloat re_taps[TAPS], im_taps[TAPS];
 #pragma unroll
     for (int lane = 0; lane < WIDTH; lane++) {
-        __global const held *sample = line + ((const int *)&index)[lane];
+        __global const held *sample = from->line + ((const int *)&index)[lane];
 #pragma unroll
         for (int k = 0; k < TAPS; k++) {
             ((float *)&re_taps[k])[lane] = ONE_HELD(sample + k);
-            ((float *)&im_taps[k])[lane] = ONE_HELD(sample + k + pitch);
+            ((float *)&im_taps[k])[lane] = ONE_HELD(sample + k + from->pitch);
         }
     }
 #define RE(k) re_taps[k]
 #define IM(k) im_taps[k]
 #endif
 #else
-    __global const held *window = line + KEEP(centre - 16, 0, pitch - 32);
-    const vfloat re_low = LOAD_HELD(window), re_high = LOAD_HELD(window + 16);
-    const vfloat im_low = LOAD_HELD(window + pitch), im_high = LOAD_HELD(window + pitch + 16);
     /* The permutation uses an index's lowest five bits only: it cannot leave the window. */
-    const vint index = AS_VINT(shifted) + (16 + 1 - TAPS / 2);
-#define RE(k) PICK(re_low, re_high, index + (k))
-#define IM(k) PICK(im_low, im_high, index + (k))
+    const vint index = AS_VINT(shifted) + from->offset;
+#define RE(k) PICK(from->re_low, from->re_high, index + (k))
+#define IM(k) PICK(from->im_low, from->im_high, index + (k))
 #endif
     vfloat sum_re = 0.0f, sum_im = 0.0f;
 #pragma unroll
@@ -181,8 +205,23 @@ INLINE void put(const vfloat *re, const vfloat *im, __global float2 *pixels, int
     const float fraction = reference_fraction[entry], turn = reference_phase[entry];
 #endif
 
-/* Element k, a constant once loops are unrolled, of a float4 or int4. */
+/* Element k of a float4: a constant one, or any. */
 #define AT(v, k) ((k) == 0 ? (v).s0 : (k) == 1 ? (v).s1 : (k) == 2 ? (v).s2 : (v).s3)
+typedef union {
+    float4 all;
+    float of[4];
+} Four;
+
+/* The first lane. */
+#define FIRST(v) ((const float *)&(v))[0]
+
+/* A loop over blocks: a GPU keeps what it indexes in registers only where it is unrolled; on a CPU all that is the
+ * same for every block would be spilled for every channel. */
+#if WIDTH == 1
+#define EACH_BLOCK _Pragma("unroll")
+#else
+#define EACH_BLOCK _Pragma("unroll 1")
+#endif
 
 /* Fixed-point passes for where a moving receiver is when the echo arrives: each gains a factor |b|,
  * 0.003 for a sonar at 5 m/s; the host allows up to 0.05. */
@@ -220,12 +259,12 @@ INLINE void put(const vfloat *re, const vfloat *im, __global float2 *pixels, int
     nearest = nearest > 0.0f ? nearest : (type)0.0f;                                               \
     nearest = nearest < BEAM - 1.0f ? nearest : (type)(BEAM - 1.0f);
 
-/* A cubic at x where x lies within (low, high), else 0. */
-INLINE vfloat beam_weight(vfloat c0, vfloat c1, vfloat c2, vfloat c3, vfloat x, vfloat low, vfloat high)
+/* A cubic at x, where the place lies within (low, high); else 0. */
+INLINE vfloat beam_weight(vfloat c0, vfloat c1, vfloat c2, vfloat c3, vfloat x, vfloat place, float low, float high)
 {
     vfloat weight = c0 + x * (c1 + x * (c2 + x * c3));
-    weight = x > low ? weight : (vfloat)0.0f;
-    return x < high ? weight : (vfloat)0.0f;
+    weight = place > low ? weight : (vfloat)0.0f;
+    return place < high ? weight : (vfloat)0.0f;
 }
 
 /* The weights at places, each with a cubic of its own. */
@@ -236,8 +275,7 @@ INLINE vfloat beam_weights(__global const float *beam, vfloat place, float low, 
 #if ONE_CUBIC
     const int one = ((const int *)&interval)[MIDDLE];
     __global const float *cubic = beam + 4 * one;
-    const vfloat middle = place - one;
-    return beam_weight(cubic[0], cubic[1], cubic[2], cubic[3], middle, low - one, high - one);
+    return beam_weight(cubic[0], cubic[1], cubic[2], cubic[3], place - one, place, low, high);
 #else
     vfloat c0, c1, c2, c3;
 #pragma unroll
@@ -248,7 +286,7 @@ INLINE vfloat beam_weights(__global const float *beam, vfloat place, float low, 
         ((float *)&c2)[lane] = cubic[2];
         ((float *)&c3)[lane] = cubic[3];
     }
-    return beam_weight(c0, c1, c2, c3, place - nearest, low - nearest, high - nearest);
+    return beam_weight(c0, c1, c2, c3, place - nearest, place, low, high);
 #endif
 }
 #else
@@ -402,6 +440,15 @@ __kernel void expand_tiles(__global const float *geometry, int channel_pitch,
 #endif
 }
 
+/* What expand_tiles has left of a channel, from `term` on: sum_n CUBIC_n(term, i) j^n, with scalars or vectors i and j. */
+#define TERM(term, n) (term)[(n) * channel_pitch]
+#define CUBIC_0(term, i) ((i) * (TERM(term, 0) + (i) * (TERM(term, 2) + (i) * TERM(term, 5))))
+#define CUBIC_1(term, i) (TERM(term, 1) + (i) * (TERM(term, 3) + (i) * TERM(term, 6)))
+#define CUBIC_2(term, i) (TERM(term, 4) + (i) * TERM(term, 7))
+#define CUBIC_3(term) TERM(term, 8)
+#define CUBIC(term, i, j) \
+    (CUBIC_0(term, i) + (j) * (CUBIC_1(term, i) + (j) * (CUBIC_2(term, i) + (j) * CUBIC_3(term))))
+
 /* Planar grids: pixels of a tile by the expansion of expand_tiles.
  * Global size (TILE_ROWS TILE_COLUMNS / (4 WIDTH), tiles). Tiles are counted from first_tile, row by row over parts of
  * the image of `down` x `across` tiles each; corners: int [parts][2], a part's first row and column in `pixels`, whose
@@ -438,10 +485,14 @@ __kernel void backproject_tiles(__global const held *samples, int pitch,
     expansion += TERMS * first;
     samples += (size_t)ranges[2] * 2 * pitch;
 
-    /* Lanes from their block's centre, blocks' centres from the tile's, in pixels. */
-    const vfloat lane_i = LANE_COLUMNS, lane_j = LANE_ROWS;
-    const float i = block_column + 0.5f * (BLOCK_COLUMNS - TILE_COLUMNS);
-    const float4 j = block_row + 0.5f * (BLOCK_ROWS - TILE_ROWS) + BLOCK_ROWS * (float4)(0.0f, 1.0f, 2.0f, 3.0f);
+    /* In pixels from the tile's centre: all lanes, and the middles of the four blocks. */
+    const float middle_i = block_column + 0.5f * (BLOCK_COLUMNS - TILE_COLUMNS);
+    const float4 middle_j = block_row + 0.5f * (BLOCK_ROWS - TILE_ROWS) + BLOCK_ROWS * (float4)(0.0f, 1.0f, 2.0f, 3.0f);
+    const vfloat i = middle_i + LANE_COLUMNS;
+    vfloat j[STACK];
+#pragma unroll
+    for (int block = 0; block < STACK; block++)
+        j[block] = AT(middle_j, block) + LANE_ROWS;
 
     vfloat re[STACK], im[STACK];
 #pragma unroll
@@ -458,67 +509,63 @@ __kernel void backproject_tiles(__global const held *samples, int pitch,
         const int entry = channel - begin;
         __global const float *term = expansion + entry;
 #if BEAM
-        /* The place in the beam and its slopes at the four blocks' centres. */
-        const float q_0 = term[10 * channel_pitch], q_1 = term[11 * channel_pitch];
-        const float q_00 = term[12 * channel_pitch], q_01 = term[13 * channel_pitch],
-                    q_11 = term[14 * channel_pitch];
-        const float q_000 = term[15 * channel_pitch], q_001 = term[16 * channel_pitch],
-                    q_011 = term[17 * channel_pitch], q_111 = term[18 * channel_pitch];
-        const float q_j = q_1 + i * (q_01 + i * q_001);
-        const float q_jj = q_11 + i * q_011;
-        const float4 place = (term[9 * channel_pitch] + i * (q_0 + i * (q_00 + i * q_000)))
-            + j * (q_j + j * (q_jj + j * q_111));
-        const float4 q_slope_i = (q_0 + i * (2.0f * q_00 + i * (3.0f * q_000)))
-            + j * ((q_01 + i * (2.0f * q_001)) + j * q_011);
-        const float4 q_slope_j = q_j + j * (2.0f * q_jj + j * (3.0f * q_111));
+        __global const float *of_place = term + 10 * channel_pitch;
+        const float q_0 = term[9 * channel_pitch];
+#if ONE_CUBIC
+        INTERVAL(float, q_0, nearest)
+        const int interval = ROUNDED_INT(nearest + ROUNDER);
+#else
+        /* The place in the beam and its slopes at the four blocks' middles. */
+        const float4 place = q_0 + CUBIC(of_place, middle_i, middle_j);
+        const float4 slope_i = (TERM(of_place, 0) + middle_i * (2.0f * TERM(of_place, 2) + middle_i * (3.0f * TERM(of_place, 5))))
+            + middle_j * ((TERM(of_place, 3) + middle_i * (2.0f * TERM(of_place, 6))) + middle_j * TERM(of_place, 7));
+        const float4 slope_j = CUBIC_1(of_place, middle_i)
+            + middle_j * (2.0f * CUBIC_2(of_place, middle_i) + middle_j * (3.0f * CUBIC_3(of_place)));
         /* Half a pixel more than the lanes reach leaves room for the curvature. */
-        const float4 q_reach = 0.5f * BLOCK_COLUMNS * MAGNITUDE(q_slope_i) + 0.5f * BLOCK_ROWS * MAGNITUDE(q_slope_j);
-        const int4 seen = (place + q_reach > low) & (place - q_reach < high);
+        const float4 reach = 0.5f * BLOCK_COLUMNS * MAGNITUDE(slope_i) + 0.5f * BLOCK_ROWS * MAGNITUDE(slope_j);
+        const int4 seen = (place + reach > low) & (place - reach < high);
         if (!(seen.s0 | seen.s1 | seen.s2 | seen.s3))
             continue;
-        INTERVAL(float4, place, nearest)
-        const int4 interval = as_int4(nearest + ROUNDER) - 0x4B400000;
-        const float4 middle = place - nearest, first_x = low - nearest, last_x = high - nearest;
-        const vfloat q_curvature = lane_i * (lane_i * q_00 + lane_j * q_01) + lane_j * lane_j * q_11;
+        INTERVAL(float4, place, nearest_place)
+        const Four nearest_of = {nearest_place}, interval_of = {nearest_place + ROUNDER};
 #endif
-        const float g0 = term[0], g1 = term[channel_pitch];
-        const float h0 = term[2 * channel_pitch], h1 = term[3 * channel_pitch], h2 = term[4 * channel_pitch];
-        const float k0 = term[5 * channel_pitch], k1 = term[6 * channel_pitch], k2 = term[7 * channel_pitch],
-                    k3 = term[8 * channel_pitch];
-
-        /* The polynomial in j at this i, and the slopes, at the four blocks' centres. */
-        const float v0 = i * (g0 + i * (h0 + i * k0));
-        const float v1 = g1 + i * (h1 + i * k1);
-        const float v2 = h2 + i * k2;
-        const float4 move = v0 + j * (v1 + j * (v2 + j * k3));
-        const float4 slope_i = (g0 + i * (2.0f * h0 + i * (3.0f * k0))) + j * ((h1 + i * (2.0f * k1)) + j * k2);
-        const float4 slope_j = v1 + j * (2.0f * v2 + j * (3.0f * k3));
-        /* Curvature over the lanes of a block in row 0 and its change per row. */
-        const vfloat curvature = lane_i * (lane_i * (h0 + 3.0f * k0 * i) + lane_j * (h1 + 2.0f * k1 * i))
-            + lane_j * lane_j * (h2 + k2 * i);
-        const vfloat bend = lane_i * (lane_i * k1 + lane_j * (2.0f * k2)) + lane_j * lane_j * (3.0f * k3);
-
+        const vfloat q0 = q_0 + CUBIC_0(of_place, i), q1 = CUBIC_1(of_place, i), q2 = CUBIC_2(of_place, i);
+        const float q3 = CUBIC_3(of_place);
+#endif
         REFERENCE
-        const float4 position = move + fraction;
-        const float4 shifted = position + ROUNDER;
-        const float4 start = position - (shifted - ROUNDER) - 0.5f;
-        const int4 centre = nearest_sample + (as_int4(shifted) - 0x4B400000);
-        const float4 cycles = move * cycles_per_sample + turn;
-        const float4 phase = cycles - ((cycles + ROUNDER) - ROUNDER);
+        /* Polynomials in j at the lanes' i, less the half sample of interpolate(). */
+        const float start = fraction - 0.5f;
+        const vfloat t0 = start + CUBIC_0(term, i), t1 = CUBIC_1(term, i), t2 = CUBIC_2(term, i);
+        const float t3 = CUBIC_3(term);
+        const float cycles = turn - start * cycles_per_sample;
+        const float phase = cycles - ((cycles + ROUNDER) - ROUNDER);
 
         __global const held *line = samples + (size_t)entry * 2 * pitch;
-#pragma unroll
+#if ONE_WINDOW
+        /* About the middle of the first lane's column, which is there for nothing. */
+        const float row = 0.5f * (middle_j.s1 + middle_j.s2);
+        const float position = FIRST(t0) + row * (FIRST(t1) + row * (FIRST(t2) + row * t3));
+        const Source from = source(line, pitch, nearest_sample, WHOLE(position + 0.5f));
+#else
+        const Four position = {fraction + CUBIC(term, middle_i, middle_j)};
+#endif
+EACH_BLOCK
         for (int block = 0; block < STACK; block++) {
-            const vfloat d = lane_i * AT(slope_i, block)
-                + (lane_j * AT(slope_j, block) + (bend * AT(j, block) + curvature));
+            const vfloat t = t0 + j[block] * (t1 + j[block] * (t2 + j[block] * t3));
             vfloat line_re, line_im, sine, cosine;
-            interpolate(line, pitch, AT(centre, block), d + AT(start, block), weights, &line_re, &line_im);
-            sincos_cycles(d * cycles_per_sample + AT(phase, block), &sine, &cosine);
+#if !ONE_WINDOW
+            const Source from = source(line, pitch, nearest_sample, WHOLE(position.of[block]));
+#endif
+            interpolate(&from, t, weights, &line_re, &line_im);
+            sincos_cycles(t * cycles_per_sample + phase, &sine, &cosine);
 #if BEAM
-            __global const float *cubic = beam + 4 * AT(interval, block);
-            const vfloat x = lane_i * AT(q_slope_i, block)
-                + (lane_j * AT(q_slope_j, block) + (q_curvature + AT(middle, block)));
-            const vfloat weight = beam_weight(cubic[0], cubic[1], cubic[2], cubic[3], x, AT(first_x, block), AT(last_x, block));
+#if !ONE_CUBIC
+            const float nearest = nearest_of.of[block];
+            const int interval = ROUNDED_INT(interval_of.of[block]);
+#endif
+            __global const float *cubic = beam + 4 * interval;
+            const vfloat q = q0 + j[block] * (q1 + j[block] * (q2 + j[block] * q3));
+            const vfloat weight = beam_weight(cubic[0], cubic[1], cubic[2], cubic[3], q - nearest, q, low, high);
             sine *= weight;
             cosine *= weight;
 #if NORMALISE
@@ -620,6 +667,9 @@ __kernel void backproject_points(__global const held *samples, int pitch,
 #endif
         REFERENCE
         __global const held *line = samples + (size_t)entry * 2 * pitch;
+#if ONE_WINDOW
+        const Source from = source(line, pitch, nearest_sample, 0); /* the fraction is half a sample at most */
+#endif
 #pragma unroll
         for (int block = 0; block < STACK; block++) {
             const vfloat dx = LOAD(offsets + block * WIDTH);
@@ -650,13 +700,11 @@ __kernel void backproject_points(__global const held *samples, int pitch,
             const vfloat move = path * (0.5f * samples_per_m);
 #endif
             const vfloat t = move + fraction;
-#ifndef WINDOW
-            const int whole = 0;
-#else
-            const int whole = ROUNDED_INT(((const float *)&t)[MIDDLE] + ROUNDER);
+#if !ONE_WINDOW
+            const Source from = source(line, pitch, nearest_sample, WHOLE(((const float *)&t)[MIDDLE]));
 #endif
             vfloat line_re, line_im, sine, cosine;
-            interpolate(line, pitch, nearest_sample + whole, t - (whole + 0.5f), weights, &line_re, &line_im);
+            interpolate(&from, t - 0.5f, weights, &line_re, &line_im);
             sincos_cycles(move * cycles_per_sample + turn, &sine, &cosine);
 #if BEAM
             sine *= weight;

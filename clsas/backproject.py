@@ -21,7 +21,16 @@ from clsas.geometry import bistatic_range_m, pairwise_range_m
 from clsas.grid import Grid
 from clsas.image import Image, holds_any
 from clsas.interpolation import Gain, Interpolator, Resampling, Spectrum
-from clsas.layout import GEOMETRY_ERROR, STACK, Groups, Tiles, allowed, lay_out
+from clsas.layout import (
+    GEOMETRY_ERROR,
+    PHASE_ERRORS,
+    STACK,
+    Groups,
+    Tiles,
+    allowed,
+    lay_out,
+    phase_terms,
+)
 from clsas.lines import RangeLines
 from clsas.window import INTERVALS, BeamWindow, channel_ranges, sines
 
@@ -53,6 +62,8 @@ class Preparation:
     layout: Tiles | Groups
     interpolator: Interpolator
     resampling: Resampling
+    phase_terms: int
+    """Of the polynomials for sine and cosine."""
     beam: BeamWindow | None = None
     along: NDArray[np.float64] | None = None
     """The track's unit direction for every channel, [channels, 3]; None without a beam."""
@@ -193,12 +204,13 @@ def prepare(
         beam=beam,
     )
     _check_distances(antennas_m, layout)
+    terms = max(PHASE_ERRORS) if fixed else phase_terms(accuracy_db)
     interpolator = interpolation.choose(
         spectrum,
         accuracy_db,
         taps=taps,
         upsampling=upsampling,
-        other_error=geometry_error,
+        other_error=math.hypot(geometry_error, PHASE_ERRORS[terms]),
         pixels_per_sample=grid.size / lines.length,
         most_upsampling=most_upsampling(lines, layout.block_radius_m),
     )
@@ -209,7 +221,7 @@ def prepare(
         reach = layout.block_radius_m / max(nearest_m, 1e-30)
         one_cubic = bool(beam.block_error(min(reach, 2.0)) <= geometry_error)
     return Preparation(
-        device, lines, grid, layout, interpolator, resampling, beam, along, one_cubic
+        device, lines, grid, layout, interpolator, resampling, terms, beam, along, one_cubic
     )
 
 
@@ -385,13 +397,11 @@ class _Run:
         self.terms, self.channels_at_once = blocks.terms, blocks.channels_at_once
         self.parts_at_once = blocks.parts_at_once
 
-        fits = layout.block_radius_m * p.samples_per_m <= lookup_room(p.interpolator.taps)
         options = {
             "WIDTH": device.info.width,
             "TAPS": p.interpolator.taps,
             "TILE_ROWS": layout.side if self.tiled else 16,
             "TILE_COLUMNS": layout.side if self.tiled else 16,
-            "PERMUTE": int(device.info.permute and fits),
             "BISTATIC": int(self.bistatic),
             "MOVING": int(self.moving),
             "BEAM": 0 if p.beam is None else INTERVALS,
@@ -399,7 +409,9 @@ class _Run:
             "NORMALISE": int(p.beam is not None and p.beam.normalise),
             "ALONE": 0,
             "CENTRED": 0,
+            "PHASE_TERMS": p.phase_terms,
         }
+        options |= lookup_options(device, layout, p.samples_per_m, p.interpolator.taps)
         name = "backproject_tiles" if self.tiled else "backproject_points"
         self.kernel = device.kernel("backproject", name, **options)
         self.expand = device.kernel("backproject", "expand_tiles", **options)
@@ -675,6 +687,17 @@ def float_pairs(positions_m: NDArray[np.float64]) -> NDArray[np.float32]:
     """Return float32 [n, 6]: positions [n, 3] as nearest float32 numbers, and what these leave."""
     nearest = positions_m.astype(np.float32)
     return np.concatenate([nearest, (positions_m - nearest).astype(np.float32)], axis=1)
+
+
+def lookup_options(
+    device: Device, layout: Tiles | Groups, samples_per_m: float, taps: int
+) -> dict[str, int]:
+    """Return the build options that say how samples are looked up (cl/backproject.cl)."""
+    room_m = lookup_room(taps) / samples_per_m
+    return {
+        "PERMUTE": int(device.info.permute and layout.block_radius_m <= room_m),
+        "ONE_WINDOW": int(layout.item_radius_m <= room_m),
+    }
 
 
 def lookup_room(taps: int) -> float:

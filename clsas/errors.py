@@ -53,8 +53,8 @@ def in_db(power: float) -> float:
 def leaf_error(view: View, sides: NDArray[np.int64], device: Device) -> NDArray[np.float64]:
     """Return the power of the error that expanding leaves of some sizes adds.
 
-    See `layout.lay_out`: the fourth order of a tile, and the third within a block. In long leaves
-    the former is 0.35 of the largest rms. Off a plane nothing is expanded, and float32 rounds.
+    See `layout.lay_out`: the fourth order, in long leaves 0.35 of the largest rms. Off a plane
+    nothing is expanded, and float32 rounds.
     """
     if not view.surface.is_plane:
         radius_m = np.array([view.surface.radius_m(tuple(side)) for side in sides.tolist()])
@@ -63,7 +63,7 @@ def leaf_error(view: View, sides: NDArray[np.int64], device: Device) -> NDArray[
     radius_m = np.hypot(*(sides * steps_m).T) / 2
     block_m = np.hypot(*(np.array(BLOCKS[device.info.width]) * steps_m)) / 2
     nearest_m = np.maximum(view.nearest_m, 1e-6)
-    remainder_m = 0.35 * radius_m**4 / (8 * nearest_m**3) + 0.04 * block_m**3 / nearest_m**2
+    remainder_m = 0.35 * radius_m**4 / (8 * nearest_m**3)
     result = (2 * np.pi * view.highest_cycles_per_m * remainder_m) ** 2
     if view.beam is not None:
         result += view.beam.block_error(block_m / nearest_m) ** 2

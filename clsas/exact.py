@@ -19,7 +19,7 @@ from clsas.backproject import (
 )
 from clsas.costs import Costs
 from clsas.device import Device
-from clsas.layout import STACK, Tiles
+from clsas.layout import PHASE_ERRORS, STACK, Tiles, phase_terms
 from clsas.view import View
 from clsas.window import INTERVALS
 
@@ -89,7 +89,7 @@ def expect(view: View, accuracy_db: float, device: Device) -> Exact:
     interpolator = interpolation.choose(
         view.spectrum,
         accuracy_db,
-        other_error=error,
+        other_error=math.hypot(error, PHASE_ERRORS[phase_terms(accuracy_db)]),
         pixels_per_sample=grid.size / lines.length,
         most_upsampling=most_upsampling(lines, block_m),
     )

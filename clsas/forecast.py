@@ -15,7 +15,7 @@ from clsas.errors import in_db, leaf_error, power
 from clsas.exact import Exact
 from clsas.filters import UPSAMPLING_SHARE, Filters, edges_gain
 from clsas.interpolation import PHASES
-from clsas.layout import STACK
+from clsas.layout import PHASE_ERRORS, STACK, phase_terms
 from clsas.plan import (
     CHUNK,
     GIVEN_BYTES,
@@ -122,6 +122,8 @@ def factorized(
         Stage(*side, count, round(channels), samples, operations, final.scatter_db, 1e-9 * cost_ns)
     )
     tile = _tile(view, sides[-1], device) if nearest else sides[-1]
+    if tolerance_db is not None:
+        error += PHASE_ERRORS[phase_terms(tolerance_db)] ** 2
     half_precision = False
     if upsampler is not None and tolerance_db is not None and device.info.half_precision:
         rounding = _half_rounding(view, reach)

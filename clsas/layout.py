@@ -6,6 +6,7 @@ the centres; within a part the device computes differences in float32.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -27,6 +28,10 @@ GEOMETRY_ERROR = 3.2e-5
 ROUNDING = 2.2e-7
 """Rms error of a phase, radians, per cycle over a part's radius: measured."""
 
+PHASE_ERRORS = {4: 8.9e-4, 5: 2.6e-5, 6: 5.0e-7}
+"""Relative rms errors of phases, by the terms of sine's and cosine's polynomials (cl/common.h)."""
+
+_PHASE_SHARE = 0.03  # of an image's error, as power
 _SIDES = (64, 32, 16)
 _AT_ONCE = 1024  # groups: what stays in a cache
 
@@ -72,12 +77,18 @@ class Tiles:
     @property
     def radius_m(self) -> float:
         """Largest distance of a pixel from its tile's centre."""
-        return (self.side - 1) / 2 * _longest_diagonal(self.grid)
+        return _radius_m(self.grid, self.side, self.side)
 
     @property
     def block_radius_m(self) -> float:
         """Largest distance of a pixel from the centre of its work-item's block."""
-        return (max(BLOCKS[self.width]) - 1) / 2 * _longest_diagonal(self.grid)
+        return _radius_m(self.grid, *BLOCKS[self.width])
+
+    @property
+    def item_radius_m(self) -> float:
+        """Largest distance of a pixel from the middle of all that its work-item computes."""
+        rows, columns = BLOCKS[self.width]
+        return _radius_m(self.grid, STACK * rows, columns)
 
     def centres_m(self, parts: slice) -> NDArray[np.float64]:
         """Return the centres of some tiles, counted row by row, float64 [parts, 3]."""
@@ -145,6 +156,11 @@ class Groups:
         away *= away
         return float(np.sqrt(away.sum(axis=-1).max()))
 
+    @property
+    def item_radius_m(self) -> float:
+        """Largest distance of a pixel from its work-item's centre, that of the group."""
+        return self.radius_m
+
     def centres_m(self, parts: slice) -> NDArray[np.float64]:
         """Return the centres of some groups, float64 [parts, 3]."""
         return self.centre_m[parts]
@@ -159,6 +175,12 @@ class Groups:
 def allowed(accuracy_db: float) -> float:
     """Return what the geometry may add to an image's error: 6 % of its power, -90 dB at least."""
     return max(GEOMETRY_ERROR, 10 ** ((accuracy_db - 12) / 20))
+
+
+def phase_terms(error_db: float) -> int:
+    """Return how many terms sine and cosine need in an image of some relative rms error, dB."""
+    most = math.sqrt(_PHASE_SHARE) * 10 ** (error_db / 20)
+    return min((n for n, error in PHASE_ERRORS.items() if error <= most), default=max(PHASE_ERRORS))
 
 
 def lay_out(
@@ -231,7 +253,6 @@ def tiles(
         shape = Tiles(grid, side, width)
         nearest = max(_nearest_m(shape, antennas_m), 1e-30)
         remainder_m = 0.15 * shape.radius_m**4 / (8 * nearest**3)
-        remainder_m += 0.04 * shape.block_radius_m**3 / nearest**2
         remainder_m += 0.2 * speed_ratio * shape.radius_m**3 / nearest**2
         rounding = ROUNDING * cycles_per_m * shape.radius_m
         phase_error = np.hypot(2 * np.pi * cycles_per_m * remainder_m, rounding)
@@ -346,11 +367,7 @@ def _neighbours(grid: Grid, positions: NDArray[np.float64], width: int) -> NDArr
     return index.reshape(down, rows, across, columns).swapaxes(1, 2).ravel()
 
 
-def _longest_diagonal(grid: Grid) -> float:
-    """Return the longer diagonal of a pixel, metres."""
-    return float(
-        max(
-            np.linalg.norm(grid.row_step_m + grid.column_step_m),
-            np.linalg.norm(grid.row_step_m - grid.column_step_m),
-        )
-    )
+def _radius_m(grid: Grid, rows: int, columns: int) -> float:
+    """Return the largest distance of a pixel from the centre of rows x columns of them, metres."""
+    down, across = (rows - 1) / 2 * grid.row_step_m, (columns - 1) / 2 * grid.column_step_m
+    return float(max(np.linalg.norm(down + across), np.linalg.norm(down - across)))

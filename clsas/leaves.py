@@ -15,13 +15,13 @@ from clsas.backproject import (
     beam_arguments,
     channel_pitch,
     float_pairs,
-    lookup_room,
+    lookup_options,
     normalising,
 )
 from clsas.device import Device, Slot
 from clsas.errors import power
 from clsas.geometry import bistatic_range_m
-from clsas.layout import BLOCKS, STACK, Tiles, groups_within
+from clsas.layout import BLOCKS, STACK, Groups, Tiles, groups_within
 from clsas.lines import RangeLines
 from clsas.plan import GUARD
 from clsas.sector import MOST_KEPT_BYTES, Geometry, Sector
@@ -86,24 +86,29 @@ class Leaves:
         """Build the kernels, and lay out what they work on."""
         raise NotImplementedError
 
-    def _options(self, block_radius_m: float) -> dict[str, int]:
-        reach = block_radius_m * self.geometry.samples_per_m
-        fits = reach <= lookup_room(self.plan.final.taps)
+    def _options(self, layout: Tiles | Groups, within_m: float) -> dict[str, int]:
+        """Return the kernels' build options; `within_m`: from where a cubic of weights is taken."""
+        chosen, one_cubic = self.plan, False
+        if chosen.beam is not None:
+            radius_m = self.surface.radius_m(self.geometry.division.sides[0])
+            nearest_m = max(self.geometry.nearest_m - radius_m, 1e-6)
+            error = chosen.beam.block_error(within_m / nearest_m)
+            one_cubic = error**2 < _SHARE * power(chosen.predicted_error_db)
         return {
             "WIDTH": self.width,
             "TAPS": self.plan.final.taps,
             "TILE_ROWS": self.plan.tile[0],
             "TILE_COLUMNS": self.plan.tile[1],
-            "PERMUTE": int(self.device.info.permute and fits),
             "BISTATIC": 0,
             "MOVING": 0,
             "BEAM": 0 if self.plan.beam is None else INTERVALS,
-            "ONE_CUBIC": 0,
+            "ONE_CUBIC": int(one_cubic),
             "NORMALISE": int(self.normalise),
             "ALONE": 1,
             "CENTRED": int(self.centred),
             "HALF": int(self.half_precision),
-        }
+            "PHASE_TERMS": chosen.phase_terms,
+        } | lookup_options(self.device, layout, self.geometry.samples_per_m, self.plan.final.taps)
 
     def fill(self, slot: Slot, sector: Sector) -> None:
         """Start copying to the device what it is told of a sector's leaves."""
@@ -174,7 +179,8 @@ class PlaneLeaves(Leaves):
         # A CPU sets the pixels where they belong.
         on_cpu = device.info.kind == "cpu" and not self.normalise
         self.shared = device.share(image) if on_cpu else None
-        options = self._options(Tiles(plane, chosen.tile[0], self.width).block_radius_m)
+        layout = Tiles(plane, chosen.tile[0], self.width)
+        options = self._options(layout, self.surface.radius_m(chosen.tile))
         self.expand = device.kernel("backproject", "expand_tiles", **options)
         self.backproject = device.kernel("backproject", "backproject_tiles", **options)
         self.tiles = Division(self.surface, (chosen.sides[0], chosen.sides[-1], chosen.tile))
@@ -361,14 +367,7 @@ class SurfaceLeaves(Leaves):
         self.number = {tuple(root): n for n, root in enumerate(roots)}
         self.ends = np.searchsorted(self.leaf, np.arange(len(roots) + 1) * corners.shape[1])
         self.pixels_before = np.concatenate([[0], np.cumsum(held)])
-        block_m = self.groups.block_radius_m
-        options = self._options(block_m)
-        if self.plan.beam is not None:
-            nearest_m = max(
-                self.geometry.nearest_m - self.surface.radius_m(division.sides[0]), 1e-6
-            )
-            error = self.plan.beam.block_error(block_m / nearest_m)
-            options["ONE_CUBIC"] = int(error**2 < _SHARE * power(self.plan.predicted_error_db))
+        options = self._options(self.groups, self.groups.block_radius_m)
         self.backproject = device.kernel("backproject", "backproject_points", **options)
 
     def _cells(self, corners: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

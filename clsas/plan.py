@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from clsas.grid import Grid
 from clsas.interpolation import PHASES, UPSAMPLING_TAPS, Interpolator, Resampling, Upsampler
+from clsas.layout import phase_terms
 from clsas.lines import RangeLines
 from clsas.window import BeamWindow
 
@@ -244,6 +245,13 @@ class Plan:
     def __getstate__(self) -> dict[str, Any]:
         """Return the fields: what is kept for other images is not sent to other processes."""
         return {name: value for name, value in self.__dict__.items() if name != "kept"}
+
+    @property
+    def phase_terms(self) -> int:
+        """Terms of the polynomials for sine and cosine of pixels' phases."""
+        return phase_terms(
+            self.predicted_error_db if self.tolerance_db is None else self.tolerance_db
+        )
 
     @property
     def is_exact(self) -> bool:

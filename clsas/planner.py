@@ -18,6 +18,7 @@ from clsas.filters import ALIGN_TAPS, Choice, Filters, steering_spectrum
 from clsas.forecast import MARGIN_DB, Way
 from clsas.grid import Grid
 from clsas.interpolation import Interpolator
+from clsas.layout import PHASE_ERRORS, phase_terms
 from clsas.lines import RangeLines
 from clsas.plan import Plan
 from clsas.search import MOST_STAGES, Allowed, Tree, root_limits, search
@@ -224,7 +225,8 @@ def _fastest(
     most = root_limits(view, _ROOTS_SHARE * allowed)
     beam_cycles = 0.0 if view.beam is None else _LEAST_BEAM_CYCLES
     needed = math.inf
-    besides = trimmed + 0.08 * allowed  # the errors of filters and roots
+    # The errors of filters and roots, and of phases.
+    besides = trimmed + 0.08 * allowed + PHASE_ERRORS[phase_terms(tolerance_db)] ** 2
     tree: Tree | None = None
     designed: tuple[Choice, float] | None = None
     leaf_pixels = 1
