@@ -310,6 +310,8 @@ class _Run:
             self.levels[level],
             tables.strides[level],
         )
+        # A buffer that grows waits for all that is under way.
+        lines_each = max(stride, self.plan.most_channels[level])
         per_root = self.division.per_root(level)
         children = (batch.stop - batch.start) * per_root
         if level == 0:
@@ -351,7 +353,8 @@ class _Run:
             self.filters["align"],
             self.filters["aperture"],
             self.slot.zeros(
-                f"lines{level}", sample_bytes(self.half_precision) * children * stride * shape.pitch
+                f"lines{level}",
+                sample_bytes(self.half_precision) * children * lines_each * shape.pitch,
             ),
             stride,
             shape.pitch,

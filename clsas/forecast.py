@@ -33,6 +33,7 @@ from clsas.view import View
 
 HALF_ROUNDING = 4e-8
 """Power of the error that rounding lines to half precision once adds: 2^-11/sqrt(6) rms."""
+_ROOM = 1.06  # for virtual channels, over the most expected
 _ROUNDING_SHARE = 0.1  # of an image's error
 _MOST_CHUNKS = 16  # that a sum in half precision is made of
 MARGIN_DB = 1.0  # between prediction and tolerance, for what measured errors scatter
@@ -132,8 +133,9 @@ def factorized(
     line_bytes = sample_bytes(half_precision) * lines.channels * padded_length(resampling)
     if upsampler is not None:
         line_bytes += min(lines.samples.nbytes, GIVEN_BYTES)
+    most_channels = _most_channels(view, way, stages)
     root_bytes, table_bytes = _root_bytes(
-        view, way, tile, stages, width, sample_bytes(half_precision)
+        view, way, tile, stages, most_channels, width, sample_bytes(half_precision)
     )
     room = memory_bytes - line_bytes
     batch_bytes = _CACHED_BYTES if device.info.kind == "cpu" else _BATCH_BYTES
@@ -174,6 +176,7 @@ def factorized(
         limits=view.limits,
         crowding=way.crowding,
         beam_cycles=way.beam_cycles,
+        most_channels=tuple(math.ceil(_ROOM * most) for _, most in most_channels),
     )
 
 
@@ -203,31 +206,41 @@ def _power_of_filters(way: Way) -> float:
     return len(way.sides) * _power_of_stage(way) + power(way.filters.final.scatter_db)
 
 
+def _most_channels(view: View, way: Way, stages: Sequence[Stage]) -> list[tuple[float, float]]:
+    """Return how many virtual channels the whole aperture has, and who sees most, by stage."""
+    if way.nearest:
+        return [(stage.channels, stage.channels) for stage in stages[:-1]]
+    taps, density, found = way.filters.aperture.taps, 2 * way.filters.aperture.upsampling, []
+    for level, side in enumerate(way.sides):
+        seen = view.seen(side)
+        everywhere, most = (
+            density * way.crowding[level] * view.turns(side, where, most=True) + taps + 2
+            for where in (np.ones_like(seen), seen)
+        )
+        if view.beam is not None:
+            if level == len(way.sides) - 1:
+                most += density * way.beam_cycles * view.cycles(view.beam_rates, seen, most=True)
+            most *= 1 + OF_BEAM
+        found.append((everywhere, most))
+    return found
+
+
 def _root_bytes(
-    view: View, way: Way, tile: tuple[int, int], stages: Sequence[Stage], width: int, of_sample: int
+    view: View,
+    way: Way,
+    tile: tuple[int, int],
+    stages: Sequence[Stage],
+    most_channels: Sequence[tuple[float, float]],
+    width: int,
+    of_sample: int,
 ) -> tuple[float, float]:
     """Return the device memory that a root takes while it is worked on, and that of its tables.
 
     See `factorize` and `leaves`.
     """
-    taps, channels, work, tables = way.filters.aperture.taps, view.lines.channels, 0.0, 0.0
-    density, sides = 2 * way.filters.aperture.upsampling, way.sides
-    for level, side in enumerate(sides):
-        if way.nearest:
-            everywhere = most = stages[level].channels
-        else:
-            # Virtual channels of the whole aperture, and those of the subimage that sees most.
-            seen = view.seen(side)
-            everywhere, most = (
-                density * way.crowding[level] * view.turns(side, where, most=True) + taps + 2
-                for where in (np.ones_like(seen), seen)
-            )
-            if view.beam is not None:
-                if level == len(sides) - 1:
-                    most += (
-                        density * way.beam_cycles * view.cycles(view.beam_rates, seen, most=True)
-                    )
-                most *= 1 + OF_BEAM
+    channels, work, tables, sides = view.lines.channels, 0.0, 0.0, way.sides
+    for level, (everywhere, most) in enumerate(most_channels):
+        side = sides[level]
         subimages = _subimages(sides[0], side)
         work += of_sample * subimages * most * (stages[level].samples + 2 * GUARD)
         tables += subimages * (44 if level else 20) + (channels + 32) * (8 + (12 if level else 20))

@@ -212,7 +212,8 @@ class PlaneLeaves(Leaves):
         steps_m = (plane.column_step_m, plane.row_step_m)
         drift = [self.geometry.drift @ step * samples_per_m for step in steps_m]
         terms = 9 + (10 if chosen.beam is not None else 0)
-        expansion = slot.buffer("expansion", 4 * terms * tiles * pitch)
+        most = max(pitch, channel_pitch(chosen.most_channels[-1]))
+        expansion = slot.buffer("expansion", 4 * terms * tiles * most)
         device.run(
             self.expand,
             (pitch // self.width, tiles),

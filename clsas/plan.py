@@ -119,6 +119,8 @@ class Plan:
         stage: where their spacing changes along the track filters err.
     beam_cycles : float
         For how many cycles per edge of the beam the last stage's virtual channels are dense enough.
+    most_channels : tuple of int
+        Virtual channels of a subimage, stage by stage, that there is room for from the beginning.
     """
 
     tolerance_db: float | None
@@ -148,6 +150,7 @@ class Plan:
     limits: tuple[float, float] | None = None
     crowding: tuple[float, ...] = ()
     beam_cycles: float = 0.0
+    most_channels: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
         """Check what sizes buffers and indices."""
@@ -191,6 +194,9 @@ class Plan:
         fits = isinstance(self.half_lengths, tuple) and len(self.half_lengths) == levels
         fits = fits and all(whole(n, 0) for n in self.half_lengths)
         check(fits, "half_lengths", "a whole number for every stage")
+        fits = isinstance(self.most_channels, tuple) and len(self.most_channels) == levels
+        fits = fits and all(whole(n, 0) for n in self.most_channels)
+        check(fits, "most_channels", "a whole number for every stage")
         for name, most in (
             ("highest_cycles_per_m", 1e9),
             ("beam_cycles", 1e3),
@@ -350,6 +356,7 @@ class Plan:
                 values["limits"] = tuple(values["limits"])
             values["half_lengths"] = tuple(values["half_lengths"])
             values["nearest"] = tuple(values["nearest"])
+            values["most_channels"] = tuple(values["most_channels"])
             values["crowding"] = tuple(values["crowding"])
             values["stages"] = tuple(Stage(**stage) for stage in values["stages"])
             return cls(**values)
