@@ -14,7 +14,7 @@
  *   PERMUTE    fetch samples from a window of 32 per component held in two AVX-512 registers, five
  *              times as fast as a gather. The host asks for it where all lanes' samples lie
  *              within 32, and the compiler decides whether it can (WIDTH 16 only).
- *   ONE_WINDOW the samples of a work-item's four blocks lie within 32 too: they are fetched once.
+ *   WINDOWS    how many such windows a work-item's four blocks take: 1, 2 (tiles only) or 4.
  *   BISTATIC   receiver positions differ from the transmitter's.
  *   MOVING     receivers move at `velocity` (in units of the sound speed) during the echo's flight.
  *   BEAM       intervals of the table of the channels' weights by aspect angle; 0 is no weights.
@@ -22,6 +22,7 @@
  *   NORMALISE  with BEAM: sum the weights too.
  *   ALONE      these sums are all of the pixels, which are set; 0: they are added to them.
  *   HALF       1: lines are of half in place of float (common.h).
+ *   PHASE_TERMS  of the polynomials for sine and cosine of phases.
  *   CENTRED    every line is aligned on its part's centre, at one sample: there are no references. Lines stand
  *              for `shares` others each.
  *
@@ -41,6 +42,8 @@
  *   reference  per (part, channel): nearest sample (int, counted from the line's first margin
  *              sample), the fraction to the tile centre's range (samples) and phase (cycles in
  *              [-0.5, 0.5]), each [parts][channel_pitch].
+ *   weights    of the interpolation, [TAPS / 2][2][TAPS / 2] (see interpolate()), then of the polynomials of PHASE_TERMS
+ *              terms for sine and cosine, highest power first.
  *   pixels     float2 [rows][columns], whole tiles.
  *   beam       float [BEAM][4]: the weight as cubics of a place in this table, constant terms first,
  *              from 0 to 1 each. A pixel's place is along.e - lowest, with e the unit vector to it
@@ -79,8 +82,7 @@
 #define MAGNITUDE(v) as_float4(as_int4(v) & 0x7fffffff)
 
 /* Where the samples of a line are taken from: those at `offset` and after, counted from `line`; no number leads out
- * of the line. With WINDOW 32 samples in registers about the one at nearest + whole, where nearest is counted from the
- * line's first margin sample. */
+ * of the line. With WINDOW 32 samples in registers, those about a place t as of interpolate(). */
 typedef struct {
 #ifdef WINDOW
     vfloat re_low, re_high, im_low, im_high;
@@ -92,23 +94,19 @@ typedef struct {
 } Source;
 
 #ifdef WINDOW
-#define WHOLE(t) ROUNDED_INT((t) + ROUNDER)
-INLINE Source source(__global const held *line, int pitch, int nearest, int whole)
+INLINE Source source(__global const held *line, int pitch, int nearest, float t)
 {
-    __global const held *window = line + KEEP(nearest + whole - 16, 0, pitch - 32);
+    const int whole = ROUNDED_INT(t + ROUNDER);
+    __global const held *window = line + KEEP(nearest + whole - 15, 0, pitch - 32);
     return (Source){LOAD_HELD(window), LOAD_HELD(window + 16), LOAD_HELD(window + pitch), LOAD_HELD(window + pitch + 16),
-                    16 + 1 - TAPS / 2 - whole};
+                    16 - TAPS / 2 - whole};
 }
 #else
-#define WHOLE(t) 0
-INLINE Source source(__global const held *line, int pitch, int nearest, int whole)
-{
-    return (Source){line, pitch, nearest + 1 - TAPS / 2};
-}
+#define source(line, pitch, nearest, t) ((Source){line, pitch, (nearest) + 1 - TAPS / 2})
 #endif
 
-/* Interpolates one line at t + 0.5 samples from `nearest` (the 0.5 makes rounding find the lower of the two
- * middle taps).
+/* Interpolates one line at t + 0.5 samples from sample `nearest`, counted from the line's first margin sample (the 0.5
+ * makes rounding find the lower of the two middle taps).
  *
  * The weight of the tap at distance a + 0.5 is E(nu^2) + nu O(nu^2) and its mirror image's
  * E(nu^2) - nu O(nu^2), nu in [-0.5, 0.5] the position between the middle taps; `weights` holds, per
@@ -172,6 +170,23 @@ INLINE void interpolate(const Source *from, vfloat t, __global const float *weig
 #undef IM
 }
 
+/* sin and cos of 2 pi t for t in cycles, |t| < 2^22, by polynomials of PHASE_TERMS terms in the square of what is left of
+ * a cycle. */
+INLINE void turn_of(vfloat t, __global const float *terms, vfloat *sine, vfloat *cosine)
+{
+    const vfloat nearest = (t + ROUNDER) - ROUNDER;
+    const vfloat r = t - nearest;
+    const vfloat square = r * r;
+    vfloat s = terms[0], c = terms[PHASE_TERMS];
+#pragma unroll
+    for (int power = 1; power < PHASE_TERMS; power++) {
+        s = s * square + terms[power];
+        c = c * square + terms[PHASE_TERMS + power];
+    }
+    *sine = s * r;
+    *cosine = c;
+}
+
 #if ALONE
 #define PUT =
 #else
@@ -212,14 +227,32 @@ typedef union {
     float of[4];
 } Four;
 
-/* The first lane. */
-#define FIRST(v) ((const float *)&(v))[0]
+/* A lane in a block's middle column. */
+#define ONE(v) ((const float *)&(v))[WIDTH == 16 ? 1 : 0]
 
-/* A loop over blocks: a GPU keeps what it indexes in registers only where it is unrolled; on a CPU all that is the
- * same for every block would be spilled for every channel. */
+#ifdef WINDOW
+#define PER_WINDOW (STACK / WINDOWS)
+#else
+#undef WINDOWS
+#define WINDOWS 1
+#define PER_WINDOW STACK
+#endif
+
+/* What weights are in memory stays there: kept in registers there would be none left, and a product may take one factor
+ * from memory. */
+#ifdef AVX512
+#define FRESH __asm__ volatile("" : : : "memory")
+#else
+#define FRESH
+#endif
+
+/* Loops over windows and blocks: a GPU keeps what it indexes in registers only where it is unrolled; on a CPU all that
+ * is the same for every block would be spilled for every channel. */
 #if WIDTH == 1
+#define EACH_WINDOW _Pragma("unroll")
 #define EACH_BLOCK _Pragma("unroll")
 #else
+#define EACH_WINDOW _Pragma("unroll 1")
 #define EACH_BLOCK _Pragma("unroll 1")
 #endif
 
@@ -541,39 +574,35 @@ __kernel void backproject_tiles(__global const held *samples, int pitch,
         const float phase = cycles - ((cycles + ROUNDER) - ROUNDER);
 
         __global const held *line = samples + (size_t)entry * 2 * pitch;
-#if ONE_WINDOW
-        /* About the middle of the first lane's column, which is there for nothing. */
-        const float row = 0.5f * (middle_j.s1 + middle_j.s2);
-        const float position = FIRST(t0) + row * (FIRST(t1) + row * (FIRST(t2) + row * t3));
-        const Source from = source(line, pitch, nearest_sample, WHOLE(position + 0.5f));
-#else
-        const Four position = {fraction + CUBIC(term, middle_i, middle_j)};
-#endif
+EACH_WINDOW
+        for (int window = 0; window < WINDOWS; window++) {
+            /* About the middle of its blocks, in a column in their middle. */
+            const float row = middle_j.s0 + BLOCK_ROWS * (0.5f * (PER_WINDOW - 1) + window * PER_WINDOW);
+            const Source from = source(line, pitch, nearest_sample, ONE(t0) + row * (ONE(t1) + row * (ONE(t2) + row * t3)));
 EACH_BLOCK
-        for (int block = 0; block < STACK; block++) {
-            const vfloat t = t0 + j[block] * (t1 + j[block] * (t2 + j[block] * t3));
-            vfloat line_re, line_im, sine, cosine;
-#if !ONE_WINDOW
-            const Source from = source(line, pitch, nearest_sample, WHOLE(position.of[block]));
-#endif
-            interpolate(&from, t, weights, &line_re, &line_im);
-            sincos_cycles(t * cycles_per_sample + phase, &sine, &cosine);
+            for (int block = window * PER_WINDOW; block < (window + 1) * PER_WINDOW; block++) {
+                FRESH;
+                const vfloat t = t0 + j[block] * (t1 + j[block] * (t2 + j[block] * t3));
+                vfloat line_re, line_im, sine, cosine;
+                interpolate(&from, t, weights, &line_re, &line_im);
+                turn_of(t * cycles_per_sample + phase, weights + TAPS * TAPS / 2, &sine, &cosine);
 #if BEAM
 #if !ONE_CUBIC
-            const float nearest = nearest_of.of[block];
-            const int interval = ROUNDED_INT(interval_of.of[block]);
+                const float nearest = nearest_of.of[block];
+                const int interval = ROUNDED_INT(interval_of.of[block]);
 #endif
-            __global const float *cubic = beam + 4 * interval;
-            const vfloat q = q0 + j[block] * (q1 + j[block] * (q2 + j[block] * q3));
-            const vfloat weight = beam_weight(cubic[0], cubic[1], cubic[2], cubic[3], q - nearest, q, low, high);
-            sine *= weight;
-            cosine *= weight;
+                __global const float *cubic = beam + 4 * interval;
+                const vfloat q = q0 + j[block] * (q1 + j[block] * (q2 + j[block] * q3));
+                const vfloat weight = beam_weight(cubic[0], cubic[1], cubic[2], cubic[3], q - nearest, q, low, high);
+                sine *= weight;
+                cosine *= weight;
 #if NORMALISE
-            sum[block] += SHARE(channel) * weight;
+                sum[block] += SHARE(channel) * weight;
 #endif
 #endif
-            re[block] += line_re * cosine - line_im * sine;
-            im[block] += line_re * sine + line_im * cosine;
+                re[block] += line_re * cosine - line_im * sine;
+                im[block] += line_re * sine + line_im * cosine;
+            }
         }
     }
     corners += (first_tile + tile) / (down * across) * 2;
@@ -667,8 +696,8 @@ __kernel void backproject_points(__global const held *samples, int pitch,
 #endif
         REFERENCE
         __global const held *line = samples + (size_t)entry * 2 * pitch;
-#if ONE_WINDOW
-        const Source from = source(line, pitch, nearest_sample, 0); /* the fraction is half a sample at most */
+#if WINDOWS == 1
+        const Source from = source(line, pitch, nearest_sample, fraction - 0.5f);
 #endif
 #pragma unroll
         for (int block = 0; block < STACK; block++) {
@@ -699,13 +728,13 @@ __kernel void backproject_points(__global const held *samples, int pitch,
 #else
             const vfloat move = path * (0.5f * samples_per_m);
 #endif
-            const vfloat t = move + fraction;
-#if !ONE_WINDOW
-            const Source from = source(line, pitch, nearest_sample, WHOLE(((const float *)&t)[MIDDLE]));
+            const vfloat t = move + (fraction - 0.5f);
+#if WINDOWS > 1
+            const Source from = source(line, pitch, nearest_sample, ((const float *)&t)[MIDDLE]);
 #endif
             vfloat line_re, line_im, sine, cosine;
-            interpolate(&from, t - 0.5f, weights, &line_re, &line_im);
-            sincos_cycles(move * cycles_per_sample + turn, &sine, &cosine);
+            interpolate(&from, t, weights, &line_re, &line_im);
+            turn_of(move * cycles_per_sample + turn, weights + TAPS * TAPS / 2, &sine, &cosine);
 #if BEAM
             sine *= weight;
             cosine *= weight;

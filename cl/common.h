@@ -51,44 +51,25 @@ typedef float vfloat_anywhere __attribute__((ext_vector_type(WIDTH), aligned(4))
 #define ROUNDED_INT(shifted) (as_int(shifted) - 0x4B400000)
 #define ROUNDED_VINT(shifted) (AS_VINT(shifted) - 0x4B400000)
 
-/* sin and cos of 2 pi t for t in cycles, |t| < 2^22, by least-squares polynomials of PHASE_TERMS terms over one reduced
- * cycle: rms error of exp(j 2 pi t) 8.9e-4 (-61 dB), 2.5e-5 (-92 dB) or 5e-7 with 4, 5 or 6, the default. They are in place of sin() and
- * cos(), which are scalar code on some CPU drivers and take radians, whose reduction loses bits. */
+/* sin and cos of 2 pi t for t in cycles, |t| < 2^22. Error below 1.3e-6: least-squares polynomials
+ * with equalised error over one reduced cycle, in place of sin() and cos(), which are scalar code on some
+ * CPU drivers and take radians, whose reduction loses bits. */
 INLINE void sincos_cycles(vfloat t, vfloat *sine, vfloat *cosine)
 {
     const vfloat nearest = (t + ROUNDER) - ROUNDER;
     const vfloat r = t - nearest;
     const vfloat z = r * r;
-#if PHASE_TERMS == 4
-    vfloat s = z * -57.1160889f + 78.3270874f;
-    s = s * z - 41.1362572f;
-    s = s * z + 6.2797308f;
-    vfloat c = z * -61.0895844f + 61.5972748f;
-    c = c * z - 19.5911083f;
-    c = c * z + 0.998987138f;
-#elif PHASE_TERMS == 5
-    vfloat s = z * 33.1688118f - 74.6762238f;
-    s = s * z + 81.4001389f;
-    s = s * z - 41.333252f;
-    s = s * z + 6.28308868f;
-    vfloat c = z * 46.3106308f - 82.7014313f;
-    c = c * z + 64.7144012f;
-    c = c * z - 19.7327976f;
-    c = c * z + 0.999971092f;
-#else
     vfloat s = z * -12.2712614f + 41.2053942f;
     s = s * z - 76.5801004f;
     s = s * z + 81.5961839f;
     s = s * z - 41.3414214f;
     s = s * z + 6.28318282f;
+    *sine = s * r;
     vfloat c = z * -21.0767793f + 58.794037f;
     c = c * z - 85.2723966f;
     c = c * z + 64.9287266f;
     c = c * z - 19.7389825f;
-    c = c * z + 0.999999222f;
-#endif
-    *sine = s * r;
-    *cosine = c;
+    *cosine = c * z + 0.999999222f;
 }
 
 /* The weights of an interpolation by an even number of taps, a constant, at nu in [-0.5, 0.5] from their middle: the

@@ -15,22 +15,13 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from clsas import interpolation, validate
+from clsas import interpolation, phases, validate
 from clsas.device import Device, Slot, aligned, open_device
 from clsas.geometry import bistatic_range_m, pairwise_range_m
 from clsas.grid import Grid
 from clsas.image import Image, holds_any
 from clsas.interpolation import Gain, Interpolator, Resampling, Spectrum
-from clsas.layout import (
-    GEOMETRY_ERROR,
-    PHASE_ERRORS,
-    STACK,
-    Groups,
-    Tiles,
-    allowed,
-    lay_out,
-    phase_terms,
-)
+from clsas.layout import GEOMETRY_ERROR, STACK, Groups, Tiles, allowed, lay_out
 from clsas.lines import RangeLines
 from clsas.window import INTERVALS, BeamWindow, channel_ranges, sines
 
@@ -204,15 +195,15 @@ def prepare(
         beam=beam,
     )
     _check_distances(antennas_m, layout)
-    terms = max(PHASE_ERRORS) if fixed else phase_terms(accuracy_db)
+    terms = phases.TERMS[-1] if fixed else phases.terms_within(accuracy_db)
     interpolator = interpolation.choose(
         spectrum,
         accuracy_db,
         taps=taps,
         upsampling=upsampling,
-        other_error=math.hypot(geometry_error, PHASE_ERRORS[terms]),
+        other_error=math.hypot(geometry_error, phases.error(terms)),
         pixels_per_sample=grid.size / lines.length,
-        most_upsampling=most_upsampling(lines, layout.block_radius_m),
+        most_upsampling=most_upsampling(lines, layout.lookup_radius_m),
     )
     resampling = interpolation.resampling(lines.length, interpolator, spectrum)
     one_cubic = False
@@ -242,9 +233,9 @@ def antennas_and_phase(
     return antennas_m, math.hypot(of_phase, 0.3 / lines.range_step_m)
 
 
-def most_upsampling(lines: RangeLines, block_radius_m: float) -> float:
+def most_upsampling(lines: RangeLines, lookup_radius_m: float) -> float:
     """Return the upsampling beyond which a block does not fit the lookup's window."""
-    return lookup_room(max(interpolation.TAPS)) * lines.range_step_m / max(block_radius_m, 1e-30)
+    return lookup_room(max(interpolation.TAPS)) * lines.range_step_m / max(lookup_radius_m, 1e-30)
 
 
 def execute(
@@ -411,7 +402,7 @@ class _Run:
             "CENTRED": 0,
             "PHASE_TERMS": p.phase_terms,
         }
-        options |= lookup_options(device, layout, p.samples_per_m, p.interpolator.taps)
+        options |= lookup_options(device, layout, p.lines, p.samples_per_m, p.interpolator.taps)
         name = "backproject_tiles" if self.tiled else "backproject_points"
         self.kernel = device.kernel("backproject", name, **options)
         self.expand = device.kernel("backproject", "expand_tiles", **options)
@@ -419,7 +410,7 @@ class _Run:
         # While one set of buffers is in use on the device, the other is filled.
         self.line_slots = itertools.cycle([Slot(device), Slot(device)])
         self.part_slots = itertools.cycle([Slot(device), Slot(device)])
-        self.weights = device.upload(p.interpolator.coefficients.astype(np.float32))
+        self.weights = device.upload(lookup_weights(p.interpolator.coefficients, p.phase_terms))
         self.per_sine, self.beam = beam_arguments(device, p.beam, p.lines)
         self.corner = device.upload(np.zeros(2, np.int32))
         self.progress = progress
@@ -690,19 +681,27 @@ def float_pairs(positions_m: NDArray[np.float64]) -> NDArray[np.float32]:
 
 
 def lookup_options(
-    device: Device, layout: Tiles | Groups, samples_per_m: float, taps: int
+    device: Device, layout: Tiles | Groups, lines: RangeLines, samples_per_m: float, taps: int
 ) -> dict[str, int]:
     """Return the build options that say how samples are looked up (cl/backproject.cl)."""
-    room_m = lookup_room(taps) / samples_per_m
-    return {
-        "PERMUTE": int(device.info.permute and layout.block_radius_m <= room_m),
-        "ONE_WINDOW": int(layout.item_radius_m <= room_m),
-    }
+    # Ranges to receivers that move change a little faster than pixels' places.
+    reach_m = lookup_room(taps) / samples_per_m / (1 + 2 * fastest(lines))
+    windows = layout.windows(reach_m)
+    return {"PERMUTE": int(device.info.permute and windows > 0), "WINDOWS": windows or STACK}
+
+
+def lookup_weights(coefficients: NDArray[np.float64], terms: int) -> NDArray[np.float32]:
+    """Return what the kernels take as weights: an interpolator's, and polynomials for phases."""
+    polynomials = phases.polynomials(terms).ravel()
+    return np.concatenate([coefficients.ravel().astype(np.float32), polynomials])
 
 
 def lookup_room(taps: int) -> float:
-    """Return how many samples a block may reach from its middle within the lookup window."""
-    return _WINDOW / 2 - 2 - taps / 2
+    """Return how many samples pixels may lie from the middle of the lookup's window.
+
+    A pixel's taps begin taps/2 samples before it; the window's middle is rounded.
+    """
+    return _WINDOW / 2 - 1.05 - taps / 2
 
 
 def channel_pitch(channels: int) -> int:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from clsas import interpolation, layout
+from clsas import interpolation, layout, phases
 from clsas.backproject import (
     Blocks,
     antennas_and_phase,
@@ -19,7 +19,7 @@ from clsas.backproject import (
 )
 from clsas.costs import Costs
 from clsas.device import Device
-from clsas.layout import PHASE_ERRORS, STACK, Tiles, phase_terms
+from clsas.layout import STACK, Tiles
 from clsas.view import View
 from clsas.window import INTERVALS
 
@@ -85,11 +85,11 @@ def expect(view: View, accuracy_db: float, device: Device) -> Exact:
         part_pixels, across = STACK * width, 1
         parts = -(-grid.size // part_pixels)
         radius_m = min(layout.largest_radius_m(cycles_per_m), lines.length * lines.range_step_m)
-    block_m = Tiles(grid, 16, width).block_radius_m if grid.is_planar else 0.0
+    block_m = Tiles(grid, 16, width).lookup_radius_m if grid.is_planar else 0.0
     interpolator = interpolation.choose(
         view.spectrum,
         accuracy_db,
-        other_error=math.hypot(error, PHASE_ERRORS[phase_terms(accuracy_db)]),
+        other_error=math.hypot(error, phases.error(phases.terms_within(accuracy_db))),
         pixels_per_sample=grid.size / lines.length,
         most_upsampling=most_upsampling(lines, block_m),
     )

@@ -8,14 +8,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from clsas import interpolation
+from clsas import interpolation, phases
 from clsas.costs import Costs
 from clsas.device import Device
 from clsas.errors import in_db, leaf_error, power
 from clsas.exact import Exact
 from clsas.filters import UPSAMPLING_SHARE, Filters, edges_gain
 from clsas.interpolation import PHASES
-from clsas.layout import PHASE_ERRORS, STACK, phase_terms
+from clsas.layout import STACK
 from clsas.plan import (
     CHUNK,
     GIVEN_BYTES,
@@ -124,7 +124,7 @@ def factorized(
     )
     tile = _tile(view, sides[-1], device) if nearest else sides[-1]
     if tolerance_db is not None:
-        error += PHASE_ERRORS[phase_terms(tolerance_db)] ** 2
+        error += phases.error(phases.terms_within(tolerance_db)) ** 2
     half_precision = False
     if upsampler is not None and tolerance_db is not None and device.info.half_precision:
         rounding = _half_rounding(view, reach)

@@ -6,7 +6,6 @@ the centres; within a part the device computes differences in float32.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -28,10 +27,6 @@ GEOMETRY_ERROR = 3.2e-5
 ROUNDING = 2.2e-7
 """Rms error of a phase, radians, per cycle over a part's radius: measured."""
 
-PHASE_ERRORS = {4: 8.9e-4, 5: 2.6e-5, 6: 5.0e-7}
-"""Relative rms errors of phases, by the terms of sine's and cosine's polynomials (cl/common.h)."""
-
-_PHASE_SHARE = 0.03  # of an image's error, as power
 _SIDES = (64, 32, 16)
 _AT_ONCE = 1024  # groups: what stays in a cache
 
@@ -85,10 +80,22 @@ class Tiles:
         return _radius_m(self.grid, *BLOCKS[self.width])
 
     @property
-    def item_radius_m(self) -> float:
-        """Largest distance of a pixel from the middle of all that its work-item computes."""
+    def lookup_radius_m(self) -> float:
+        """Largest distance of a pixel from where the samples of its block are looked up about."""
+        return self._around(1)
+
+    def windows(self, most_m: float) -> int:
+        """Return for how many parts of a work-item samples are looked up, 0 if not even for blocks.
+
+        No pixel is further than `most_m` from where they are looked up about.
+        """
+        parts = (n for n in (1, 2, STACK) if self._around(STACK // n) <= most_m)
+        return next(parts, 0)
+
+    def _around(self, blocks: int) -> float:
+        # The column in their middle is half a pixel beside it.
         rows, columns = BLOCKS[self.width]
-        return _radius_m(self.grid, STACK * rows, columns)
+        return _radius_m(self.grid, blocks * rows, columns + 1)
 
     def centres_m(self, parts: slice) -> NDArray[np.float64]:
         """Return the centres of some tiles, counted row by row, float64 [parts, 3]."""
@@ -157,9 +164,19 @@ class Groups:
         return float(np.sqrt(away.sum(axis=-1).max()))
 
     @property
-    def item_radius_m(self) -> float:
-        """Largest distance of a pixel from its work-item's centre, that of the group."""
-        return self.radius_m
+    def lookup_radius_m(self) -> float:
+        """Largest distance of a pixel from where the samples of its block are looked up about."""
+        return self.block_radius_m
+
+    def windows(self, most_m: float) -> int:
+        """Return for how many parts of a group samples are looked up, 0 if not even for blocks.
+
+        No pixel is further than `most_m` from where they are looked up about: of a whole group from
+        its centre, else of a block from the pixel in its middle.
+        """
+        if self.radius_m <= most_m:
+            return 1
+        return STACK if self.block_radius_m <= most_m else 0
 
     def centres_m(self, parts: slice) -> NDArray[np.float64]:
         """Return the centres of some groups, float64 [parts, 3]."""
@@ -175,12 +192,6 @@ class Groups:
 def allowed(accuracy_db: float) -> float:
     """Return what the geometry may add to an image's error: 6 % of its power, -90 dB at least."""
     return max(GEOMETRY_ERROR, 10 ** ((accuracy_db - 12) / 20))
-
-
-def phase_terms(error_db: float) -> int:
-    """Return how many terms sine and cosine need in an image of some relative rms error, dB."""
-    most = math.sqrt(_PHASE_SHARE) * 10 ** (error_db / 20)
-    return min((n for n, error in PHASE_ERRORS.items() if error <= most), default=max(PHASE_ERRORS))
 
 
 def lay_out(

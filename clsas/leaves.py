@@ -16,6 +16,7 @@ from clsas.backproject import (
     channel_pitch,
     float_pairs,
     lookup_options,
+    lookup_weights,
     normalising,
 )
 from clsas.device import Device, Slot
@@ -75,7 +76,9 @@ class Leaves:
         self.plan, self.surface, self.width = chosen, geometry.surface, device.info.width
         self.normalise = chosen.beam is not None and chosen.beam.normalise
         self.per_sine, self.beam = beam_arguments(device, chosen.beam, lines)
-        self.filter = device.upload((chosen.final.coefficients / gain).astype(np.float32))
+        self.weights = device.upload(
+            lookup_weights(chosen.final.coefficients / gain, chosen.phase_terms)
+        )
         # Where tile and leaf are one, every line is aligned on its centre.
         self.centred = chosen.tile == chosen.sides[-1]
         self.per_sample = geometry.cycles_per_m / geometry.samples_per_m
@@ -108,7 +111,9 @@ class Leaves:
             "CENTRED": int(self.centred),
             "HALF": int(self.half_precision),
             "PHASE_TERMS": chosen.phase_terms,
-        } | lookup_options(self.device, layout, self.geometry.samples_per_m, self.plan.final.taps)
+        } | lookup_options(
+            self.device, layout, self.lines, self.geometry.samples_per_m, self.plan.final.taps
+        )
 
     def fill(self, slot: Slot, sector: Sector) -> None:
         """Start copying to the device what it is told of a sector's leaves."""
@@ -249,7 +254,7 @@ class PlaneLeaves(Leaves):
             tables["ranges"],
             first_tile,
             self.per_sample,
-            self.filter,
+            self.weights,
             pixels,
             columns,
             device.upload(corners.astype(np.int32)),
@@ -432,7 +437,7 @@ class SurfaceLeaves(Leaves):
                 tables["ranges"],
                 groups.start - first,
                 self.per_sample,
-                self.filter,
+                self.weights,
                 buffers[0],
                 0,
                 tables["centres"],

@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from clsas import phases
 from clsas.grid import Grid
 from clsas.interpolation import PHASES, UPSAMPLING_TAPS, Interpolator, Resampling, Upsampler
-from clsas.layout import phase_terms
 from clsas.lines import RangeLines
 from clsas.window import BeamWindow
 
@@ -255,7 +255,7 @@ class Plan:
     @property
     def phase_terms(self) -> int:
         """Terms of the polynomials for sine and cosine of pixels' phases."""
-        return phase_terms(
+        return phases.terms_within(
             self.predicted_error_db if self.tolerance_db is None else self.tolerance_db
         )
 

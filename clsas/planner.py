@@ -8,7 +8,7 @@ from functools import partial
 
 import numpy as np
 
-from clsas import forecast, interpolation, validate
+from clsas import forecast, interpolation, phases, validate
 from clsas.costs import Costs
 from clsas.costs import load as load_costs
 from clsas.device import Device, open_device
@@ -18,7 +18,6 @@ from clsas.filters import ALIGN_TAPS, Choice, Filters, steering_spectrum
 from clsas.forecast import MARGIN_DB, Way
 from clsas.grid import Grid
 from clsas.interpolation import Interpolator
-from clsas.layout import PHASE_ERRORS, phase_terms
 from clsas.lines import RangeLines
 from clsas.plan import Plan
 from clsas.search import MOST_STAGES, Allowed, Tree, root_limits, search
@@ -226,7 +225,7 @@ def _fastest(
     beam_cycles = 0.0 if view.beam is None else _LEAST_BEAM_CYCLES
     needed = math.inf
     # The errors of filters and roots, and of phases.
-    besides = trimmed + 0.08 * allowed + PHASE_ERRORS[phase_terms(tolerance_db)] ** 2
+    besides = trimmed + 0.08 * allowed + phases.error(phases.terms_within(tolerance_db)) ** 2
     tree: Tree | None = None
     designed: tuple[Choice, float] | None = None
     leaf_pixels = 1
