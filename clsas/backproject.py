@@ -699,9 +699,10 @@ def lookup_weights(coefficients: NDArray[np.float64], terms: int) -> NDArray[np.
 def lookup_room(taps: int) -> float:
     """Return how many samples pixels may lie from the middle of the lookup's window.
 
-    A pixel's taps begin taps/2 samples before it; the window's middle is rounded.
+    Half of the taps lie beyond a pixel. That the places of both are rounded is made up for by the
+    window's middle being between two samples; a twentieth is for float32.
     """
-    return _WINDOW / 2 - 1.05 - taps / 2
+    return _WINDOW / 2 - taps / 2 - 0.05
 
 
 def channel_pitch(channels: int) -> int:

@@ -27,11 +27,11 @@ from cases import (
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from clsas.backproject import backproject, execute, prepare
+from clsas.backproject import backproject, execute, lookup_options, lookup_room, prepare
 from clsas.device import list_devices
 from clsas.grid import Grid
 from clsas.image import Image
-from clsas.layout import Groups, Tiles
+from clsas.layout import BLOCKS, STACK, Groups, Tiles
 from clsas.lines import RangeLines
 from clsas.quality import relative_error_db
 from clsas.reference import same_interpolator
@@ -87,6 +87,35 @@ def test_the_predicted_error_is_the_measured_one(taps, upsampling):
     preparation = prepare(*made(thesis), taps=taps, upsampling=upsampling)
     measured = true_error_db(thesis, execute(preparation))
     assert measured == pytest.approx(preparation.interpolator.error_db, abs=1.5)
+
+
+@pytest.mark.parametrize("mirrored", [False, True])
+@pytest.mark.parametrize("parts", [1, 2, STACK])
+@pytest.mark.parametrize("taps", [2, 4, 6, 8])
+def test_samples_are_looked_up_wherever_pixels_lie(device, taps, parts, mirrored):
+    """The furthest pixel of a part of a work-item lies in range, just within a window."""
+    track = APERTURE[len(APERTURE) // 2 :][:16]
+    upsampling, nowhere = 8.0, patch(1.3, 41)
+    some = prepare(
+        thesis_lines(nowhere, track), nowhere, device=device, taps=taps, upsampling=upsampling
+    )
+    block_rows, block_columns = BLOCKS[16]
+    away = np.array([(STACK // parts * block_rows - 1) / 2, block_columns / 2])
+    pitch_m = 0.999 * lookup_room(taps) / some.samples_per_m / np.linalg.norm(away)
+    down, across = away / np.linalg.norm(away)
+    row_m, column_m = pitch_m * np.array([[across, down, 0], [-down, across, 0]])
+    if mirrored:
+        row_m, column_m = pitch_m * np.array([[across, -down, 0], [down, across, 0]])
+    grid = Grid.oriented([track[8, 0], 42, 0], row_m, column_m, (32, 8))
+    lines = thesis_lines(grid, track)
+    preparation = prepare(lines, grid, device=device, taps=taps, upsampling=upsampling)
+    layout = preparation.layout
+    assert isinstance(layout, Tiles)
+    options = lookup_options(device, layout, lines, preparation.samples_per_m, taps)
+    if device.info.permute:
+        assert (options["PERMUTE"], options["WINDOWS"]) == (1, parts)
+    wanted = same_interpolator(preparation, grid.positions_m())
+    assert relative_error_db(execute(preparation), wanted) <= -80
 
 
 @pytest.mark.parametrize("channels", [1, 15, 16, 17, 511, 513])

@@ -168,3 +168,20 @@ def test_a_plane_without_a_carrier_is_laid_out_too():
     assert layout.parts >= 1
     heights = dataclasses.replace(patch(0, 40), height_m=np.zeros((33, 40)))
     assert np.isfinite(lay_out(heights, TRACK, 0.0, 16).radius_m)
+
+
+@pytest.mark.parametrize("width", WIDTHS)
+def test_no_pixel_is_further_than_allowed_from_where_its_samples_are_looked_up(width):
+    grid = Grid.oriented([0, 40, 0], [0.001, 0.004, 0.003], [0.004, 0.0025, -0.001], (64, 64))
+    tiles, (rows, columns) = Tiles(grid, 64, width), BLOCKS[width]
+    item = np.arange(STACK * rows * columns).reshape(STACK * rows, columns)
+    row, column = np.divmod(item, columns)
+    place_m = row[..., None] * grid.row_step_m + column[..., None] * grid.column_step_m
+    found = set()
+    for most_m in np.geomspace(1e-4, 0.2, 60):
+        parts = tiles.windows(most_m)
+        found.add(parts)
+        for part in np.split(place_m, parts) if parts else []:
+            middle_m = part[:, max(columns // 2 - 1, 0)].mean(axis=0)
+            assert np.linalg.norm(part - middle_m, axis=-1).max() <= most_m * (1 + 1e-9)
+    assert found == {0, 1, 2, STACK}
