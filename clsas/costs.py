@@ -50,21 +50,21 @@ class Costs:
 
     call_ns: float = 1.2e7
     upsampled_sample_ns: float = 8.0
-    filtered_sample_ns: float = 1.7
+    filtered_sample_ns: float = 1.3
     reference_ns: float = 100.0
-    batch_ns: float = 1.5e5
+    batch_ns: float = 1.0e5
     subimage_ns: float = 300.0
-    sample_ns: float = 0.18
-    sample_tap_ns: float = 0.0225
+    sample_ns: float = 0.02
+    sample_tap_ns: float = 0.034
     given_sample_ns: float = 0.3
-    leaf_channel_ns: float = 30.0
-    leaf_ns: float = 0.7
-    leaf_point_ns: float = 1.2
+    leaf_channel_ns: float = 22.0
+    leaf_ns: float = 0.46
+    leaf_point_ns: float = 0.9
     group_ns: float = 150.0
     part_ns: float = 30.0
-    pixel_ns: float = 0.58
-    point_ns: float = 0.9
-    beam_ns: float = 0.17
+    pixel_ns: float = 0.5
+    point_ns: float = 0.78
+    beam_ns: float = 0.13
 
     def __post_init__(self) -> None:
         """Check every cost."""

@@ -6,6 +6,7 @@ the centres; within a part the device computes differences in float32.
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 
 import numpy as np
@@ -149,19 +150,17 @@ class Groups:
         """Slots of a group."""
         return self.index.shape[1]
 
-    @property
+    @functools.cached_property
     def radius_m(self) -> float:
         """Largest distance of a pixel from its group's centre."""
-        return float(np.linalg.norm(self.offset_m, axis=-1).max())
+        return _longest(self.offset_m)
 
-    @property
+    @functools.cached_property
     def block_radius_m(self) -> float:
         """Largest distance of a pixel from the one in the middle of its work-item's block."""
         blocks = self.offset_m.reshape(-1, self.width, 3)
         middle = 5 if self.width == 16 else 0  # MIDDLE in cl/backproject.cl
-        away = blocks - blocks[:, middle, None]
-        away *= away
-        return float(np.sqrt(away.sum(axis=-1).max()))
+        return _longest(blocks - blocks[:, middle, None])
 
     @property
     def lookup_radius_m(self) -> float:
@@ -376,6 +375,11 @@ def _neighbours(grid: Grid, positions: NDArray[np.float64], width: int) -> NDArr
     index = np.pad(index, [(0, -grid.shape[0] % rows), (0, -grid.shape[1] % columns)], mode="edge")
     down, across = index.shape[0] // rows, index.shape[1] // columns
     return index.reshape(down, rows, across, columns).swapaxes(1, 2).ravel()
+
+
+def _longest(vectors: NDArray[np.floating]) -> float:
+    """Return the length of the longest of vectors [..., 3]."""
+    return float(np.sqrt(np.einsum("...i,...i->...", vectors, vectors).max()))
 
 
 def _radius_m(grid: Grid, rows: int, columns: int) -> float:
