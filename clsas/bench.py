@@ -200,7 +200,11 @@ def run(
             progress(repeat + 1, repeats + 1)
     del seconds[0], kernel_seconds[0]
     pairs = lines.channels * grid.size
-    flops = flops_per_pair(preparation.interpolator.taps) * pairs / min(kernel_seconds)
+    flops = (
+        flops_per_pair(preparation.interpolator.taps, preparation.phase_terms)
+        * pairs
+        / min(kernel_seconds)
+    )
     return {
         "case": case,
         "device": device.info.label,
@@ -403,14 +407,14 @@ def _statistics(seconds: list[float]) -> dict[str, float]:
     return {"median": statistics.median(seconds), "min": min(seconds), "max": max(seconds)}
 
 
-def flops_per_pair(taps: int) -> int:
+def flops_per_pair(taps: int, phase_terms: int) -> int:
     """Return the floating-point operations of cl/backproject.cl per pixel and channel.
 
-    Counted in its source: 13 for the position, 25 for sine and cosine, 8 to turn and add, and per
-    pair of taps 4 (taps/2 - 1) + 4 for the weights and 8 to apply them.
+    Counted in its source: 13 for the position, 7 and 4 (phase_terms - 1) for sine and cosine, 8 to
+    turn and add, and per pair of taps 4 (taps/2 - 1) + 4 for the weights and 8 to apply them.
     """
     pairs = taps // 2
-    return 46 + pairs * (4 * (pairs - 1) + 12)
+    return 28 + 4 * (phase_terms - 1) + pairs * (4 * (pairs - 1) + 12)
 
 
 def peak_flops(device: Device) -> float:
