@@ -229,9 +229,9 @@ def lay_out(
     A tile is expanded to third order, so that its largest error is that of the fourth:
     r^4/(8 R^3) at most, r its half diagonal and R the distance of the nearest antenna. The rms
     over a tile's pixels and directions is 0.15 of it. What receivers' motion does to the third
-    order is left out too, 0.2 of r^3/R^2 times the speed ratio. With a window the aspect angle's sine is
-    expanded to third order too, to a millionth of the window's width (float32 holds no less than
-    1e-7), and a block, where the window is a cubic, must be small against it. Where even the
+    order is left out too, 0.2 of r^3/R^2 times the speed ratio. With a window the aspect angle's
+    sine is expanded to third order too, to a millionth of the window's width (float32 holds no less
+    than 1e-7), and a block, where the window is a cubic, must be small against it. Where even the
     smallest tile is too large, near the antennas, and off a plane, pixels go into groups, which
     expand nothing.
     """
