@@ -57,8 +57,8 @@ class Costs:
     sample_ns: float = 0.02
     sample_tap_ns: float = 0.034
     given_sample_ns: float = 0.3
-    leaf_channel_ns: float = 22.0
-    leaf_ns: float = 0.46
+    leaf_channel_ns: float = 11.0
+    leaf_ns: float = 0.55
     leaf_point_ns: float = 0.9
     group_ns: float = 150.0
     part_ns: float = 30.0

@@ -24,8 +24,10 @@ OPTIONS = {
     "TILE_ROWS": 16,
     "TILE_COLUMNS": 16,
     "PERMUTE": 0,
+    "WINDOWS": 1,
     "BISTATIC": 0,
     "MOVING": 0,
+    "PHASE_TERMS": 6,
 }
 
 
