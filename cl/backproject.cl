@@ -12,8 +12,8 @@
  *   TILE_ROWS, TILE_COLUMNS  pixels of a tile, multiples of 4 blocks' rows and of a block's columns.
  *   TAPS       2, 4, 6 or 8 samples per interpolation.
  *   PERMUTE    fetch samples from a window of 32 per component held in two AVX-512 registers, five
- *              times as fast as a gather. The host asks for it where all lanes' samples lie
- *              within 32, and the compiler decides whether it can (WIDTH 16 only).
+ *              times as fast as a gather. The host asks for it where the samples of all lanes of
+ *              a block lie within 32, and the compiler decides whether it can (WIDTH 16 only).
  *   WINDOWS    how many such windows a work-item's four blocks take: 1, 2 (tiles only) or 4.
  *   BISTATIC   receiver positions differ from the transmitter's.
  *   MOVING     receivers move at `velocity` (in units of the sound speed) during the echo's flight.

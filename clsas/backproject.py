@@ -203,7 +203,7 @@ def prepare(
         upsampling=upsampling,
         other_error=math.hypot(geometry_error, phases.error(terms)),
         pixels_per_sample=grid.size / lines.length,
-        most_upsampling=most_upsampling(lines, layout.lookup_radius_m),
+        most_upsampling=most_upsampling(device, lines, layout.lookup_radius_m),
     )
     resampling = interpolation.resampling(lines.length, interpolator, spectrum)
     one_cubic = False
@@ -233,9 +233,12 @@ def antennas_and_phase(
     return antennas_m, math.hypot(of_phase, 0.3 / lines.range_step_m)
 
 
-def most_upsampling(lines: RangeLines, lookup_radius_m: float) -> float:
-    """Return the upsampling beyond which a block does not fit the lookup's window."""
-    return lookup_room(max(interpolation.TAPS)) * lines.range_step_m / max(lookup_radius_m, 1e-30)
+def most_upsampling(device: Device, lines: RangeLines, lookup_radius_m: float) -> float:
+    """Return the upsampling beyond which a block does not fit the lookup's window, if it has one."""
+    if not device.info.permute:
+        return math.inf
+    reach_m = lookup_radius_m * (1 + 2 * fastest(lines))
+    return lookup_room(max(interpolation.TAPS)) * lines.range_step_m / max(reach_m, 1e-30)
 
 
 def execute(
@@ -686,8 +689,8 @@ def lookup_options(
     """Return the build options that say how samples are looked up (cl/backproject.cl)."""
     # Ranges to receivers that move change a little faster than pixels' places.
     reach_m = lookup_room(taps) / samples_per_m / (1 + 2 * fastest(lines))
-    windows = layout.windows(reach_m)
-    return {"PERMUTE": int(device.info.permute and windows > 0), "WINDOWS": windows or STACK}
+    windows = layout.windows(reach_m) if device.info.permute else 0
+    return {"PERMUTE": int(windows > 0), "WINDOWS": windows or 1}
 
 
 def lookup_weights(coefficients: NDArray[np.float64], terms: int) -> NDArray[np.float32]:

@@ -56,7 +56,7 @@ class Costs:
     subimage_ns: float = 300.0
     sample_ns: float = 0.02
     sample_tap_ns: float = 0.034
-    given_sample_ns: float = 0.3
+    given_sample_ns: float = 0.25
     leaf_channel_ns: float = 11.0
     leaf_ns: float = 0.55
     leaf_point_ns: float = 0.9

@@ -91,7 +91,7 @@ def expect(view: View, accuracy_db: float, device: Device) -> Exact:
         accuracy_db,
         other_error=math.hypot(error, phases.error(phases.terms_within(accuracy_db))),
         pixels_per_sample=grid.size / lines.length,
-        most_upsampling=most_upsampling(lines, block_m),
+        most_upsampling=most_upsampling(device, lines, block_m),
     )
     resampling = interpolation.resampling(lines.length, interpolator, view.spectrum)
     share = most = 1.0

@@ -176,7 +176,7 @@ def factorized(
         limits=view.limits,
         crowding=way.crowding,
         beam_cycles=way.beam_cycles,
-        most_channels=tuple(math.ceil(_ROOM * most) for _, most in most_channels),
+        most_channels=tuple(math.ceil(most) for _, most in most_channels),
     )
 
 
@@ -207,9 +207,12 @@ def _power_of_filters(way: Way) -> float:
 
 
 def _most_channels(view: View, way: Way, stages: Sequence[Stage]) -> list[tuple[float, float]]:
-    """Return how many virtual channels the whole aperture has, and who sees most, by stage."""
+    """Return how many virtual channels the whole aperture has by stage, and at most a subimage.
+
+    The latter with some room, since buffers have it from the beginning.
+    """
     if way.nearest:
-        return [(stage.channels, stage.channels) for stage in stages[:-1]]
+        return [(stage.channels, _ROOM * stage.channels) for stage in stages[:-1]]
     taps, density, found = way.filters.aperture.taps, 2 * way.filters.aperture.upsampling, []
     for level, side in enumerate(way.sides):
         seen = view.seen(side)
@@ -221,7 +224,7 @@ def _most_channels(view: View, way: Way, stages: Sequence[Stage]) -> list[tuple[
             if level == len(way.sides) - 1:
                 most += density * way.beam_cycles * view.cycles(view.beam_rates, seen, most=True)
             most *= 1 + OF_BEAM
-        found.append((everywhere, most))
+        found.append((everywhere, _ROOM * most))
     return found
 
 

@@ -30,7 +30,8 @@ def same_interpolator(
 ) -> NDArray[np.complex128]:
     """Return the image of a preparation at some points, as the device forms it but in float64.
 
-    What the device's image differs by is its rounding and its expansion of the geometry.
+    What the device's image differs by is its rounding, its expansion of the geometry, and its
+    polynomials for sine and cosine where these are short (`clsas.phases`).
 
     Parameters
     ----------
