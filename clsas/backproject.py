@@ -234,7 +234,7 @@ def antennas_and_phase(
 
 
 def most_upsampling(device: Device, lines: RangeLines, lookup_radius_m: float) -> float:
-    """Return the upsampling beyond which a block does not fit the lookup's window, if it has one."""
+    """Return the upsampling beyond which a block does not fit the lookup's window, if any."""
     if not device.info.permute:
         return math.inf
     reach_m = lookup_radius_m * (1 + 2 * fastest(lines))
