@@ -546,7 +546,6 @@ __kernel void backproject_tiles(__global const held *samples, int pitch,
         const float q_0 = term[9 * channel_pitch];
 #if ONE_CUBIC
         INTERVAL(float, q_0, nearest)
-        const int interval = ROUNDED_INT(nearest + ROUNDER);
 #else
         /* The place in the beam and its slopes at the four blocks' middles. */
         const float4 place = q_0 + CUBIC(of_place, middle_i, middle_j);
@@ -560,7 +559,7 @@ __kernel void backproject_tiles(__global const held *samples, int pitch,
         if (!(seen.s0 | seen.s1 | seen.s2 | seen.s3))
             continue;
         INTERVAL(float4, place, nearest_place)
-        const Four nearest_of = {nearest_place}, interval_of = {nearest_place + ROUNDER};
+        const Four nearest_of = {nearest_place};
 #endif
         const vfloat q0 = q_0 + CUBIC_0(of_place, i), q1 = CUBIC_1(of_place, i), q2 = CUBIC_2(of_place, i);
         const float q3 = CUBIC_3(of_place);
@@ -589,9 +588,8 @@ EACH_BLOCK
 #if BEAM
 #if !ONE_CUBIC
                 const float nearest = nearest_of.of[block];
-                const int interval = ROUNDED_INT(interval_of.of[block]);
 #endif
-                __global const float *cubic = beam + 4 * interval;
+                __global const float *cubic = beam + 4 * ROUNDED_INT(nearest + ROUNDER);
                 const vfloat q = q0 + j[block] * (q1 + j[block] * (q2 + j[block] * q3));
                 const vfloat weight = beam_weight(cubic[0], cubic[1], cubic[2], cubic[3], q - nearest, q, low, high);
                 sine *= weight;

@@ -99,12 +99,12 @@ class Leaves:
             one_cubic = error**2 < _SHARE * power(chosen.predicted_error_db)
         return {
             "WIDTH": self.width,
-            "TAPS": self.plan.final.taps,
-            "TILE_ROWS": self.plan.tile[0],
-            "TILE_COLUMNS": self.plan.tile[1],
+            "TAPS": chosen.final.taps,
+            "TILE_ROWS": chosen.tile[0],
+            "TILE_COLUMNS": chosen.tile[1],
             "BISTATIC": 0,
             "MOVING": 0,
-            "BEAM": 0 if self.plan.beam is None else INTERVALS,
+            "BEAM": 0 if chosen.beam is None else INTERVALS,
             "ONE_CUBIC": int(one_cubic),
             "NORMALISE": int(self.normalise),
             "ALONE": 1,
@@ -112,7 +112,7 @@ class Leaves:
             "HALF": int(self.half_precision),
             "PHASE_TERMS": chosen.phase_terms,
         } | lookup_options(
-            self.device, layout, self.lines, self.geometry.samples_per_m, self.plan.final.taps
+            self.device, layout, self.lines, self.geometry.samples_per_m, chosen.final.taps
         )
 
     def fill(self, slot: Slot, sector: Sector) -> None:

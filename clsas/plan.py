@@ -191,12 +191,11 @@ class Plan:
         fits = isinstance(self.half_precision, bool)
         fits = fits and not (self.half_precision and self.upsampler is None)
         check(fits, "half_precision", "true or false, false without an upsampler")
-        fits = isinstance(self.half_lengths, tuple) and len(self.half_lengths) == levels
-        fits = fits and all(whole(n, 0) for n in self.half_lengths)
-        check(fits, "half_lengths", "a whole number for every stage")
-        fits = isinstance(self.most_channels, tuple) and len(self.most_channels) == levels
-        fits = fits and all(whole(n, 0) for n in self.most_channels)
-        check(fits, "most_channels", "a whole number for every stage")
+        for name in ("half_lengths", "most_channels"):
+            counts = getattr(self, name)
+            fits = isinstance(counts, tuple) and len(counts) == levels
+            fits = fits and all(whole(n, 0) for n in counts)
+            check(fits, name, "a whole number for every stage")
         for name, most in (
             ("highest_cycles_per_m", 1e9),
             ("beam_cycles", 1e3),
