@@ -11,9 +11,9 @@
  *              pixels, and a work-item computes four such blocks, one below the other.
  *   TILE_ROWS, TILE_COLUMNS  pixels of a tile, multiples of 4 blocks' rows and of a block's columns.
  *   TAPS       2, 4, 6 or 8 samples per interpolation.
- *   PERMUTE    fetch samples from a window of 32 per component held in two AVX-512 registers, five
- *              times as fast as a gather. The host asks for it where the samples of all lanes of
- *              a block lie within 32, and the compiler decides whether it can (WIDTH 16 only).
+ *   PERMUTE    fetch samples from a window of 2 WIDTH per component held in two registers of AVX2 or AVX-512, with
+ *              these five times as fast as a gather. The host asks for it where the samples of all lanes of a block
+ *              lie within the window, and the compiler decides whether it can (common.h).
  *   WINDOWS    how many such windows a work-item's four blocks take: 1, 2 (tiles only) or 4.
  *   BISTATIC   receiver positions differ from the transmitter's.
  *   MOVING     receivers move at `velocity` (in units of the sound speed) during the echo's flight.
@@ -73,7 +73,9 @@
 #define LANE_COLUMNS 0.0f
 #define LANE_ROWS 0.0f
 #endif
-#define MIDDLE (WIDTH == 16 ? 5 : 0) /* a lane in a block's middle */
+/* A lane in a block's middle, and one in its middle column. */
+#define MIDDLE ((BLOCK_ROWS - 1) / 2 * BLOCK_COLUMNS + MIDDLE_COLUMN)
+#define MIDDLE_COLUMN ((BLOCK_COLUMNS - 1) / 2)
 #define STACK 4
 #define ITEM_ROWS (BLOCK_ROWS * STACK)
 #define BLOCKS_ACROSS (TILE_COLUMNS / BLOCK_COLUMNS)
@@ -82,7 +84,7 @@
 #define MAGNITUDE(v) as_float4(as_int4(v) & 0x7fffffff)
 
 /* Where the samples of a line are taken from: those at `offset` and after, counted from `line`; no number leads out
- * of the line. With WINDOW 32 samples in registers, those about a place t as of interpolate(). */
+ * of the line. With WINDOW 2 WIDTH samples in registers, those about a place t as of interpolate(). */
 typedef struct {
 #ifdef WINDOW
     vfloat re_low, re_high, im_low, im_high;
@@ -97,9 +99,9 @@ typedef struct {
 INLINE Source source(__global const held *line, int pitch, int nearest, float t)
 {
     const int whole = ROUNDED_INT(t + ROUNDER);
-    __global const held *window = line + KEEP(nearest + whole - 15, 0, pitch - 32);
-    return (Source){LOAD_HELD(window), LOAD_HELD(window + 16), LOAD_HELD(window + pitch), LOAD_HELD(window + pitch + 16),
-                    16 - TAPS / 2 - whole};
+    __global const held *window = line + KEEP(nearest + whole - (WIDTH - 1), 0, pitch - 2 * WIDTH);
+    return (Source){LOAD_HELD(window), LOAD_HELD(window + WIDTH), LOAD_HELD(window + pitch), LOAD_HELD(window + pitch + WIDTH),
+                    WIDTH - TAPS / 2 - whole};
 }
 #else
 #define source(line, pitch, nearest, t) ((Source){line, pitch, (nearest) + 1 - TAPS / 2})
@@ -140,7 +142,7 @@ INLINE void interpolate(const Source *from, vfloat t, __global const float *weig
 #define IM(k) im_taps[k]
 #endif
 #else
-    /* The permutation uses an index's lowest five bits only: it cannot leave the window. */
+    /* The permutation uses an index's lowest bits only: it cannot leave the window. */
     const vint index = AS_VINT(shifted) + from->offset;
 #define RE(k) PICK(from->re_low, from->re_high, index + (k))
 #define IM(k) PICK(from->im_low, from->im_high, index + (k))
@@ -227,8 +229,7 @@ typedef union {
     float of[4];
 } Four;
 
-/* A lane in a block's middle column. */
-#define ONE(v) ((const float *)&(v))[WIDTH == 16 ? 1 : 0]
+#define LANE(v, number) ((const float *)&(v))[number]
 
 #ifdef WINDOW
 #define PER_WINDOW (STACK / WINDOWS)
@@ -240,7 +241,7 @@ typedef union {
 
 /* What weights are in memory stays there: kept in registers there would be none left, and a product may take one factor
  * from memory. */
-#ifdef AVX512
+#if AVX == 512
 #define FRESH __asm__ volatile("" : : : "memory")
 #else
 #define FRESH
@@ -577,7 +578,9 @@ EACH_WINDOW
         for (int window = 0; window < WINDOWS; window++) {
             /* About the middle of its blocks, in a column in their middle. */
             const float row = middle_j.s0 + BLOCK_ROWS * (0.5f * (PER_WINDOW - 1) + window * PER_WINDOW);
-            const Source from = source(line, pitch, nearest_sample, ONE(t0) + row * (ONE(t1) + row * (ONE(t2) + row * t3)));
+            const float at = LANE(t0, MIDDLE_COLUMN)
+                + row * (LANE(t1, MIDDLE_COLUMN) + row * (LANE(t2, MIDDLE_COLUMN) + row * t3));
+            const Source from = source(line, pitch, nearest_sample, at);
 EACH_BLOCK
             for (int block = window * PER_WINDOW; block < (window + 1) * PER_WINDOW; block++) {
                 FRESH;
@@ -728,7 +731,7 @@ __kernel void backproject_points(__global const held *samples, int pitch,
 #endif
             const vfloat t = move + (fraction - 0.5f);
 #if WINDOWS > 1
-            const Source from = source(line, pitch, nearest_sample, ((const float *)&t)[MIDDLE]);
+            const Source from = source(line, pitch, nearest_sample, LANE(t, MIDDLE));
 #endif
             vfloat line_re, line_im, sine, cosine;
             interpolate(&from, t, weights, &line_re, &line_im);

@@ -94,22 +94,35 @@ INLINE void filter_weights(__global const float *filter, const int taps, vfloat 
 /* clamp() that is no call: one in an inner loop would spill every register. */
 #define KEEP(x, low, high) ((x) < (low) ? (low) : (x) > (high) ? (high) : (x))
 
-#if defined(__clang__) && defined(__AVX512F__) && WIDTH == 16
-#define AVX512
-typedef float m512 __attribute__((vector_size(64)));
-typedef int m512i __attribute__((vector_size(64)));
-typedef short m256i __attribute__((vector_size(32)));
+/* Where vectors of WIDTH floats are registers of an x86 processor: their bits. */
+#if defined(__clang__) && WIDTH == 16 && defined(__AVX512F__)
+#define AVX 512
+#elif defined(__clang__) && WIDTH == 8 && defined(__AVX2__) && defined(__F16C__)
+#define AVX 256
+#endif
+#ifdef AVX
+typedef float avx_float __attribute__((vector_size(4 * WIDTH)));
+typedef int avx_int __attribute__((vector_size(4 * WIDTH)));
+typedef short avx_half __attribute__((vector_size(2 * WIDTH)));
 #endif
 
-/* With the build option PERMUTE, where the compiler can: the elements of two vectors of 16 by their indices, of which
- * only the lowest five bits count. */
-#if PERMUTE && defined(AVX512)
+/* With the build option PERMUTE, where the compiler can: the elements of two vectors by their indices, of which only
+ * the lowest bits count that number them. */
+#if PERMUTE && defined(AVX)
 #define WINDOW
-#define PICK(low, high, index)                                                                     \
-    __builtin_astype(                                                                              \
-        __builtin_ia32_vpermi2varps512(__builtin_astype(low, m512), __builtin_astype(index, m512i), \
-                                       __builtin_astype(high, m512)),                              \
-        vfloat)
+INLINE vfloat PICK(vfloat low, vfloat high, vint index)
+{
+    const avx_float a = __builtin_astype(low, avx_float), b = __builtin_astype(high, avx_float);
+    const avx_int at = __builtin_astype(index, avx_int);
+#if AVX == 512
+    return __builtin_astype(__builtin_ia32_vpermi2varps512(a, at, b), vfloat);
+#else
+    /* The sign of the last says of which of the two. */
+    return __builtin_astype(__builtin_ia32_blendvps256(__builtin_ia32_permvarsf256(a, at),
+                                                       __builtin_ia32_permvarsf256(b, at), (avx_float)(at << 28)),
+                            vfloat);
+#endif
+}
 #endif
 
 /* The samples of lines as kernels hand them on: `held` is float or, with the build option HALF, half, which takes
@@ -127,22 +140,30 @@ typedef half held;
 #if WIDTH == 1
 #define LOAD_HELD(p) vload_half(0, p)
 #define STORE_HELD(value, p) vstore_half(value, 0, p)
-#elif defined(AVX512)
-/* vload_half16() is two conversions of 8 here. */
-typedef ushort half_anywhere __attribute__((ext_vector_type(16), aligned(2)));
+#elif defined(AVX)
+/* Those of the language are conversions of 8, or calls. */
+typedef ushort half_anywhere __attribute__((ext_vector_type(WIDTH), aligned(2)));
+#define TO_NEAREST 0
 INLINE vfloat LOAD_HELD(__global const half *p)
 {
-    const m256i halves = __builtin_astype(*(__global const half_anywhere *)p, m256i);
-    const m512 none = __builtin_astype((vfloat)0.0f, m512);
+    const avx_half halves = __builtin_astype(*(__global const half_anywhere *)p, avx_half);
+#if AVX == 512
+    const avx_float none = __builtin_astype((vfloat)0.0f, avx_float);
     return __builtin_astype(__builtin_ia32_vcvtph2ps512_mask(halves, none, (ushort)-1, 4), vfloat);
+#else
+    return __builtin_astype(__builtin_ia32_vcvtph2ps256(halves), vfloat);
+#endif
 }
 INLINE void STORE_HELD(vfloat value, __global half *p)
 {
-    const m256i none = __builtin_astype((ushort16)0, m256i);
-    const int to_nearest = 0;
-    *(__global half_anywhere *)p = __builtin_astype(
-        __builtin_ia32_vcvtps2ph512_mask(__builtin_astype(value, m512), to_nearest, none, (ushort)-1),
-        half_anywhere);
+    const avx_float floats = __builtin_astype(value, avx_float);
+#if AVX == 512
+    const avx_half none = __builtin_astype((ushort16)0, avx_half);
+    const avx_half halves = __builtin_ia32_vcvtps2ph512_mask(floats, TO_NEAREST, none, (ushort)-1);
+#else
+    const avx_half halves = __builtin_ia32_vcvtps2ph256(floats, TO_NEAREST);
+#endif
+    *(__global half_anywhere *)p = __builtin_astype(halves, half_anywhere);
 }
 #else
 #define LOAD_HELD(p) JOIN(vload_half, WIDTH)(0, p)

@@ -9,7 +9,7 @@
  *   WIDTH    lanes: consecutive samples of y (common.h).
  *   TAPS     of the filters, even.
  *   PHASES   a multiple of WIDTH.
- *   PERMUTE  take lanes' samples from two registers (WIDTH 16 with AVX-512 only; the compiler decides whether it can).
+ *   PERMUTE  take lanes' samples from two registers (where the compiler can: common.h).
  *   TURN     0: turn is 0.
  *   HALF     1: y is of half in place of float (common.h).
  *
@@ -26,9 +26,15 @@
  */
 
 #ifdef WINDOW
+#if WIDTH == 16
 #define INT_LANES ((vint)(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15))
 #define EVEN 0, 2, 4, 6, 8, 10, 12, 14, 16, 18, 20, 22, 24, 26, 28, 30
 #define ODD 1, 3, 5, 7, 9, 11, 13, 15, 17, 19, 21, 23, 25, 27, 29, 31
+#else
+#define INT_LANES ((vint)(0, 1, 2, 3, 4, 5, 6, 7))
+#define EVEN 0, 2, 4, 6, 8, 10, 12, 14
+#define ODD 1, 3, 5, 7, 9, 11, 13, 15
+#endif
 #endif
 
 /* The sample of x at an index, turned. */

@@ -28,7 +28,6 @@ from clsas.window import INTERVALS, BeamWindow, channel_ranges, sines
 BEST_ACCURACY_DB = -85.0
 """The best accuracy that may be asked for: what float32 allows."""
 
-_WINDOW = 32  # samples that the permuting lookup holds in registers
 _EXPANSION_TERMS = 9  # coefficients per (tile, channel)
 _BEAM_TERMS = 10  # further ones with a beam
 _LARGEST_DISTANCE_M = 1e9
@@ -238,7 +237,8 @@ def most_upsampling(device: Device, lines: RangeLines, lookup_radius_m: float) -
     if not device.info.permute:
         return math.inf
     reach_m = lookup_radius_m * (1 + 2 * fastest(lines))
-    return lookup_room(max(interpolation.TAPS)) * lines.range_step_m / max(reach_m, 1e-30)
+    room = lookup_room(max(interpolation.TAPS), device.info.width)
+    return room * lines.range_step_m / max(reach_m, 1e-30)
 
 
 def execute(
@@ -339,7 +339,7 @@ def blocks_of(
     """
     # Zeros around a line on the device: a part may reach beyond its end by a radius.
     reach = math.ceil(radius_m * resampling.samples_per_m(lines) * 1.1) + taps
-    margin = 2 * reach + _WINDOW
+    margin = 2 * reach + 2 * device.info.width
     pitch = _round_up(resampling.length + 2 * margin, 16)
     if pitch % 256 == 0:  # lines at equal places in cache sets would evict each other
         pitch += 16
@@ -688,7 +688,7 @@ def lookup_options(
 ) -> dict[str, int]:
     """Return the build options that say how samples are looked up (cl/backproject.cl)."""
     # Ranges to receivers that move change a little faster than pixels' places.
-    reach_m = lookup_room(taps) / samples_per_m / (1 + 2 * fastest(lines))
+    reach_m = lookup_room(taps, device.info.width) / samples_per_m / (1 + 2 * fastest(lines))
     windows = layout.windows(reach_m) if device.info.permute else 0
     return {"PERMUTE": int(windows > 0), "WINDOWS": windows or 1}
 
@@ -699,13 +699,14 @@ def lookup_weights(coefficients: NDArray[np.float64], terms: int) -> NDArray[np.
     return np.concatenate([coefficients.ravel().astype(np.float32), polynomials])
 
 
-def lookup_room(taps: int) -> float:
+def lookup_room(taps: int, width: int) -> float:
     """Return how many samples pixels may lie from the middle of the lookup's window.
 
-    Half of the taps lie beyond a pixel. That the places of both are rounded is made up for by the
-    window's middle being between two samples; a twentieth is for float32.
+    It holds two vectors of samples. Half of the taps lie beyond a pixel. That the places of both
+    are rounded is made up for by the window's middle being between two samples; a twentieth is for
+    float32.
     """
-    return _WINDOW / 2 - taps / 2 - 0.05
+    return width - taps / 2 - 0.05
 
 
 def channel_pitch(channels: int) -> int:

@@ -58,7 +58,7 @@ class DeviceInfo:
         Float lanes per work-item that clsas uses: 1 on GPUs, and where the driver's compiler
         vectorises across work-items itself.
     permute : bool
-        Whether kernels may look samples up in AVX-512 registers.
+        Whether kernels may look samples up in registers, of AVX2 or AVX-512.
     """
 
     index: int
@@ -77,7 +77,7 @@ class DeviceInfo:
     def half_precision(self) -> bool:
         """Whether kernels take half-precision numbers in and out as fast as others.
 
-        Of CPUs those with AVX-512 do, as they permute.
+        Of CPUs those do that permute.
         """
         return self.kind == "gpu" or self.permute
 
@@ -314,7 +314,7 @@ def _describe(index: int, device: cl.Device) -> DeviceInfo:
     # Intel's runtime vectorises across work-items, faster than through explicit vectors.
     if is_cpu and not platform.startswith("Intel"):
         native = device.native_vector_width_float
-        width = 16 if native >= 16 else 8 if native >= 8 else 4
+        width = _compiled_lanes(device) if native >= 16 else 8 if native >= 8 else 4
     return DeviceInfo(
         index=index,
         platform=platform,
@@ -326,8 +326,19 @@ def _describe(index: int, device: cl.Device) -> DeviceInfo:
         max_buffer_bytes=device.max_mem_alloc_size,
         fp64="cl_khr_fp64" in device.extensions.split(),
         width=width,
-        permute=width == 16,
+        permute=width >= 8,
     )
+
+
+@functools.cache
+def _compiled_lanes(device: cl.Device) -> int:
+    """Return the floats of its compiler's vectors, where a CPU itself has vectors of 16."""
+    program = cl.Program(cl.Context([device]), kernel_source("lanes.cl"))
+    try:
+        kernel = program.build().lanes
+    except cl.RuntimeError:  # a driver that builds nothing says so where there is work to do
+        return 8
+    return kernel.get_work_group_info(cl.kernel_work_group_info.COMPILE_WORK_GROUP_SIZE, device)[0]
 
 
 def _raw_devices() -> list[cl.Device]:
@@ -356,8 +367,8 @@ def choose(wish: str | int | None = None) -> tuple[DeviceInfo, str]:
     ----------
     wish : str or int, optional
         An index of `list_devices()`, or a part of "platform: name" in any case. None takes the
-        environment variable CLSAS_DEVICE, and without it the first GPU, then the first CPU, one
-        with the fast lookup in registers before others.
+        environment variable CLSAS_DEVICE, and without it the first GPU, then the CPU with the
+        widest vectors.
 
     Raises
     ------
@@ -374,13 +385,11 @@ def choose(wish: str | int | None = None) -> tuple[DeviceInfo, str]:
         source = f"asked for by {ENVIRONMENT_VARIABLE}"
     if wish is None:
         order = ("gpu", "cpu", "accelerator")
-        chosen = min(
-            devices, key=lambda info: (order.index(info.kind), not info.permute, info.index)
-        )
+        chosen = min(devices, key=lambda info: (order.index(info.kind), -info.width, info.index))
         if chosen.kind == "gpu":
             return chosen, "the first GPU"
-        fast = ", with the fast lookup in registers" if chosen.permute else ""
-        return chosen, f"the first {chosen.kind.upper()}{fast}; there is no GPU"
+        widest = f" with vectors of {chosen.width}" if chosen.width > 1 else ""
+        return chosen, f"the first {chosen.kind.upper()}{widest}; there is no GPU"
     if isinstance(wish, str) and re.fullmatch(r"\s*[0-9]+\s*", wish, re.ASCII):
         wish = int(wish)
     if isinstance(wish, (int, np.integer)) and not isinstance(wish, bool):

@@ -159,7 +159,8 @@ class Groups:
     def block_radius_m(self) -> float:
         """Largest distance of a pixel from the one in the middle of its work-item's block."""
         blocks = self.offset_m.reshape(-1, self.width, 3)
-        middle = 5 if self.width == 16 else 0  # MIDDLE in cl/backproject.cl
+        rows, columns = BLOCKS[self.width]
+        middle = (rows - 1) // 2 * columns + (columns - 1) // 2  # MIDDLE in cl/backproject.cl
         return _longest(blocks - blocks[:, middle, None])
 
     @property

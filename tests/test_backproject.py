@@ -99,9 +99,10 @@ def test_samples_are_looked_up_wherever_pixels_lie(device, taps, parts, mirrored
     some = prepare(
         thesis_lines(nowhere, track), nowhere, device=device, taps=taps, upsampling=upsampling
     )
-    block_rows, block_columns = BLOCKS[16]
+    width = device.info.width if device.info.permute else 16
+    block_rows, block_columns = BLOCKS[width]
     away = np.array([(STACK // parts * block_rows - 1) / 2, block_columns / 2])
-    pitch_m = 0.999 * lookup_room(taps) / some.samples_per_m / np.linalg.norm(away)
+    pitch_m = 0.99 * lookup_room(taps, width) / some.samples_per_m / np.linalg.norm(away)
     down, across = away / np.linalg.norm(away)
     row_m, column_m = pitch_m * np.array([[across, down, 0], [-down, across, 0]])
     if mirrored:

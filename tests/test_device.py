@@ -49,10 +49,23 @@ def test_every_device_is_described():
         assert info.label == f"{info.platform}: {info.name}"
         assert info.kind in ("gpu", "cpu", "accelerator")
         assert info.width in ((1, 4, 8, 16) if info.kind == "cpu" else (1,))
-        assert not info.permute or info.width == 16
+        assert not info.permute or info.width in (8, 16)
         assert info.driver
         assert info.compute_units >= 1
         assert 0 < info.max_buffer_bytes <= info.memory_bytes
+
+
+def test_vectors_are_no_wider_than_the_compilers(monkeypatch):
+    infos = [info for info in list_devices() if info.width == 16]
+    of_file = module.kernel_source
+    monkeypatch.setattr(
+        module, "kernel_source", lambda name: "#undef __AVX512F__\n" + of_file(name)
+    )
+    module._compiled_lanes.cache_clear()
+    try:
+        assert all(list_devices()[info.index].width == 8 for info in infos)
+    finally:
+        module._compiled_lanes.cache_clear()
 
 
 def test_it_agrees_with_opencl():
@@ -95,7 +108,7 @@ def test_a_wish_goes_before_the_environment(monkeypatch):
 
 
 def test_gpus_go_before_cpus(monkeypatch):
-    info = dataclasses.replace(list_devices()[0], permute=False)
+    info = dataclasses.replace(list_devices()[0], width=1)
     kinds = ("accelerator", "cpu", "gpu", "gpu")
     several = [dataclasses.replace(info, index=i, kind=kind) for i, kind in enumerate(kinds)]
     monkeypatch.setattr(module, "list_devices", lambda: several)
@@ -104,9 +117,9 @@ def test_gpus_go_before_cpus(monkeypatch):
     monkeypatch.setattr(module, "list_devices", lambda: several[:2])
     chosen, why = choose()
     assert (chosen.index, why) == (1, "the first CPU; there is no GPU")
-    fast = dataclasses.replace(info, index=2, kind="cpu", permute=True)
-    monkeypatch.setattr(module, "list_devices", lambda: [*several[:2], fast])
-    assert choose()[0] == fast
+    wide = dataclasses.replace(info, index=2, kind="cpu", width=8)
+    monkeypatch.setattr(module, "list_devices", lambda: [*several[:2], wide])
+    assert choose() == (wide, "the first CPU with vectors of 8; there is no GPU")
 
 
 @pytest.mark.parametrize("wish", ["no such device", 99, "99", -1, "-1"])
