@@ -29,7 +29,7 @@ def test_what_was_stored_is_loaded(cache, platform):
 
 
 def test_without_a_file_there_are_defaults(cache, platform):
-    assert costs.load(platform) == Costs()
+    assert costs.load(platform) == costs.defaults(platform)
     assert not cache.exists()
 
 
@@ -37,7 +37,7 @@ def test_devices_have_costs_of_their_own(cache, platform):
     info = dataclasses.replace(platform.info, driver="another driver")
     other = dataclasses.replace(platform, info=info, _kernels={})
     costs.save(platform, OTHER)
-    assert costs.load(other) == Costs()
+    assert costs.load(other) == costs.defaults(platform)
     costs.save(other, dataclasses.replace(OTHER, pixel_ns=9.0))
     assert costs.load(other).pixel_ns == 9
     assert costs.load(platform) == OTHER
@@ -49,7 +49,7 @@ def test_devices_have_costs_of_their_own(cache, platform):
 def test_a_broken_file_is_as_good_as_none_and_is_replaced(cache, platform, content):
     cache.parent.mkdir()
     cache.write_text(content)
-    assert costs.load(platform) == Costs()
+    assert costs.load(platform) == costs.defaults(platform)
     costs.save(platform, OTHER)
     assert costs.load(platform) == OTHER
 
@@ -60,7 +60,7 @@ def test_a_broken_number_is_as_good_as_none(cache, platform, value):
     stored = json.loads(cache.read_text())
     next(iter(stored.values()))["pixel_ns"] = value
     cache.write_text(json.dumps(stored))
-    assert costs.load(platform) == Costs()
+    assert costs.load(platform) == costs.defaults(platform)
 
 
 def test_a_number_too_few_is_as_good_as_none(cache, platform):
@@ -68,7 +68,7 @@ def test_a_number_too_few_is_as_good_as_none(cache, platform):
     stored = json.loads(cache.read_text())
     del next(iter(stored.values()))["sample_ns"]
     cache.write_text(json.dumps(stored))
-    assert costs.load(platform) == Costs()
+    assert costs.load(platform) == costs.defaults(platform)
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), -1.0])
