@@ -9,10 +9,11 @@ from collections.abc import Hashable, Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.integrate import trapezoid
 from scipy.spatial import KDTree
 
 from clsas import interpolation
-from clsas.aperture import cycles_per_extent, mean_track, turned
+from clsas.aperture import cycles_per_extent, mean_track
 from clsas.backproject import wavelength_m
 from clsas.grid import Grid
 from clsas.interpolation import Interpolator, Resampling
@@ -39,6 +40,8 @@ class View:
         Where the grid's pixels lie.
     spots_m : float64 [spots, 3]
         Over the whole grid, its corners among them.
+    track_m : float64 [samples, 3]
+        Positions at `track.samples`.
     limits : (low, high) or None
         Sines of the aspect angle between which anything is seen.
     root : (rows, columns) or None
@@ -64,8 +67,8 @@ class View:
             return
         self.surface, self.root = surface_of(grid), None
         self.spots_m = self._pixels_m(_SPOTS)
-        position = self.track.positions_m(self.track.samples)
-        sight = self.spots_m[:, None] - position
+        self.track_m = self.track.positions_m(self.track.samples)
+        sight = self.spots_m[:, None] - self.track_m
         self.distance_m = np.maximum(np.linalg.norm(sight, axis=-1), 1e-9)
         self.sight = sight / self.distance_m[..., None]
         self.on_track = np.abs(self.track.samples - 0.5) <= 0.5
@@ -109,7 +112,7 @@ class View:
         if self.beam is None:
             return True
         on_track = self.on_track
-        position = self.track.positions_m(self.track.samples[on_track])
+        position = self.track_m[on_track]
         way_m = np.concatenate([[0], np.linalg.norm(np.diff(position, axis=0), axis=1).cumsum()])
         sine = np.einsum("psi,si->ps", self.sight[:, on_track], self.along[on_track])
         way_m += 1e-9 * np.arange(len(way_m))  # a track may stand still
@@ -131,7 +134,7 @@ class View:
             return self
         on_track, (low, high) = self.on_track, np.clip(self.limits, -1, 1)
         # Everywhere: of a short aperture a pixel sees a small part of the beam only.
-        position_m = self.track.positions_m(self.track.samples[on_track])
+        position_m = self.track_m[on_track]
         sine = sines(self._pixels_m(_EVERYWHERE), position_m, self.along[on_track])
         weights = self.beam.weights(sine, wavelength_m(self.lines))
         edges = np.linspace(low, high, _BINS + 1)
@@ -151,7 +154,7 @@ class View:
         """Least sum of the beam's weights at a pixel, over the largest."""
         points_m = self._pixels_m(np.linspace(0, 1, 33))
         on_track = self.on_track
-        position_m = self.track.positions_m(self.track.samples[on_track])
+        position_m = self.track_m[on_track]
         sine = sines(points_m, position_m, self.along[on_track])
         sums = self.beam.weights(sine, wavelength_m(self.lines)).sum(axis=0)
         return float(sums.min() / max(sums.max(), 1e-30))
@@ -203,15 +206,13 @@ class View:
 
     def seen(self, side: tuple[int, int]) -> NDArray[np.bool_]:
         """Return from where channels see anything of subimages at the spots, [spots, samples]."""
-        on_track = np.broadcast_to(self.on_track, self.distance_m.shape)
         if self.limits is None:
-            return on_track
+            return np.broadcast_to(self.on_track, self.distance_m.shape)
         if side not in self._seen:
             half_m = self.extents(side, most=True)[:, None] / 2 * self.surface.steps_m
             origin_m = self.spots_m[0]
-            track_m = self.track.positions_m(self.track.samples) - origin_m
-            self._seen[side] = on_track & touches_boxes(
-                self.limits, self.spots_m - origin_m, half_m, track_m, self.along
+            self._seen[side] = self.on_track & touches_boxes(
+                self.limits, self.spots_m - origin_m, half_m, self.track_m - origin_m, self.along
             )
         return self._seen[side]
 
@@ -223,7 +224,7 @@ class View:
         self, rates: NDArray[np.float64], seen: NDArray[np.bool_], *, most: bool = False
     ) -> float:
         """Return how far a phase turns while it is seen, on average over the grid or at most."""
-        return _over_spots(turned(self.track, np.where(seen, rates, 0.0))[:, -1], most)
+        return _over_spots(trapezoid(np.where(seen, rates, 0.0), self.track.samples), most)
 
     def turns(self, side: tuple[int, int], seen: NDArray[np.bool_], *, most: bool = False) -> float:
         """Return `cycles` of the phases of subimages of a size."""
@@ -238,6 +239,8 @@ class View:
         Their relief is the most in a root, of this view unless given, on average over the roots or
         at most.
         """
+        if self.surface.is_plane:
+            return self.surface.extents(side)
         relief_m = self.surface.relief_m(side, root or self.root)
         return self.surface.extents(side, float(relief_m.max() if most else relief_m.mean()))
 
