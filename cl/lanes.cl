@@ -1,14 +1,19 @@
-/* How many floats the compiler's vectors hold, as far as its own macros tell: the host reads it from the kernel's
- * required work-group size, without running it. A driver reports what the processor has, and on processors newer than
- * itself its compiler uses less: vectors of 16 then break it.
+/* What the compiler's vectors are, as far as its own macros tell: the host reads the required work-group size, without
+ * running the kernel. Along x: the floats of one; along y: 2 if it can permute them in registers (common.h), else 1.
+ * A driver reports what the processor has. On processors newer than itself its compiler uses less, and vectors wider
+ * than that break it.
  */
 
 #ifdef __AVX512F__
-#define VECTOR 16
+#define SIZE 16, 2, 1
+#elif defined(__AVX2__) && defined(__F16C__)
+#define SIZE 8, 2, 1
+#elif defined(__AVX__)
+#define SIZE 8, 1, 1
 #else
-#define VECTOR 8
+#define SIZE 4, 1, 1
 #endif
 
-__kernel __attribute__((reqd_work_group_size(VECTOR, 1, 1))) void lanes(__global int *nothing)
+__kernel __attribute__((reqd_work_group_size(SIZE))) void lanes(__global int *nothing)
 {
 }

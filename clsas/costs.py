@@ -141,4 +141,6 @@ def save(device: Device, costs: Costs) -> Path:
 
 
 def _key(device: Device) -> str:
-    return f"{device.info.label}, {device.info.driver}, {device.info.width} lanes"
+    info = device.info
+    lookup = ", permuting" if info.permute else ""
+    return f"{info.label}, {info.driver}, {info.width} lanes{lookup}"

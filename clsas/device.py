@@ -310,11 +310,10 @@ def _describe(index: int, device: cl.Device) -> DeviceInfo:
     is_cpu = bool(device.type & cl.device_type.CPU)
     is_gpu = bool(device.type & cl.device_type.GPU)
     platform = device.platform.name
-    width = 1
+    width, permute = 1, False
     # Intel's runtime vectorises across work-items, faster than through explicit vectors.
     if is_cpu and not platform.startswith("Intel"):
-        native = device.native_vector_width_float
-        width = _compiled_lanes(device) if native >= 16 else 8 if native >= 8 else 4
+        width, permute = _compiled_vectors(device)
     return DeviceInfo(
         index=index,
         platform=platform,
@@ -326,19 +325,24 @@ def _describe(index: int, device: cl.Device) -> DeviceInfo:
         max_buffer_bytes=device.max_mem_alloc_size,
         fp64="cl_khr_fp64" in device.extensions.split(),
         width=width,
-        permute=width >= 8,
+        permute=permute,
     )
 
 
 @functools.cache
-def _compiled_lanes(device: cl.Device) -> int:
-    """Return the floats of its compiler's vectors, where a CPU itself has vectors of 16."""
-    program = cl.Program(cl.Context([device]), kernel_source("lanes.cl"))
+def _compiled_vectors(device: cl.Device) -> tuple[int, bool]:
+    """Return the floats of a vector as a CPU's compiler has them, and whether it permutes them."""
     try:
-        kernel = program.build().lanes
-    except cl.RuntimeError:  # a driver that builds nothing says so where there is work to do
-        return 8
-    return kernel.get_work_group_info(cl.kernel_work_group_info.COMPILE_WORK_GROUP_SIZE, device)[0]
+        context = cl.Context([device])
+        program = cl.Program(context, kernel_source("lanes.cl"))
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", cl.CompilerWarning)
+            kernel = cl.Kernel(program.build(), "lanes")
+        size = kernel.get_work_group_info(cl.kernel_work_group_info.COMPILE_WORK_GROUP_SIZE, device)
+    except cl.Error:  # whatever is wrong is told where there is work to do
+        size = ()
+    lanes, permute = size[:2] if len(size) == 3 else (4, 1)
+    return (lanes, permute == 2) if lanes in (8, 16) else (4, False)
 
 
 def _raw_devices() -> list[cl.Device]:

@@ -8,7 +8,7 @@ import pytest
 from clsas.device import list_devices, open_device
 
 # What other devices have: float lanes (one is what runs on GPUs), and whether kernels may permute.
-# Of a CPU no more lanes are asked for than it has: some compilers break at that.
+# No more lanes are asked for than a compiler has that is driven with several: it may break.
 FORCED = ((1, False), (4, False), (8, False), (8, True), (16, False))
 
 
@@ -31,7 +31,13 @@ def _variants():
     # Of the CPUs' compilers PoCL's is the fastest.
     cpus = sorted((info for info in first if info.kind == "cpu"), key=lambda i: i.platform)[-1:]
     forced = _named(
-        [(info.index, *way) for info in cpus for way in FORCED if way[0] <= info.width], infos
+        [
+            (info.index, *way)
+            for info in cpus
+            for way in FORCED
+            if way[0] <= info.width or info.width == 1
+        ],
+        infos,
     )
     # Without any device the tests fail, with the message that says how to get one.
     return own or {"none": (None, None, None)}, forced

@@ -55,17 +55,27 @@ def test_every_device_is_described():
         assert 0 < info.max_buffer_bytes <= info.memory_bytes
 
 
-def test_vectors_are_no_wider_than_the_compilers(monkeypatch):
-    infos = [info for info in list_devices() if info.width == 16]
+VECTORS = {
+    "AVX-512": ("", (16, True)),
+    "AVX2": ("#undef __AVX512F__", (8, True)),
+    "AVX": ("#undef __AVX512F__\n#undef __AVX2__", (8, False)),
+    "none": ("#undef __AVX512F__\n#undef __AVX2__\n#undef __AVX__", (4, False)),
+    "broken": ("#error", (4, False)),
+}
+
+
+@pytest.mark.parametrize(("macros", "most"), VECTORS.values(), ids=VECTORS)
+def test_vectors_are_no_wider_than_the_compilers(macros, most, monkeypatch):
+    before = list_devices()
     of_file = module.kernel_source
-    monkeypatch.setattr(
-        module, "kernel_source", lambda name: "#undef __AVX512F__\n" + of_file(name)
-    )
-    module._compiled_lanes.cache_clear()
+    monkeypatch.setattr(module, "kernel_source", lambda name: f"{macros}\n{of_file(name)}")
+    module._compiled_vectors.cache_clear()
     try:
-        assert all(list_devices()[info.index].width == 8 for info in infos)
+        for info, narrow in zip(before, list_devices(), strict=True):
+            vectors = info.width, info.permute
+            assert (narrow.width, narrow.permute) == min(vectors, most)
     finally:
-        module._compiled_lanes.cache_clear()
+        module._compiled_vectors.cache_clear()
 
 
 def test_it_agrees_with_opencl():
