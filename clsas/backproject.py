@@ -232,13 +232,13 @@ def antennas_and_phase(
     return antennas_m, math.hypot(of_phase, 0.3 / lines.range_step_m)
 
 
-def most_upsampling(device: Device, lines: RangeLines, lookup_radius_m: float) -> float:
-    """Return the upsampling beyond which a block does not fit the lookup's window, if any."""
+def most_upsampling(device: Device, lines: RangeLines, lookup_radius_m: float) -> dict[int, float]:
+    """Return by taps the upsampling beyond which a block is too large for the window, if any."""
     if not device.info.permute:
-        return math.inf
+        return {}
     reach_m = lookup_radius_m * (1 + 2 * fastest(lines))
-    room = lookup_room(max(interpolation.TAPS), device.info.width)
-    return room * lines.range_step_m / max(reach_m, 1e-30)
+    samples = {taps: lookup_room(taps, device.info.width) for taps in interpolation.TAPS}
+    return {taps: room * lines.range_step_m / max(reach_m, 1e-30) for taps, room in samples.items()}
 
 
 def execute(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,7 +17,7 @@ TAPS = (2, 4, 6, 8)
 UPSAMPLINGS = (1.0, 1.25, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0, 12.0, 16.0)
 
 # Device time per pixel and channel by taps, relative to 4 taps: measured with PoCL and Intel's
-# runtime on an AVX-512 CPU (scripts/bench taps).
+# runtime on an AVX-512 CPU (scripts/bench taps). With AVX2 more taps cost a tenth more.
 COST = {2: 0.75, 4: 1.0, 6: 1.3, 8: 1.55}
 # The same for one upsampled sample: an FFT on the host.
 _UPSAMPLINGCOST = 40.0
@@ -201,7 +201,7 @@ def choose(
     upsampling: float | None = None,
     other_error: float = 0.0,
     pixels_per_sample: float = np.inf,
-    most_upsampling: float = np.inf,
+    most_upsampling: Mapping[int, float] | None = None,
 ) -> Interpolator:
     """Return the cheapest interpolator that keeps the error below `accuracy_db`.
 
@@ -219,8 +219,8 @@ def choose(
         Relative rms error that comes from elsewhere and adds in power.
     pixels_per_sample : float
         Pixels over samples of a line: how soon upsampling pays.
-    most_upsampling : float
-        Prefer not to upsample beyond this (where the device's fast lookup ends).
+    most_upsampling : mapping of float, optional
+        By taps: prefer not to upsample beyond this (where the device's fast lookup ends).
 
     Raises
     ------
@@ -252,7 +252,7 @@ def choose(
         )
 
     def cost(candidate: Interpolator) -> tuple[bool, float]:
-        slow = candidate.upsampling > most_upsampling
+        slow = candidate.upsampling > (most_upsampling or {}).get(candidate.taps, np.inf)
         upsampling_cost = _UPSAMPLINGCOST * candidate.upsampling / pixels_per_sample
         return slow, COST[candidate.taps] + upsampling_cost
 

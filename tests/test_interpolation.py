@@ -134,9 +134,13 @@ def test_what_is_fixed_is_kept():
 def test_upsampling_stays_within_what_is_preferred():
     spectrum = flat(0.8)
     free = choose(spectrum, -70)
-    bounded = choose(spectrum, -70, most_upsampling=free.upsampling - 0.1)
+    limit = free.upsampling - 0.1
+    bounded = choose(spectrum, -70, most_upsampling=dict.fromkeys(TAPS, limit))
     assert bounded.upsampling < free.upsampling
     assert bounded.error_db <= -70
+    of_taps = choose(spectrum, -70, most_upsampling={free.taps: limit})
+    assert of_taps.taps != free.taps
+    assert of_taps.error_db <= -70
 
 
 # Spectra
