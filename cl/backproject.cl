@@ -11,8 +11,8 @@
  *              pixels, and a work-item computes four such blocks, one below the other.
  *   TILE_ROWS, TILE_COLUMNS  pixels of a tile, multiples of 4 blocks' rows and of a block's columns.
  *   TAPS       2, 4, 6 or 8 samples per interpolation.
- *   PERMUTE    fetch samples from a window of 2 WIDTH per component held in two registers of AVX2 or AVX-512, with
- *              these five times as fast as a gather. The host asks for it where the samples of all lanes of a block
+ *   PERMUTE    fetch samples from a window of 2 WIDTH per component held in two registers: five times as fast as a
+ *              gather with AVX-512, twice with AVX2. The host asks for it where the samples of all lanes of a block
  *              lie within the window, and the compiler decides whether it can (common.h).
  *   WINDOWS    how many such windows a work-item's four blocks take: 1, 2 (tiles only) or 4.
  *   BISTATIC   receiver positions differ from the transmitter's.
@@ -239,8 +239,8 @@ typedef union {
 #define PER_WINDOW STACK
 #endif
 
-/* What weights are in memory stays there: kept in registers there would be none left, and a product may take one factor
- * from memory. */
+/* What weights are in memory stays there: kept in registers there would be none left, and a product of AVX-512 may take
+ * one factor, for all lanes, from memory. With AVX2 they are spilled as vectors, from which a product takes it. */
 #if AVX == 512
 #define FRESH __asm__ volatile("" : : : "memory")
 #else

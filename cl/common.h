@@ -141,7 +141,7 @@ typedef half held;
 #define LOAD_HELD(p) vload_half(0, p)
 #define STORE_HELD(value, p) vstore_half(value, 0, p)
 #elif defined(AVX)
-/* Those of the language are conversions of 8, or calls. */
+/* vload_half16() is two conversions of 8 here, and vload_half8() may be a call. */
 typedef ushort half_anywhere __attribute__((ext_vector_type(WIDTH), aligned(2)));
 #define TO_NEAREST 0
 INLINE vfloat LOAD_HELD(__global const half *p)
