@@ -135,10 +135,7 @@ class Device:
             definitions = [f"-D{option}={value}" for option, value in sorted(options.items())]
             text = kernel_source("common.h") + kernel_source(f"{source}.cl")
             try:
-                with warnings.catch_warnings():
-                    # Some drivers' compilers greet; a failure brings its log anyway.
-                    warnings.simplefilter("ignore", cl.CompilerWarning)
-                    program = cl.Program(self.context, text).build(["-cl-mad-enable", *definitions])
+                program = _built(self.context, text, ["-cl-mad-enable", *definitions])
             except cl.RuntimeError as error:
                 raise DeviceError(
                     f"{self.info.label} could not build {source}.cl with "
@@ -306,6 +303,14 @@ def kernel_source(name: str) -> str:
     return (Path(__file__).parents[1] / "cl" / name).read_text()  # a source checkout
 
 
+def _built(context: cl.Context, text: str, options: Sequence[str] = ()) -> cl.Program:
+    """Return a built program."""
+    with warnings.catch_warnings():
+        # Some drivers' compilers greet; a failure brings its log anyway.
+        warnings.simplefilter("ignore", cl.CompilerWarning)
+        return cl.Program(context, text).build(list(options))
+
+
 def _describe(index: int, device: cl.Device) -> DeviceInfo:
     is_cpu = bool(device.type & cl.device_type.CPU)
     is_gpu = bool(device.type & cl.device_type.GPU)
@@ -334,14 +339,11 @@ def _compiled_vectors(device: cl.Device) -> tuple[int, bool]:
     """Return the floats of a vector as a CPU's compiler has them, and whether it permutes them."""
     try:
         context = cl.Context([device])
-        program = cl.Program(context, kernel_source("lanes.cl"))
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", cl.CompilerWarning)
-            kernel = cl.Kernel(program.build(), "lanes")
+        kernel = cl.Kernel(_built(context, kernel_source("lanes.cl")), "lanes")
         size = kernel.get_work_group_info(cl.kernel_work_group_info.COMPILE_WORK_GROUP_SIZE, device)
     except cl.Error:  # whatever is wrong is told where there is work to do
-        size = ()
-    lanes, permute = size[:2] if len(size) == 3 else (4, 1)
+        return 4, False
+    lanes, permute, _ = size
     return (lanes, permute == 2) if lanes in (8, 16) else (4, False)
 
 
