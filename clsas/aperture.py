@@ -17,6 +17,7 @@ from clsas.surface import Surface
 _POINTS = 257  # along the track, where rates are evaluated
 _MOST_PLACES = 9  # along a side of a box, where rates are evaluated
 _BEYOND = 12  # points past either end, each twice as far as the one before
+_TOGETHER = 1 << 15  # rates that are evaluated together
 _CHANNELS_PER_KNOT = 16
 _MOST_INTERVALS = 64
 _CLOSE_ENOUGH = 0.01  # distance of phase centres from the track, wavelengths rms
@@ -55,6 +56,11 @@ class MeanTrack:
         """Parameters at which rates along the curve are evaluated, past its ends too, [n]."""
         beyond = 2.0 ** np.arange(1 - _BEYOND, 1) * 4
         return np.concatenate([-beyond[::-1], np.linspace(0, 1, _POINTS), 1 + beyond])
+
+    @functools.cached_property
+    def sampled_m(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Positions and tangents at `samples`, [n, 3] each."""
+        return self.positions_m(self.samples), self.tangents_m(self.samples)
 
     def places_seen_from(
         self, points_m: NDArray[np.float64], phase_centres_m: NDArray[np.float64]
@@ -217,17 +223,16 @@ def cycles_per_extent(
     float64 [axes, n, samples]
         Per row, per column and per metre of relief, at `track.samples`.
     """
-    place = track.samples[::every]
+    position, tangent = (each[::every] for each in track.sampled_m)
     along = along if along is None else along[::every]
-    position, tangent = track.positions_m(place), track.tangents_m(place)
     steps = surface.steps_m
     sides_m = extents[:, None] * steps
-    rates = np.zeros((len(steps), len(centres_m), len(place)))
+    rates = np.zeros((len(steps), len(centres_m), len(position)))
     # Products of the sight to a place in a box follow from those of that to its middle.
     sight = centres_m[:, None] - position
     square = np.einsum("psi,psi->ps", sight, sight)
     ahead = np.einsum("psi,si->ps", sight, tangent)
-    leaning = [sight @ step for step in steps]
+    leaning = np.stack([sight @ step for step in steps])
     sideways = None if limits is None else np.einsum("psi,si->ps", sight, along)
     # Places in a box lie closer where it is large against its distance.
     closest_m = np.sqrt(square.min()) + nearest_m
@@ -235,26 +240,32 @@ def cycles_per_extent(
         np.linalg.norm(sides_m, axis=1) / closest_m, 0, _MOST_PLACES // 2 - 1
     ).astype(int)
     counts[extents == 0] = 1
-    within = [np.linspace(-0.5, 0.5, n) if n > 1 else np.zeros(1) for n in counts]
+    parts = np.array(
+        list(product(*(np.linspace(-0.5, 0.5, n) if n > 1 else [0.0] for n in counts)))
+    )
     apart = 1 / np.maximum(counts - 1, 1)
     between_m = np.linalg.norm(apart @ np.abs(sides_m)) / 2
-    for parts in product(*within):
-        offset_m = parts @ sides_m
-        distance = square + offset_m @ offset_m
-        for moved, lean in zip(parts * extents, leaning, strict=True):
-            distance += 2 * moved * lean
-        distance = np.maximum(np.sqrt(np.maximum(distance, 0, out=distance)), nearest_m)
-        inverse = 1 / distance
-        turn = (ahead + tangent @ offset_m) * inverse**2
+    for some in np.array_split(parts, -(-len(parts) * square.size // _TOGETHER)):
+        offset_m = some @ sides_m
+        inverse = np.tensordot(2 * some * extents, leaning, 1)
+        inverse += square
+        inverse += np.einsum("oi,oi->o", offset_m, offset_m)[:, None, None]
+        np.maximum(inverse, nearest_m**2, out=inverse)
+        np.divide(1, np.sqrt(inverse, out=inverse), out=inverse)
+        turn = ahead + (offset_m @ tangent.T)[:, None]
+        turn *= inverse
+        turn *= inverse
         if limits is not None:
             low, high = limits
-            sine, reach = (sideways + along @ offset_m) * inverse, between_m * inverse
+            sine, reach = sideways + (offset_m @ along.T)[:, None], between_m * inverse
+            sine *= inverse
             inverse[(sine + reach < low) | (sine - reach > high)] = 0  # as if far away
         for rate, step, lean in zip(rates, steps, leaning, strict=True):
-            here = turn * (lean + offset_m @ step)
+            here = lean + (offset_m @ step)[:, None, None]
+            here *= turn
             np.subtract(tangent @ step, here, out=here)
             here *= inverse
-            np.maximum(rate, np.abs(here, out=here), out=rate)
+            np.maximum(rate, np.abs(here, out=here).max(axis=0), out=rate)
     return cycles_per_m / 2 * rates
 
 

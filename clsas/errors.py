@@ -6,9 +6,11 @@ import functools
 import math
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, replace
+from itertools import repeat
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.distance import cdist
 
 from clsas.aperture import drift, stretches
 from clsas.backproject import wavelength_m
@@ -93,15 +95,16 @@ class Errors:
 def other_errors(
     view: View,
     sides: Sequence[tuple[int, int]],
+    roots: float,
     aperture: Interpolator,
     crowding: tuple[float, ...],
     beam_cycles: float,
     device: Device,
 ) -> Errors:
-    """Return the errors of a tree; `view` is that within its roots."""
+    """Return the errors of a tree; `view` is that within its roots, whose error is known."""
     last = len(sides) - 1
     return Errors(
-        roots=root_error(view, sides[0]),
+        roots=roots,
         nodes=tuple(
             excess_error(view, side, aperture, crowd, beam_cycles if level == last else 0.0)
             for level, (side, crowd) in enumerate(zip(sides, crowding, strict=True))
@@ -153,41 +156,47 @@ def _off_track(view: View, side: tuple[int, int], extents: NDArray[np.float64]) 
     lines, track = view.lines, view.track
     index = _some_channels(lines.channels)
     part = replace(track, place=track.place[index])
-    middle_m = lines.phase_centres_m
-    seen = view.seen(side)
-    powers, total = [], 0.0
-    for spot in _SOME_SPOTS:
-        some = np.interp(part.place, track.samples, seen[spot]) > 0
-        if not some.any():
-            continue
-        near_index = index[some]
-        velocity = lines.rx_velocity_m_s
-        near = replace(track, place=part.place[some])
-        points_m = view.spots_m[spot] + _pixels_m(view, extents, spot)[0]
-        antennas_m = lines.tx_m[near_index], lines.rx_m[near_index]
-        moving = velocity if velocity is None else velocity[near_index]
-        range_m = pairwise_range_m(points_m, *antennas_m, moving, lines.sound_speed_m_s)
-        virtual_m = track.positions_m(near.places_seen_from(points_m[:1], middle_m[near_index])[0])
-        on_track_m = pairwise_range_m(points_m, virtual_m, virtual_m)
-        on_track_m -= (points_m @ drift(lines))[:, None]
-        stretch = 1 + stretches(*antennas_m, view.surface.plane, points_m[:1], virtual_m[None])
-        away_m = (range_m - range_m[0]) - (on_track_m - on_track_m[0]) * stretch
-        wrong = 2 * np.pi * view.highest_cycles_per_m * away_m[1:]
-        # Lines are stretched by turning their phase; their envelope stays.
-        stretched_m = ((on_track_m - on_track_m[0]) * (stretch - 1))[1:]
-        wrong = np.hypot(wrong, 2 * np.pi * view.rms_cycles_per_m * stretched_m)
-        weights = np.ones_like(wrong)
-        if view.beam is not None:
-            directions = interpolated_directions(track.samples, view.along, near.place)
-            channels = middle_m[near_index], view.channels_along[near_index]
-            weights, of_virtual = (
-                view.beam.weights(sines(points_m[1:], *places).T, wavelength_m(lines))
-                for places in (channels, (virtual_m, directions))
+    tx_m, rx_m, middle_m = (each[index] for each in (lines.tx_m, lines.rx_m, lines.phase_centres_m))
+    velocity = lines.rx_velocity_m_s
+    moving = velocity if velocity is None else velocity[index]
+    spots = np.array(_SOME_SPOTS)
+    places = [np.interp(part.place, track.samples, each) for each in view.seen(side)[spots]]
+    seen = np.stack(places) > 0
+    somewhere = seen.any(axis=1)
+    spots, seen = spots[somewhere], seen[somewhere]
+    if not spots.size:
+        return 0.0
+    # [spots, pixels, channels]; the first pixel is the middle of a root.
+    pixels_m = np.stack([_pixels_m(view, extents, spot)[0] for spot in spots])
+    points_m = view.spots_m[spots, None] + pixels_m
+    centres_m, all_m = points_m[:, 0], points_m.reshape(-1, 3)
+    range_m = pairwise_range_m(all_m, tx_m, rx_m, moving, lines.sound_speed_m_s)
+    range_m = range_m.reshape(*points_m.shape[:2], -1)
+    virtual_m = track.positions_m(part.places_seen_from(centres_m, middle_m))
+    on_track_m = np.stack([cdist(*each) for each in zip(points_m, virtual_m, strict=True)])
+    on_track_m -= (points_m @ drift(lines))[..., None]
+    range_m, on_track_m = (each[:, 1:] - each[:, :1] for each in (range_m, on_track_m))
+    stretch = stretches(tx_m, rx_m, view.surface.plane, centres_m, virtual_m)[:, None]
+    stretched_m = on_track_m * stretch
+    wrong = (2 * np.pi * view.highest_cycles_per_m * (range_m - on_track_m - stretched_m)) ** 2
+    # Lines are stretched by turning their phase; their envelope stays.
+    wrong += (2 * np.pi * view.rms_cycles_per_m * stretched_m) ** 2
+    weights = np.ones_like(wrong)
+    if view.beam is not None:
+        directions = interpolated_directions(track.samples, view.along, part.place)
+        weights, of_virtual = (
+            view.beam.weights(
+                np.stack([sines(*each).T for each in zip(points_m[:, 1:], *places, strict=False)]),
+                wavelength_m(lines),
             )
-            wrong = np.hypot(weights * wrong, weights - of_virtual)
-        powers.append(np.sum(wrong**2))
-        total += np.sum(weights**2)
-    return float(sum(powers) / max(total, 1e-30))
+            for places in (
+                (repeat(middle_m), repeat(view.channels_along[index])),
+                (virtual_m, repeat(directions)),
+            )
+        )
+        wrong = weights**2 * wrong + (weights - of_virtual) ** 2
+    total = np.sum(weights**2, where=seen[:, None])
+    return float(np.sum(wrong, where=seen[:, None]) / max(total, 1e-30))
 
 
 @_kept
@@ -243,9 +252,11 @@ def _between_nodes(
     index = nodes.base[..., None] + np.arange(nodes.taps)
     wrong = total = 0.0
     for each, sampled, taps, weights in zip(exact, of_nodes, index, nodes.weights, strict=True):
-        between = np.einsum("pct,ct->pc", sampled[:, taps], weights.astype(np.float32))
-        wrong += float(np.sum(np.abs(between - each) ** 2))
-        total += float(np.sum(np.abs(each) ** 2))
+        away = -each
+        for tap, weight in zip(taps.T, weights.T.astype(np.float32), strict=True):
+            away += weight * sampled[:, tap]
+        wrong += float(np.vdot(away, away).real)
+        total += float(np.vdot(each, each).real)
     return max(wrong / max(total, 1e-30) - power(aperture.error_db), 0.0)
 
 

@@ -232,7 +232,8 @@ def _fastest(
     steering = steering_spectrum(view.carriers(_CARRIERS) / view.highest_cycles_per_m)
     while most is not None:
         # Roots are often smaller than they might be.
-        spared = besides + root_error(view, most if tree is None else tree.sides[0])
+        roots = root_error(view, most if tree is None else tree.sides[0])
+        spared = besides + roots
         if spared >= 0.9 * allowed:
             break
         filters_db = in_db(allowed - spared) - MARGIN_DB
@@ -250,7 +251,9 @@ def _fastest(
             filters = choice.design(view.spectrum, steering, len(tree.sides), filters_db)
         way = Way(tree.sides, filters, crowding=crowding, beam_cycles=beam_cycles)
         within = view.within(tree.sides[0])
-        others = other_errors(within, way.sides, filters.aperture, crowding, beam_cycles, device)
+        others = other_errors(
+            within, way.sides, roots, filters.aperture, crowding, beam_cycles, device
+        )
         found = forecast.factorized(
             within, way, others.total + trimmed, tolerance_db, exact, device, costs, memory_bytes
         )

@@ -98,10 +98,36 @@ class _Sizes:
         extents = [self.view.extents(side, root=root if any(root) else None) for side in sides]
         return self.view.cycles_in_root(root, sides) @ np.stack(extents).T
 
-    def in_root(self, root: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """Return the sizes inside a root's, and their `cycles` there."""
+    def in_root(self, root: int) -> _Within:
+        """Return what is known of the sizes inside a root's."""
         within = np.flatnonzero(self.inside[root])
-        return within, self.cycles(self.pairs[root], within)
+        return _Within.of(self, within, self.cycles(self.pairs[root], within))
+
+
+@dataclass(frozen=True, eq=False)
+class _Within:
+    """What is known of the sizes inside a root's.
+
+    Attributes
+    ----------
+    sizes : int [n]
+        Which these are.
+    turns, of_leaf : float [n, n], [n]
+        Cycles that a child of size i uses of a parent of size j; and those of leaves.
+    step_ns : float [n, n]
+        0 where a parent of size j may be divided into those of size i, else infinite.
+    """
+
+    sizes: NDArray[np.int64]
+    turns: NDArray[np.float64]
+    of_leaf: NDArray[np.float64]
+    step_ns: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, sizes: _Sizes, within: NDArray[np.int64], turns: NDArray[np.float64]) -> _Within:
+        smaller = sizes.inside[np.ix_(within, within)].T & (within[:, None] != within)
+        of_leaf = np.diag(turns) + sizes.beam_turns[within]
+        return cls(within, turns, of_leaf, np.where(smaller, 0.0, np.inf))
 
 
 def _sizes(
@@ -225,9 +251,9 @@ def search(
     if not options or not roots.size:
         return None
     # In a root phases turn no less than in the middle of it.
-    everything, turns = np.arange(len(sizes.sides)), sizes.cycles((0, 0))
+    anywhere = _Within.of(sizes, np.arange(len(sizes.sides)), sizes.cycles((0, 0)))
     roots_ns = np.array([option.roots_ns(sizes, costs) for option in options])
-    least_ns = np.array([_onward(sizes, option, everything, turns)[0] for option in options])
+    least_ns = np.array([_onward(view, option, anywhere)[0] for option in options])
     least_ns = (roots_ns + least_ns)[:, roots]
     in_root = functools.cache(sizes.in_root)
     best_ns, best = math.inf, None
@@ -235,40 +261,38 @@ def search(
         if least_ns.flat[place] >= best_ns:
             break
         index, root = place // len(roots), int(roots[place % len(roots)])
-        within, turns = in_root(root)
-        onward_ns, children = _onward(sizes, options[index], within, turns)
-        size = int(np.searchsorted(within, root))
+        within = in_root(root)
+        onward_ns, children = _onward(view, options[index], within)
+        size = int(np.searchsorted(within.sizes, root))
         cost_ns = roots_ns[index, root] + onward_ns[size]
         if cost_ns < best_ns:
             path = [size]
             for each in children:
                 path.append(int(each[path[-1]]))
             choice = options[index].choice
-            sides = tuple(sizes.pairs[within[size]] for size in path)
+            sides = tuple(sizes.pairs[within.sizes[size]] for size in path)
             best_ns, best = cost_ns, Tree(sides, choice.align_taps, choice.aperture_taps)
     return best
 
 
 def _onward(
-    sizes: _Sizes, option: _Option, within: NDArray[np.int64], turns: NDArray[np.float64]
+    view: View, option: _Option, within: _Within
 ) -> tuple[NDArray[np.float64], list[NDArray[np.int64]]]:
     """Return what it costs to come from subimages of some sizes to pixels, in the stages left.
 
     Beside it, stage by stage, the sizes (as places in `within`) that are best to go on to.
-    `turns` are those of `_Sizes.cycles`.
     """
     # To a child of size i from a parent of size j: the channels of the parent that it uses.
-    step_ns = option.channels(sizes.view, turns) * option.channel_ns[within, None]
-    step_ns += option.subimages_ns[within, None]
-    smaller = sizes.inside[np.ix_(within, within)].T & (within[:, None] != within)
-    step_ns[~smaller] = np.inf
-    onward_ns = option.channels(sizes.view, np.diag(turns) + sizes.beam_turns[within])
-    onward_ns = onward_ns * option.pixels_ns[within]
+    step_ns = option.channels(view, within.turns)
+    step_ns *= option.channel_ns[within.sizes, None]
+    step_ns += option.subimages_ns[within.sizes, None]
+    step_ns += within.step_ns
+    onward_ns = option.channels(view, within.of_leaf) * option.pixels_ns[within.sizes]
     children = []
     for _ in range(option.stages - 1):
         through_ns = step_ns + onward_ns[:, None]
-        children.append(through_ns.argmin(axis=0))
-        onward_ns = through_ns.min(axis=0)
+        children.append(best := through_ns.argmin(axis=0))
+        onward_ns = through_ns[best, np.arange(len(best))]
     return onward_ns, children[::-1]
 
 

@@ -116,7 +116,7 @@ class Geometry:
         away = not np.array_equal(lines.tx_m, lines.rx_m) or off_m > _ON_TRACK * wavelength_m
         self.ramps = bool(away and not chosen.nearest)
         # From elsewhere a channel off the track appears at another place.
-        way_m = np.linalg.norm(self.track.tangents_m(self.track.samples), axis=1)
+        way_m = np.linalg.norm(self.track.sampled_m[1], axis=1)
         self._slack = 2 * off_m / max(way_m.min(), 1e-9)
 
     @property

@@ -16,6 +16,7 @@ LEAST_SIDE = (16, 4)
 """Rows and columns of the smallest subimages; sides of all others are multiples of these."""
 
 _LEAST_CELL_M = 1e-6
+_CORNERS = {n: np.array(list(product((-0.5, 0.5), repeat=n))) for n in (2, 3)}  # of boxes
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,8 +103,8 @@ class Surface:
     def radius_m(self, side: tuple[int, int]) -> float:
         """Return the largest distance of a pixel from the middle of its subimage of a size."""
         extents = self.extents(side, float(self.relief_m(side).max()))
-        corners = np.array(list(product((-0.5, 0.5), repeat=len(extents)))) * extents
-        return float(np.linalg.norm(corners @ self.steps_m, axis=1).max())
+        corners_m = (_CORNERS[len(extents)] * extents) @ self.steps_m
+        return math.sqrt(np.einsum("ci,ci->c", corners_m, corners_m).max())
 
     @functools.cached_property
     def _smallest(self) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:

@@ -243,7 +243,7 @@ def beam_rate(
     That is [points, samples]: nodes must be dense enough for the weights too, with a cycle over an
     edge of the window. `along` is the track's direction at `track.samples`.
     """
-    sight = points_m[:, None] - track.positions_m(track.samples)
+    sight = points_m[:, None] - track.sampled_m[0]
     sight /= np.maximum(np.linalg.norm(sight, axis=-1, keepdims=True), 1e-9)
     sine = np.einsum("psi,si->ps", sight, along)
     return np.abs(np.gradient(sine, track.samples, axis=1)) / beam.edge

@@ -9,7 +9,6 @@ from collections.abc import Hashable, Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.integrate import trapezoid
 from scipy.spatial import KDTree
 
 from clsas import interpolation
@@ -21,11 +20,12 @@ from clsas.layout import STACK
 from clsas.lines import RangeLines
 from clsas.surface import LEAST_SIDE, surface_of, within_roots
 from clsas.tree import beam_directions, beam_rate
-from clsas.window import BeamWindow, sines, touches_boxes
+from clsas.window import BeamWindow, Sight, sines
 
 _NEIGHBOURS = 64  # channels whose density is looked at
 _SPOTS = (0.02, 0.25, 0.5, 0.75, 0.98)  # of rows and columns, where the geometry is looked at
-_OF_SPOTS = (0.135, 0.24, 0.25, 0.24, 0.135)  # what these stand for
+_OF_SPOTS = np.array([0.135, 0.24, 0.25, 0.24, 0.135])  # what these stand for
+_SHARES = np.outer(_OF_SPOTS, _OF_SPOTS).ravel() / _OF_SPOTS.sum() ** 2
 _EVERYWHERE = np.linspace(0, 1, 17)  # parts of rows and columns
 _BINS = 512  # of a beam
 _COARSER = 4  # of the track's samples: where roots are compared
@@ -42,6 +42,8 @@ class View:
         Over the whole grid, its corners among them.
     track_m : float64 [samples, 3]
         Positions at `track.samples`.
+    spacing : float64 [samples]
+        What each of these stands for, of the track's parameter.
     limits : (low, high) or None
         Sines of the aspect angle between which anything is seen.
     root : (rows, columns) or None
@@ -67,7 +69,8 @@ class View:
             return
         self.surface, self.root = surface_of(grid), None
         self.spots_m = self._pixels_m(_SPOTS)
-        self.track_m = self.track.positions_m(self.track.samples)
+        self.track_m, _ = self.track.sampled_m
+        self.spacing = _spacing(self.track.samples)
         sight = self.spots_m[:, None] - self.track_m
         self.distance_m = np.maximum(np.linalg.norm(sight, axis=-1), 1e-9)
         self.sight = sight / self.distance_m[..., None]
@@ -82,6 +85,7 @@ class View:
         self._seen: dict[tuple[int, int], NDArray[np.bool_]] = {}
         self._within: dict[tuple[int, int], View] = {}
         self._in_roots: dict[tuple[int, int], NDArray[np.float64]] = {}
+        self._while_seen: dict[tuple[int, int], NDArray[np.float64]] = {}
         self.along = self.channels_along = None
         if beam is not None:
             self.channels_along = beam.directions(lines)
@@ -136,15 +140,17 @@ class View:
         # Everywhere: of a short aperture a pixel sees a small part of the beam only.
         position_m = self.track_m[on_track]
         sine = sines(self._pixels_m(_EVERYWHERE), position_m, self.along[on_track])
-        weights = self.beam.weights(sine, wavelength_m(self.lines))
-        edges = np.linspace(low, high, _BINS + 1)
-        power = np.histogram(sine, edges, weights=weights**2)[0].cumsum()
+        sine = sine[(sine > low) & (sine < high)]
+        power = self.beam.weights(sine, wavelength_m(self.lines)) ** 2
+        place = np.minimum((sine - low) * (_BINS / (high - low)), _BINS - 1).astype(np.int64)
+        power = np.bincount(place, power, _BINS).cumsum()
         first = np.searchsorted(power, share / 2 * power[-1])
         last = np.searchsorted(power, (1 - share / 2) * power[-1])
         if not 0 < first <= last:
             return self
         view = copy.copy(self)
-        view._seen, view._within, view._in_roots, view.kept = {}, {}, {}, {}
+        view._seen, view._within, view._in_roots, view._while_seen, view.kept = {}, {}, {}, {}, {}
+        edges = np.linspace(low, high, _BINS + 1)
         view.limits = float(edges[first]), float(edges[min(last + 1, _BINS)])
         view.rates = view._rates(np.zeros(len(self.surface.steps_m)), self.spots_m)
         return view
@@ -209,22 +215,28 @@ class View:
         if self.limits is None:
             return np.broadcast_to(self.on_track, self.distance_m.shape)
         if side not in self._seen:
-            half_m = self.extents(side, most=True)[:, None] / 2 * self.surface.steps_m
-            origin_m = self.spots_m[0]
-            self._seen[side] = self.on_track & touches_boxes(
-                self.limits, self.spots_m - origin_m, half_m, self.track_m - origin_m, self.along
-            )
+            half = self.extents(side, most=True) / 2
+            self._seen[side] = self.on_track & self._boxes.touches(self.limits, half)
         return self._seen[side]
+
+    @functools.cached_property
+    def _boxes(self) -> Sight:
+        """How the track sees boxes of cells at the spots."""
+        origin_m = self.spots_m[0]
+        return Sight.of(
+            self.spots_m - origin_m, self.surface.steps_m, self.track_m - origin_m, self.along
+        )
 
     def share_seen(self, side: tuple[int, int], *, most: bool = False) -> float:
         """Return which part of the channels sees anything of a subimage, on average or at most."""
-        return _over_spots(self.seen(side)[:, self.on_track].mean(axis=1), most)
+        count = np.count_nonzero(self.seen(side), axis=1)
+        return _over_spots(count / np.count_nonzero(self.on_track), most)
 
     def cycles(
         self, rates: NDArray[np.float64], seen: NDArray[np.bool_], *, most: bool = False
     ) -> float:
         """Return how far a phase turns while it is seen, on average over the grid or at most."""
-        return _over_spots(trapezoid(np.where(seen, rates, 0.0), self.track.samples), most)
+        return _over_spots(np.where(seen, rates, 0.0) @ self.spacing, most)
 
     def turns(self, side: tuple[int, int], seen: NDArray[np.bool_], *, most: bool = False) -> float:
         """Return `cycles` of the phases of subimages of a size."""
@@ -276,10 +288,15 @@ class View:
         middle = np.arange(len(_SPOTS) ** 2).reshape(len(_SPOTS), -1)[1:-1, 1:-1].ravel()
         if root not in self._in_roots:
             extents = self.extents(root, most=True) if any(root) else self.surface.extents(root)
-            self._in_roots[root] = self._rates(extents, self.spots_m[middle], _COARSER)
-        seen = np.stack([self.seen(side)[middle, ::_COARSER] for side in sides])
-        while_seen = seen * np.gradient(self.track.samples[::_COARSER])
-        return np.einsum("nps,kps->nk", while_seen, self._in_roots[root]) / len(middle)
+            rates = self._rates(extents, self.spots_m[middle], _COARSER)
+            self._in_roots[root] = rates.reshape(len(rates), -1) / len(middle)
+        spacing = _spacing(self.track.samples[::_COARSER])
+        for side in sides:
+            if side not in self._while_seen:
+                seen = self.seen(side)[middle, ::_COARSER]
+                self._while_seen[side] = (seen * spacing).ravel()
+        while_seen = np.stack([self._while_seen[side] for side in sides])
+        return while_seen @ self._in_roots[root].T
 
     def _rates(
         self, extents: NDArray[np.float64], centres_m: NDArray[np.float64], every: int = 1
@@ -331,6 +348,10 @@ class View:
 
 def _over_spots(values: NDArray[np.float64], most: bool) -> float:
     """Return the largest of values at the spots, or their mean over the grid."""
-    if most:
-        return float(values.max())
-    return float(np.average(values, weights=np.outer(_OF_SPOTS, _OF_SPOTS).ravel()))
+    return float(values.max() if most else values @ _SHARES)
+
+
+def _spacing(samples: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return by what to multiply values at samples for the integral over them (trapezoids)."""
+    halves = np.diff(samples) / 2
+    return np.concatenate([halves, [0.0]]) + np.concatenate([[0.0], halves])

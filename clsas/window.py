@@ -185,7 +185,10 @@ class BeamWindow:
         """Return the weights at sines `q` of the aspect angle; `wavelength_m` is for "inverse"."""
         q = np.asarray(q, np.float64)
         low, high = self.limits
-        return np.where((q > low) & (q < high), self._inside(q, wavelength_m), 0.0)
+        inside = (q > low) & (q < high)
+        weights = np.zeros(q.shape)
+        weights[inside] = self._inside(q[inside], wavelength_m)
+        return weights
 
     def table(self, wavelength_m: float = math.inf) -> NDArray[np.float32]:
         """Return the weights as cubics, float32 [INTERVALS, 4], constant terms first.
@@ -286,9 +289,7 @@ def sines(
     Takes points [points, 3] and the phase centre and the direction of every channel, [channels, 3];
     a phase centre's own sine is 0.
     """
-    offset_m = points_m - phase_centres_m[:, None]
-    distance_m = np.linalg.norm(offset_m, axis=2)
-    return np.einsum("cpi,ci->cp", offset_m, along) / np.maximum(distance_m, 1e-30)
+    return _sines(points_m, phase_centres_m, along)[0].T
 
 
 def channel_ranges(
@@ -349,6 +350,78 @@ def channel_ranges(
     return ranges
 
 
+@dataclass(frozen=True, eq=False)
+class Sight:
+    """How places on a track see points, and boxes about them.
+
+    Attributes
+    ----------
+    sine, inverse_m : float64 [points, places]
+        Of the aspect angle of a point, and one over its distance.
+    axes_m : float64 [axes, 3]
+        Along the sides of boxes.
+    slopes : float64 [axes, points, places]
+        By how much the sine changes along each, at most.
+    """
+
+    sine: NDArray[np.float64]
+    inverse_m: NDArray[np.float64]
+    axes_m: NDArray[np.float64]
+    slopes: NDArray[np.float64]
+
+    @classmethod
+    def of(
+        cls,
+        points_m: NDArray[np.float64],
+        axes_m: NDArray[np.float64],
+        track_m: NDArray[np.float64],
+        along: NDArray[np.float64],
+    ) -> Sight:
+        """Return how places [places, 3] on a track of some unit directions see points [n, 3]."""
+        sine, distance_m = _sines(points_m, track_m, along)
+        inverse_m = 1 / np.maximum(distance_m, 1e-9, out=distance_m)
+        slopes = np.empty((len(axes_m), *sine.shape))
+        for slope, axis in zip(slopes, axes_m, strict=True):
+            np.subtract((points_m @ axis)[:, None], track_m @ axis, out=slope)
+            slope *= inverse_m
+            slope *= sine
+            np.subtract(along @ axis, slope, out=slope)
+            slope *= inverse_m
+            np.abs(slope, out=slope)
+        return cls(sine, inverse_m, axes_m, slopes)
+
+    def touches(
+        self,
+        limits: tuple[float, float],
+        half: NDArray[np.float64],
+        around_m: float | NDArray[np.float64] = 0.0,
+        spread: float | NDArray[np.float64] = 0.0,
+    ) -> NDArray[np.bool_]:
+        """Return whether a window may touch boxes about the points, bool [points, places].
+
+        Parameters
+        ----------
+        limits : (low, high)
+            Sines of the aspect angle between which the window lies.
+        half : float64 [axes]
+            Half their sides, in lengths of the axes.
+        around_m, spread : float or float64 [places]
+            How far from the places other positions and directions may lie that they stand for.
+        """
+        radius_m = np.linalg.norm(np.abs(half[:, None] * self.axes_m).sum(axis=0))
+        reach = radius_m * self.inverse_m
+        reach *= reach
+        for each, slope in zip(half, self.slopes, strict=True):
+            reach += each * slope
+        low, high = limits
+        if np.any(around_m) or np.any(spread):
+            ratio = np.minimum(around_m * self.inverse_m, 0.5)
+            # From so much nearer the box reaches further; half way to it, anywhere.
+            reach = (reach + ratio + ratio**3) / (1 - ratio) + spread
+            reach[ratio == 0.5] = np.inf
+        return (self.sine + reach > low) & (self.sine - reach < high)
+
+
 def touches_boxes(
     limits: tuple[float, float],
     centres_m: NDArray[np.float64],
@@ -358,7 +431,7 @@ def touches_boxes(
     around_m: float | NDArray[np.float64] = 0.0,
     spread: float | NDArray[np.float64] = 0.0,
 ) -> NDArray[np.bool_]:
-    """Return whether a window may touch boxes, bool [boxes, places].
+    """Return whether a window may touch boxes, bool [boxes, places]; see `Sight`.
 
     Parameters
     ----------
@@ -372,35 +445,19 @@ def touches_boxes(
     around_m, spread : float or float64 [places]
         How far from them other positions and directions may lie that these stand for.
     """
-    sine, distance_m = _sines(centres_m, track_m, along)
-    np.maximum(distance_m, 1e-9, out=distance_m)
-    inverse = 1 / distance_m
-    reach = (np.linalg.norm(np.abs(half_m).sum(axis=0)) * inverse) ** 2
-    for half in half_m:
-        ahead = (centres_m @ half)[:, None] - track_m @ half
-        ahead *= inverse
-        ahead *= sine
-        np.subtract(along @ half, ahead, out=ahead)
-        ahead *= inverse
-        reach += np.abs(ahead, out=ahead)
-    low, high = limits
-    if np.any(around_m) or np.any(spread):
-        ratio = np.minimum(around_m * inverse, 0.5)
-        # From so much nearer the box reaches further; half way to it, anywhere.
-        reach = (reach + ratio + ratio**3) / (1 - ratio) + spread
-        reach[ratio == 0.5] = np.inf
-    return (sine + reach > low) & (sine - reach < high)
+    sight = Sight.of(centres_m, half_m, track_m, along)
+    return sight.touches(limits, np.ones(len(half_m)), around_m, spread)
 
 
 def _sines(
     points_m: NDArray[np.float64], centres_m: NDArray[np.float64], along: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return sines of aspect angles and distances, [points, centres]; no sine is right at 0 m."""
+    """Return sines of aspect angles, 0 at 0 m, and distances, [points, centres]."""
     origin_m = centres_m[0]  # so that little cancels
     distance_m = cdist(points_m, centres_m)
     sine = (points_m - origin_m) @ along.T
     sine -= np.einsum("ci,ci->c", centres_m - origin_m, along)
-    sine /= np.maximum(distance_m, 1e-30)
+    sine /= np.where(distance_m > 0, distance_m, np.inf)
     return sine, distance_m
 
 
