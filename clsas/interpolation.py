@@ -26,7 +26,6 @@ Gain = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 """A factor of spectra, by the distance from their centre in cycles per sample."""
 _POSITIONS = 17
 _LINES_TOGETHER = 8  # that are transformed
-_BLOCK_ROWS = 256
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,28 +150,27 @@ def design(taps: int, upsampling: float, spectrum: Spectrum) -> Interpolator:
     at f.
     Linear interpolation is the one filter that is given: E = 1/2, O = 1.
     """
-    f = spectrum.frequency[:, None, None, None] / upsampling
-    nu = np.linspace(-0.5, 0.5, _POSITIONS)[None, :, None, None]
-    a = (np.arange(taps // 2) + 0.5)[None, None, :, None]
-    power = nu ** (2 * np.arange(taps // 2)[None, None, None, ::-1])
-    basis = (2 * np.cos(2 * np.pi * f * a) * power, 2 * np.sin(2 * np.pi * f * a) * nu * power)
-    aim = (np.cos(2 * np.pi * f * nu), np.sin(2 * np.pi * f * nu))
+    f = spectrum.frequency / upsampling
+    nu = np.linspace(-0.5, 0.5, _POSITIONS)
+    turns = 2 * np.pi * np.outer(f, np.arange(taps // 2) + 0.5)
+    even = nu[:, None] ** (2 * np.arange(taps // 2)[::-1])
+    aims = np.cos(2 * np.pi * np.outer(f, nu)), np.sin(2 * np.pi * np.outer(f, nu))
+    bases = (2 * np.cos(turns), even), (2 * np.sin(turns), nu[:, None] * even)
     # A floor keeps the empty part of the band from making the problem singular.
     share = np.sqrt(spectrum.power + 1e-13)[:, None]
     coefficients = np.empty((taps // 2, 2, taps // 2))
     residuals = []
-    for part in (0, 1):
-        matrix = basis[part].reshape(*aim[part].shape[:2], -1)
-        wanted = aim[part][..., 0, 0]
+    for part, (aim, (of_frequency, of_position)) in enumerate(zip(aims, bases, strict=True)):
         if taps == 2:
-            solution = np.array([(0.5, 1.0)[part]])
+            solution = np.array([[(0.5, 1.0)[part]]])
         else:
-            weighted = (matrix * share[..., None]).reshape(-1, matrix.shape[-1])
-            solution = _least_squares(weighted, (wanted * share).ravel())
-        coefficients[:, part] = solution.reshape(taps // 2, taps // 2)
-        residuals.append(matrix @ solution - wanted)
+            # All products of functions of f and of nu: one after the other.
+            at_positions = lstsq(share * of_frequency, share * aim, lapack_driver="gelsy")[0]
+            solution = lstsq(of_position, at_positions.T, lapack_driver="gelsy")[0].T
+        coefficients[:, part] = solution
+        residuals.append(of_frequency @ solution @ of_position.T - aim)
     # Turned back by the position it is the response less 1; its mean is real.
-    turned = aim[0][..., 0, 0] - 1j * aim[1][..., 0, 0]
+    turned = aims[0] - 1j * aims[1]
     error = (residuals[0] + 1j * residuals[1]) * turned
     scatter = (error - (bias := error.mean(axis=1, keepdims=True).real)) / (1 + bias)
     error_db, scatter_db = (
@@ -180,19 +178,6 @@ def design(taps: int, upsampling: float, spectrum: Spectrum) -> Interpolator:
         for e in (error, scatter)
     )
     return Interpolator(taps, upsampling, coefficients, error_db, scatter_db)
-
-
-def _least_squares(matrix: NDArray[np.float64], wanted: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the least-squares solution of a tall system.
-
-    Rows are condensed in blocks first, so small that LAPACK does not spread them over threads: on
-    a busy machine these wait for each other far longer than they work.
-    """
-    rows = np.column_stack([matrix, wanted])
-    rows = np.pad(rows, ((0, -len(rows) % _BLOCK_ROWS), (0, 0)))
-    blocks = rows.reshape(-1, _BLOCK_ROWS, rows.shape[1])
-    condensed = np.linalg.qr(blocks, mode="r").reshape(-1, rows.shape[1])
-    return lstsq(condensed[:, :-1], condensed[:, -1], lapack_driver="gelsy")[0]
 
 
 def choose(
@@ -406,7 +391,7 @@ def upsampler(spectrum: Spectrum, step: int, gain: Gain, most_db: float) -> Upsa
     frequency = spectrum.frequency
     aim = gain(frequency)
     weight = np.sqrt(spectrum.power + 1e-13)[:, None]
-    place = np.arange(PHASES)[:, None, None] / PHASES
+    place = np.arange(PHASES // 2 + 1)[:, None, None] / PHASES
     for taps in UPSAMPLING_TAPS:
         turns = 2 * np.pi * frequency[:, None] * (np.arange(taps) + 1 - taps // 2 - place)
         matrix = np.concatenate([weight * np.cos(turns), weight * np.sin(turns)], axis=1)
@@ -414,7 +399,10 @@ def upsampler(spectrum: Spectrum, step: int, gain: Gain, most_db: float) -> Upsa
         q, r = np.linalg.qr(matrix)
         coefficients = np.linalg.solve(r, np.einsum("pft,f->pt", q, wanted)[..., None])[..., 0]
         residual = np.einsum("pft,pt->pf", matrix, coefficients) - wanted
-        power = np.mean(np.sum(residual**2, axis=1)) / (spectrum.power @ aim**2)
+        # Those of the second half mirror those of the first.
+        coefficients = np.concatenate([coefficients, coefficients[-2:0:-1, ::-1]])
+        of_phases = np.sum(residual**2, axis=1)
+        power = (of_phases.sum() + of_phases[1:-1].sum()) / PHASES / (spectrum.power @ aim**2)
         error_db = 10 * np.log10(max(float(power), 1e-30))
         if error_db <= most_db:
             return Upsampler(step, coefficients, error_db)

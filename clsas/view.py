@@ -80,7 +80,7 @@ class View:
         steps_m = np.linalg.norm(self.surface.steps_m[:2], axis=1)
         between_m = steps_m @ (np.array(self.surface.plane.shape) - 1) / 128
         between_m += self.surface.relief_m(LEAST_SIDE).max() / 2
-        nearest_m = KDTree(lines.phase_centres_m).query(dense_m)[0].min() - between_m
+        nearest_m = KDTree(dense_m).query(lines.phase_centres_m)[0].min() - between_m
         self.nearest_m = max(float(nearest_m), 1e-9)
         self._seen: dict[tuple[int, int], NDArray[np.bool_]] = {}
         self._within: dict[tuple[int, int], View] = {}
