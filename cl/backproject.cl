@@ -18,7 +18,8 @@
  *   BISTATIC   receiver positions differ from the transmitter's.
  *   MOVING     receivers move at `velocity` (in units of the sound speed) during the echo's flight.
  *   BEAM       intervals of the table of the channels' weights by aspect angle; 0 is no weights.
- *   ONE_CUBIC  with BEAM: the points of a block, or the pixels of a tile, lie so close that one cubic serves all.
+ *   ONE_CUBIC  with BEAM: the pixels of a work-item, or the points of a block, lie so close that one cubic of the
+ *              weights serves all; 0: those of a block, or each point, have one.
  *   NORMALISE  with BEAM: sum the weights too.
  *   ALONE      these sums are all of the pixels, which are set; 0: they are added to them.
  *   HALF       1: lines are of half in place of float (common.h).
@@ -80,8 +81,21 @@
 #define ITEM_ROWS (BLOCK_ROWS * STACK)
 #define BLOCKS_ACROSS (TILE_COLUMNS / BLOCK_COLUMNS)
 
-/* fabs() of a float4 that is no call (see KEEP). */
+/* Middles of what has one cubic of the beam's weights: of a work-item, or its blocks. fabs() of these that is no call
+ * (see KEEP). */
+#if !ONE_CUBIC
+typedef float4 middles;
+typedef int4 truths;
+#define CUBIC_ROWS BLOCK_ROWS
 #define MAGNITUDE(v) as_float4(as_int4(v) & 0x7fffffff)
+#define ANY(v) ((v).s0 | (v).s1 | (v).s2 | (v).s3)
+#else
+typedef float middles;
+typedef int truths;
+#define CUBIC_ROWS ITEM_ROWS
+#define MAGNITUDE(v) as_float(as_int(v) & 0x7fffffff)
+#define ANY(v) (v)
+#endif
 
 /* Where the samples of a line are taken from: those at `offset` and after, counted from `line`; no number leads out
  * of the line. With WINDOW 2 WIDTH samples in registers, those about a place t as of interpolate(). */
@@ -522,6 +536,11 @@ __kernel void backproject_tiles(__global const held *samples, int pitch,
     /* In pixels from the tile's centre: all lanes, and the middles of the four blocks. */
     const float middle_i = block_column + 0.5f * (BLOCK_COLUMNS - TILE_COLUMNS);
     const float4 middle_j = block_row + 0.5f * (BLOCK_ROWS - TILE_ROWS) + BLOCK_ROWS * (float4)(0.0f, 1.0f, 2.0f, 3.0f);
+#if !ONE_CUBIC
+    const float4 middle_q = middle_j;
+#else
+    const float middle_q = block_row + 0.5f * (ITEM_ROWS - TILE_ROWS);
+#endif
     const vfloat i = middle_i + LANE_COLUMNS;
     vfloat j[STACK];
 #pragma unroll
@@ -545,25 +564,32 @@ __kernel void backproject_tiles(__global const held *samples, int pitch,
 #if BEAM
         __global const float *of_place = term + 10 * channel_pitch;
         const float q_0 = term[9 * channel_pitch];
-#if ONE_CUBIC
-        INTERVAL(float, q_0, nearest)
-#else
-        /* The place in the beam and its slopes at the four blocks' middles. */
-        const float4 place = q_0 + CUBIC(of_place, middle_i, middle_j);
-        const float4 slope_i = (TERM(of_place, 0) + middle_i * (2.0f * TERM(of_place, 2) + middle_i * (3.0f * TERM(of_place, 5))))
-            + middle_j * ((TERM(of_place, 3) + middle_i * (2.0f * TERM(of_place, 6))) + middle_j * TERM(of_place, 7));
-        const float4 slope_j = CUBIC_1(of_place, middle_i)
-            + middle_j * (2.0f * CUBIC_2(of_place, middle_i) + middle_j * (3.0f * CUBIC_3(of_place)));
+        /* The place in the beam and its slopes at the middles of what has one cubic. */
+        const middles place = q_0 + CUBIC(of_place, middle_i, middle_q);
+        const middles slope_i = (TERM(of_place, 0) + middle_i * (2.0f * TERM(of_place, 2) + middle_i * (3.0f * TERM(of_place, 5))))
+            + middle_q * ((TERM(of_place, 3) + middle_i * (2.0f * TERM(of_place, 6))) + middle_q * TERM(of_place, 7));
+        const middles slope_j = CUBIC_1(of_place, middle_i)
+            + middle_q * (2.0f * CUBIC_2(of_place, middle_i) + middle_q * (3.0f * CUBIC_3(of_place)));
         /* Half a pixel more than the lanes reach leaves room for the curvature. */
-        const float4 reach = 0.5f * BLOCK_COLUMNS * MAGNITUDE(slope_i) + 0.5f * BLOCK_ROWS * MAGNITUDE(slope_j);
-        const int4 seen = (place + reach > low) & (place - reach < high);
-        if (!(seen.s0 | seen.s1 | seen.s2 | seen.s3))
+        const middles reach = 0.5f * BLOCK_COLUMNS * MAGNITUDE(slope_i) + 0.5f * CUBIC_ROWS * MAGNITUDE(slope_j);
+        const truths seen = (place + reach > low) & (place - reach < high);
+        if (!ANY(seen))
             continue;
-        INTERVAL(float4, place, nearest_place)
-        const Four nearest_of = {nearest_place};
-#endif
+        INTERVAL(middles, place, nearest_place)
+#if ONE_CUBIC
+        /* About the work-item's middle: slopes, and the one of these that matters. */
+        const float nearest = nearest_place;
+        const vfloat aside = i - middle_i;
+        const vfloat q1 = slope_j
+            + aside * (TERM(of_place, 3) + 2.0f * (middle_i * TERM(of_place, 6) + middle_q * TERM(of_place, 7)));
+        const vfloat q0 = place + aside * slope_i - middle_q * q1;
+#define PLACE(j) (q0 + (j) * q1)
+#else
         const vfloat q0 = q_0 + CUBIC_0(of_place, i), q1 = CUBIC_1(of_place, i), q2 = CUBIC_2(of_place, i);
         const float q3 = CUBIC_3(of_place);
+#define PLACE(j) (q0 + (j) * (q1 + (j) * (q2 + (j) * q3)))
+        const Four nearest_of = {nearest_place};
+#endif
 #endif
         REFERENCE
         /* Polynomials in j at the lanes' i, less the half sample of interpolate(). */
@@ -593,7 +619,7 @@ EACH_BLOCK
                 const float nearest = nearest_of.of[block];
 #endif
                 __global const float *cubic = beam + 4 * ROUNDED_INT(nearest + ROUNDER);
-                const vfloat q = q0 + j[block] * (q1 + j[block] * (q2 + j[block] * q3));
+                const vfloat q = PLACE(j[block]);
                 const vfloat weight = beam_weight(cubic[0], cubic[1], cubic[2], cubic[3], q - nearest, q, low, high);
                 sine *= weight;
                 cosine *= weight;

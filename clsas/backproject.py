@@ -13,7 +13,6 @@ import numpy as np
 import pyopencl as cl
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
-from scipy.spatial import KDTree
 
 from clsas import interpolation, phases, validate
 from clsas.device import Device, Slot, aligned, open_device
@@ -58,7 +57,7 @@ class Preparation:
     along: NDArray[np.float64] | None = None
     """The track's unit direction for every channel, [channels, 3]; None without a beam."""
     one_cubic: bool = False
-    """Whether the beam's weights may be taken as one cubic over a block of points."""
+    """Whether one cubic of the beam's weights serves a work-item of a tile, a block of points."""
 
     @property
     def samples_per_m(self) -> float:
@@ -206,10 +205,10 @@ def prepare(
     )
     resampling = interpolation.resampling(lines.length, interpolator, spectrum)
     one_cubic = False
-    if beam is not None and isinstance(layout, Groups):
-        nearest_m = KDTree(lines.phase_centres_m).query(layout.centre_m)[0].min() - layout.radius_m
-        reach = layout.block_radius_m / max(nearest_m, 1e-30)
-        one_cubic = bool(beam.block_error(min(reach, 2.0)) <= geometry_error)
+    if beam is not None:
+        nearest_m = max(layout.nearest_m(lines.phase_centres_m) - layout.radius_m, 1e-30)
+        error = layout.one_cubic_error(beam, nearest_m, wavelength_m(lines))
+        one_cubic = bool(error <= geometry_error)
     return Preparation(
         device, lines, grid, layout, interpolator, resampling, terms, beam, along, one_cubic
     )

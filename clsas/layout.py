@@ -7,6 +7,7 @@ the centres; within a part the device computes differences in float32.
 from __future__ import annotations
 
 import functools
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -80,6 +81,15 @@ class Tiles:
         """Largest distance of a pixel from the centre of its work-item's block."""
         return _radius_m(self.grid, *BLOCKS[self.width])
 
+    def one_cubic_error(self, beam: BeamWindow, nearest_m: float, wavelength_m: float) -> float:
+        """Return the rms error of a beam's weights if one cubic serves a whole work-item.
+
+        No pixel is nearer than `nearest_m`. The sine in it is taken as bilinear, too.
+        """
+        rows, columns = BLOCKS[self.width]
+        reach = min(_radius_m(self.grid, STACK * rows, columns) / nearest_m, 2.0)
+        return math.hypot(beam.block_error(reach), beam.plane_error(reach, wavelength_m))
+
     @property
     def lookup_radius_m(self) -> float:
         """Largest distance of a pixel from where the samples of its block are looked up about."""
@@ -97,6 +107,23 @@ class Tiles:
         # The column in their middle is half a pixel beside it.
         rows, columns = BLOCKS[self.width]
         return _radius_m(self.grid, blocks * rows, columns + 1)
+
+    def nearest_m(self, places_m: NDArray[np.float64]) -> float:
+        """Return the distance between places [n, 3] and centres of tiles, or a little less."""
+        grid, counts = self.grid, (self.down - 1, self.across - 1)
+        sides_m = [
+            n * self.side * s
+            for n, s in zip(counts, (grid.row_step_m, grid.column_step_m), strict=True)
+        ]
+        lengths_m = [np.linalg.norm(side) for side in sides_m]
+        if abs(sides_m[0] @ sides_m[1]) > 1e-9 * lengths_m[0] * lengths_m[1]:
+            return float(KDTree(places_m).query(self.centres_m(slice(None)))[0].min())
+        # Of the rectangle on whose lattice the centres lie.
+        way_m = places_m - self.centres_m(slice(0, 1))
+        for side, length in zip(sides_m, lengths_m, strict=True):
+            along = np.clip(way_m @ side / max(length, 1e-150) ** 2, 0, 1)
+            way_m = way_m - along[:, None] * side
+        return float(np.linalg.norm(way_m, axis=1).min())
 
     def centres_m(self, parts: slice) -> NDArray[np.float64]:
         """Return the centres of some tiles, counted row by row, float64 [parts, 3]."""
@@ -177,6 +204,17 @@ class Groups:
         if self.radius_m <= most_m:
             return 1
         return STACK if self.block_radius_m <= most_m else 0
+
+    def one_cubic_error(self, beam: BeamWindow, nearest_m: float, wavelength_m: float) -> float:
+        """Return the rms error of a beam's weights if one cubic serves all points of a block.
+
+        None is nearer than `nearest_m`.
+        """
+        return beam.block_error(min(self.block_radius_m / nearest_m, 2.0))
+
+    def nearest_m(self, places_m: NDArray[np.float64]) -> float:
+        """Return the least distance between places [n, 3] and centres of groups."""
+        return float(KDTree(places_m).query(self.centre_m)[0].min())
 
     def centres_m(self, parts: slice) -> NDArray[np.float64]:
         """Return the centres of some groups, float64 [parts, 3]."""
@@ -261,7 +299,7 @@ def tiles(
     tried = []
     for side in _SIDES:
         shape = Tiles(grid, side, width)
-        nearest = max(_nearest_m(shape, antennas_m), 1e-30)
+        nearest = max(shape.nearest_m(antennas_m), 1e-30)
         remainder_m = 0.15 * shape.radius_m**4 / (8 * nearest**3)
         remainder_m += 0.2 * speed_ratio * shape.radius_m**3 / nearest**2
         rounding = ROUNDING * cycles_per_m * shape.radius_m
@@ -278,24 +316,6 @@ def tiles(
             if shape_error <= most and sine_error <= most_sine:
                 return shape
     return None
-
-
-def _nearest_m(tiles: Tiles, antennas_m: NDArray[np.float64]) -> float:
-    """Return the least distance between antennas and centres of tiles, or a little less."""
-    grid, counts = tiles.grid, (tiles.down - 1, tiles.across - 1)
-    sides_m = [
-        n * tiles.side * s
-        for n, s in zip(counts, (grid.row_step_m, grid.column_step_m), strict=True)
-    ]
-    lengths_m = [np.linalg.norm(side) for side in sides_m]
-    if abs(sides_m[0] @ sides_m[1]) > 1e-9 * lengths_m[0] * lengths_m[1]:
-        return float(KDTree(antennas_m).query(tiles.centres_m(slice(None)))[0].min())
-    # Of the rectangle on whose lattice the centres lie.
-    way_m = antennas_m - tiles.centres_m(slice(0, 1))
-    for side, length in zip(sides_m, lengths_m, strict=True):
-        along = np.clip(way_m @ side / max(length, 1e-150) ** 2, 0, 1)
-        way_m = way_m - along[:, None] * side
-    return float(np.linalg.norm(way_m, axis=1).min())
 
 
 def largest_radius_m(cycles_per_m: float) -> float:

@@ -18,6 +18,7 @@ from clsas.backproject import (
     lookup_options,
     lookup_weights,
     normalising,
+    wavelength_m,
 )
 from clsas.device import Device, Slot
 from clsas.errors import power
@@ -89,13 +90,13 @@ class Leaves:
         """Build the kernels, and lay out what they work on."""
         raise NotImplementedError
 
-    def _options(self, layout: Tiles | Groups, within_m: float) -> dict[str, int]:
-        """Return the kernels' build options; `within_m`: from where a cubic of weights is taken."""
+    def _options(self, layout: Tiles | Groups) -> dict[str, int]:
+        """Return the kernels' build options."""
         chosen, one_cubic = self.plan, False
         if chosen.beam is not None:
             radius_m = self.surface.radius_m(self.geometry.division.sides[0])
             nearest_m = max(self.geometry.nearest_m - radius_m, 1e-6)
-            error = chosen.beam.block_error(within_m / nearest_m)
+            error = layout.one_cubic_error(chosen.beam, nearest_m, wavelength_m(self.lines))
             one_cubic = error**2 < _SHARE * power(chosen.predicted_error_db)
         return {
             "WIDTH": self.width,
@@ -185,7 +186,7 @@ class PlaneLeaves(Leaves):
         on_cpu = device.info.kind == "cpu" and not self.normalise
         self.shared = device.share(image) if on_cpu else None
         layout = Tiles(plane, chosen.tile[0], self.width)
-        options = self._options(layout, self.surface.radius_m(chosen.tile))
+        options = self._options(layout)
         self.expand = device.kernel("backproject", "expand_tiles", **options)
         self.backproject = device.kernel("backproject", "backproject_tiles", **options)
         self.tiles = Division(self.surface, (chosen.sides[0], chosen.sides[-1], chosen.tile))
@@ -373,7 +374,7 @@ class SurfaceLeaves(Leaves):
         self.number = {tuple(root): n for n, root in enumerate(roots)}
         self.ends = np.searchsorted(self.leaf, np.arange(len(roots) + 1) * corners.shape[1])
         self.pixels_before = np.concatenate([[0], np.cumsum(held)])
-        options = self._options(self.groups, self.groups.block_radius_m)
+        options = self._options(self.groups)
         self.backproject = device.kernel("backproject", "backproject_points", **options)
 
     def _cells(self, corners: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

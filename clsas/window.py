@@ -181,6 +181,19 @@ class BeamWindow:
         low, high = np.clip(self.limits, -1, 1)
         return 0.03 * x**2 * math.sqrt(min(8 * reach / (high - low), 1.0))
 
+    def plane_error(self, reach: float, wavelength_m: float = math.inf) -> float:
+        """Return the relative rms error of taking the sine as bilinear over a longer block.
+
+        Along a block of half a length r at the distance R it bends by 0.6 (r/R)^2 at most. As far
+        edges where the weights do not vanish are displaced, by which channels come in or are lost;
+        how many of them on which side is measured.
+        """
+        low, high = np.clip(self.limits, -1, 1)
+        square = self._inside(np.linspace(low, high, 65), wavelength_m) ** 2
+        jump = (square[0] + square[-1]) / 2 / square.mean()
+        bend = reach**2 / self.edge
+        return math.hypot(0.5 * bend, math.sqrt(0.3 * jump * bend))
+
     def weights(self, q: ArrayLike, wavelength_m: float = math.inf) -> NDArray[np.float64]:
         """Return the weights at sines `q` of the aspect angle; `wavelength_m` is for "inverse"."""
         q = np.asarray(q, np.float64)

@@ -229,6 +229,26 @@ def test_an_image_is_the_weighted_sum(name, device):
     assert relative_error_db(execute(preparation).pixels.ravel()[chosen], wanted) <= -75
 
 
+@pytest.mark.parametrize("turned", [False, True])
+@pytest.mark.parametrize("squint_deg", [0, 10])
+@pytest.mark.parametrize("shape", ["hann", "hamming", "taylor", "rectangular"])
+def test_one_cubic_of_weights_errs_by_no_more_than_is_expected(shape, squint_deg, turned):
+    beam = BeamWindow(8, shape, squint_deg=squint_deg, along=X)
+    steps_m = ([0.015, 0.015, 0], [0.015, -0.015, 0]) if turned else ([0.02, 0, 0], [0, 0.02, 0])
+    middle = np.array([16 * np.tan(squint_deg * DEGREE), 16, 0])
+    grid = Grid(middle - 31.5 * np.sum(steps_m, axis=0), *steps_m, shape=(64, 64))
+    lines = thesis_lines(grid, along_x(800, 0.005))
+    preparation = prepare(lines, grid, beam=beam, accuracy_db=-60)
+    each, one = (
+        execute(dataclasses.replace(preparation, one_cubic=choice)) for choice in (False, True)
+    )
+    tiles = preparation.layout
+    nearest_m = tiles.nearest_m(lines.phase_centres_m) - tiles.radius_m
+    expected_db = 20 * np.log10(tiles.one_cubic_error(beam, nearest_m, 0.0015))
+    assert preparation.one_cubic == (expected_db <= -72)
+    assert expected_db - 15 <= relative_error_db(one, each) <= expected_db
+
+
 @pytest.mark.parametrize("normalise", [False, True])
 def test_the_references_weigh_each_channel(normalise):
     """Against images of single channels, weighted by hand."""
