@@ -78,14 +78,14 @@ class Patch:
     columns: slice
     grid: Grid
     record: Record
-    _pixels: NDArray[np.complex64] | None
+    _formed: Image | None
     _store: Store | None
 
     @property
     def image(self) -> Image:
         """The pixels; read from the store where another process formed them."""
-        if self._pixels is not None:
-            return Image(self._pixels, self.grid)
+        if self._formed is not None:
+            return self._formed
         return Image(self._store.pixels[self.rows, self.columns], self.grid)
 
 
@@ -243,11 +243,9 @@ class Mosaic:
             parts.append(slice(index * side, min((index + 1) * side, most)))
         return self.grid.window(*parts), row, column, *parts
 
-    def _finished(
-        self, place: tuple[int, int], record: Record, pixels: NDArray[np.complex64] | None
-    ) -> Patch:
+    def _finished(self, place: tuple[int, int], record: Record, formed: Image | None) -> Patch:
         grid, *where = self._window(*place)
-        return Patch(*where, grid, record, pixels, self._job.opened_store())
+        return Patch(*where, grid, record, formed, self._job.opened_store())
 
     def _ready(
         self, todo: Sequence[tuple[int, int]], sight: _Sight, ended: bool
@@ -535,33 +533,30 @@ def _opened(files: tuple[tuple[Path, tuple[int, int]], ...], beam: str | None) -
 
 def _form(
     job: _Job, grid: Grid, row: int, column: int, rows: slice, columns: slice
-) -> tuple[Record, NDArray[np.complex64] | None]:
-    """Form one patch, on whichever worker this is; return its pixels where no store has them."""
+) -> tuple[Record, Image | None]:
+    """Form one patch, on whichever worker this is; return its image where no store has it."""
     try:
-        record, pixels = _image(job, job.sight(), grid, _this_device(job))
+        record, image = _image(job, job.sight(), grid, _this_device(job))
     except ValueError as error:
         raise ValueError(f"patch {row},{column}: {error}") from error
     store = job.opened_store()
     if store is not None:
-        store.write(row, column, rows, columns, pixels, record)
-    return record, pixels if job.local else None
+        store.write(row, column, rows, columns, image.pixels, record)
+    return record, image if job.local else None
 
 
-def _image(
-    job: _Job, sight: _Sight, grid: Grid, device: Device
-) -> tuple[Record, NDArray[np.complex64]]:
+def _image(job: _Job, sight: _Sight, grid: Grid, device: Device) -> tuple[Record, Image]:
     start = time.perf_counter()
     seen = sight.sees(grid)
     known = {"survey_channels": sight.survey.channels, "device": device.info.label}
     known |= {"driver": device.info.driver, "channels": int(np.count_nonzero(seen))}
-    empty = np.zeros(grid.shape, np.complex64)
     if not seen.any():
-        return Record(**known, seconds=time.perf_counter() - start), empty
+        return Record(**known, seconds=time.perf_counter() - start), _empty(grid)
     lines, missing = sight.survey.read(seen, *sight.ranges_m(grid))
     known |= {"missing_channels": int(np.count_nonzero(missing))}
     known |= {"gap_m": largest_gap_m(lines, missing), "read_seconds": time.perf_counter() - start}
     if missing.all():
-        return Record(**known, seconds=time.perf_counter() - start), empty
+        return Record(**known, seconds=time.perf_counter() - start), _empty(grid)
     beam = None if job.beam is None else replace(job.beam, along=sight.along[seen])
     # A normalising beam multiplies by the number of channels: that of all.
     scale = sight.survey.channels / lines.channels if beam is not None and beam.normalise else 1.0
@@ -588,9 +583,14 @@ def _image(
             "plan": json.loads(_without_directions(chosen).to_json()),
         }
         image = factorize(lines, grid, chosen, device=device)
-    pixels = image.pixels if scale == 1 else np.float32(scale) * image.pixels
-    known |= {"has_pixels": holds_any(pixels), "seconds": time.perf_counter() - start}
-    return Record(**known), pixels
+    if scale != 1:
+        image = Image(np.float32(scale) * image.pixels, grid)
+    known |= {"has_pixels": holds_any(image.pixels), "seconds": time.perf_counter() - start}
+    return Record(**known), image
+
+
+def _empty(grid: Grid) -> Image:
+    return Image(np.zeros(grid.shape, np.complex64), grid)
 
 
 def _host_bytes(channels: int, length: int, pixels: int) -> int:

@@ -143,11 +143,14 @@ class Survey:
             first_m[here] = geometry.first_range_m[rows][wanted]
             first_m[here] += columns.start * geometry.range_step_m
             place = here.stop
+        # Sums tell of most: they may also be too large, or cancel.
         with np.errstate(over="ignore", invalid="ignore"):
-            missing = ~np.isfinite(np.add.reduce(samples, axis=1))
-        missing[missing] = ~np.isfinite(samples[missing]).all(axis=1)  # or sums were too large
+            sums = np.add.reduce(samples, axis=1)
+        missing, silent = ~np.isfinite(sums), sums == 0
+        missing[missing] = ~np.isfinite(samples[missing]).all(axis=1)
         samples[missing] = 0
-        missing |= ~samples.any(axis=1)
+        silent[silent] = ~samples[silent].any(axis=1)
+        missing |= silent
         velocity = geometry.rx_velocity_m_s
         lines = replace(
             geometry,
