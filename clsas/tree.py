@@ -12,7 +12,7 @@ from scipy.ndimage import gaussian_filter1d
 from clsas.aperture import MeanTrack, turned
 from clsas.interpolation import Interpolator
 from clsas.surface import Surface
-from clsas.window import BeamWindow, touches_boxes
+from clsas.window import BeamWindow, Sight, touches_boxes
 
 _EVEN_NODES = 2.5  # over how many nodes their spacing is smoothed, rms
 _LEAST_RATE = 0.3  # of the mean over the track
@@ -276,32 +276,31 @@ def seen_from(
     samples = track.samples
     on_track = np.flatnonzero(np.abs(samples - 0.5) <= 0.5)[::_COARSER]
     places, along = samples[on_track], along[on_track]
-    position_m = track.positions_m(places)
+    position_m = track.sampled_m[0][on_track]
     origin_m = position_m[0]
     position_m, centres_m = position_m - origin_m, centres_m.reshape(-1, 3) - origin_m
     # Runs of places first, each the one in its middle with what is around it; then single ones.
-    runs = [slice(start, start + _RUN) for start in range(0, len(places), _RUN)]
-    middle = np.array([min(run.start + _RUN // 2, len(places) - 1) for run in runs])
-    around_m, spread = np.empty((2, len(runs)))
-    for index, run in enumerate(runs):
-        for result, values in ((around_m, position_m), (spread, along)):
-            away = np.linalg.norm(values[run] - values[middle[index]], axis=1)
-            result[index] = away.max()
+    starts, run = np.arange(0, len(places), _RUN), np.arange(len(places)) // _RUN
+    middle = np.minimum(starts + _RUN // 2, len(places) - 1)
+    around_m, spread = (
+        np.maximum.reduceat(np.linalg.norm(values - values[middle[run]], axis=1), starts)
+        for values in (position_m, along)
+    )
     seen = touches_boxes(
         limits, centres_m, half_m, position_m[middle], along[middle], around_m, spread
     )
     ever = seen.any(axis=1)
-    of_first, of_last = seen.argmax(axis=1), len(runs) - 1 - seen[:, ::-1].argmax(axis=1)
+    of_first, of_last = seen.argmax(axis=1), len(starts) - 1 - seen[:, ::-1].argmax(axis=1)
     widest = _RUN * of_first, np.minimum(_RUN * (of_last + 1), len(places)) - 1
-    first, last = widest[0].copy(), widest[1].copy()
-    for index, run in enumerate(runs):
-        for edge, of_edge, step in ((first, of_first, 1), (last, of_last, -1)):
-            mine = np.flatnonzero(ever & (of_edge == index))
-            if mine.size:
-                some = position_m[run][::step], along[run][::step]
-                seen = touches_boxes(limits, centres_m[mine], half_m, *some)
-                found = np.where(seen.any(axis=1), seen.argmax(axis=1), len(some[0]))
-                edge[mine] += step * found
+    first, last = widest[0] + _RUN, _RUN * of_last - 1
+    some, halves = np.flatnonzero(ever), np.ones(len(half_m))
+    for edge, run, step in ((first, of_first, 1), (last, of_last, -1)):
+        index = np.minimum(_RUN * run[some, None] + np.arange(_RUN)[::step], len(places) - 1)
+        sight = Sight.of(centres_m[some], half_m, position_m[index], along[index])
+        seen = sight.touches(limits, halves)
+        inside = seen.any(axis=1)
+        nearest = seen[inside].argmax(axis=1)
+        edge[some[inside]] = index[inside, nearest]
     # What no single place sees may be seen from between them.
     between = first > last
     first[between], last[between] = widest[0][between], widest[1][between]

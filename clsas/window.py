@@ -390,12 +390,20 @@ class Sight:
         track_m: NDArray[np.float64],
         along: NDArray[np.float64],
     ) -> Sight:
-        """Return how places [places, 3] on a track of some unit directions see points [n, 3]."""
-        sine, distance_m = _sines(points_m, track_m, along)
+        """Return how places on a track of some unit directions see points [n, 3].
+
+        Places and directions are [places, 3], or [n, places, 3] where every point has its own.
+        """
+        if track_m.ndim == 2:
+            sine, distance_m = _sines(points_m, track_m, along)
+            slopes = (axes_m @ points_m.T)[..., None] - (axes_m @ track_m.T)[:, None]
+        else:
+            offset_m = points_m[:, None] - track_m
+            distance_m = np.sqrt(np.einsum("npi,npi->np", offset_m, offset_m))
+            sine = np.einsum("npi,npi->np", offset_m, along) / np.maximum(distance_m, 1e-9)
+            slopes = np.stack([offset_m @ axis for axis in axes_m])
         inverse_m = 1 / np.maximum(distance_m, 1e-9, out=distance_m)
-        slopes = np.empty((len(axes_m), *sine.shape))
         for slope, axis in zip(slopes, axes_m, strict=True):
-            np.subtract((points_m @ axis)[:, None], track_m @ axis, out=slope)
             slope *= inverse_m
             slope *= sine
             np.subtract(along @ axis, slope, out=slope)
