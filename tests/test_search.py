@@ -18,10 +18,10 @@ def everything_tried(view, filters_db, most, leaf_pixels, beam_cycles, device, c
     best = math.inf
     for option in search._options(sizes, filters_db, costs, allowed):
         for root in np.flatnonzero((sizes.sides <= most).all(axis=1)):
-            within, turns = sizes.in_root(root)
-            onward_ns, _ = search._onward(sizes, option, within, turns)
-            cost_ns = option.roots_ns(sizes, costs)[root] + onward_ns[np.searchsorted(within, root)]
-            best = min(best, cost_ns)
+            within = sizes.in_root(root)
+            onward_ns, _ = search._onward(view, option, within)
+            place = np.searchsorted(within.sizes, root)
+            best = min(best, option.roots_ns(sizes, costs)[root] + onward_ns[place])
     return best
 
 
@@ -38,8 +38,8 @@ def cost_of(tree, view, filters_db, most, leaf_pixels, beam_cycles, device, cost
     allowed = Allowed(*taps, stages=(len(tree.sides),))
     (option,) = search._options(sizes, filters_db, costs, allowed)
     path = [sizes.pairs.index(side) for side in tree.sides]
-    within, turns = sizes.in_root(path[0])
-    place = {int(size): index for index, size in enumerate(within)}
+    within = sizes.in_root(path[0])
+    turns, place = within.turns, {int(size): index for index, size in enumerate(within.sizes)}
     total = option.roots_ns(sizes, costs)[path[0]]
     for parent, child in pairwise(path):
         used = option.channels(view, turns[place[child], place[parent]])
