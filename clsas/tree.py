@@ -386,8 +386,10 @@ def _between(
 
     `more` on either side are taken where places may lie further apart than these.
     """
-    first = _rowwise(places, start, "left") - more
-    last = _rowwise(places, stop, "right") + more
+    first, last = _rowwise(places, start, "left"), _rowwise(places, stop, "right")
+    if more:
+        between = last <= first
+        first, last = first - between, last + between
     return np.clip(first, 0, counts), np.clip(last, 0, counts)
 
 
