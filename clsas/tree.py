@@ -19,6 +19,7 @@ _LEAST_RATE = 0.3  # of the mean over the track
 _LEAST_NODES = 2.0  # between the track's ends
 _COARSER = 2  # of the track's samples those at which it is decided what they see
 _RUN = 8  # of these, tried together
+_LESS = 0.2  # of the way between two: a margin for what lies between
 
 
 @dataclass(frozen=True, eq=False)
@@ -291,22 +292,40 @@ def seen_from(
     )
     ever = seen.any(axis=1)
     of_first, of_last = seen.argmax(axis=1), len(starts) - 1 - seen[:, ::-1].argmax(axis=1)
-    widest = _RUN * of_first, np.minimum(_RUN * (of_last + 1), len(places)) - 1
-    first, last = widest[0] + _RUN, _RUN * of_last - 1
-    some, halves = np.flatnonzero(ever), np.ones(len(half_m))
-    for edge, run, step in ((first, of_first, 1), (last, of_last, -1)):
-        index = np.minimum(_RUN * run[some, None] + np.arange(_RUN)[::step], len(places) - 1)
-        sight = Sight.of(centres_m[some], half_m, position_m[index], along[index])
-        seen = sight.touches(limits, halves)
-        inside = seen.any(axis=1)
-        nearest = seen[inside].argmax(axis=1)
-        edge[some[inside]] = index[inside, nearest]
+    bounds = np.concatenate([[-np.inf], places[1:-1], [np.inf]])
+    widest = (
+        bounds[np.maximum(_RUN * of_first - 1, 0)],
+        bounds[np.minimum(_RUN * (of_last + 1), len(places) - 1)],
+    )
+    begin, end = np.full(len(ever), np.inf), np.full(len(ever), -np.inf)
+    halves, inward = np.ones(len(half_m)), np.arange(-1, _RUN + 1)
+    for edge, outermost, at, last, step in (
+        (begin, widest[0], of_first.copy(), of_last, 1),
+        (end, widest[1], of_last.copy(), of_first, -1),
+    ):
+        some = np.flatnonzero(ever)
+        while some.size:
+            # With the places beside them; at the track's ends that is their first or last one.
+            index = _RUN * at[some, None] + (inward if step > 0 else _RUN - 1 - inward)
+            index = np.clip(index, 0, len(places) - 1)
+            sight = Sight.of(centres_m[some], half_m, position_m[index], along[index])
+            inside_by = sight.inside_by(limits, halves)
+            inside = inside_by[:, :-1] > 0
+            whole = some[inside[:, 0]]
+            edge[whole] = outermost[whole]
+            # Between two places it changes nearly evenly, unless it has its most there.
+            found = np.flatnonzero(inside.any(axis=1) & ~inside[:, 0])
+            inner = inside[found].argmax(axis=1)
+            before, after, later = (inside_by[found, inner + n] for n in (-1, 0, 1))
+            share = np.where(later > after, before / (before - after) - _LESS, 0.0).clip(0)
+            before, after = places[index[found, inner - 1]], places[index[found, inner]]
+            edge[some[found]] = before + share * (after - before)
+            # On to the next run, if there is one.
+            some = some[~inside.any(axis=1) & (at[some] != last[some])]
+            at[some] += step
     # What no single place sees may be seen from between them.
-    between = first > last
-    first[between], last[between] = widest[0][between], widest[1][between]
-    # The edge lies between two samples.
-    edges = np.concatenate([[-np.inf], places[1:-1], [np.inf]])
-    begin, end = edges[np.maximum(first - 1, 0)], edges[np.minimum(last + 1, len(places) - 1)]
+    between = begin > end
+    begin[between], end[between] = widest[0][between], widest[1][between]
     begin[~ever] = end[~ever] = -np.inf
     return begin.reshape(shape), end.reshape(shape)
 

@@ -216,7 +216,7 @@ class View:
             return np.broadcast_to(self.on_track, self.distance_m.shape)
         if side not in self._seen:
             half = self.extents(side, most=True) / 2
-            self._seen[side] = self.on_track & self._boxes.touches(self.limits, half)
+            self._seen[side] = self.on_track & (self._boxes.inside_by(self.limits, half) > 0)
         return self._seen[side]
 
     @functools.cached_property

@@ -411,19 +411,21 @@ class Sight:
             np.abs(slope, out=slope)
         return cls(sine, inverse_m, axes_m, slopes)
 
-    def touches(
+    def inside_by(
         self,
         limits: tuple[float, float],
         half: NDArray[np.float64],
         around_m: float | NDArray[np.float64] = 0.0,
         spread: float | NDArray[np.float64] = 0.0,
-    ) -> NDArray[np.bool_]:
-        """Return whether a window may touch boxes about the points, bool [points, places].
+    ) -> NDArray[np.float64]:
+        """Return how far into a window boxes about the points reach, [points, places].
+
+        That is in sines of the aspect angle, negative where a box lies outside.
 
         Parameters
         ----------
         limits : (low, high)
-            Sines of the aspect angle between which the window lies.
+            Sines between which the window lies.
         half : float64 [axes]
             Half their sides, in lengths of the axes.
         around_m, spread : float or float64 [places]
@@ -440,7 +442,10 @@ class Sight:
             # From so much nearer the box reaches further; half way to it, anywhere.
             reach = (reach + ratio + ratio**3) / (1 - ratio) + spread
             reach[ratio == 0.5] = np.inf
-        return (self.sine + reach > low) & (self.sine - reach < high)
+        # Beyond which of the limits: the one that is nearer.
+        reach -= np.abs(self.sine - (low + high) / 2)
+        reach += (high - low) / 2
+        return reach
 
 
 def touches_boxes(
@@ -467,7 +472,7 @@ def touches_boxes(
         How far from them other positions and directions may lie that these stand for.
     """
     sight = Sight.of(centres_m, half_m, track_m, along)
-    return sight.touches(limits, np.ones(len(half_m)), around_m, spread)
+    return sight.inside_by(limits, np.ones(len(half_m)), around_m, spread) > 0
 
 
 def _sines(

@@ -2,18 +2,20 @@ import importlib
 
 import numpy as np
 import pytest
-from cases import along_x
+from cases import along_x, thesis_lines
 from test_factorize import BEAMS, EXACT_IS_SLOW, arc, around, made, near, over, straight, swaying
 
 from clsas import interpolation, tree
 from clsas.aperture import cycles_per_extent, mean_track
 from clsas.backproject import backproject
 from clsas.factorize import factorize
+from clsas.grid import Grid
 from clsas.interpolation import Spectrum
 from clsas.planner import plan
 from clsas.quality import relative_error_db
 from clsas.surface import surface_of
 from clsas.tree import Division, interpolated_nodes, nearest_nodes
+from clsas.window import BeamWindow, touches_boxes
 
 FLAT = Spectrum(0.0, (np.arange(64) + 0.5) / 128, np.full(64, 1 / 64))
 
@@ -219,6 +221,39 @@ def test_places_from_where_leaves_are_seen_hold_all_that_weigh():
             sine = np.einsum("pi,pi->p", sight, direction) / np.linalg.norm(sight, axis=1)
             weighs = place[beam.weights(sine) > 0]
             assert ((weighs >= first) & (weighs <= last)).all()
+
+
+@pytest.mark.parametrize("range_m", [3, 40])
+@pytest.mark.parametrize("beam", [BeamWindow(1), BeamWindow(8), BeamWindow(60, squint_deg=20)])
+def test_boxes_are_seen_from_where_they_are_and_from_hardly_more(beam, range_m):
+    place = np.linspace(0, 1, 300)
+    track_m = np.stack([80 * place - 40, 0.3 * np.sin(9 * place), 0 * place], axis=1)
+    lines = thesis_lines(Grid.plane((-1, 1, 4), (29, 30, 4)), track_m)
+    track = mean_track(lines)
+    along = tree.beam_directions(beam.directions(lines), track, track.samples)
+    random = np.random.default_rng(1)
+    centres_m = random.uniform((-70, 0.7 * range_m, -1), (70, 1.3 * range_m, 1), (300, 3))
+    half_m = range_m * np.array([[0.02, 0, 0], [0, 0.01, 0]])
+    begin, end = tree.seen_from(beam.limits, track, along, centres_m, half_m)
+    place, spacing = np.linspace(0, 1, 4001), 2 / 256  # of those that are looked at
+    seen = touches_boxes(
+        beam.limits,
+        centres_m,
+        half_m,
+        track.positions_m(place),
+        tree.interpolated_directions(track.samples, along, place),
+    )
+    ever = seen.any(axis=1)
+    assert 50 < np.count_nonzero(ever) < 300
+    first = place[seen.argmax(axis=1)][ever]
+    last = place[::-1][seen[:, ::-1].argmax(axis=1)][ever]
+    begin, end = begin[ever], end[ever]
+    assert (begin <= first).all()
+    assert (end >= last).all()
+    wide = (last - first > 2 * spacing) & np.isfinite(begin) & np.isfinite(end)
+    assert wide.any() or range_m == 3
+    assert (first - begin)[wide].max(initial=0) < 0.4 * spacing
+    assert (end - last)[wide].max(initial=0) < 0.4 * spacing
 
 
 def test_directions_between_channels_are_of_length_one():
