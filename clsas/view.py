@@ -262,7 +262,7 @@ class View:
         `taps` and `density`, nodes per cycle, are those of the filter along the aperture, which
         reaches beyond the track's ends.
         """
-        return density * turns + 2 + self.ends_seen * (taps / 2 - 1)
+        return density * turns + 1 + self.ends_seen * (taps / 2 - 0.5)
 
     @functools.cached_property
     def ends_seen(self) -> float:
