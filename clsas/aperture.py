@@ -245,7 +245,9 @@ def cycles_per_extent(
     )
     apart = 1 / np.maximum(counts - 1, 1)
     between_m = np.linalg.norm(apart @ np.abs(sides_m)) / 2
-    for some in np.array_split(parts, -(-len(parts) * square.size // _TOGETHER)):
+    together = max(_TOGETHER // square.size, 1)
+    for start in range(0, len(parts), together):
+        some = parts[start : start + together]
         offset_m = some @ sides_m
         inverse = np.tensordot(2 * some * extents, leaning, 1)
         inverse += square

@@ -208,7 +208,10 @@ def prepare(
     if beam is not None:
         nearest_m = max(layout.nearest_m(lines.phase_centres_m) - layout.radius_m, 1e-30)
         error = layout.one_cubic_error(beam, nearest_m, wavelength_m(lines))
-        one_cubic = bool(error <= geometry_error)
+        some = slice(None, None, max(lines.channels // 256, 1))
+        centres_m = layout.centres_m(slice(None, None, max(layout.parts // 256, 1)))
+        sine = sines(centres_m, lines.phase_centres_m[some], along[some])
+        one_cubic = error <= geometry_error * beam.fullness(sine, wavelength_m(lines))
     return Preparation(
         device, lines, grid, layout, interpolator, resampling, terms, beam, along, one_cubic
     )

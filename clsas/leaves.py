@@ -28,7 +28,7 @@ from clsas.lines import RangeLines
 from clsas.plan import GUARD
 from clsas.sector import MOST_KEPT_BYTES, Geometry, Sector
 from clsas.tree import Division
-from clsas.window import INTERVALS
+from clsas.window import INTERVALS, sines
 
 _ALL = slice(None)
 _SHARE = 0.02  # of an image's error: what neighbours' weights may be off
@@ -96,7 +96,12 @@ class Leaves:
         if chosen.beam is not None:
             radius_m = self.surface.radius_m(self.geometry.division.sides[0])
             nearest_m = max(self.geometry.nearest_m - radius_m, 1e-6)
-            error = layout.one_cubic_error(chosen.beam, nearest_m, wavelength_m(self.lines))
+            wave_m, track = wavelength_m(self.lines), self.geometry.track
+            places = np.abs(track.samples - 0.5) <= 0.5
+            centres_m = self.geometry.division.centres_m(0, self.geometry.division.roots)
+            sine = sines(centres_m, track.sampled_m[0][places], self.geometry.along[places])
+            error = layout.one_cubic_error(chosen.beam, nearest_m, wave_m)
+            error /= chosen.beam.fullness(sine, wave_m)
             one_cubic = error**2 < _SHARE * power(chosen.predicted_error_db)
         return {
             "WIDTH": self.width,

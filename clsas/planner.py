@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -225,7 +226,8 @@ def _fastest(
     beam_cycles = 0.0 if view.beam is None else _LEAST_BEAM_CYCLES
     needed = math.inf
     # The errors of filters and roots, and of phases.
-    besides = trimmed + 0.08 * allowed + phases.error(phases.terms_within(tolerance_db)) ** 2
+    least = trimmed + 0.08 * allowed + phases.error(phases.terms_within(tolerance_db)) ** 2
+    besides = least
     tree: Tree | None = None
     designed: tuple[Choice, float] | None = None
     leaf_pixels = 1
@@ -234,18 +236,25 @@ def _fastest(
         # Roots are often smaller than they might be.
         roots = root_error(view, most if tree is None else tree.sides[0])
         spared = besides + roots
-        if spared >= 0.9 * allowed:
+        choice = None
+        if spared < 0.9 * allowed:
+            filters_db = in_db(allowed - spared) - MARGIN_DB
+            choice = None if tree is None else tree.filters(view.spectrum, filters_db)
+        elif tree is None:
             break
-        filters_db = in_db(allowed - spared) - MARGIN_DB
         if tree is None:
             tree = search(view, filters_db, most, leaf_pixels, beam_cycles, device, costs, choices)
             if tree is None:
                 break
             crowding = (1.0,) * len(tree.sides)
             continue
-        choice = tree.filters(view.spectrum, filters_db)
         if choice is None:
-            break
+            # Fewer stages are of larger subimages, with more nodes.
+            fewer = tuple(n for n in choices.stages if n < len(tree.sides))
+            if not fewer or _MOST_CROWDING not in crowding[:-1]:
+                break
+            choices, tree, besides = replace(choices, stages=fewer), None, least
+            continue
         if (choice, filters_db) != designed:
             designed = choice, filters_db
             filters = choice.design(view.spectrum, steering, len(tree.sides), filters_db)

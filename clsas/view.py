@@ -115,6 +115,11 @@ class View:
         """
         if self.beam is None:
             return True
+        # Neighbours on the track must look the same way: one may lead back beside another.
+        along = self.channels_along[np.argsort(self.track.place, kind="stable")]
+        turned = np.linalg.norm(np.diff(along, axis=0), axis=1)
+        if turned.max(initial=0.0) > self.beam.edge:
+            return False
         on_track = self.on_track
         position = self.track_m[on_track]
         way_m = np.concatenate([[0], np.linalg.norm(np.diff(position, axis=0), axis=1).cumsum()])

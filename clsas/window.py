@@ -55,7 +55,8 @@ class BeamWindow:
     squint_deg : float
         Middle of the window, degrees ahead of broadside; the whole window lies within +-90.
     taper : float
-        For "tukey": which part of the width, 0 to 1, its two raised-cosine edges take together.
+        For "tukey": which part of the width, 0 to 1, its two raised-cosine edges take together;
+        below 1/512 it has none.
     element_length_m : float, optional
         For "inverse": L. It may amplify by 40 dB at most.
     along : array_like, [3] or [channels, 3], optional
@@ -169,6 +170,11 @@ class BeamWindow:
         low, high = np.clip(self.limits, -1, 1)
         return (high - low) / 2 * (max(self.taper, 0.02) if self.shape == "tukey" else 1.0)
 
+    @property
+    def _has_taper(self) -> bool:
+        """Whether it is "tukey" with edges: none are narrower than an interval of the table."""
+        return self.shape == "tukey" and self.taper * INTERVALS >= 2
+
     def block_error(self, reach: float) -> float:
         """Return the relative rms error of taking the weights over a block as one cubic.
 
@@ -176,7 +182,7 @@ class BeamWindow:
         begin with a kink, which no cubic follows; the other shapes are smooth between the limits.
         """
         x = math.pi * reach / self.edge
-        if self.shape != "tukey" or not self.taper:
+        if not self._has_taper:
             return 0.01 * x**4
         low, high = np.clip(self.limits, -1, 1)
         return 0.03 * x**2 * math.sqrt(min(8 * reach / (high - low), 1.0))
@@ -184,15 +190,29 @@ class BeamWindow:
     def plane_error(self, reach: float, wavelength_m: float = math.inf) -> float:
         """Return the relative rms error of taking the sine as bilinear over a longer block.
 
-        Along a block of half a length r at the distance R it bends by 0.6 (r/R)^2 at most. As far
-        edges where the weights do not vanish are displaced, by which channels come in or are lost;
-        how many of them on which side is measured.
+        Along a block of half a length r at the distance R it bends by 0.6 (r/R)^2 at most. By as
+        much edges are displaced; where the weights jump there, channels come in or are lost.
         """
-        low, high = np.clip(self.limits, -1, 1)
-        square = self._inside(np.linspace(low, high, 65), wavelength_m) ** 2
+        square = self._all(wavelength_m) ** 2
         jump = (square[0] + square[-1]) / 2 / square.mean()
         bend = reach**2 / self.edge
         return math.hypot(0.5 * bend, math.sqrt(0.3 * jump * bend))
+
+    def fullness(self, sine: NDArray[np.float64], wavelength_m: float = math.inf) -> float:
+        """Return the rms of the weights at some sines over that of all, 1 at most.
+
+        An image that sees an edge of the window only errs by as much more.
+        """
+        weights = self.weights(sine, wavelength_m)
+        seen = weights[weights > 0]
+        if not seen.size:
+            return 1.0
+        rms, of_all = (np.sqrt(np.mean(each**2)) for each in (seen, self._all(wavelength_m)))
+        return float(min(rms / of_all, 1.0))
+
+    def _all(self, wavelength_m: float) -> NDArray[np.float64]:
+        """Return weights all over the window."""
+        return self._inside(np.linspace(*np.clip(self.limits, -1, 1), 65), wavelength_m)
 
     def weights(self, q: ArrayLike, wavelength_m: float = math.inf) -> NDArray[np.float64]:
         """Return the weights at sines `q` of the aspect angle; `wavelength_m` is for "inverse"."""
@@ -284,8 +304,9 @@ class BeamWindow:
         if self.shape == "taylor":
             return _taylor(u)
         if self.shape == "tukey":
-            edge = max(self.taper / 2, 1e-30)
-            return np.sin(np.pi / 2 * np.clip((0.5 - np.abs(u)) / edge, 0, 1)) ** 2
+            if not self._has_taper:
+                return np.ones_like(q)
+            return np.sin(np.pi * np.clip((0.5 - np.abs(u)) / self.taper, 0, 0.5)) ** 2
         if self.shape == "inverse":
             one_way = element_pattern(self.element_length_m, np.sin(angle), 1.0, wavelength_m)
             return 1 / np.maximum(one_way**2, 1e-30)

@@ -181,6 +181,18 @@ def test_no_phase_turns_faster_than_its_bound(seed):
         assert (rate <= 1.1 * bound + 1e-3 * bound.max())[within].all()
 
 
+def test_rates_about_many_places_are_those_about_each():
+    track = mean_track(lines_of(along_x(300, 0.02)))
+    surface = surface_of(Grid.plane((-1, 1, 40), (3, 5, 40)))
+    centres_m = np.random.default_rng(2).uniform((-3, 2, -1), (3, 9, 1), (300, 3))
+    others = surface, np.array([16.0, 8.0]), 160.0, 0.1
+    together = cycles_per_extent(track, others[0], centres_m, *others[1:])
+    for index in (0, 150, 299):
+        alone = cycles_per_extent(track, others[0], centres_m[[index]], *others[1:])
+        # Boxes are sampled more finely the nearer the nearest of them is.
+        np.testing.assert_allclose(together[:, index], alone[:, 0], rtol=0.05)
+
+
 def test_turns_are_the_integral_of_rates():
     track = mean_track(lines_of(TRACKS["straight"]))
     place = track.samples

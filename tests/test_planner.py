@@ -189,6 +189,16 @@ def test_planning_ends_whatever_is_tried_in_vain(monkeypatch):
     assert plan(lines, grid, **wish).is_exact
 
 
+def test_a_track_there_and_back_is_not_factorized_with_a_beam():
+    """Neighbours on the track look opposite ways."""
+    there_m = along_x(300, 0.02)
+    track_m = np.concatenate([there_m, there_m[::-1] + [0, -0.05, 0]])
+    lines, grid = over(around(0, 40), track_m)
+    wish = {"tolerance_db": -30, "costs": EXACT_IS_SLOW}
+    assert not plan(lines, grid, **wish).is_exact
+    assert plan(lines, grid, beam=BeamWindow(8, "hann"), **wish).is_exact
+
+
 @pytest.mark.parametrize("tolerance_db", [-30, -50])
 def test_what_may_be_lost_is_made_use_of(tolerance_db):
     lines, grid = over(around(0, 40, shape=(512, 512)))

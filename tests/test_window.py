@@ -229,6 +229,29 @@ def test_an_image_is_the_weighted_sum(name, device):
     assert relative_error_db(execute(preparation).pixels.ravel()[chosen], wanted) <= -75
 
 
+@pytest.mark.parametrize("taper", [0.0, 1e-3])
+def test_a_window_without_taper_is_rectangular(taper):
+    bare, plain = BeamWindow(60, "tukey", taper=taper), BeamWindow(60)
+    np.testing.assert_array_equal(bare.table(), plain.table())
+    q = np.linspace(-0.6, 0.6, 1001)
+    np.testing.assert_array_equal(bare.weights(q), plain.weights(q))
+    assert bare.plane_error(3e-3) >= plain.plane_error(3e-3) > 1e-3
+
+
+@pytest.mark.parametrize("shape", ["hann", "hamming", "tukey"])
+@pytest.mark.parametrize("accuracy_db", [-50, -70])
+def test_an_image_at_the_edge_of_a_window_is_as_accurate(shape, accuracy_db):
+    beam = BeamWindow(60, shape, along=X)
+    grid = Grid((-23.07, 40, 0), (0.02, 0, 0), (0, 0.02, 0), shape=(48, 48))
+    lines = thesis_lines(grid, along_x(150, 0.004))
+    preparation = prepare(lines, grid, beam=beam, accuracy_db=accuracy_db)
+    chosen, each = (
+        execute(choice)
+        for choice in (preparation, dataclasses.replace(preparation, one_cubic=False))
+    )
+    assert relative_error_db(chosen, each) <= accuracy_db - 6
+
+
 @pytest.mark.parametrize("turned", [False, True])
 @pytest.mark.parametrize("squint_deg", [0, 10])
 @pytest.mark.parametrize("shape", ["hann", "hamming", "taylor", "rectangular"])
