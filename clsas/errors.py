@@ -6,7 +6,6 @@ import functools
 import math
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, replace
-from itertools import repeat
 
 import numpy as np
 from numpy.typing import NDArray
@@ -184,15 +183,11 @@ def _off_track(view: View, side: tuple[int, int], extents: NDArray[np.float64]) 
     weights = np.ones_like(wrong)
     if view.beam is not None:
         directions = interpolated_directions(track.samples, view.along, part.place)
+        virtual = [sines(*each, directions) for each in zip(points_m, virtual_m, strict=True)]
+        channels = [sines(each, middle_m, view.channels_along[index]) for each in points_m]
         weights, of_virtual = (
-            view.beam.weights(
-                np.stack([sines(*each).T for each in zip(points_m[:, 1:], *places, strict=False)]),
-                wavelength_m(lines),
-            )
-            for places in (
-                (repeat(middle_m), repeat(view.channels_along[index])),
-                (virtual_m, repeat(directions)),
-            )
+            view.beam.weights(np.stack(each).swapaxes(1, 2)[:, 1:], wavelength_m(lines))
+            for each in (channels, virtual)
         )
         wrong = weights**2 * wrong + (weights - of_virtual) ** 2
     total = np.sum(weights**2, where=seen[:, None])

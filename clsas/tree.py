@@ -375,8 +375,8 @@ def ranges(
     start, stop = np.where(empty, np.inf, seen[0]), np.where(empty, -np.inf, seen[1])
     result = []
     for level in reversed(range(len(nodes))):
-        begin, end = _between(places[level], counts[level], start, stop, int(level > 0))
-        first, last = _between(places[level + 1], counts[level + 1], start, stop, 1)
+        begin, end = _between(places[level], counts[level], start, stop, level > 0)
+        first, last = _between(places[level + 1], counts[level + 1], start, stop, True)
         empty = (end <= begin) | (last <= first) | (stop < start)
         for array in (first, last, begin, end):
             array[empty] = 0
@@ -399,14 +399,14 @@ def _between(
     counts: NDArray[np.int64],
     start: NDArray[np.float64],
     stop: NDArray[np.float64],
-    more: int,
+    nearest: bool,
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return which of ascending places lie between others, first and one past the last.
 
-    `more` on either side are taken where places may lie further apart than these.
+    Where none does these are, with `nearest`, the two beside.
     """
     first, last = _rowwise(places, start, "left"), _rowwise(places, stop, "right")
-    if more:
+    if nearest:
         between = last <= first
         first, last = first - between, last + between
     return np.clip(first, 0, counts), np.clip(last, 0, counts)
