@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
-from clsas.aperture import drift, stretches
+from clsas.aperture import drift, some_channels, stretches
 from clsas.backproject import wavelength_m
 from clsas.device import Device
 from clsas.geometry import pairwise_range_m
@@ -24,7 +24,6 @@ from clsas.window import sines
 
 _FLOAT32 = 4.5e-8  # rms error of a phase in the stages over the phase across a root: measured
 _CHANNELS, _PLACES, _PIXELS = 128, 160, 24  # at which errors are evaluated
-_GOLDEN = (np.sqrt(5) - 1) / 2
 _SOME_SPOTS = (0, 7, 14, 16, 23)  # of 5 by 5, in every row and column one
 
 
@@ -153,7 +152,7 @@ def _off_track(view: View, side: tuple[int, int], extents: NDArray[np.float64]) 
     much the weights of the two differ.
     """
     lines, track = view.lines, view.track
-    index = _some_channels(lines.channels)
+    index = some_channels(lines.channels, _CHANNELS)
     part = replace(track, place=track.place[index])
     tx_m, rx_m, middle_m = (each[index] for each in (lines.tx_m, lines.rx_m, lines.phase_centres_m))
     velocity = lines.rx_velocity_m_s
@@ -225,17 +224,23 @@ def _between_nodes(
     interpolation makes of them; unless `beam_cycles` is None, weighted by the beam.
     """
     track, seen = view.track, view.seen(side)
-    somewhere = seen.any(axis=1)
-    if not somewhere.any():
-        return 0.0
-    spots = np.array([spot for spot in _SOME_SPOTS if somewhere[spot]], np.int64)
-    spots = spots if spots.size else np.flatnonzero(somewhere)[:1]
+    # Of channels, not of the track: that may have gaps.
+    channels = np.sort(track.place)
+    ends = [track.samples[each][[0, -1]] if each.any() else (0.0, -1.0) for each in seen]
+    begin, end = np.transpose(ends)
+    first, count = np.searchsorted(channels, begin), np.searchsorted(channels, end, "right")
+    count = np.maximum(count - first, 0)
+    if not count.any():
+        return math.inf
+    spots = np.array([spot for spot in _SOME_SPOTS if count[spot]], np.int64)
+    spots = spots if spots.size else np.flatnonzero(count)[:1]
+    first, count = first[spots], count[spots]
     weighted = view.beam is not None and beam_cycles is not None
     rates = crowding * np.tensordot(extents, view.rates[:, spots], 1)
     if weighted:
         rates = rates + beam_cycles * view.beam_rates[spots]
-    ends = [track.samples[each][[0, -1]] for each in seen[spots]]
-    place = np.linspace(*np.transpose(ends), _PLACES, axis=1)
+    number = np.linspace(first, first + count - 1, _PLACES, axis=1)
+    place = np.interp(number, np.arange(len(channels)), channels)
     nodes = interpolated_nodes(track, rates, place, aperture)
     frequencies = view.carriers(_PIXELS)
     pixels = [_pixels_m(view, extents, spot) for spot in spots]
@@ -246,12 +251,13 @@ def _between_nodes(
     exact, of_nodes = steering(nodes.ordered(place)), steering(nodes.place)
     index = nodes.base[..., None] + np.arange(nodes.taps)
     wrong = total = 0.0
-    for each, sampled, taps, weights in zip(exact, of_nodes, index, nodes.weights, strict=True):
+    found = zip(count, exact, of_nodes, index, nodes.weights, strict=True)
+    for share, each, sampled, taps, weights in found:
         away = -each
         for tap, weight in zip(taps.T, weights.T.astype(np.float32), strict=True):
             away += weight * sampled[:, tap]
-        wrong += float(np.vdot(away, away).real)
-        total += float(np.vdot(each, each).real)
+        wrong += share * float(np.vdot(away, away).real)
+        total += share * float(np.vdot(each, each).real)
     return max(wrong / max(total, 1e-30) - power(aperture.error_db), 0.0)
 
 
@@ -293,14 +299,6 @@ def _steering(
         sine = (sine + pixels_m[:, 1:] @ along.swapaxes(1, 2)) / range_m[:, 1:]
         result *= view.beam.weights(sine, wavelength_m(view.lines)).astype(np.float32)
     return result
-
-
-def _some_channels(count: int) -> NDArray[np.int64]:
-    """Return about _CHANNELS of so many, evenly but not regularly: arrays come in regular steps."""
-    if count <= _CHANNELS:
-        return np.arange(count)
-    number = np.arange(_CHANNELS)
-    return ((number + number * _GOLDEN % 1) * count / _CHANNELS).astype(np.int64)
 
 
 def _pixels_m(

@@ -40,7 +40,8 @@ _WORTH = 0.95  # of the time of an exact image
 _LEAST_CROWDED, _MOST_CROWDING = 1.05, 2.0  # more nodes at a time, and altogether
 _CROWDING_POWER = 0.08  # of an error that more nodes are to mend
 _LEAST_STEP = 0.02  # of the error allowed
-_LEAST_COVERED = 0.25
+_LEAST_COVERED = 0.25  # of the sum of weights at the best covered pixel
+_LEAST_SHARE_COVERED = 0.1  # of an image
 _LEAST_BEAM_CYCLES, _MOST_BEAM_CYCLES = 0.5, 64.0
 
 
@@ -199,9 +200,13 @@ def _divisible(view: View) -> bool:
     """Return whether an image can be factorized at all."""
     if view.track is None or view.grid.size == 1 or not view.sweeps_once:
         return False
+    if view.beam is None:
+        return True
     # What is normalised is amplified with its errors where hardly anything is seen.
-    normalise = view.beam is not None and view.beam.normalise
-    return not normalise or view.least_covered >= _LEAST_COVERED
+    if view.beam.normalise and view.coverage(1).min() < _LEAST_COVERED:
+        return False
+    # Where hardly any pixel sees anything there is as little to gain as is known about errors.
+    return float(view.coverage(2).mean()) >= _LEAST_SHARE_COVERED
 
 
 def _fastest(

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import KDTree
 
 from clsas import interpolation
-from clsas.aperture import cycles_per_extent, mean_track
+from clsas.aperture import cycles_per_extent, mean_track, some_channels
 from clsas.backproject import wavelength_m
 from clsas.grid import Grid
 from clsas.interpolation import Interpolator, Resampling
@@ -23,11 +23,13 @@ from clsas.tree import beam_directions, beam_rate
 from clsas.window import BeamWindow, Sight, sines
 
 _NEIGHBOURS = 64  # channels whose density is looked at
+_CHANNELS = 256  # of which it is looked at what they see
 _SPOTS = (0.02, 0.25, 0.5, 0.75, 0.98)  # of rows and columns, where the geometry is looked at
 _OF_SPOTS = np.array([0.135, 0.24, 0.25, 0.24, 0.135])  # what these stand for
 _SHARES = np.outer(_OF_SPOTS, _OF_SPOTS).ravel() / _OF_SPOTS.sum() ** 2
 _EVERYWHERE = np.linspace(0, 1, 17)  # parts of rows and columns
 _BINS = 512  # of a beam
+_MOST_TURNED = 1 / 16  # of a beam, from one channel to the next
 _COARSER = 4  # of the track's samples: where roots are compared
 
 
@@ -115,10 +117,11 @@ class View:
         """
         if self.beam is None:
             return True
-        # Neighbours on the track must look the same way: one may lead back beside another.
+        # Neighbours on the track must look much the same way: at a kink a beam may swing past a
+        # spot within a few channels, and one may lead back beside another.
         along = self.channels_along[np.argsort(self.track.place, kind="stable")]
         turned = np.linalg.norm(np.diff(along, axis=0), axis=1)
-        if turned.max(initial=0.0) > self.beam.edge:
+        if turned.max(initial=0.0) > _MOST_TURNED * np.ptp(np.clip(self.beam.limits, -1, 1)):
             return False
         on_track = self.on_track
         position = self.track_m[on_track]
@@ -141,16 +144,18 @@ class View:
         """
         if self.beam is None:
             return self
-        on_track, (low, high) = self.on_track, np.clip(self.limits, -1, 1)
-        # Everywhere: of a short aperture a pixel sees a small part of the beam only.
-        position_m = self.track_m[on_track]
-        sine = sines(self._pixels_m(_EVERYWHERE), position_m, self.along[on_track])
-        sine = sine[(sine > low) & (sine < high)]
-        power = self.beam.weights(sine, wavelength_m(self.lines)) ** 2
-        place = np.minimum((sine - low) * (_BINS / (high - low)), _BINS - 1).astype(np.int64)
-        power = np.bincount(place, power, _BINS).cumsum()
-        first = np.searchsorted(power, share / 2 * power[-1])
-        last = np.searchsorted(power, (1 - share / 2) * power[-1])
+        low, high = np.clip(self.limits, -1, 1)
+        on_track, bounds = self.on_track, []
+        of_track = sines(self._everywhere_m, self.track_m[on_track], self.along[on_track])
+        # Of channels too, since the track may have gaps; filters reach into these. Everywhere: of
+        # a short aperture a pixel sees a small part of the beam only.
+        for sine in (self._sines_of_channels, of_track):
+            sine = sine[(sine > low) & (sine < high)]
+            power = self.beam.weights(sine, wavelength_m(self.lines)) ** 2
+            place = np.minimum((sine - low) * (_BINS / (high - low)), _BINS - 1).astype(np.int64)
+            power = np.bincount(place, power, _BINS).cumsum()
+            bounds.append(np.searchsorted(power, np.array([share / 2, 1 - share / 2]) * power[-1]))
+        first, last = np.min(bounds, axis=0)[0], np.max(bounds, axis=0)[1]
         if not 0 < first <= last:
             return self
         view = copy.copy(self)
@@ -160,15 +165,25 @@ class View:
         view.rates = view._rates(np.zeros(len(self.surface.steps_m)), self.spots_m)
         return view
 
-    @property
-    def least_covered(self) -> float:
-        """Least sum of the beam's weights at a pixel, over the largest."""
-        points_m = self._pixels_m(np.linspace(0, 1, 33))
-        on_track = self.on_track
-        position_m = self.track_m[on_track]
-        sine = sines(points_m, position_m, self.along[on_track])
-        sums = self.beam.weights(sine, wavelength_m(self.lines)).sum(axis=0)
-        return float(sums.min() / max(sums.max(), 1e-30))
+    def coverage(self, power: int) -> NDArray[np.float64]:
+        """Return sums over channels of a power of the beam's weights, over the largest, [points].
+
+        At points all over the grid; 0 where nothing is seen from anywhere.
+        """
+        weights = self.beam.weights(self._sines_of_channels, wavelength_m(self.lines))
+        sums = (weights**power).sum(axis=0)
+        return sums / max(sums.max(), 1e-30)
+
+    @functools.cached_property
+    def _everywhere_m(self) -> NDArray[np.float64]:
+        return self._pixels_m(_EVERYWHERE)
+
+    @functools.cached_property
+    def _sines_of_channels(self) -> NDArray[np.float64]:
+        """Sines of the aspect angle of all over the grid, [channels, points]; of some channels."""
+        some = some_channels(self.lines.channels, _CHANNELS)
+        position_m, along = self.lines.phase_centres_m[some], self.channels_along[some]
+        return sines(self._everywhere_m, position_m, along)
 
     @functools.cached_property
     def densest(self) -> float:

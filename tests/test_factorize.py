@@ -842,6 +842,26 @@ def test_a_gap_in_the_track_stays_empty(platform):
     assert np.abs(image.pixels[unseen]).max() <= 0.01 * np.abs(exact.pixels).max()
 
 
+def with_gap(channels, spacing_m, gap_m):
+    track_m = along_x(channels, spacing_m)
+    track_m[:, 0] += np.sign(track_m[:, 0]) * gap_m / 2
+    return track_m
+
+
+@pytest.mark.parametrize("tolerance_db", [-20, -40])
+@pytest.mark.parametrize("gap_m", [2, 3, 4])
+@pytest.mark.parametrize(
+    "beam", [BeamWindow(39, "hamming"), BeamWindow(20, "hann")], ids=["hamming", "hann"]
+)
+def test_pixels_that_see_the_ends_of_a_gap_keep_the_promise(beam, gap_m, tolerance_db):
+    """Beside it channels weigh little, and what is expected of the track is not of them."""
+    lines, grid = over(around(-0.2, 6.5, shape=(113, 150)), with_gap(300, 0.022, gap_m))
+    wish = {"beam": beam, "tolerance_db": tolerance_db}
+    chosen = plan(lines, grid, costs=EXACT_IS_SLOW, **wish)
+    exact = backproject(lines, grid, beam=beam, accuracy_db=-80)
+    assert relative_error_db(factorize(lines, grid, chosen), exact) <= tolerance_db
+
+
 # Memory
 
 

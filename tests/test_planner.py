@@ -17,6 +17,7 @@ from test_factorize import (
     planned,
     straight,
     swaying,
+    with_gap,
 )
 
 from clsas import planner
@@ -197,6 +198,31 @@ def test_a_track_there_and_back_is_not_factorized_with_a_beam():
     wish = {"tolerance_db": -30, "costs": EXACT_IS_SLOW}
     assert not plan(lines, grid, **wish).is_exact
     assert plan(lines, grid, beam=BeamWindow(8, "hann"), **wish).is_exact
+
+
+@pytest.mark.parametrize(("slope", "is_exact"), [(0.0005, False), (0.3, True)])
+def test_a_beam_that_swings_past_within_few_channels_is_not_factorized(slope, is_exact):
+    """At a kink of the track; elsewhere nothing of this image is seen where that is sharp."""
+    track_m = along_x(1000, 0.0055)
+    track_m[:, 1] = slope * np.abs(track_m[:, 0] - 0.3)
+    lines, grid = over(around(-0.6, 50, pixel_m=(0.012, 0.012), shape=(133, 129)), track_m)
+    wish = {"beam": BeamWindow(4.4, "hann"), "tolerance_db": -40, "costs": EXACT_IS_SLOW}
+    assert plan(lines, grid, **wish).is_exact == is_exact
+
+
+def test_an_image_that_lies_in_a_gap_of_the_track_is_not_factorized():
+    """Where hardly a pixel sees a channel, errors are as large as the image."""
+    lines, grid = over(around(0.74, 18, shape=(200, 360)), with_gap(1000, 0.022, 7.2))
+    for normalise in (False, True):
+        beam = BeamWindow(2.8, "hann", normalise=normalise)
+        assert plan(lines, grid, tolerance_db=-50, beam=beam, costs=EXACT_IS_SLOW).is_exact
+
+
+def test_a_gap_is_not_covered_where_an_image_is_normalised():
+    lines, grid = over(around(-1.2, 10, shape=(200, 100)), with_gap(1000, 0.011, 2))
+    wish = {"tolerance_db": -15, "costs": EXACT_IS_SLOW}
+    assert plan(lines, grid, beam=BeamWindow(5, "hann", normalise=True), **wish).is_exact
+    assert not plan(lines, grid, beam=BeamWindow(5, "hann"), **wish).is_exact
 
 
 @pytest.mark.parametrize("tolerance_db", [-30, -50])

@@ -36,6 +36,7 @@ from clsas.window import INTERVALS, SHAPES, BeamWindow, channel_ranges, sines
 FINE = {"taps": 8, "upsampling": 4}
 X = (1.0, 0, 0)
 DEGREE = np.pi / 180
+ROUNDING_DB = -87  # of what two images in float32 differ by
 
 
 def window(shape, width_deg=20.0, **others):
@@ -268,8 +269,11 @@ def test_one_cubic_of_weights_errs_by_no_more_than_is_expected(shape, squint_deg
     tiles = preparation.layout
     nearest_m = tiles.nearest_m(lines.phase_centres_m) - tiles.radius_m
     expected_db = 20 * np.log10(tiles.one_cubic_error(beam, nearest_m, 0.0015))
-    assert expected_db <= -72 or not preparation.one_cubic
-    assert expected_db - 25 <= relative_error_db(one, each) <= expected_db
+    assert preparation.one_cubic == (expected_db <= -72)
+    measured_db = relative_error_db(one, each)
+    assert measured_db <= max(expected_db, ROUNDING_DB)
+    # Blocks of one column are lines, of which little more than nothing may remain.
+    assert measured_db >= expected_db - 25 or tiles.width == 1
 
 
 @pytest.mark.parametrize("normalise", [False, True])
