@@ -54,11 +54,13 @@ def test_factorized_against_exact(beam, monkeypatch):
     assert result["error_db"] < -38
     assert result["predicted_error_db"] <= -40
     assert result["plan"].startswith("Plan: tolerance -40 dB")
-    for key in ("seconds", "again_seconds", "exact_seconds"):
+    for key in ("seconds", "again_seconds", "exact_seconds", "default_seconds"):
         assert 0 < result[key]["min"] <= result[key]["median"] <= result[key]["max"]
     for key, speedup in (("seconds", "speedup"), ("again_seconds", "speedup_again")):
         ratio = result["exact_seconds"]["median"] / result[key]["median"]
         assert result[speedup] == pytest.approx(ratio)
+    ratio = result["default_seconds"]["median"] / result["seconds"]["median"]
+    assert result["speedup_over_default"] == pytest.approx(ratio)
     assert result["plan_seconds"] > 0
     assert result["predicted_seconds"] > 0
     assert {"device", "driver", "samples"} < result.keys()

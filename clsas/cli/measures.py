@@ -197,7 +197,7 @@ def bench(
         for key, value in result.items():
             parts = value.items() if isinstance(value, dict) else [("", value)]
             told = ", ".join(f"{part} {_plain(item)}".strip() for part, item in parts)
-            click.echo(f"{key:>24}  " + told.replace("\n", "\n" + 26 * " "))
+            click.echo(f"{key:>26}  " + told.replace("\n", "\n" + 28 * " "))
 
 
 def _case(name: str) -> Any:
