@@ -220,16 +220,12 @@ def _between_nodes(
     """Return the power of the error between nodes beside that of the aperture's filter.
 
     The filter takes nodes as equally spaced and weights as constant. Evaluated as it is, for some
-    subimages and pixels of them: steering functions between nodes against what
-    interpolation makes of them; unless `beam_cycles` is None, weighted by the beam.
+    subimages and pixels of them and where there are channels: steering functions between nodes
+    against what interpolation makes of them; unless `beam_cycles` is None, weighted by the beam.
+    Infinite where nothing is seen, of which nothing is known.
     """
-    track, seen = view.track, view.seen(side)
-    # Of channels, not of the track: that may have gaps.
-    channels = np.sort(track.place)
-    ends = [track.samples[each][[0, -1]] if each.any() else (0.0, -1.0) for each in seen]
-    begin, end = np.transpose(ends)
-    first, count = np.searchsorted(channels, begin), np.searchsorted(channels, end, "right")
-    count = np.maximum(count - first, 0)
+    track = view.track
+    channels, first, count = _channels_seen(view, side)
     if not count.any():
         return math.inf
     spots = np.array([spot for spot in _SOME_SPOTS if count[spot]], np.int64)
@@ -239,7 +235,7 @@ def _between_nodes(
     rates = crowding * np.tensordot(extents, view.rates[:, spots], 1)
     if weighted:
         rates = rates + beam_cycles * view.beam_rates[spots]
-    number = np.linspace(first, first + count - 1, _PLACES, axis=1)
+    number = np.linspace(first, first + count - 1, _PLACES, axis=1)  # of places like channels
     place = np.interp(number, np.arange(len(channels)), channels)
     nodes = interpolated_nodes(track, rates, place, aperture)
     frequencies = view.carriers(_PIXELS)
@@ -259,6 +255,20 @@ def _between_nodes(
         wrong += share * float(np.vdot(away, away).real)
         total += share * float(np.vdot(each, each).real)
     return max(wrong / max(total, 1e-30) - power(aperture.error_db), 0.0)
+
+
+def _channels_seen(
+    view: View, side: tuple[int, int]
+) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.int64]]:
+    """Return places of channels, ascending, the first that sees a subimage and how many do.
+
+    The latter of subimages at all spots. The track that sees one may have a gap there.
+    """
+    places, samples = np.sort(view.track.place), view.track.samples
+    ends = [samples[seen][[0, -1]] if seen.any() else (0.0, -1.0) for seen in view.seen(side)]
+    begin, end = np.transpose(ends)
+    first = np.searchsorted(places, begin)
+    return places, first, np.maximum(np.searchsorted(places, end, "right") - first, 0)
 
 
 def _steering(
