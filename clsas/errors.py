@@ -222,12 +222,12 @@ def _between_nodes(
     The filter takes nodes as equally spaced and weights as constant. Evaluated as it is, for some
     subimages and pixels of them and where there are channels: steering functions between nodes
     against what interpolation makes of them; unless `beam_cycles` is None, weighted by the beam.
-    Infinite where nothing is seen, of which nothing is known.
+    As large as the image where nothing is seen, of which nothing is known.
     """
     track = view.track
     channels, first, count = _channels_seen(view, side)
     if not count.any():
-        return math.inf
+        return 1.0
     spots = np.array([spot for spot in _SOME_SPOTS if count[spot]], np.int64)
     spots = spots if spots.size else np.flatnonzero(count)[:1]
     first, count = first[spots], count[spots]
