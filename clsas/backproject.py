@@ -15,6 +15,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from clsas import interpolation, phases, validate
+from clsas.aperture import some_channels
 from clsas.device import Device, Slot, aligned, open_device
 from clsas.geometry import bistatic_range_m, pairwise_range_m
 from clsas.grid import Grid
@@ -208,7 +209,7 @@ def prepare(
     if beam is not None:
         nearest_m = max(layout.nearest_m(lines.phase_centres_m) - layout.radius_m, 1e-30)
         error = layout.one_cubic_error(beam, nearest_m, wavelength_m(lines))
-        some = slice(None, None, max(lines.channels // 256, 1))
+        some = some_channels(lines.channels, 256)
         centres_m = layout.centres_m(slice(None, None, max(layout.parts // 256, 1)))
         sine = sines(centres_m, lines.phase_centres_m[some], along[some])
         one_cubic = error <= geometry_error * beam.fullness(sine, wavelength_m(lines))

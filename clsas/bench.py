@@ -328,7 +328,7 @@ def run_mosaic(
     tolerance_db : float
         As for `clsas.mosaic`.
     repeats : int
-        Timed turns, after one that builds the kernels.
+        As for `run_factorized`.
     progress : callable, optional
         Called as progress(done, total), while the lines are simulated and then turn by turn.
 

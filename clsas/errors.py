@@ -228,10 +228,12 @@ def _between_nodes(
     channels, first, count = _channels_seen(view, side)
     if not count.any():
         return 1.0
-    spots = np.array([spot for spot in _SOME_SPOTS if count[spot]], np.int64)
-    spots = spots if spots.size else np.flatnonzero(count)[:1]
-    first, count = first[spots], count[spots]
     weighted = view.beam is not None and beam_cycles is not None
+    everywhere = weighted and view.beam.jumps  # steps are seen from some spots only
+    spots = np.flatnonzero(count)
+    if not everywhere and np.isin(spots, _SOME_SPOTS).any():
+        spots = np.intersect1d(spots, _SOME_SPOTS)
+    first, count = first[spots], count[spots]
     rates = crowding * np.tensordot(extents, view.rates[:, spots], 1)
     if weighted:
         rates = rates + beam_cycles * view.beam_rates[spots]

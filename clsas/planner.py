@@ -41,7 +41,7 @@ _LEAST_CROWDED, _MOST_CROWDING = 1.05, 2.0  # more nodes at a time, and altogeth
 _CROWDING_POWER = 0.08  # of an error that more nodes are to mend
 _LEAST_STEP = 0.02  # of the error allowed
 _LEAST_COVERED = 0.25  # of the sum of weights at the best covered pixel
-_LEAST_SHARE_COVERED = 0.1  # of an image
+_LEAST_SHARE_COVERED, _LEAST_PARTIAL = 0.1, 0.25  # of an image
 _LEAST_BEAM_CYCLES, _MOST_BEAM_CYCLES = 0.5, 64.0
 
 
@@ -204,6 +204,9 @@ def _divisible(view: View) -> bool:
         return True
     # What is normalised is amplified with its errors where hardly anything is seen.
     if view.beam.normalise and view.coverage(1).min() < _LEAST_COVERED:
+        return False
+    # Steps of a window that are seen from few pixels cost these more than is expected of all.
+    if view.beam.jumps and 0 < view.share_partial < _LEAST_PARTIAL:
         return False
     # Where hardly any pixel sees anything there is as little to gain as is known about errors.
     return float(view.coverage(2).mean()) >= _LEAST_SHARE_COVERED

@@ -160,6 +160,8 @@ class View:
             return self
         view = copy.copy(self)
         view._seen, view._within, view._in_roots, view._while_seen, view.kept = {}, {}, {}, {}, {}
+        for name in ("ends_seen", "slopes_m"):  # these depend on what is seen
+            view.__dict__.pop(name, None)
         edges = np.linspace(low, high, _BINS + 1)
         view.limits = float(edges[first]), float(edges[min(last + 1, _BINS)])
         view.rates = view._rates(np.zeros(len(self.surface.steps_m)), self.spots_m)
@@ -173,6 +175,13 @@ class View:
         weights = self.beam.weights(self._sines_of_channels, wavelength_m(self.lines))
         sums = (weights**power).sum(axis=0)
         return sums / max(sums.max(), 1e-30)
+
+    @property
+    def share_partial(self) -> float:
+        """Which part of the image's points sees the track through an edge of the beam."""
+        low, high = self.beam.limits
+        seen = ((self._sines_of_channels > low) & (self._sines_of_channels < high)).mean(axis=0)
+        return float(((seen > 0) & (seen < 1)).mean())
 
     @functools.cached_property
     def _everywhere_m(self) -> NDArray[np.float64]:

@@ -171,6 +171,11 @@ class BeamWindow:
         return (high - low) / 2 * (max(self.taper, 0.02) if self.shape == "tukey" else 1.0)
 
     @property
+    def jumps(self) -> bool:
+        """Whether its weights jump where it begins and ends."""
+        return self.shape != "hann" and not self._has_taper
+
+    @property
     def _has_taper(self) -> bool:
         """Whether it is "tukey" with edges: none are narrower than an interval of the table."""
         return self.shape == "tukey" and self.taper * INTERVALS >= 2

@@ -862,6 +862,27 @@ def test_pixels_that_see_the_ends_of_a_gap_keep_the_promise(beam, gap_m, toleran
     assert relative_error_db(factorize(lines, grid, chosen), exact) <= tolerance_db
 
 
+@pytest.mark.parametrize(
+    ("shape", "squint_deg", "tolerance_db"),
+    [
+        ("rectangular", -22.2, -25),
+        ("rectangular", -22, -25),
+        ("rectangular", -22, -15),
+        ("hamming", -22, -25),
+        ("taylor", -24, -40),
+        ("hann", -22, -40),
+    ],
+)
+def test_an_edge_of_the_beam_that_crosses_the_image(shape, squint_deg, tolerance_db):
+    """Few pixels see it: most see all of a short track, or nothing."""
+    grid = around(-10.7, 18.8, pixel_m=(0.0144, 0.0184), shape=(214, 164), z=-1.3)
+    lines, _ = over(grid, along_x(99, 0.01))
+    wish = {"beam": BeamWindow(12.2, shape, squint_deg=squint_deg), "tolerance_db": tolerance_db}
+    chosen = plan(lines, grid, costs=EXACT_IS_SLOW, **wish)
+    exact = backproject(lines, grid, beam=wish["beam"], accuracy_db=-80)
+    assert relative_error_db(factorize(lines, grid, chosen), exact) <= tolerance_db
+
+
 # Memory
 
 

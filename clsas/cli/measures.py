@@ -155,7 +155,7 @@ def tradeoff(
 )
 @click.option(
     "--tolerance-db", type=float, callback=options.check_tolerance_db,
-    help="And in factorized ones. [default: -50]",
+    help="And in factorized ones. [default: -50, of the mosaic -40]",
 )  # fmt: skip
 @click.option("--repeats", type=click.IntRange(1), default=5, show_default=True, help="Timed runs.")
 @options.as_json

@@ -98,7 +98,8 @@ dial = _together(
 beam = _together(
     click.option("--beam-deg", type=float, help="Use a beam of this full width only."),
     click.option(
-        "--beam-shape", type=click.Choice(SHAPES), help="Its shape. [default: rectangular]"
+        "--beam-shape", type=click.Choice(SHAPES),
+        help="Its shape; 'hann' is the fastest to image with. [default: rectangular]",
     ),
     click.option("--squint-deg", type=float, help="Its middle, ahead of broadside. [default: 0]"),
     click.option(
