@@ -26,11 +26,12 @@ from clsas.scene import PointTargets
 from clsas.simulate import simulate_lines
 from clsas.store import Record
 from clsas.tradeoff import REFERENCE_DB
-from clsas.window import BeamWindow
+from clsas.window import BeamWindow, sines
 
 _PIXELS = 300  # random pixels at which errors are measured
 _POINTS = 1000
 _DUNES_M = 8.0
+_SIDE = 64  # pixels at which it is looked what they see
 _OFTEN = 3  # in a turn what is fast, which scatters most
 
 
@@ -340,7 +341,8 @@ def run_mosaic(
         `unlimited_seconds` of `clsas.backproject` with the beam and without, as accurate as the
         tolerance, and `default_unlimited_seconds` of the latter with its default accuracy;
         `speedup`, `speedup_unlimited` and `speedup_over_default` are their medians over that of
-        the mosaic. `error_db` is against an exact image of -80 dB,
+        the mosaic. `share_seen` is that of all pairs of a pixel and a channel that the beam
+        leaves. `error_db` is against an exact image of -80 dB,
         `shadow_contrast_difference_db` is by how much the contrast of the wreck's shadow differs
         from that image's.
     """
@@ -380,6 +382,7 @@ def run_mosaic(
         "patches": len(records),
         "tolerance_db": tolerance_db,
         **found,
+        "share_seen": _share_seen(lines, wreck.grid(_SIDE), beam),
         "plan_seconds": sum(record.plan_seconds for record in records),
         "speedup": found["exact_seconds"]["median"] / seconds,
         "speedup_unlimited": found["unlimited_seconds"]["median"] / seconds,
@@ -389,6 +392,14 @@ def run_mosaic(
         "shadow_contrast_db": contrast_db,
         "shadow_contrast_difference_db": contrast_db - reference_db,
     }
+
+
+def _share_seen(lines: RangeLines, grid: Grid, beam: BeamWindow) -> float:
+    """Return in which part of all pairs of pixel and channel one sees the other."""
+    points_m = grid.positions_m().reshape(-1, 3)
+    sine = sines(points_m, lines.phase_centres_m, beam.directions(lines))
+    low, high = beam.limits
+    return float(((sine > low) & (sine < high)).mean())
 
 
 def _in_turns(

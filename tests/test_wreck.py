@@ -69,6 +69,7 @@ def test_benchmark(monkeypatch):
     assert result["pixels"] == [128, 128]
     assert result["error_db"] <= result["predicted_error_db"] <= -40
     assert abs(result["shadow_contrast_difference_db"]) < 0.2
+    assert 0 < result["share_seen"] < 0.2
     for speedup, name in (
         ("speedup", "exact_seconds"),
         ("speedup_unlimited", "unlimited_seconds"),
