@@ -11,6 +11,7 @@ ERRORS = {121: (3, 64), 60: (3, 32), 30: (3, 16), 15: (3, 8), 7: (3, 4), 3: (3, 
 # The halving from 30.3, which the thesis gives for QR = 2 and QI = 4, by powers of two.
 HALVINGS = {121: (2, 16), 60: (2, 8), 30: (2, 4), 15: (2, 2), 7: (4, 2), 3: (8, 2), 1: (16, 2)}
 TOLERANCES_DB = (-20, -40)
+TAPS = (4, 6, 8)  # in range and along the aperture, at -40 dB
 DYNAMIC_RANGE_DB = 40  # as in the thesis's pictures
 PANEL = 256  # dots along a picture's side
 
@@ -56,6 +57,8 @@ def main() -> None:
         add(f"nearest, λ/{label}", stages=[pair])
     for db in TOLERANCES_DB:
         add(f"interpolated, {db} dB", tolerance_db=db)
+    for taps in TAPS:
+        add(f"interpolated, {taps} taps", kept=False, tolerance_db=-40, taps=(taps, taps))
     for label, pair in HALVINGS.items():
         add(f"nearest, thesis's λ/{label}?", kept=False, stages=[pair])
     chapter5.report(given.out, "figures_21_36", rows)
