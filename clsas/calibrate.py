@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import product
 
@@ -20,6 +20,7 @@ from clsas.device import Device, open_device
 from clsas.exact import Exact, expect
 from clsas.factorize import factorize
 from clsas.grid import Grid
+from clsas.image import Image
 from clsas.interpolation import COST
 from clsas.lines import RangeLines
 from clsas.plan import Plan
@@ -210,9 +211,14 @@ def _images(device: Device) -> list[_Image]:
 
     def factorized(lines: RangeLines, grid: Grid, tolerance_db: float, told: Costs) -> None:
         chosen = plan(lines, grid, tolerance_db=tolerance_db, device=device, costs=told)
-        if not chosen.is_exact:
-            form = partial(factorize, lines, grid, chosen, device=device)
-            images.append(_Image(form, lines.channels, chosen, grid.is_planar))
+        if chosen.is_exact:
+            return
+
+        def form() -> Image:
+            """Form the first image of the plan: a copy has kept nothing."""
+            return factorize(lines, grid, replace(chosen), device=device)
+
+        images.append(_Image(form, lines.channels, chosen, grid.is_planar))
 
     for channels, pixels in _SIZES:
         lines, grid = _scene(channels, pixels)

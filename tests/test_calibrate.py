@@ -54,6 +54,21 @@ def test_what_is_measured_is_stored(cache, small, monkeypatch):
     assert found.sample_ns + found.sample_tap_ns > 0
 
 
+def test_first_images_of_plans_are_measured(cache, small, monkeypatch):
+    """Others find the geometry that the first has left."""
+    form, kept = module.factorize, []
+
+    def looked_at(lines, grid, chosen, **others):
+        kept.append(dict(chosen.kept))
+        return form(lines, grid, chosen, **others)
+
+    monkeypatch.setattr(module, "factorize", looked_at)
+    monkeypatch.setattr(module.validate, "warn", lambda _: None)  # whatever this machine does
+    calibrate()
+    assert len(kept) > 10
+    assert not any(kept)
+
+
 def test_measurements_of_a_busy_machine_are_not_stored(cache, small, disturbed):
     """What else there is to do comes and goes: every other run takes half a second more."""
     disturbed(lambda image, seconds: seconds + 0.5 * (len(image.seconds) % 2))
