@@ -65,6 +65,8 @@ class SceneFile:
         `DIAL`) or `clsas.backproject` (some of `EXACT`), either with a `beam`.
     mosaic : dict
         What `clsas mosaic` reads (`lines`), writes (`store`), and its `patches` and `memory_mib`.
+    files : dict
+        The paths of what is read beside it, by their keys: "track.file", "mosaic.lines".
     """
 
     name: str
@@ -76,6 +78,7 @@ class SceneFile:
     compress: dict[str, Any] = field(default_factory=dict)
     image: dict[str, Any] = field(default_factory=dict)
     mosaic: dict[str, Any] = field(default_factory=dict)
+    files: dict[str, Path] = field(default_factory=dict)
 
     def need(self, *tables: str) -> tuple[Any, ...]:
         """Return the parts of these names; raises ValueError naming one that is missing."""
@@ -475,6 +478,10 @@ class _Scene(_Table):
                 )
         if self.seabed is not None:
             parts.append(self.seabed.build())
+        read = {
+            "track.file": self.track and self.track.file,
+            "mosaic.lines": self.mosaic.lines,
+        }
         return SceneFile(
             name=name,
             sonar=self.sonar.build() if self.sonar else None,
@@ -485,6 +492,7 @@ class _Scene(_Table):
             compress=self.compress.build(),
             image=self.image.build(),
             mosaic=self.mosaic.build(folder),
+            files={key: folder / file for key, file in read.items() if file},
         )
 
 

@@ -389,7 +389,8 @@ def mosaic(
             "channels"
         )
     if follows and not folder:
-        raise ValueError(f"source must be a folder to follow, got {source!r}")
+        got = "lines in memory" if isinstance(source, RangeLines) else repr(str(source))
+        raise ValueError(f"source must be a folder where follow_s is given, got {got}")
     if not isinstance(source, RangeLines):
         source = Path(source).resolve()
     devices = _devices(device)
@@ -619,8 +620,8 @@ def _choose_shape(sight: _Sight, grid: Grid, memory_bytes: int) -> tuple[int, in
             return shape
         side //= 2
     raise ValueError(
-        f"memory_bytes must be at least {needed / 2**20:.0f} MiB for patches of "
-        f"{shape[0]} x {shape[1]} pixels, got {memory_bytes / 2**20:.0f} MiB"
+        f"memory_bytes must be at least {needed / 2**20:.0f} MiB to choose patches by it, of "
+        f"{shape[0]} x {shape[1]} pixels, got {memory_bytes / 2**20:.3g} MiB: give patches"
     )
 
 

@@ -360,7 +360,8 @@ class Plan:
             values["stages"] = tuple(Stage(**stage) for stage in values["stages"])
             return cls(**values)
         except (TypeError, KeyError, AttributeError, json.JSONDecodeError) as error:
-            raise ValueError(f"text must be a plan as of Plan.to_json: {error}") from error
+            what = f"it lacks {error}" if isinstance(error, KeyError) else error
+            raise ValueError(f"text must be a plan as of Plan.to_json: {what}") from error
 
     def check(self, lines: RangeLines, grid: Grid) -> None:
         """Raise ValueError unless this plan was made for these lines and this grid."""

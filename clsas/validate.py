@@ -52,7 +52,8 @@ def number(
     """
     scalar = value[()] if getattr(value, "ndim", None) == 0 else value
     if isinstance(scalar, bool) or not isinstance(scalar, Real) or np.ma.is_masked(value):
-        raise TypeError(f"{name} must be one real number{_in(unit)}, got {value!r}")
+        kind = f"number in {unit}" if unit else "number"
+        raise TypeError(f"{name} must be one real {kind}, got {value!r}")
     try:
         result = float(scalar)
     except OverflowError:  # a whole number or fraction beyond float64

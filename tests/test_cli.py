@@ -4,6 +4,7 @@ import os
 import pty
 import re
 import shlex
+import shutil
 import signal
 import subprocess
 import sys
@@ -459,6 +460,44 @@ def test_errors_are_one_message_and_leave_nothing(made, monkeypatch, args, code,
     assert len(re.findall("^Error: ", stderr, re.MULTILINE)) == 1
     assert stderr.count("\n") == 1 or code == 2
     assert set(folder.iterdir()) == before
+
+
+@pytest.mark.parametrize(
+    ("args", "kept"),
+    [
+        (["simulate", "scene.toml", "-o", "scene.toml"], "scene.toml"),
+        (["simulate", "scene.toml", "--png", "scene.toml", "-o", "new"], "scene.toml"),
+        (["simulate", "along.toml", "-o", "track.csv"], "track.csv"),
+        (["compress", "echoes.h5", "-o", "echoes.h5"], "echoes.h5"),
+        (["compress", "-o", "echoes.h5", "echoes.h5"], "echoes.h5"),
+        (["compress", "echoes.h5", "--scene", "scene.toml", "-o", "scene.toml"], "scene.toml"),
+        (["image", "lines.h5", *GRID, "-o", "lines.h5"], "lines.h5"),
+        (["image", "lines.h5", *GRID, "-o", "link.h5"], "lines.h5"),
+        (["image", "lines.h5", *GRID, "-o", "new", "--png", "./lines.h5"], "lines.h5"),
+        (["image", "lines.h5", "--scene", "scene.toml", "-o", "scene.toml"], "scene.toml"),
+        (["image", "lines.h5", "--scene", "along.toml", "-o", "track.csv"], "track.csv"),
+        (["quality", "image.h5", "--near", "0,20", "--png", "image.h5"], "image.h5"),
+        (["quality", "image.h5", "--reference", "b.h5", "--near", "0,20", "--png", "b.h5"], "b.h5"),
+        (["tradeoff", "lines.h5", *GRID, "--csv", "lines.h5"], "lines.h5"),
+        (["mosaic", "scene.toml", "--lines", "lines.h5", "-o", "lines.h5"], "lines.h5"),
+        (["mosaic", "scene.toml", "--lines", "lines.h5", "--png", "lines.h5"], "lines.h5"),
+        (["mosaic", "scene.toml", "--lines", "lines.h5", "--png", "scene.toml"], "scene.toml"),
+    ],
+)
+def test_what_is_read_is_not_written_over(made, tmp_path, monkeypatch, args, kept):
+    for name in ("scene.toml", "echoes.h5", "lines.h5", "image.h5"):
+        shutil.copy(made[0] / name, tmp_path)
+    shutil.copy(made[0] / "image.h5", tmp_path / "b.h5")
+    monkeypatch.chdir(tmp_path)
+    Path("link.h5").symlink_to("lines.h5")
+    Path("track.csv").write_text("time_s,x_m,y_m,z_m\n0,0,0,0\n1,1,0,0\n")
+    start, end = EXAMPLE.index("[track]"), EXAMPLE.index("[[targets]]")
+    Path("along.toml").write_text(f'{EXAMPLE[:start]}[track]\nfile = "track.csv"\n{EXAMPLE[end:]}')
+    before = {path: path.read_bytes() for path in tmp_path.iterdir()}
+    stdout, stderr = run(*args, code=2)
+    assert stdout == ""
+    assert f"must be two files, got {kept!r}" in stderr or "link.h5" in args
+    assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
 
 
 def test_a_pipe_is_no_output(made, tmp_path):

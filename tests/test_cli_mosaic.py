@@ -167,10 +167,12 @@ def test_flags_are_told(made, tmp_path):
     ("args", "code", "message"),
     [
         (["--patches", "2y2"], 2, "'2y2' must be ROWSxCOLUMNS"),
-        (["--patches", "0x2"], 1, "every entry of patches must be"),
+        (["--patches", "0x2"], 2, "'0x2' must be ROWSxCOLUMNS, at least 1x1"),
         (["--patches", "90x2"], 1, "patches must leave each some of 100 pixels"),
         (["--workers", "2", "--scheduler", "tcp://localhost:1"], 2, "exclude each other"),
         (["--workers", "2", "--device", "0"], 2, "--device plays no part"),
+        (["--lines", "folder", "-o", "./folder"], 2, "--lines and -o must be two files"),
+        (["-o", "new", "--png", "new"], 2, "-o and --png must be two files"),
         (["--follow"], 2, "--follow goes with --lines, a folder"),
         (["--tolerance-db", "-30"], 1, "tolerance_db is -40.0 there, -30.0 given"),
         (["--tolerance-db", "-300"], 2, "tolerance_db must be"),
@@ -198,6 +200,26 @@ def test_a_scheduler_that_is_not_there(made, monkeypatch):
     monkeypatch.setattr("clsas.cli.mosaics._SCHEDULER_S", 0.5)
     _, stderr = run("mosaic", made[0] / "scene.toml", "--scheduler", "tcp://127.0.0.1:9", code=1)
     assert "--scheduler tcp://127.0.0.1:9 cannot be reached" in stderr
+
+
+@pytest.mark.parametrize(
+    ("mosaic", "args", "message"),
+    [
+        ("", ["--png", "scene.zarr"], "--png and the store must be two files"),
+        ('store = "a.zarr"', ["--png", "a.zarr"], "--png and the store must be two files"),
+        ('lines = "folder"', ["-o", "folder"], "mosaic.lines and -o must be two files"),
+        ('lines = "a.h5"', ["--png", "./a.h5"], "mosaic.lines and --png must be two files"),
+        ('lines = "folder"\nstore = "folder"', [], "the range lines and the store must be two"),
+    ],
+)
+def test_what_a_scene_names_is_not_written_over(tmp_path, monkeypatch, mosaic, args, message):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "scene.toml").write_text(SCENE + mosaic)
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "a.h5").touch()
+    _, stderr = run("mosaic", "scene.toml", *args, code=2)
+    assert message in stderr
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.h5", "folder", "scene.toml"]
 
 
 @pytest.mark.parametrize(

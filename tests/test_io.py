@@ -227,7 +227,7 @@ def change(file, name):
         ("without step", "lacks range_step_m of the range_lines"),
         ("of one channel too many", r"is damaged: tx_m must have shape \(4, 3\)"),
         ("with NaN", "is damaged: first_range_m must be finite, got 1 NaN"),
-        ("with text", "is damaged: carrier_hz must be one real number Hz"),
+        ("with text", "is damaged: carrier_hz must be one real number in Hz"),
     ],
 )
 def test_load_names_what_is_wrong(name, words, tmp_path):

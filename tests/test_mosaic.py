@@ -209,7 +209,7 @@ def test_patches_that_do_not_divide_the_grid(exact):
         ({"patches": None, "memory_bytes": 1000}, "memory_bytes must be at least .* MiB"),
         ({"beam": 8.0}, "beam must be"),
         ({"device": []}, "device must name at least one device"),
-        ({"follow_s": 1.0}, "source must be a folder to follow"),
+        ({"follow_s": 1.0}, "source must be a folder where follow_s is given"),
     ],
 )
 def test_bad_arguments(wrong, message):

@@ -118,7 +118,7 @@ def test_sample_rate_defaults_to_twice_the_bandwidth():
         ({"bandwidth_hz": 3e6}, ValueError, r"bandwidth_hz must be .* <= 2e\+06 Hz, got 3e\+06"),
         ({"bandwidth_hz": np.nan}, ValueError, "bandwidth_hz must be finite"),
         ({"duration_s": -1.0}, ValueError, "duration_s must be finite and > 0 s, got -1"),
-        ({"duration_s": "1 ms"}, TypeError, "duration_s must be one real number s, got '1 ms'"),
+        ({"duration_s": "1 ms"}, TypeError, "duration_s must be one real number in s, got '1 ms'"),
         ({"taper": 1.5}, ValueError, "taper must be .* <= 1, got 1.5"),
         ({"code": "sideways"}, ValueError, "code must be one of 'up', 'down', got 'sideways'"),
         (

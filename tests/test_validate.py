@@ -36,7 +36,7 @@ def test_number_takes_every_real_number(value):
     ],
 )
 def test_number_refuses_other_kinds(value):
-    with pytest.raises(TypeError, match=r"speed must be one .*number m/s, got"):
+    with pytest.raises(TypeError, match=r"speed must be one .*number in m/s, got"):
         validate.number("speed", value, "m/s")
 
 

@@ -9,8 +9,9 @@ from typing import Any
 import click
 
 import clsas
-from clsas import validate
-from clsas.config import DIAL, EXACT, SceneFile, read_scene
+from clsas import config, validate
+from clsas.cli.parameters import keep_apart, written_to
+from clsas.config import DIAL, EXACT, SceneFile
 
 DEFAULT_WISH = {"tolerance_db": -50.0}
 
@@ -28,6 +29,15 @@ def load(path: Path, kind: type) -> Any:
     raise ValueError(
         f"{path} must hold {kind.__name__}{hint.get(kind, '')}, got {type(obj).__name__}"
     )
+
+
+def read_scene(path: Path) -> SceneFile:
+    """Return what a scene file describes; nothing may be written over a file that it names."""
+    described = config.read_scene(path)
+    for key, file in described.files.items():
+        for option, written in written_to(click.get_current_context()).items():
+            keep_apart(f"{path}: {key}", file, option, written)
+    return described
 
 
 def read_grid(

@@ -10,10 +10,9 @@ import click
 
 import clsas
 from clsas.cli import options
-from clsas.cli.inputs import load, warn_of_sampling
+from clsas.cli.inputs import load, read_scene, warn_of_sampling
 from clsas.cli.outputs import progress_bar, report
 from clsas.cli.parameters import INPUT
-from clsas.config import read_scene
 
 
 @click.command()

@@ -18,7 +18,7 @@ import clsas
 from clsas.cli import options
 from clsas.cli.inputs import read_beam, read_grid, read_wish, warn_of_sampling
 from clsas.cli.outputs import progress_bar, report
-from clsas.cli.parameters import COUNTS, INPUT
+from clsas.cli.parameters import COUNTS, INPUT, File, Store, keep_apart
 from clsas.config import DIAL, SceneFile, simulation_digest
 from clsas.device import open_device
 
@@ -28,11 +28,11 @@ _SCHEDULER_S = 10  # to answer
 @click.command()
 @click.argument("scene", metavar="SCENE.TOML", type=INPUT)
 @click.option(
-    "--lines", "lines_path", type=click.Path(exists=True, path_type=Path),
+    "--lines", "lines_path", type=File(exists=True),
     help="Range lines, or a folder of files of them. [default: simulated from the scene]",
 )  # fmt: skip
 @click.option(
-    "-o", "--output", type=click.Path(path_type=Path),
+    "-o", "--output", type=Store(),
     help="Zarr store to write or go on with. [default: SCENE.zarr]",
 )  # fmt: skip
 @options.axes
@@ -90,6 +90,8 @@ def mosaic(
     in_scene = described.mosaic
     output = output or in_scene.get("store") or scene.with_suffix(".zarr")
     lines_path = lines_path or in_scene.get("lines")
+    keep_apart("--png", png, "the store", output)
+    keep_apart("the range lines", lines_path, "the store", output)
     if follow and (lines_path is None or not lines_path.is_dir()):
         raise click.UsageError("--follow goes with --lines, a folder")
     patches = patches or in_scene.get("patches")

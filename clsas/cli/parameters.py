@@ -65,27 +65,50 @@ def _stages(text: str) -> tuple[tuple[int, int], ...]:
 
 
 def _counts(text: str) -> tuple[int, int]:
-    rows, columns = text.lower().split("x")
-    return int(rows), int(columns)
+    rows, columns = map(int, text.lower().split("x"))
+    if min(rows, columns) < 1:
+        raise ValueError
+    return rows, columns
 
 
-AXIS = Parsed("START:STOP:N", _axis, "START:STOP:N, metres and a number of pixels")
+AXIS = Parsed("START:STOP:N", _axis, "START:STOP:N, metres and a number of pixels, at least 1")
 PLACE = Parsed("X,Y", _place, "X,Y in metres")
 RATIO = Parsed("NUMBER", _ratio, "a number or a fraction such as 1/30")
 STAGES = Parsed("stages", _stages, "QRxQI for every stage, such as 2x2,2x2")
-COUNTS = Parsed("ROWSxCOLUMNS", _counts, "ROWSxCOLUMNS, such as 8x8")
-INPUT = click.Path(exists=True, dir_okay=False, path_type=Path)
+COUNTS = Parsed("ROWSxCOLUMNS", _counts, "ROWSxCOLUMNS, at least 1x1, such as 8x8")
 
 
-class Output(click.Path):
+class File(click.Path):
+    """A file or folder that a command reads or writes: nothing is written over what it reads."""
+
+    written = False
+
+    def __init__(self, **allowed: Any) -> None:
+        super().__init__(**allowed, path_type=Path)
+
+    def convert(self, value: Any, param: Any, ctx: Any) -> Path:
+        """Return the path; a file that is also another of the command's is a usage error."""
+        path: Any = super().convert(value, param, ctx)
+        for other in ctx.command.params:
+            # Whichever comes second on the command line finds the first one here.
+            if other is not param and isinstance(other.type, File):
+                taken = ctx.params.get(other.name)
+                if self.written or other.type.written:
+                    keep_apart(_shown(other), taken, _shown(param), path)
+        return path
+
+
+class Output(File):
     """A file to write: what would keep it from being written is said before any work."""
 
+    written = True
+
     def __init__(self) -> None:
-        super().__init__(dir_okay=False, writable=True, path_type=Path)
+        super().__init__(dir_okay=False, writable=True)
 
     def convert(self, value: Any, param: Any, ctx: Any) -> Path:
         """Return the path; what keeps it from being written is a usage error."""
-        path: Any = super().convert(value, param, ctx)
+        path = super().convert(value, param, ctx)
         if not path.parent.is_dir():
             self.fail(f"there is no folder {str(path.parent)!r}", param, ctx)
         try:
@@ -96,14 +119,36 @@ class Output(click.Path):
             self.fail(f"{str(path)!r} cannot be written: {error.strerror}", param, ctx)
         if special:
             self.fail(f"{str(path)!r} is not an ordinary file", param, ctx)
-        for other in ctx.command.params:
-            # Whichever comes second on the command line finds the first one here.
-            taken = ctx.params.get(other.name) if isinstance(other.type, Output) else None
-            if other is not param and taken is not None and taken.resolve() == path.resolve():
-                self.fail(f"{other.opts[0]} and {param.opts[0]} must be two files", param, ctx)
         if param.name == "png":
             need_matplotlib()
         return path
+
+
+class Store(File):
+    """A Zarr store to write, which is a folder."""
+
+    written = True
+
+
+INPUT = File(exists=True, dir_okay=False)
+
+
+def keep_apart(one: str, path: Path | None, other: str, path_of_other: Path | None) -> None:
+    """End the command where two of its files, so called, are one."""
+    if path and path_of_other and path.resolve() == path_of_other.resolve():
+        raise click.UsageError(f"{one} and {other} must be two files, got {str(path)!r}")
+
+
+def written_to(ctx: click.Context) -> dict[str, Path]:
+    """Return the files that the running command is to write, by the names of their options."""
+    outputs = [p for p in ctx.command.params if isinstance(p.type, File) and p.type.written]
+    paths = {_shown(param): ctx.params.get(param.name) for param in outputs}
+    return {shown: path for shown, path in paths.items() if path is not None}
+
+
+def _shown(param: click.Parameter) -> str:
+    """Return how a parameter is called on the command line."""
+    return param.opts[0] if isinstance(param, click.Option) else (param.metavar or "").strip("[]")
 
 
 def _exists(path: Path) -> bool:
