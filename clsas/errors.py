@@ -237,7 +237,9 @@ def _between_nodes(
     rates = crowding * np.tensordot(extents, view.rates[:, spots], 1)
     if weighted:
         rates = rates + beam_cycles * view.beam_rates[spots]
-    number = np.linspace(first, first + count - 1, _PLACES, axis=1)  # of places like channels
+    # Places like channels, with one beyond those that see anything: edges lie in between.
+    number = np.linspace(first - 1, first + count, _PLACES, axis=1)
+    number = np.clip(number, 0, len(channels) - 1)
     place = np.interp(number, np.arange(len(channels)), channels)
     nodes = interpolated_nodes(track, rates, place, aperture)
     frequencies = view.carriers(_PIXELS)

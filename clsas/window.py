@@ -186,11 +186,12 @@ class BeamWindow:
         `reach` is by how much the sine may change from the block's middle. The edges of "tukey"
         begin with a kink, which no cubic follows; the other shapes are smooth between the limits.
         """
-        x = math.pi * reach / self.edge
-        if not self._has_taper:
-            return 0.01 * x**4
         low, high = np.clip(self.limits, -1, 1)
-        return 0.03 * x**2 * math.sqrt(min(8 * reach / (high - low), 1.0))
+        width = high - low
+        if not self._has_taper:
+            return 0.01 * (math.pi * reach / self.edge) ** 4
+        x = math.pi * reach / (width / 2 * self.taper)
+        return 0.04 * x**2 * math.sqrt(min(8 * reach / width, 1.0))
 
     def plane_error(self, reach: float, wavelength_m: float = math.inf) -> float:
         """Return the relative rms error of taking the sine as bilinear over a longer block.
@@ -232,7 +233,8 @@ class BeamWindow:
         """Return the weights as cubics, float32 [INTERVALS, 4], constant terms first.
 
         Their argument runs from 0 to 1 over each of equal intervals of the sine between `limits`,
-        or -1 and 1.
+        or -1 and 1. Blocks of pixels take one beyond its interval, too: where a kink lies in an
+        interval, its cubic is that of the side on which its middle lies.
 
         Raises
         ------
@@ -241,8 +243,11 @@ class BeamWindow:
         """
         low, high = np.clip(self.limits, -1, 1)
         place = np.array([0.0, 0.25, 0.75, 1.0])
-        q = low + (high - low) * (np.arange(INTERVALS)[:, None] + place) / INTERVALS
-        values = self._inside(q, wavelength_m)
+        number = np.arange(INTERVALS)[:, None]
+        q, middle = (
+            low + (high - low) * (number + each) / INTERVALS for each in (place, np.array([0.5]))
+        )
+        values = self._inside(q, wavelength_m, middle)
         if not values.max() <= _MOST_WEIGHT:
             raise ValueError(
                 f"width_deg must keep 'inverse' within -40 dB of an element of "
@@ -298,10 +303,14 @@ class BeamWindow:
         found = np.stack([np.interp(place_m, covered_m, each) for each in tangent.T], axis=-1)
         return found / np.linalg.norm(found, axis=1, keepdims=True)
 
-    def _inside(self, q: NDArray[np.float64], wavelength_m: float) -> NDArray[np.float64]:
-        """Return the weights as if the window had no end."""
-        angle = np.arcsin(np.clip(q, -1, 1)) - math.radians(self.squint_deg)
-        u = angle / math.radians(self.width_deg)
+    def _inside(
+        self, q: NDArray[np.float64], wavelength_m: float, around: NDArray[np.float64] | None = None
+    ) -> NDArray[np.float64]:
+        """Return the weights as if the window had no end.
+
+        Where it has kinks, those on the side of a kink where `around` lies go on beyond it.
+        """
+        angle, u = self._place(q)
         if self.shape == "hann":
             return np.cos(np.pi * u) ** 2
         if self.shape == "hamming":
@@ -311,11 +320,20 @@ class BeamWindow:
         if self.shape == "tukey":
             if not self._has_taper:
                 return np.ones_like(q)
-            return np.sin(np.pi * np.clip((0.5 - np.abs(u)) / self.taper, 0, 0.5)) ** 2
+            share, of_side = (
+                np.maximum((0.5 - np.abs(each)) / self.taper, 0.0)
+                for each in (u, u if around is None else self._place(around)[1])
+            )
+            return np.sin(np.pi * np.where(of_side < 0.5, share, 0.5)) ** 2
         if self.shape == "inverse":
             one_way = element_pattern(self.element_length_m, np.sin(angle), 1.0, wavelength_m)
             return 1 / np.maximum(one_way**2, 1e-30)
         return np.ones_like(q)
+
+    def _place(self, q: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return angles from the window's middle of some sines, in radians and in widths."""
+        angle = np.arcsin(np.clip(q, -1, 1)) - math.radians(self.squint_deg)
+        return angle, angle / math.radians(self.width_deg)
 
 
 def sines(

@@ -65,6 +65,29 @@ def test_the_table_holds_the_weights(shape, width_deg, squint_deg):
     np.testing.assert_allclose(held, beam.weights(q, 1.0), atol=1e-5)
 
 
+@pytest.mark.parametrize("taper", [0.002, 0.004, 0.01, 0.03, 0.1, 0.2, 0.5, 1.0])
+def test_the_table_of_a_window_with_kinks_serves_blocks(taper):
+    """One cubic of it serves a block: beyond its interval too, on whichever side of a kink."""
+    window = BeamWindow(20, "tukey", squint_deg=3, taper=taper)
+    low, high = window.limits
+    table = window.table().astype(float)
+    sine = np.linspace(low, high, 200_001)[1:-1]
+    weights, place = window.weights(sine), (sine - low) / (high - low) * INTERVALS
+
+    def error(reach):
+        wrong = []
+        for beside in np.linspace(-reach, reach, 9):
+            number = np.clip(place - beside, 0, INTERVALS - 1e-6).astype(int)
+            cubics = np.polynomial.polynomial.polyval(place - number, table[number].T, tensor=False)
+            wrong.append(cubics - weights)
+        return np.sqrt(np.mean(np.square(wrong)) / np.mean(weights**2))
+
+    assert error(0.0) < 1e-4
+    for reach in (0.7, 1.5, 4.0, 8.0, 16.0, 32.0):
+        expected = window.block_error((reach + 0.5) / INTERVALS * (high - low))
+        assert error(reach) <= expected or expected > 0.05
+
+
 @pytest.mark.parametrize("shape", SHAPES)
 def test_a_window_is_one_in_its_middle_and_nothing_beyond(shape):
     beam = window(shape, 20, squint_deg=5)
