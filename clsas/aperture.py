@@ -20,7 +20,6 @@ _BEYOND = 12  # points past either end, each twice as far as the one before
 _TOGETHER = 1 << 15  # rates that are evaluated together
 _CHANNELS_PER_KNOT = 16
 _MOST_INTERVALS = 64
-_GOLDEN = (np.sqrt(5) - 1) / 2
 _CLOSE_ENOUGH = 0.01  # distance of phase centres from the track, wavelengths rms
 
 
@@ -97,17 +96,6 @@ class MeanTrack:
         # Where the curve leads towards the point, direction says nothing about the place.
         seen = np.maximum(length - along**2 / square, 0.01 * length)
         return self.place + both / seen
-
-
-def some_channels(count: int, most: int) -> NDArray[np.int64]:
-    """Return about so many channels of a number, evenly but not regularly.
-
-    Arrays come in regular steps.
-    """
-    if count <= most:
-        return np.arange(count)
-    number = np.arange(most)
-    return ((number + number * _GOLDEN % 1) * count / most).astype(np.int64)
 
 
 def mean_track(lines: RangeLines) -> MeanTrack | None:

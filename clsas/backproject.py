@@ -15,14 +15,13 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from clsas import interpolation, phases, validate
-from clsas.aperture import some_channels
 from clsas.device import Device, Slot, aligned, open_device
 from clsas.geometry import bistatic_range_m, pairwise_range_m
 from clsas.grid import Grid
 from clsas.image import Image, holds_any
 from clsas.interpolation import Gain, Interpolator, Resampling, Spectrum
 from clsas.layout import GEOMETRY_ERROR, STACK, Groups, Tiles, allowed, lay_out
-from clsas.lines import RangeLines
+from clsas.lines import RangeLines, some_channels
 from clsas.window import INTERVALS, BeamWindow, channel_ranges, sines
 
 BEST_ACCURACY_DB = -85.0

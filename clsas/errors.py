@@ -11,19 +11,20 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
-from clsas.aperture import drift, some_channels, stretches
+from clsas.aperture import drift, stretches
 from clsas.backproject import wavelength_m
 from clsas.device import Device
 from clsas.geometry import pairwise_range_m
 from clsas.interpolation import Interpolator
 from clsas.layout import BLOCKS, ROUNDING
+from clsas.lines import some_channels
 from clsas.nearest import stage_errors_m
 from clsas.tree import interpolated_directions, interpolated_nodes
 from clsas.view import View
 from clsas.window import sines
 
 _FLOAT32 = 4.5e-8  # rms error of a phase in the stages over the phase across a root: measured
-_CHANNELS, _PLACES, _PIXELS = 128, 160, 24  # at which errors are evaluated
+_CHANNELS, _FURTHEST, _PLACES, _PIXELS = 128, 32, 160, 24  # at which errors are evaluated
 _SOME_SPOTS = (0, 7, 14, 16, 23)  # of 5 by 5, in every row and column one
 
 
@@ -152,14 +153,15 @@ def _off_track(view: View, side: tuple[int, int], extents: NDArray[np.float64]) 
     much the weights of the two differ.
     """
     lines, track = view.lines, view.track
-    index = some_channels(lines.channels, _CHANNELS)
+    spots = np.array(_SOME_SPOTS)
+    seen = view.seen(side)[spots]
+    candidates = np.flatnonzero(np.interp(track.place, track.samples, seen.any(axis=0)))
+    index, counts = _some_off_track(view, candidates)
     part = replace(track, place=track.place[index])
     tx_m, rx_m, middle_m = (each[index] for each in (lines.tx_m, lines.rx_m, lines.phase_centres_m))
     velocity = lines.rx_velocity_m_s
     moving = velocity if velocity is None else velocity[index]
-    spots = np.array(_SOME_SPOTS)
-    places = [np.interp(part.place, track.samples, each) for each in view.seen(side)[spots]]
-    seen = np.stack(places) > 0
+    seen = np.stack([np.interp(part.place, track.samples, each) for each in seen]) > 0
     somewhere = seen.any(axis=1)
     spots, seen = spots[somewhere], seen[somewhere]
     if not spots.size:
@@ -189,8 +191,25 @@ def _off_track(view: View, side: tuple[int, int], extents: NDArray[np.float64]) 
             for each in (channels, virtual)
         )
         wrong = weights**2 * wrong + (weights - of_virtual) ** 2
-    total = np.sum(weights**2, where=seen[:, None])
-    return float(np.sum(wrong, where=seen[:, None]) / max(total, 1e-30))
+    counts = counts * seen[:, None]
+    return float(np.sum(counts * wrong) / max(np.sum(counts * weights**2), 1e-30))
+
+
+def _some_off_track(
+    view: View, candidates: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Return some channels of these, those furthest off the track, and how many each is like.
+
+    Where a track turns sharply a few may be much further off than all others.
+    """
+    if len(candidates) <= _CHANNELS:
+        return candidates, np.ones(len(candidates))
+    by_distance = candidates[np.argsort(view.off_track_m[candidates], kind="stable")]
+    others, furthest = np.split(by_distance, [-_FURTHEST])
+    others.sort()
+    some = others[some_channels(len(others), _CHANNELS - _FURTHEST)]
+    counts = np.repeat([len(others) / len(some), 1.0], [len(some), _FURTHEST])
+    return np.concatenate([some, furthest]), counts
 
 
 @_kept

@@ -37,9 +37,21 @@ _ROOM = 1.06  # for virtual channels, over the most expected
 _ROUNDING_SHARE = 0.1  # of an image's error
 _MOST_CHUNKS = 16  # that a sum in half precision is made of
 MARGIN_DB = 1.0  # between prediction and tolerance, for what measured errors scatter
+_FEW_CHANNELS = 7.0, 30.0  # where no more see a pixel errors scatter much; with steps
 _CACHED_BYTES, _BATCH_BYTES = 16 << 20, 256 << 20  # of a batch, on CPUs and elsewhere
 _MOST_TABLE_BYTES = 64 << 20
 _ROOTS_PREPARED = 16  # enough for few and large arrays
+
+
+def margin_db(view: View) -> float:
+    """Return what lies between an error as expected and as predicted, for what it scatters.
+
+    Where few channels see a pixel it depends on how these happen to lie between nodes, and whether
+    any lies at a step of the window.
+    """
+    channels = view.lines.channels * view.share_seen((16, 16))
+    few = _FEW_CHANNELS[view.beam is not None and view.beam.jumps]
+    return MARGIN_DB + in_db(1 + few / max(channels, 1.0))
 
 
 @dataclass(frozen=True)
@@ -165,7 +177,7 @@ def factorized(
         roots_at_once=at_once,
         roots_prepared=prepared,
         stages=tuple(stages),
-        predicted_error_db=in_db(error) + (0.0 if nearest else MARGIN_DB),
+        predicted_error_db=in_db(error) + (0.0 if nearest else margin_db(view)),
         predicted_seconds=sum(stage.seconds for stage in stages) + besides,
         exact_seconds=exact.seconds(costs),
         memory_bytes=int(line_bytes + at_once * root_bytes + 2 * prepared * table_bytes),

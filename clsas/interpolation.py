@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.linalg import lstsq
 
 from clsas import validate
-from clsas.lines import RangeLines
+from clsas.lines import RangeLines, some_channels
 
 TAPS = (2, 4, 6, 8)
 UPSAMPLINGS = (1.0, 1.25, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0, 12.0, 16.0)
@@ -101,8 +101,10 @@ class Interpolator:
 
 
 def measure_spectrum(lines: RangeLines, most_channels: int = 256) -> Spectrum:
-    """Return the mean power spectrum of (a regular selection of) the lines' channels."""
-    samples = lines.samples[:: -(-lines.channels // most_channels)]
+    """Return the mean power spectrum of the lines' channels, of some that hold anything."""
+    samples = lines.samples[some_channels(lines.channels, most_channels)]
+    if not samples.any() and (filled := np.flatnonzero(lines.samples.any(axis=1))).size:
+        samples = lines.samples[filled[some_channels(len(filled), most_channels)]]
     length = scipy.fft.next_fast_len(2 * lines.length)
     power = np.zeros(length)
     parts = samples.view(samples.real.dtype)  # real and imaginary, neither of which may overflow

@@ -9,6 +9,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from clsas import validate
 
+_GOLDEN = (np.sqrt(5) - 1) / 2
+
 
 @dataclass(frozen=True, eq=False)
 class RangeLines:
@@ -163,3 +165,14 @@ class RangeLines:
     def without_samples(self) -> RangeLines:
         """Return everything about these lines but their samples: of each there is one, 0."""
         return replace(self, samples=np.zeros((self.channels, 1), np.complex64))
+
+
+def some_channels(count: int, most: int) -> NDArray[np.int64]:
+    """Return about so many channels of a number, evenly but not regularly.
+
+    Arrays come in regular steps.
+    """
+    if count <= most:
+        return np.arange(count)
+    number = np.arange(most)
+    return ((number + number * _GOLDEN % 1) * count / most).astype(np.int64)

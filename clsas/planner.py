@@ -16,7 +16,7 @@ from clsas.device import Device, open_device
 from clsas.errors import excess_error, in_db, nearest_error, other_errors, power, root_error
 from clsas.exact import Exact, expect
 from clsas.filters import ALIGN_TAPS, Choice, Filters, steering_spectrum
-from clsas.forecast import MARGIN_DB, Way
+from clsas.forecast import MARGIN_DB, Way, margin_db
 from clsas.grid import Grid
 from clsas.interpolation import Interpolator
 from clsas.lines import RangeLines
@@ -246,7 +246,7 @@ def _fastest(
         spared = besides + roots
         choice = None
         if spared < 0.9 * allowed:
-            filters_db = in_db(allowed - spared) - MARGIN_DB
+            filters_db = in_db(allowed - spared) - margin_db(view)
             choice = None if tree is None else tree.filters(view.spectrum, filters_db)
         elif tree is None:
             break
@@ -295,7 +295,8 @@ def _fastest(
             leaf_pixels, tree = 2 * math.prod(found.sides[-1]), None
             continue
         elif not any(excess) or max(crowding) == _MOST_CROWDING:
-            too_much = power(found.predicted_error_db - MARGIN_DB) - power(-MARGIN_DB) * allowed
+            margin = power(-margin_db(view))
+            too_much = margin * (power(found.predicted_error_db) - allowed)
             besides += 1.3 * too_much + _LEAST_STEP * allowed
             continue
         more = (max((1 + each / share) ** _CROWDING_POWER, _LEAST_CROWDED) for each in excess)

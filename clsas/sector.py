@@ -15,7 +15,7 @@ from scipy.spatial.distance import cdist
 from clsas import tree
 from clsas.aperture import cycles_per_extent, drift, mean_track, stretches
 from clsas.geometry import pairwise_range_m
-from clsas.lines import RangeLines
+from clsas.lines import RangeLines, some_channels
 from clsas.plan import MARGIN, Plan
 from clsas.surface import Surface
 from clsas.tree import Division, Nodes, Ranges
@@ -140,13 +140,13 @@ class Geometry:
 
     def rms(self, lines: RangeLines) -> float:
         """Return the rms value of lines' samples, of some of them, from about where pixels lie."""
-        every = -(-lines.channels // _SOME_LINES)
+        some = some_channels(lines.channels, _SOME_LINES)
         root_m = self.division.centres_m(0, self.division.roots)
-        away_m = cdist(root_m, lines.phase_centres_m[::every])
+        away_m = cdist(root_m, lines.phase_centres_m[some])
         radius_m = self.surface.radius_m(self.plan.sides[0])
         near_m, far_m = away_m.min(axis=0) - radius_m, away_m.max(axis=0) + radius_m
         total, count = 0.0, 0
-        for i, near, far in zip(range(0, lines.channels, every), near_m, far_m, strict=True):
+        for i, near, far in zip(some, near_m, far_m, strict=True):
             limits = (np.array([near, far]) - lines.first_range_m[i]) / lines.range_step_m
             first, last = np.clip(limits, 0, lines.length).astype(np.int64)
             seen = lines.samples[i, first : last + 1].astype(np.complex128)

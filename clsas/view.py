@@ -12,12 +12,12 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import KDTree
 
 from clsas import interpolation
-from clsas.aperture import cycles_per_extent, mean_track, some_channels
+from clsas.aperture import cycles_per_extent, mean_track
 from clsas.backproject import wavelength_m
 from clsas.grid import Grid
 from clsas.interpolation import Interpolator, Resampling
 from clsas.layout import STACK
-from clsas.lines import RangeLines
+from clsas.lines import RangeLines, some_channels
 from clsas.surface import LEAST_SIDE, surface_of, within_roots
 from clsas.tree import beam_directions, beam_rate
 from clsas.window import BeamWindow, Sight, sines
@@ -193,6 +193,12 @@ class View:
         some = some_channels(self.lines.channels, _CHANNELS)
         position_m, along = self.lines.phase_centres_m[some], self.channels_along[some]
         return sines(self._everywhere_m, position_m, along)
+
+    @functools.cached_property
+    def off_track_m(self) -> NDArray[np.float64]:
+        """How far channels are off the mean track, [channels]."""
+        away_m = self.lines.phase_centres_m - self.track.positions_m(self.track.place)
+        return np.linalg.norm(away_m, axis=1)
 
     @functools.cached_property
     def densest(self) -> float:

@@ -337,6 +337,53 @@ def test_windows_with_kinks_and_steps_keep_the_promise(beam, tolerance_db):
     assert relative_error_db(factorize(lines, grid, chosen).pixels, exact.pixels) <= tolerance_db
 
 
+def few_seen(y, channels, spacing_m, *, pixel_m, off_m=0.0, **more):
+    """A small image, for the beam of which there are few channels; these `off_m` their track."""
+    off = np.random.default_rng(1).normal(0, off_m, (channels, 3)) * [0.3, 1, 0.5]
+    grid = around(0, y, shape=(96, 96), pixel_m=pixel_m)
+    return over(grid, along_x(channels, spacing_m) + off, **more)
+
+
+def jittery_and_few(off_m):
+    return few_seen(110, 315, 0.457, pixel_m=(0.006, 0.004), off_m=off_m)
+
+
+@pytest.mark.parametrize("costs", [EXACT_IS_SLOW, None], ids=["forced", "as they are"])
+@pytest.mark.parametrize(
+    ("case", "beam", "tolerance_db"),
+    [
+        (lambda: few_seen(50, 240, 0.3, pixel_m=(0.005, 0.005)), BeamWindow(12, "hamming"), -50),
+        (lambda: few_seen(117, 260, 0.36, pixel_m=(0.004, 0.006)), BeamWindow(6.8), -60),
+        (lambda: few_seen(40, 150, 0.22, pixel_m=(0.02, 0.01)), BeamWindow(3.6, "hann"), -20),
+        (lambda: jittery_and_few(0.03), BeamWindow(2.4), -20),
+        (lambda: jittery_and_few(0.03), BeamWindow(2.4), -40),
+        (lambda: jittery_and_few(0.01), BeamWindow(2.4, "hann"), -40),
+        (
+            lambda: few_seen(8.7, 438, 0.0078, pixel_m=(0.004, 0.008), carrier_hz=300e3),
+            BeamWindow(3.4, "tukey", taper=0.2),
+            -25,
+        ),
+    ],
+)
+def test_edges_of_a_beam_that_few_channels_see(case, beam, tolerance_db, costs):
+    """They lie between channels, beyond the last one that sees anything; so do kinks."""
+    lines, grid = case()
+    chosen = plan(lines, grid, tolerance_db=tolerance_db, beam=beam, costs=costs)
+    exact = backproject(lines, grid, accuracy_db=-80, beam=beam)
+    assert relative_error_db(factorize(lines, grid, chosen), exact) <= tolerance_db
+
+
+@pytest.mark.parametrize("tolerance_db", [-25, -40])
+def test_a_track_that_turns_back_within_a_few_channels(tolerance_db):
+    """These are further off the mean track than all others."""
+    there, back = along_x(227, 0.1011), along_x(228, 0.1006)[::-1] + [0, -2.41, 0]
+    grid = around(-10.86, 41.35, pixel_m=(0.0059, 0.0034), shape=(158, 74), z=-12.46)
+    lines, grid = over(grid, np.concatenate([there, back]), band=0.05)
+    chosen = plan(lines, grid, tolerance_db=tolerance_db, costs=EXACT_IS_SLOW)
+    exact = backproject(lines, grid, accuracy_db=-80)
+    assert relative_error_db(factorize(lines, grid, chosen), exact) <= tolerance_db
+
+
 def test_a_beam_on_every_platform(platform):
     check(near, -40, platform, HANN)
 

@@ -76,8 +76,8 @@ def test_the_table_of_a_window_with_kinks_serves_blocks(taper):
 
     def error(reach):
         wrong = []
-        for beside in np.linspace(-reach, reach, 9):
-            number = np.clip(place - beside, 0, INTERVALS - 1e-6).astype(int)
+        for aside in np.linspace(-reach, reach, 9):
+            number = np.clip(place - aside, 0, INTERVALS - 1e-6).astype(int)
             cubics = np.polynomial.polynomial.polyval(place - number, table[number].T, tensor=False)
             wrong.append(cubics - weights)
         return np.sqrt(np.mean(np.square(wrong)) / np.mean(weights**2))
