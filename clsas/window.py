@@ -205,16 +205,21 @@ class BeamWindow:
         return math.hypot(0.5 * bend, math.sqrt(0.3 * jump * bend))
 
     def fullness(self, sine: NDArray[np.float64], wavelength_m: float = math.inf) -> float:
-        """Return the rms of the weights at some sines over that of all, 1 at most.
+        """Return the rms of the weights at sines [channels, points] over that of all, 1 at most.
 
-        An image that sees an edge of the window only errs by as much more.
+        An image that sees an edge of the window only errs by as much more; and a normalised one
+        by as much as least is seen of any point.
         """
         weights = self.weights(sine, wavelength_m)
         seen = weights[weights > 0]
         if not seen.size:
             return 1.0
         rms, of_all = (np.sqrt(np.mean(each**2)) for each in (seen, self._all(wavelength_m)))
-        return float(min(rms / of_all, 1.0))
+        result = float(min(rms / of_all, 1.0))
+        if self.normalise:
+            sums = weights.sum(axis=0)
+            result *= float(sums[sums > 0].min() / sums.max())
+        return result
 
     def _all(self, wavelength_m: float) -> NDArray[np.float64]:
         """Return weights all over the window."""
