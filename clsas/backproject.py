@@ -37,7 +37,7 @@ _LOOKED_AT = 1 << 18  # numbers of lines at a time
 _FASTEST = 0.05  # of a receiver, in sound speeds: cl/backproject.cl iterates on it
 _CHANNELS_AT_ONCE = 512  # bounds a float32 partial sum; lines that stay in a CPU's cache
 _LINES_AT_ONCE = 32  # upsampled together: what stays in a core's cache
-_UNSEEN = 1e-6  # a sum of weights that is none
+_UNSEEN = 1e-3  # a sum of weights that is none
 _PART_BYTES = 64 << 20  # device memory for one set of parts: a job of some tenths of a second
 
 

@@ -31,6 +31,7 @@ _TRACK_SHARE = 4  # the track's direction is that of cubics through this part of
 _JUMP, _SHORTEST_LEG = 10.0, 5  # steps in usual ones between legs, and pings of a leg
 _ROUNDING = 1e-5  # of sines on the device, amply
 _CHANNELS_TOGETHER = 16
+_NEARLY_A_STEP = 0.1  # of the width of a window: what its edges take
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,7 +70,7 @@ class BeamWindow:
         Multiply every pixel by channels / sum_i w_i(x), w_i the weights: a point has the amplitude
         it has without a window, also near the ends of the aperture, where fewer channels see it.
         (Noise there grows, by the root of that.) Channels weigh in the sum whether or not the
-        pixel lies within their lines. Pixels whose sum is below 1e-6 are 0.
+        pixel lies within their lines. Pixels whose sum is below 1e-3 are 0.
 
     Raises
     ------
@@ -172,8 +173,8 @@ class BeamWindow:
 
     @property
     def jumps(self) -> bool:
-        """Whether its weights jump where it begins and ends."""
-        return self.shape != "hann" and not self._has_taper
+        """Whether its weights jump where it begins and ends, or nearly so."""
+        return self.shape != "hann" and not (self._has_taper and self.taper > _NEARLY_A_STEP)
 
     @property
     def _has_taper(self) -> bool:
