@@ -285,11 +285,14 @@ def _channels_seen(
 ) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.int64]]:
     """Return places of channels, ascending, the first that sees a subimage and how many do.
 
-    The latter of subimages at all spots. The track that sees one may have a gap there.
+    The latter of subimages at all spots. The track that sees one may have a gap there. Edges of
+    what is seen lie between the track's samples.
     """
     places, samples = np.sort(view.track.place), view.track.samples
-    ends = [samples[seen][[0, -1]] if seen.any() else (0.0, -1.0) for seen in view.seen(side)]
-    begin, end = np.transpose(ends)
+    seen = view.seen(side)
+    begin = samples[np.maximum(seen.argmax(axis=1) - 1, 0)]
+    end = samples[np.minimum(seen.shape[1] - seen[:, ::-1].argmax(axis=1), len(samples) - 1)]
+    end[~seen.any(axis=1)] = -np.inf
     first = np.searchsorted(places, begin)
     return places, first, np.maximum(np.searchsorted(places, end, "right") - first, 0)
 

@@ -895,6 +895,23 @@ def with_gap(channels, spacing_m, gap_m):
     return track_m
 
 
+@pytest.mark.parametrize(
+    ("x", "beam", "tolerance_db"),
+    [
+        (-30, BeamWindow(8.2, "hamming"), -40),
+        (-38, BeamWindow(10, "hamming"), -45),
+        (-38, BeamWindow(8.2), -30),
+    ],
+)
+def test_steps_of_a_beam_beside_a_gap_keep_the_promise(x, beam, tolerance_db):
+    """The track, which runs through the gap, is looked at more coarsely than channels lie."""
+    grid = around(x, 91.5, shape=(64, 84), pixel_m=(0.0029, 0.0014))
+    lines, grid = over(grid, with_gap(457, 0.2345, 64.3), carrier_hz=300e3, band=0.1)
+    chosen = plan(lines, grid, tolerance_db=tolerance_db, beam=beam, costs=EXACT_IS_SLOW)
+    exact = backproject(lines, grid, accuracy_db=-80, beam=beam)
+    assert relative_error_db(factorize(lines, grid, chosen), exact) <= tolerance_db
+
+
 @pytest.mark.parametrize("tolerance_db", [-20, -40])
 @pytest.mark.parametrize("gap_m", [2, 3, 4])
 @pytest.mark.parametrize(
