@@ -240,7 +240,8 @@ def _between_nodes(
 
     The filter takes nodes as equally spaced and weights as constant. Evaluated as it is, for some
     subimages and pixels of them and where there are channels: steering functions between nodes
-    against what interpolation makes of them; unless `beam_cycles` is None, weighted by the beam.
+    against what interpolation makes of them; unless `beam_cycles` is None, weighted by the beam
+    at places and nodes alike, since what nodes hold that it does not see is left out.
     As large as the image where nothing is seen, of which nothing is known.
     """
     track = view.track

@@ -103,12 +103,14 @@ class Interpolator:
 def measure_spectrum(lines: RangeLines, most_channels: int = 256) -> Spectrum:
     """Return the mean power spectrum of the lines' channels, of some that hold anything."""
     samples = lines.samples[some_channels(lines.channels, most_channels)]
-    if not samples.any() and (filled := np.flatnonzero(lines.samples.any(axis=1))).size:
+    largest = _largest_part(samples)
+    if largest == 0 and (filled := np.flatnonzero(lines.samples.any(axis=1))).size:
         samples = lines.samples[filled[some_channels(len(filled), most_channels)]]
+        largest = _largest_part(samples)
+    largest = largest or samples.real.dtype.type(1)
     length = scipy.fft.next_fast_len(2 * lines.length)
     power = np.zeros(length)
-    parts = samples.view(samples.real.dtype)  # real and imaginary, neither of which may overflow
-    largest = max(parts.max(initial=0.0), -parts.min(initial=0.0)) or samples.real.dtype.type(1)
+    parts = samples.view(samples.real.dtype)
     # So few together that they stay in the processor's caches.
     for block in np.array_split(parts, -(-len(parts) // _LINES_TOGETHER)):
         amplitude = scipy.fft.fft((block / largest).view(samples.dtype), length)
@@ -121,6 +123,12 @@ def measure_spectrum(lines: RangeLines, most_channels: int = 256) -> Spectrum:
     nearest = np.minimum((2 * _FREQUENCIES * distance).astype(np.int64), _FREQUENCIES - 1)
     share = np.bincount(nearest, power / power.sum(), _FREQUENCIES)
     return Spectrum(centre, (np.arange(_FREQUENCIES) + 0.5) / (2 * _FREQUENCIES), share)
+
+
+def _largest_part(samples: NDArray[np.complex64]) -> np.float32:
+    """Return the largest real or imaginary part; magnitudes might overflow."""
+    parts = samples.view(samples.real.dtype)
+    return max(parts.max(initial=0.0), -parts.min(initial=0.0))
 
 
 def cycles_per_m(lines: RangeLines, frequency: float) -> float:
