@@ -288,7 +288,9 @@ def _fastest(
         share = _NODES_SHARE * allowed / len(found.sides)
         excess = [max(of_stage - share, 0.0) for of_stage in others.nodes]
         uneven = partial(excess_error, within, found.sides[-1], found.aperture, crowding[-1], None)
-        if excess[-1] and 0 < beam_cycles < _MOST_BEAM_CYCLES and 2 * uneven() < others.nodes[-1]:
+        if excess[-1] and beam_cycles > 0 and 2 * uneven() < others.nodes[-1]:
+            if beam_cycles >= _MOST_BEAM_CYCLES:
+                break  # no nodes follow a step
             beam_cycles, excess[-1] = 2 * beam_cycles, 0.0
         elif excess[-1] and crowding[-1] == _MOST_CROWDING:
             # Smaller leaves have fewer nodes, less evenly spaced.

@@ -176,6 +176,23 @@ def test_half_precision_is_for_tolerances_and_devices_that_allow_it(device):
     assert not plan(lines, grid, stages=[(4, 2)], device=device).half_precision
 
 
+@pytest.mark.parametrize("width_deg", [20, 40])
+def test_planning_ends_soon_where_nodes_follow_no_step(monkeypatch, width_deg):
+    """More of them do not help: once as many as are allowed were tried, others are not."""
+    tried, errors = [], planner.other_errors
+
+    def counted(*arguments):
+        tried.append(arguments)
+        return errors(*arguments)
+
+    monkeypatch.setattr(planner, "other_errors", counted)
+    grid = around(-2, 10.8, shape=(99, 164), pixel_m=(0.0016, 0.0036))
+    lines, grid = over(grid, along_x(341, 0.0346), carrier_hz=300e3, band=0.05)
+    beam = BeamWindow(width_deg)
+    assert plan(lines, grid, tolerance_db=-40, beam=beam, costs=EXACT_IS_SLOW).is_exact
+    assert 1 < len(tried) <= 12
+
+
 def test_planning_ends_whatever_is_tried_in_vain(monkeypatch):
     """A stage's nodes may not follow, however many there are."""
     lines, grid = over(around(0, 40))
