@@ -500,6 +500,13 @@ def test_what_is_read_is_not_written_over(made, tmp_path, monkeypatch, args, kep
     assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
 
 
+def test_a_link_to_itself_is_no_output(made, tmp_path):
+    (tmp_path / "loop").symlink_to("loop")
+    grid = ["--x", "0:1:4", "--y", "19:20:4"]
+    _, stderr = run("image", made[0] / "lines.h5", *grid, "-o", tmp_path / "loop", code=2)
+    assert "cannot be written" in stderr
+
+
 def test_a_pipe_is_no_output(made, tmp_path):
     os.mkfifo(tmp_path / "pipe")
     _, stderr = run("simulate", made[0] / "scene.toml", "-o", tmp_path / "pipe", code=2)

@@ -173,6 +173,11 @@ def test_flags_are_told(made, tmp_path):
         (["--workers", "2", "--device", "0"], 2, "--device plays no part"),
         (["--lines", "folder", "-o", "./folder"], 2, "--lines and -o must be two files"),
         (["-o", "new", "--png", "new"], 2, "-o and --png must be two files"),
+        (
+            ["-o", "scene.zarr", "--png", "scene.zarr/zarr.json"],
+            2,
+            "--png must not lie in the store",
+        ),
         (["--follow"], 2, "--follow goes with --lines, a folder"),
         (["--tolerance-db", "-30"], 1, "tolerance_db is -40.0 there, -30.0 given"),
         (["--tolerance-db", "-300"], 2, "tolerance_db must be"),
@@ -200,6 +205,15 @@ def test_a_scheduler_that_is_not_there(made, monkeypatch):
     monkeypatch.setattr("clsas.cli.mosaics._SCHEDULER_S", 0.5)
     _, stderr = run("mosaic", made[0] / "scene.toml", "--scheduler", "tcp://127.0.0.1:9", code=1)
     assert "--scheduler tcp://127.0.0.1:9 cannot be reached" in stderr
+
+
+def test_lines_that_were_simulated_are_not_written_over(made, monkeypatch):
+    monkeypatch.chdir(made[0])
+    name = lines_of(made).name
+    before = lines_of(made).read_bytes()
+    _, stderr = run("mosaic", "scene.toml", "--png", name, code=2)
+    assert "--png and the simulated range lines must be two files" in stderr
+    assert lines_of(made).read_bytes() == before
 
 
 @pytest.mark.parametrize(

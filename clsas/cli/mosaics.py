@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import signal
 import time
 from collections.abc import Callable, Iterator
@@ -91,13 +92,17 @@ def mosaic(
     output = output or in_scene.get("store") or scene.with_suffix(".zarr")
     lines_path = lines_path or in_scene.get("lines")
     keep_apart("--png", png, "the store", output)
+    if png is not None and Path(os.path.realpath(png)).is_relative_to(os.path.realpath(output)):
+        raise click.UsageError(f"--png must not lie in the store, got {str(png)!r}")
     keep_apart("the range lines", lines_path, "the store", output)
     if follow and (lines_path is None or not lines_path.is_dir()):
         raise click.UsageError("--follow goes with --lines, a folder")
     patches = patches or in_scene.get("patches")
     memory_mib = memory_mib or in_scene.get("memory_mib")
     if lines_path is None:
-        lines_path = _simulated(described, scene, output, click.echo if not as_json else None)
+        lines_path = _beside(output, scene)
+        keep_apart("--png", png, "the simulated range lines", lines_path)
+        _simulate(described, scene, lines_path, click.echo if not as_json else None)
     start = time.perf_counter()
     with _cluster(workers, scheduler) as client:
         formed = clsas.mosaic(
@@ -144,16 +149,20 @@ def mosaic(
     )  # fmt: skip
 
 
-def _simulated(
-    described: SceneFile, scene: Path, output: Path, say: Callable[..., None] | None
-) -> Path:
-    """Return the file of a scene's range lines beside the store; made where it is not there."""
+def _beside(output: Path, scene: Path) -> Path:
+    """Return the file for a scene's simulated range lines, beside the store."""
     digest = simulation_digest(scene.read_bytes(), scene.parent)
-    path = output.with_name(f"{output.stem}-{digest}.lines.h5")
+    return output.with_name(f"{output.stem}-{digest}.lines.h5")
+
+
+def _simulate(
+    described: SceneFile, scene: Path, path: Path, say: Callable[..., None] | None
+) -> None:
+    """Make the file of a scene's range lines, unless it is there."""
     if path.exists():
         if say is not None:
             say(f"{path}: range lines, simulated before", err=True)
-        return path
+        return
     sonar, track, targets = described.need("sonar", "track", "targets")
     with progress_bar("simulating") as progress:
         echoes = clsas.simulate(sonar, track, targets, **described.simulate, progress=progress)
@@ -161,7 +170,6 @@ def _simulated(
         clsas.save(path, clsas.compress(echoes, **described.compress, progress=progress))
     if say is not None:
         say(f"{path}: range lines, simulated from {scene}", err=True)
-    return path
 
 
 @contextmanager

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import math
+import os
 import tempfile
 from collections.abc import Callable
 from fractions import Fraction
@@ -135,7 +136,7 @@ INPUT = File(exists=True, dir_okay=False)
 
 def keep_apart(one: str, path: Path | None, other: str, path_of_other: Path | None) -> None:
     """End the command where two of its files, so called, are one."""
-    if path and path_of_other and path.resolve() == path_of_other.resolve():
+    if path and path_of_other and os.path.realpath(path) == os.path.realpath(path_of_other):
         raise click.UsageError(f"{one} and {other} must be two files, got {str(path)!r}")
 
 
