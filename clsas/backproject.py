@@ -37,7 +37,7 @@ _LOOKED_AT = 1 << 18  # numbers of lines at a time
 _FASTEST = 0.05  # of a receiver, in sound speeds: cl/backproject.cl iterates on it
 _CHANNELS_AT_ONCE = 512  # bounds a float32 partial sum; lines that stay in a CPU's cache
 _LINES_AT_ONCE = 32  # upsampled together: what stays in a core's cache
-_UNSEEN = 1e-3  # a sum of weights that is none
+_HARDLY_SEEN = 1e-3  # a sum of weights below which pixels fade
 _PART_BYTES = 64 << 20  # device memory for one set of parts: a job of some tenths of a second
 
 
@@ -280,7 +280,7 @@ def execute(
 
 def normalising(sums: NDArray[np.floating], channels: int) -> NDArray[np.floating]:
     """Return what a normalising beam multiplies pixels by whose weights have these sums."""
-    return np.where(sums > _UNSEEN, channels / np.maximum(sums, _UNSEEN), 0).astype(sums.dtype)
+    return (channels / np.maximum(sums, _HARDLY_SEEN)).astype(sums.dtype)
 
 
 def wavelength_m(lines: RangeLines) -> float:

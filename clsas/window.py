@@ -70,7 +70,7 @@ class BeamWindow:
         Multiply every pixel by channels / sum_i w_i(x), w_i the weights: a point has the amplitude
         it has without a window, also near the ends of the aperture, where fewer channels see it.
         (Noise there grows, by the root of that.) Channels weigh in the sum whether or not the
-        pixel lies within their lines. Pixels whose sum is below 1e-3 are 0.
+        pixel lies within their lines. Below a sum of 1e-3 pixels fade to 0.
 
     Raises
     ------
