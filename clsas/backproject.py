@@ -22,7 +22,7 @@ from clsas.image import Image, holds_any
 from clsas.interpolation import Gain, Interpolator, Resampling, Spectrum
 from clsas.layout import GEOMETRY_ERROR, STACK, Groups, Tiles, allowed, lay_out
 from clsas.lines import RangeLines, some_channels
-from clsas.window import INTERVALS, BeamWindow, channel_ranges, sines
+from clsas.window import HARDLY_SEEN, INTERVALS, BeamWindow, channel_ranges, sines
 
 BEST_ACCURACY_DB = -85.0
 """The best accuracy that may be asked for: what float32 allows."""
@@ -37,7 +37,7 @@ _LOOKED_AT = 1 << 18  # numbers of lines at a time
 _FASTEST = 0.05  # of a receiver, in sound speeds: cl/backproject.cl iterates on it
 _CHANNELS_AT_ONCE = 512  # bounds a float32 partial sum; lines that stay in a CPU's cache
 _LINES_AT_ONCE = 32  # upsampled together: what stays in a core's cache
-_HARDLY_SEEN = 1e-3  # a sum of weights below which pixels fade
+_CHANNELS, _PLACES = 256, 16  # at which is looked how full of what is seen the beam is
 _PART_BYTES = 64 << 20  # device memory for one set of parts: a job of some tenths of a second
 
 
@@ -178,6 +178,7 @@ def prepare(
         validate.instance("beam", beam, BeamWindow)
     check_numbers(lines, beam)
     along = None if beam is None else beam.directions(lines)
+    fullness = 1.0 if beam is None else fullness_of(lines, grid, beam, along)
     device = open_device(device)
     spectrum = interpolation.measure_spectrum(lines)
     antennas_m, cycles_per_m = antennas_and_phase(lines, spectrum, beam)
@@ -191,6 +192,7 @@ def prepare(
         error=geometry_error,
         speed_ratio=fastest(lines),
         beam=beam,
+        fullness=fullness,
     )
     _check_distances(antennas_m, layout)
     terms = phases.TERMS[-1] if fixed else phases.terms_within(accuracy_db)
@@ -208,10 +210,7 @@ def prepare(
     if beam is not None:
         nearest_m = max(layout.nearest_m(lines.phase_centres_m) - layout.radius_m, 1e-30)
         error = layout.one_cubic_error(beam, nearest_m, wavelength_m(lines))
-        some = some_channels(lines.channels, 256)
-        centres_m = layout.centres_m(slice(None, None, max(layout.parts // 256, 1)))
-        sine = sines(centres_m, lines.phase_centres_m[some], along[some])
-        one_cubic = error <= geometry_error * beam.fullness(sine, wavelength_m(lines))
+        one_cubic = error <= geometry_error * fullness
     return Preparation(
         device, lines, grid, layout, interpolator, resampling, terms, beam, along, one_cubic
     )
@@ -232,6 +231,17 @@ def antennas_and_phase(
         antennas_m = np.concatenate([antennas_m, lines.phase_centres_m])
     of_phase = interpolation.cycles_per_m(lines, spectrum.centre)
     return antennas_m, math.hypot(of_phase, 0.3 / lines.range_step_m)
+
+
+def fullness_of(
+    lines: RangeLines, grid: Grid, beam: BeamWindow, along: NDArray[np.float64]
+) -> float:
+    """Return `BeamWindow.fullness` of some channels at points all over a grid, its edges too."""
+    some = some_channels(lines.channels, _CHANNELS)
+    places = [np.unique(np.linspace(0, n - 1, _PLACES).round().astype(int)) for n in grid.shape]
+    index = np.ravel_multi_index(np.ix_(*places), grid.shape).ravel()
+    sine = sines(grid.at(index), lines.phase_centres_m[some], along[some])
+    return beam.fullness(sine, wavelength_m(lines), len(some) / lines.channels)
 
 
 def most_upsampling(device: Device, lines: RangeLines, lookup_radius_m: float) -> dict[int, float]:
@@ -280,7 +290,7 @@ def execute(
 
 def normalising(sums: NDArray[np.floating], channels: int) -> NDArray[np.floating]:
     """Return what a normalising beam multiplies pixels by whose weights have these sums."""
-    return (channels / np.maximum(sums, _HARDLY_SEEN)).astype(sums.dtype)
+    return (channels / np.maximum(sums, HARDLY_SEEN)).astype(sums.dtype)
 
 
 def wavelength_m(lines: RangeLines) -> float:

@@ -15,6 +15,7 @@ from clsas.backproject import (
     blocks_of,
     channel_pitch,
     fastest,
+    fullness_of,
     most_upsampling,
 )
 from clsas.costs import Costs
@@ -75,7 +76,14 @@ def expect(view: View, accuracy_db: float, device: Device) -> Exact:
     antennas_m, cycles_per_m = antennas_and_phase(lines, view.spectrum, beam)
     error = layout.allowed(accuracy_db)
     tiles = layout.tiles(
-        grid, antennas_m, cycles_per_m, width, error=error, speed_ratio=fastest(lines), beam=beam
+        grid,
+        antennas_m,
+        cycles_per_m,
+        width,
+        error=error,
+        speed_ratio=fastest(lines),
+        beam=beam,
+        fullness=1.0 if beam is None else fullness_of(lines, grid, beam, view.channels_along),
     )
     if tiles is not None:
         parts, part_pixels, across, radius_m = (

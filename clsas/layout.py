@@ -241,6 +241,7 @@ def lay_out(
     error: float = GEOMETRY_ERROR,
     speed_ratio: float = 0.0,
     beam: BeamWindow | None = None,
+    fullness: float = 1.0,
 ) -> Tiles | Groups:
     """Return how to divide a grid so that the geometry's share of the error stays small.
 
@@ -262,6 +263,8 @@ def lay_out(
         Speed of the fastest receiver over that of sound.
     beam : BeamWindow, optional
         Weights of the channels.
+    fullness : float
+        Of the beam, by what it sees of the pixels: `BeamWindow.fullness`.
 
     Notes
     -----
@@ -275,7 +278,14 @@ def lay_out(
     expand nothing.
     """
     found = tiles(
-        grid, antennas_m, cycles_per_m, width, error=error, speed_ratio=speed_ratio, beam=beam
+        grid,
+        antennas_m,
+        cycles_per_m,
+        width,
+        error=error,
+        speed_ratio=speed_ratio,
+        beam=beam,
+        fullness=fullness,
     )
     if found is not None:
         return found
@@ -291,6 +301,7 @@ def tiles(
     error: float = GEOMETRY_ERROR,
     speed_ratio: float = 0.0,
     beam: BeamWindow | None = None,
+    fullness: float = 1.0,
 ) -> Tiles | None:
     """Return the tiles that `lay_out` makes, None where it makes groups."""
     if not grid.is_planar:
@@ -306,7 +317,7 @@ def tiles(
         phase_error = np.hypot(2 * np.pi * cycles_per_m * remainder_m, rounding)
         block_error = 0.0
         if beam is not None:
-            block_error = beam.block_error(shape.block_radius_m / nearest)
+            block_error = beam.block_error(shape.block_radius_m / nearest) / fullness
         sine_error = 0.1 * (shape.radius_m / nearest) ** 4
         tried.append((shape, max(phase_error, block_error), sine_error))
     # Where the finest takes groups, tiles as fine as is wanted are much faster.

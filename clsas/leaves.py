@@ -101,7 +101,7 @@ class Leaves:
             centres_m = self.geometry.division.centres_m(0, self.geometry.division.roots)
             sine = sines(centres_m, track.sampled_m[0][places], self.geometry.along[places])
             error = layout.one_cubic_error(chosen.beam, nearest_m, wave_m)
-            error /= chosen.beam.fullness(sine, wave_m)
+            error /= chosen.beam.fullness(sine, wave_m, places.sum() / self.lines.channels)
             one_cubic = error**2 < _SHARE * power(chosen.predicted_error_db)
         return {
             "WIDTH": self.width,

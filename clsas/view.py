@@ -63,10 +63,11 @@ class View:
         occupied = self.spectrum.frequency[np.cumsum(self.spectrum.power) < 1 - 1e-6]
         half_band = (occupied[-1] if len(occupied) else 0.5) / lines.range_step_m
         centre = interpolation.cycles_per_m(lines, self.spectrum.centre)
-        self.highest_cycles_per_m = abs(centre) + half_band
+        self.highest_cycles_per_m = float(abs(centre) + half_band)
         mean_square = self.spectrum.power @ self.spectrum.frequency**2
         self.rms_cycles_per_m = float(np.sqrt(mean_square)) / lines.range_step_m  # of the band
         self.track, self.limits = mean_track(lines), None if beam is None else beam.limits
+        self.along, self.channels_along = None, None if beam is None else beam.directions(lines)
         if self.track is None:
             return
         self.surface, self.root = surface_of(grid), None
@@ -88,9 +89,7 @@ class View:
         self._within: dict[tuple[int, int], View] = {}
         self._in_roots: dict[tuple[int, int], NDArray[np.float64]] = {}
         self._while_seen: dict[tuple[int, int], NDArray[np.float64]] = {}
-        self.along = self.channels_along = None
         if beam is not None:
-            self.channels_along = beam.directions(lines)
             self.along = beam_directions(self.channels_along, self.track, self.track.samples)
             self.beam_rates = beam_rate(beam, self.track, self.along, self.spots_m)
         self.rates = self._rates(np.zeros(len(self.surface.steps_m)), self.spots_m)

@@ -19,6 +19,9 @@ SHAPES = ("rectangular", "hann", "hamming", "taylor", "tukey", "inverse")
 INTERVALS = 1024
 """Cubics of a table: enough for the kinks of a Tukey window."""
 
+HARDLY_SEEN = 0.01
+"""A sum of weights below which normalised pixels fade to 0."""
+
 MOST_TRACK_PINGS = 101
 """Pings over which a track's direction is smoothed at most, unless told otherwise."""
 
@@ -70,7 +73,7 @@ class BeamWindow:
         Multiply every pixel by channels / sum_i w_i(x), w_i the weights: a point has the amplitude
         it has without a window, also near the ends of the aperture, where fewer channels see it.
         (Noise there grows, by the root of that.) Channels weigh in the sum whether or not the
-        pixel lies within their lines. Below a sum of 1e-3 pixels fade to 0.
+        pixel lies within their lines. Below a sum of 0.01 pixels fade to 0.
 
     Raises
     ------
@@ -205,11 +208,13 @@ class BeamWindow:
         bend = reach**2 / self.edge
         return math.hypot(0.5 * bend, math.sqrt(0.3 * jump * bend))
 
-    def fullness(self, sine: NDArray[np.float64], wavelength_m: float = math.inf) -> float:
+    def fullness(
+        self, sine: NDArray[np.float64], wavelength_m: float = math.inf, share: float = 1.0
+    ) -> float:
         """Return the rms of the weights at sines [channels, points] over that of all, 1 at most.
 
-        An image that sees an edge of the window only errs by as much more; and a normalised one
-        by as much as least is seen of any point.
+        An image that sees an edge of the window only errs by as much more; and a normalised one by
+        as much as it amplifies what is seen less. Sines are of a `share` of the channels.
         """
         weights = self.weights(sine, wavelength_m)
         seen = weights[weights > 0]
@@ -218,8 +223,10 @@ class BeamWindow:
         rms, of_all = (np.sqrt(np.mean(each**2)) for each in (seen, self._all(wavelength_m)))
         result = float(min(rms / of_all, 1.0))
         if self.normalise:
-            sums = weights.sum(axis=0)
-            result *= float(sums[sums > 0].min() / sums.max())
+            sums = weights.sum(axis=0) / share
+            least = [] if sums.all() else [HARDLY_SEEN]  # at the edge of what is seen
+            amplified = sums.max() / np.maximum(np.append(sums[sums > 0], least), HARDLY_SEEN)
+            result /= float(np.sqrt(np.mean(amplified**2)))
         return result
 
     def _all(self, wavelength_m: float) -> NDArray[np.float64]:

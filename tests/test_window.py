@@ -360,12 +360,15 @@ def test_normalising_levels_points_along_the_track(platform):
     np.testing.assert_allclose(level, 1, atol=0.03)
 
 
-@pytest.mark.parametrize("accuracy_db", [-40, -50])
-def test_normalising_amplifies_no_errors_where_little_is_seen(accuracy_db):
+@pytest.mark.parametrize(
+    ("shape", "y_m", "accuracy_db"),
+    [("hann", 13.3, -40), ("hann", 13.3, -50), ("tukey", 18, -31), ("tukey", 26, -40)],
+)
+def test_normalising_amplifies_no_errors_where_little_is_seen(shape, y_m, accuracy_db):
     """Next to the edge of what is seen, pixels are divided by a small part of a weight."""
-    grid = Grid((1.95, 13.3, 0), (0, 0.1, 0), (0.077, 0, 0), shape=(154, 184))
+    grid = Grid((1.95, y_m, 0), (0, 0.1, 0), (0.077, 0, 0), shape=(154, 184))
     lines = lines_over(grid, along_x(296, 0.077), carrier_hz=20e3, step_m=0.15)
-    beam = BeamWindow(10, "hann", normalise=True)
+    beam = BeamWindow(10, shape, normalise=True)
     exact = backproject(lines, grid, beam=beam, accuracy_db=-85)
     assert 0.1 < np.mean(exact.pixels == 0) < 0.3
     image = backproject(lines, grid, beam=beam, accuracy_db=accuracy_db)
