@@ -28,6 +28,10 @@ Progress = Callable[[int, int], None] | None
 
 _CLOSE_UP_M = 0.25  # to each side of the measured point
 _CLOSE_UP_PIXELS = 501
+_FILES = (
+    "scene.toml", "echoes.h5", "echoes.png", "lines.h5", "lines.png", "image.h5", "image.png",
+    "point.h5", "point.png", "cuts.png",
+)  # fmt: skip
 
 
 def _silent(step: str) -> AbstractContextManager[Progress]:
@@ -65,18 +69,26 @@ def run(
     ------
     DeviceError
         If there is no such device.
+    FileExistsError
+        If the folder holds files of the demo's names that are not of a demo.
     ImportError
         If matplotlib is not installed.
     OSError
         If a file cannot be written.
     """
     opened = open_device(device)
+    text, file = built_in_scene("thesis_wide_beam"), out / "scene.toml"
+    taken = [name for name in _FILES if (out / name).exists()]
+    if taken and not (file.is_file() and file.read_bytes() == text):
+        raise FileExistsError(
+            f"out must be a new folder or that of a demo whose scene.toml is as it was made: in "
+            f"{out} this would write over {', '.join(taken)}"
+        )
     out.mkdir(parents=True, exist_ok=True)
-    (out / "scene.toml").write_bytes(built_in_scene("thesis_wide_beam"))
-    scene = read_scene(out / "scene.toml")
+    file.write_bytes(text)
+    scene = read_scene(file)
     sonar, track, targets, grid = scene.need("sonar", "track", "targets", "grid")
     seconds: dict[str, float] = {}
-    written = ["scene.toml"]
 
     def timed(step: str, work: Callable[[Progress], Any]) -> Any:
         with progress(step) as callback:
@@ -88,7 +100,6 @@ def run(
     def keep(name: str, obj: Any, figure: Any) -> None:
         save(out / f"{name}.h5", obj)
         plot.save_png(figure, out / f"{name}.png")
-        written.extend([f"{name}.h5", f"{name}.png"])
 
     def form(step: str, on: Grid) -> Any:
         def work(callback: Progress) -> Any:
@@ -140,7 +151,6 @@ def run(
 
     response = measure_point(close_up, near=(x, y))
     plot.save_png(plot.cuts(response), out / "cuts.png")
-    written.append("cuts.png")
     azimuth_m, range_m = expected_resolution_m(sonar, track, point)
     say(
         f"{'measure':<10} peak at x = {response.x_m:.5f} m, y = {response.y_m:.5f} m; the point is "
@@ -156,14 +166,14 @@ def run(
             f"{1e3 * expected:.2f} mm; {rule} mm), PSLR {max(cut.pslr_db):.1f} dB, "
             f"ISLR {cut.islr_db:.1f} dB"
         )
-    say(f"{'files':<10} {out}: {', '.join(written)}")
+    say(f"{'files':<10} {out}: {', '.join(_FILES)}")
     return {
         "seconds": seconds,
         "device": info.label,
         "driver": info.driver,
         "point": response,
         "expected": {"azimuth_resolution_m": azimuth_m, "range_resolution_m": range_m},
-        "files": [out / name for name in written],
+        "files": [out / name for name in _FILES],
     }
 
 

@@ -591,9 +591,27 @@ def test_demo_in_json(tmp_path, monkeypatch):
         assert point[axis]["resolution_m"] == pytest.approx(
             expected[f"{axis}_resolution_m"], rel=5e-3
         )
+    assert {Path(file) for file in result["files"]} == set((tmp_path / "new/folder").iterdir())
     # A range side lobe of an unweighted band, and an azimuth one that the beams weigh.
     assert point["range"]["pslr_db"] == pytest.approx([-13.26, -13.26], abs=0.5)
     assert max(point["azimuth"]["pslr_db"]) < -20
+
+
+def test_demo_writes_over_no_other_files(tmp_path, monkeypatch):
+    small = built_in_scene("thesis_wide_beam").replace(b"count = 1024", b"count = 64")
+    monkeypatch.setattr(demo, "built_in_scene", lambda name: small)
+    out = tmp_path / "out"
+    run("demo", "--out", out)
+    run("demo", "--out", out)
+    mine = small + b"# mine"
+    (out / "scene.toml").write_bytes(mine)
+    before = {file: file.read_bytes() for file in out.iterdir()}
+    _, stderr = run("demo", "--out", out, code=1)
+    assert "would write over scene.toml, echoes.h5" in stderr
+    (out / "scene.toml").unlink()
+    assert "would write over echoes.h5" in run("demo", "--out", out, code=1)[1]
+    del before[out / "scene.toml"]
+    assert {file: file.read_bytes() for file in out.iterdir()} == before
 
 
 def test_expected_resolution_of_a_plain_aperture():

@@ -67,7 +67,7 @@ def calibrate(device: str | None, as_json: bool) -> None:
 @click.command()
 @click.option(
     "--out", type=click.Path(file_okay=False, path_type=Path), default="clsas-demo",
-    show_default=True, help="Folder for the files.",
+    show_default=True, help="Folder for the files, new or of a demo.",
 )  # fmt: skip
 @options.device
 @options.as_json
