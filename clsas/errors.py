@@ -6,9 +6,11 @@ import functools
 import math
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csr_array
 from scipy.spatial.distance import cdist
 
 from clsas.aperture import drift, stretches
@@ -28,11 +30,11 @@ _CHANNELS, _FURTHEST, _PLACES, _PIXELS = 128, 32, 160, 24  # at which errors are
 _SOME_SPOTS = (0, 7, 14, 16, 23)  # of 5 by 5, in every row and column one
 
 
-def _kept(function: Callable[..., float]) -> Callable[..., float]:
+def _kept(function: Callable[..., Any]) -> Callable[..., Any]:
     """Return a function of a view that keeps with it what it returned."""
 
     @functools.wraps(function)
-    def kept(view: View, *arguments: Hashable) -> float:
+    def kept(view: View, *arguments: Hashable) -> Any:
         key = function.__name__, *arguments
         if key not in view.kept:
             view.kept[key] = function(view, *arguments)
@@ -244,41 +246,78 @@ def _between_nodes(
     at places and nodes alike, since what nodes hold that it does not see is left out.
     As large as the image where nothing is seen, of which nothing is known.
     """
-    track = view.track
+    weighted = view.beam is not None and beam_cycles is not None
+    looked = _looked_at(view, side, weighted, tuple(extents))
+    if looked is None:
+        return 1.0
+    rates = crowding * np.tensordot(extents, view.rates[:, looked.spots], 1)
+    if weighted:
+        rates = rates + beam_cycles * view.beam_rates[looked.spots]
+    nodes = interpolated_nodes(view.track, rates, looked.place, aperture)
+    of_nodes = looked.steering(nodes.place)
+    # A matrix that interpolates at all places of a spot, spot after spot.
+    index = nodes.base[..., None] + np.arange(nodes.taps)
+    index += nodes.place.shape[1] * np.arange(len(index))[:, None, None]
+    weights = nodes.weights.astype(np.float32).ravel()
+    rows = np.arange(0, weights.size + 1, nodes.taps)
+    of_nodes = of_nodes.reshape(-1, of_nodes.shape[-1])
+    interpolate = csr_array((weights, index.ravel(), rows), shape=(len(rows) - 1, len(of_nodes)))
+    away = (interpolate @ of_nodes).reshape(looked.exact.shape) - looked.exact
+    wrong, total = (
+        looked.count @ np.einsum("nsp,nsp->n", each, each, dtype=np.float64)
+        for each in (away, looked.exact)
+    )
+    return float(max(wrong / max(total, 1e-30) - power(aperture.error_db), 0.0))
+
+
+@dataclass(frozen=True, eq=False)
+class _LookedAt:
+    """Some subimages of a size, and steering functions of pixels in them where there are channels.
+
+    Attributes
+    ----------
+    spots : int64 [n]
+        Where they are.
+    count : int64 [n]
+        How many channels see each.
+    place : float64 [n, places]
+        Like those of channels, ascending.
+    exact : float32 [n, places, 2 pixels]
+        The steering functions.
+    steering : callable
+        Returns them at other places.
+    """
+
+    spots: NDArray[np.int64]
+    count: NDArray[np.int64]
+    place: NDArray[np.float64]
+    exact: NDArray[np.float32]
+    steering: Callable[[NDArray[np.float64]], NDArray[np.float32]]
+
+
+@_kept
+def _looked_at(
+    view: View, side: tuple[int, int], weighted: bool, extents: tuple[float, ...]
+) -> _LookedAt | None:
+    """Return at what errors between nodes are evaluated, None where nothing is seen."""
     channels, first, count = _channels_seen(view, side)
     if not count.any():
-        return 1.0
-    weighted = view.beam is not None and beam_cycles is not None
+        return None
     everywhere = weighted and view.beam.jumps  # steps are seen from some spots only
     spots = np.flatnonzero(count)
     if not everywhere and np.isin(spots, _SOME_SPOTS).any():
         spots = np.intersect1d(spots, _SOME_SPOTS)
     first, count = first[spots], count[spots]
-    rates = crowding * np.tensordot(extents, view.rates[:, spots], 1)
-    if weighted:
-        rates = rates + beam_cycles * view.beam_rates[spots]
-    # Places like channels, with one beyond those that see anything: edges lie in between.
+    # One place beyond those that see anything: edges lie in between.
     number = np.linspace(first - 1, first + count, _PLACES, axis=1)
     number = np.clip(number, 0, len(channels) - 1)
     place = np.interp(number, np.arange(len(channels)), channels)
-    nodes = interpolated_nodes(track, rates, place, aperture)
     frequencies = view.carriers(_PIXELS)
-    pixels = [_pixels_m(view, extents, spot) for spot in spots]
+    pixels = [_pixels_m(view, np.array(extents), spot) for spot in spots]
     pixels_m = np.stack([each_m for each_m, _ in pixels])
     carriers = np.stack([frequencies[(share * _PIXELS).astype(int)] for _, share in pixels])
-    centres_m = view.spots_m[spots]
-    steering = functools.partial(_steering, view, centres_m, pixels_m, carriers, weighted)
-    exact, of_nodes = steering(nodes.ordered(place)), steering(nodes.place)
-    index = nodes.base[..., None] + np.arange(nodes.taps)
-    wrong = total = 0.0
-    found = zip(count, exact, of_nodes, index, nodes.weights, strict=True)
-    for share, each, sampled, taps, weights in found:
-        away = -each
-        for tap, weight in zip(taps.T, weights.T.astype(np.float32), strict=True):
-            away += weight * sampled[:, tap]
-        wrong += share * float(np.vdot(away, away).real)
-        total += share * float(np.vdot(each, each).real)
-    return max(wrong / max(total, 1e-30) - power(aperture.error_db), 0.0)
+    steering = functools.partial(_steering, view, view.spots_m[spots], pixels_m, carriers, weighted)
+    return _LookedAt(spots, count, place, steering(place), steering)
 
 
 def _channels_seen(
@@ -305,8 +344,10 @@ def _steering(
     carriers: NDArray[np.float64],
     weighted: bool,
     at: NDArray[np.float64],
-) -> NDArray[np.complex64]:
-    """Return steering functions at places on the track, [n, pixels, places].
+) -> NDArray[np.float32]:
+    """Return steering functions at places on the track, float32 [n, places, 2 pixels].
+
+    Of all pixels the real parts, then the imaginary ones.
 
     Parameters
     ----------
@@ -321,20 +362,19 @@ def _steering(
     at : float64 [n, places]
     """
     sight = centres_m[:, None] - view.track.positions_m(at)
-    square = np.einsum("nsi,nsi->ns", sight, sight)[:, None]
-    square = square + 2 * pixels_m @ sight.swapaxes(1, 2)
-    square += np.einsum("npi,npi->np", pixels_m, pixels_m)[..., None]
+    pixels_m = pixels_m.swapaxes(1, 2)
+    square = np.einsum("nsi,nsi->ns", sight, sight)[..., None] + 2 * sight @ pixels_m
+    square += np.einsum("nip,nip->np", pixels_m, pixels_m)[:, None]
     range_m = np.sqrt(np.maximum(square, 1e-18))
-    turns = carriers[..., None] * (range_m[:, 1:] - range_m[:, :1])
+    turns = carriers[:, None] * (range_m[..., 1:] - range_m[..., :1])
     angle = (2 * np.pi * (turns - np.rint(turns))).astype(np.float32)
-    result = np.empty(angle.shape, np.complex64)
-    np.cos(angle, out=result.real)
-    np.sin(angle, out=result.imag)
+    result = np.concatenate([np.cos(angle), np.sin(angle)], axis=-1)
     if weighted:
         along = interpolated_directions(view.track.samples, view.along, at)
-        sine = np.einsum("nsi,nsi->ns", sight, along)[:, None]
-        sine = (sine + pixels_m[:, 1:] @ along.swapaxes(1, 2)) / range_m[:, 1:]
-        result *= view.beam.weights(sine, wavelength_m(view.lines)).astype(np.float32)
+        sine = np.einsum("nsi,nsi->ns", sight, along)[..., None]
+        sine = (sine + along @ pixels_m[..., 1:]) / range_m[..., 1:]
+        weights = view.beam.weights(sine, wavelength_m(view.lines)).astype(np.float32)
+        result *= np.concatenate([weights, weights], axis=-1)
     return result
 
 

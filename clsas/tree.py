@@ -108,11 +108,11 @@ def _even(track: MeanTrack, rate: NDArray[np.float64], density: float) -> NDArra
     the track's ends and where nearly nothing turns, nodes go on much as they are beside.
     """
     on_track = np.flatnonzero(np.abs(track.samples - 0.5) <= 0.5)
-    inside = np.ones((len(rate), len(on_track)))
-    for root, each in enumerate(rate[:, on_track]):
-        seen = np.flatnonzero(each > 0)
-        if seen.size:
-            inside[root] = np.interp(np.arange(len(each)), seen, each[seen])
+    inside = rate[:, on_track]
+    for root in np.flatnonzero((inside <= 0).any(axis=1)):
+        seen = np.flatnonzero(inside[root] > 0)
+        every = np.arange(len(on_track))
+        inside[root] = np.interp(every, seen, inside[root, seen]) if seen.size else 1.0
     mean = inside.mean(axis=1, keepdims=True)
     inside = np.maximum(inside, np.maximum(_LEAST_RATE * mean, _LEAST_NODES / density))
     nodes_per_sample = density * inside.mean(axis=1) / (len(on_track) - 1)
@@ -122,8 +122,8 @@ def _even(track: MeanTrack, rate: NDArray[np.float64], density: float) -> NDArra
     for each in np.unique(width):
         mine = width == each
         inside[mine] = gaussian_filter1d(inside[mine], 2 ** (each / 2), mode="nearest")
-    before, after = on_track[0], rate.shape[1] - 1 - on_track[-1]
-    return np.pad(np.exp(inside), ((0, 0), (before, after)), mode="edge")
+    nearest = np.clip(np.arange(rate.shape[1]) - on_track[0], 0, len(on_track) - 1)
+    return np.exp(inside, out=inside)[:, nearest]
 
 
 def nearest_nodes(
@@ -308,7 +308,7 @@ def seen_from(
             # With the places beside them; at the track's ends that is their first or last one.
             index = _RUN * at[some, None] + (inward if step > 0 else _RUN - 1 - inward)
             index = np.clip(index, 0, len(places) - 1)
-            sight = Sight.of(centres_m[some], half_m, position_m[index], along[index])
+            sight = Sight.of(centres_m[some], half_m, position_m, along, index)
             inside_by = sight.inside_by(limits, halves)
             inside = inside_by[:, :-1] > 0
             whole = some[inside[:, 0]]

@@ -6,6 +6,7 @@ import copy
 import functools
 import math
 from collections.abc import Hashable, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -58,7 +59,7 @@ class View:
 
     def __init__(self, lines: RangeLines, grid: Grid, beam: BeamWindow | None) -> None:
         self.lines, self.grid, self.beam = lines, grid, beam
-        self.kept: dict[Hashable, float] = {}
+        self.kept: dict[Hashable, Any] = {}
         self.spectrum = interpolation.measure_spectrum(lines)
         occupied = self.spectrum.frequency[np.cumsum(self.spectrum.power) < 1 - 1e-6]
         half_band = (occupied[-1] if len(occupied) else 0.5) / lines.range_step_m

@@ -446,24 +446,36 @@ class Sight:
         axes_m: NDArray[np.float64],
         track_m: NDArray[np.float64],
         along: NDArray[np.float64],
+        index: NDArray[np.int64] | None = None,
     ) -> Sight:
-        """Return how places on a track of some unit directions see points [n, 3].
+        """Return how places [:, 3] on a track of some unit directions see points [n, 3].
 
-        Places and directions are [places, 3], or [n, places, 3] where every point has its own.
+        All of them see all points; with `index` [n, places] those see a point that it names.
         """
-        if track_m.ndim == 2:
+        changes = along @ axes_m.T  # [:, axes]
+        if index is None:
             sine, distance_m = _sines(points_m, track_m, along)
             slopes = (axes_m @ points_m.T)[..., None] - (axes_m @ track_m.T)[:, None]
+            changes = changes.T
         else:
-            offset_m = points_m[:, None] - track_m
-            distance_m = np.sqrt(np.einsum("npi,npi->np", offset_m, offset_m))
-            sine = np.einsum("npi,npi->np", offset_m, along) / np.maximum(distance_m, 1e-9)
-            slopes = np.stack([offset_m @ axis for axis in axes_m])
+            sine, square = np.zeros(index.shape), np.zeros(index.shape)
+            for point_m, place_m, direction in zip(points_m.T, track_m.T, along.T, strict=True):
+                offset_m = point_m[:, None] - place_m[index]
+                sine += offset_m * direction[index]
+                square += offset_m * offset_m
+            distance_m = np.sqrt(square)
+            sine /= np.maximum(distance_m, 1e-9)
+            towards_m = axes_m @ points_m.T
+            slopes = [
+                each[:, None] - of_place[index]
+                for each, of_place in zip(towards_m, axes_m @ track_m.T, strict=True)
+            ]
+            changes = [each[index] for each in changes.T]
         inverse_m = 1 / np.maximum(distance_m, 1e-9, out=distance_m)
-        for slope, axis in zip(slopes, axes_m, strict=True):
+        for slope, change in zip(slopes, changes, strict=True):
             slope *= inverse_m
             slope *= sine
-            np.subtract(along @ axis, slope, out=slope)
+            np.subtract(change, slope, out=slope)
             slope *= inverse_m
             np.abs(slope, out=slope)
         return cls(sine, inverse_m, axes_m, slopes)
