@@ -92,15 +92,20 @@ class Costs:
 
 
 _AVX2 = Costs(
-    filtered_sample_ns=2.9,
+    call_ns=1.4e7,
+    filtered_sample_ns=2.5,
+    reference_ns=60.0,
+    batch_ns=1.3e5,
+    subimage_ns=600.0,
     sample_ns=0.04,
-    sample_tap_ns=0.08,
-    leaf_channel_ns=8.0,
-    leaf_ns=1.2,
-    leaf_point_ns=1.4,
+    sample_tap_ns=0.067,
+    given_sample_ns=0.2,
+    leaf_channel_ns=9.5,
+    leaf_ns=0.75,
+    leaf_point_ns=1.1,
     pixel_ns=1.07,
     point_ns=1.35,
-    beam_ns=0.6,
+    beam_ns=0.55,
 )
 
 

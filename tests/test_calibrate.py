@@ -85,3 +85,16 @@ def test_times_that_no_costs_explain_are_not_stored(cache, small, disturbed):
     with pytest.warns(ClsasWarning, match=r"the costs miss the times measured by \d+"):
         calibrate()
     assert not cache.exists()
+
+
+def test_what_times_cannot_tell_apart_is_divided_as_usual():
+    names = ("batch_ns", "call_ns", "sample_ns")
+    usual = Costs(batch_ns=1e5, call_ns=2e7, sample_ns=0.02)
+    # Twice as fast as usual; batches go with calls, 100 to one.
+    work = [[100.0 * calls, calls, samples] for calls, samples in ((1, 1e8), (2, 3e9), (1, 9e9))]
+    seconds = [1e-9 * (100 * 5e4 + 1e7) * row[1] + 1e-9 * 0.01 * row[2] for row in work]
+    found = module._least_squares(usual, names, work, seconds)
+    assert found == pytest.approx({"batch_ns": 5e4, "call_ns": 1e7, "sample_ns": 0.01}, rel=1e-3)
+    # One that is not as usual is found where it matters.
+    slow = [s + 1e-9 * 0.03 * row[2] for s, row in zip(seconds, work, strict=True)]
+    assert module._least_squares(usual, names, work, slow)["sample_ns"] == pytest.approx(0.04, 0.1)
