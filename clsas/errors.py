@@ -254,7 +254,7 @@ def _between_nodes(
     if weighted:
         rates = rates + beam_cycles * view.beam_rates[looked.spots]
     nodes = interpolated_nodes(view.track, rates, looked.place, aperture)
-    of_nodes = looked.steering(nodes.place)
+    of_nodes = _steering(view, *looked.pixels, weighted, nodes.place)
     # A matrix that interpolates at all places of a spot, spot after spot.
     index = nodes.base[..., None] + np.arange(nodes.taps)
     index += nodes.place.shape[1] * np.arange(len(index))[:, None, None]
@@ -282,17 +282,17 @@ class _LookedAt:
         How many channels see each.
     place : float64 [n, places]
         Like those of channels, ascending.
+    pixels : (centres_m, pixels_m, carriers)
+        What `_steering` takes.
     exact : float32 [n, places, 2 pixels]
         The steering functions.
-    steering : callable
-        Returns them at other places.
     """
 
     spots: NDArray[np.int64]
     count: NDArray[np.int64]
     place: NDArray[np.float64]
+    pixels: tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]
     exact: NDArray[np.float32]
-    steering: Callable[[NDArray[np.float64]], NDArray[np.float32]]
 
 
 @_kept
@@ -313,11 +313,11 @@ def _looked_at(
     number = np.clip(number, 0, len(channels) - 1)
     place = np.interp(number, np.arange(len(channels)), channels)
     frequencies = view.carriers(_PIXELS)
-    pixels = [_pixels_m(view, np.array(extents), spot) for spot in spots]
-    pixels_m = np.stack([each_m for each_m, _ in pixels])
-    carriers = np.stack([frequencies[(share * _PIXELS).astype(int)] for _, share in pixels])
-    steering = functools.partial(_steering, view, view.spots_m[spots], pixels_m, carriers, weighted)
-    return _LookedAt(spots, count, place, steering(place), steering)
+    found = [_pixels_m(view, np.array(extents), spot) for spot in spots]
+    pixels_m = np.stack([each_m for each_m, _ in found])
+    carriers = np.stack([frequencies[(share * _PIXELS).astype(int)] for _, share in found])
+    pixels = view.spots_m[spots], pixels_m, carriers
+    return _LookedAt(spots, count, place, pixels, _steering(view, *pixels, weighted, place))
 
 
 def _channels_seen(
