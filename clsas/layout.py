@@ -264,7 +264,8 @@ def lay_out(
     beam : BeamWindow, optional
         Weights of the channels.
     fullness : float
-        Of the beam, by what it sees of the pixels: `BeamWindow.fullness`.
+        Of the beam, by what it sees of the pixels: `BeamWindow.fullness`. Errors of weights must be
+        as much smaller.
 
     Notes
     -----
@@ -322,7 +323,7 @@ def tiles(
         tried.append((shape, max(phase_error, block_error), sine_error))
     # Where the finest takes groups, tiles as fine as is wanted are much faster.
     for most in (GEOMETRY_ERROR, error):
-        most_sine = max(max(1e-6, most**2) * window_sine, 1e-7)
+        most_sine = max(max(1e-6, (most * fullness) ** 2) * window_sine, 1e-7)
         for shape, shape_error, sine_error in tried:
             if shape_error <= most and sine_error <= most_sine:
                 return shape

@@ -5,7 +5,8 @@ import pytest
 from cases import along_x, beside, patch
 
 from clsas.grid import Grid
-from clsas.layout import BLOCKS, GEOMETRY_ERROR, STACK, Groups, Tiles, lay_out
+from clsas.layout import BLOCKS, GEOMETRY_ERROR, STACK, Groups, Tiles, allowed, lay_out
+from clsas.window import BeamWindow
 
 CYCLES_PER_M = 2 * 1e6 / 1500
 TRACK = along_x(20, 0.2)
@@ -54,6 +55,18 @@ def test_everything_else_is_grouped(grid):
 def test_tiles_shrink_towards_the_antennas():
     fine = {"pitch": 0.5e-3}
     sides = [lay_out(patch(0, y, **fine), TRACK, CYCLES_PER_M, 16).side for y in (40.0, 3.0, 1.0)]
+    assert sides[0] > sides[-1]
+    assert sides == sorted(sides, reverse=True)
+
+
+def test_tiles_shrink_where_a_beam_amplifies_errors_of_weights():
+    """As in a normalised image next to the edge of what is seen."""
+    grid, beam = patch(0, 4, pitch=2e-2), BeamWindow(18, "hamming")
+    found = [
+        lay_out(grid, TRACK, 20.0, 8, error=allowed(-31), beam=beam, fullness=fullness)
+        for fullness in (1.0, 0.1, 0.001)
+    ]
+    sides = [each.side if isinstance(each, Tiles) else 0 for each in found]
     assert sides[0] > sides[-1]
     assert sides == sorted(sides, reverse=True)
 
