@@ -606,3 +606,62 @@ class TestFollowing:
         (tmp_path / "none").mkdir()
         with pytest.raises(ValueError, match="has no file"):
             clsas.mosaic(tmp_path / "none", self.GRID, **self.WISH, follow_s=0.1)
+
+
+def test_lines_larger_than_memory_are_read_in_parts(tmp_path):
+    """200 km of track, 30 GB of samples, of which next to nothing is on the disk."""
+    pings, length = 640_000, 6000
+    small = LINES
+    track = along_x(pings, 0.05)
+    first = pings // 2 - 80
+    assert np.allclose(track[first : first + 160], small.tx_m, atol=1e-6)
+    clsas.save(tmp_path / "lines.h5", small)
+    with h5py.File(tmp_path / "lines.h5", "r+") as file:
+        for name, values in (
+            ("tx_m", track),
+            ("rx_m", track),
+            ("first_range_m", np.full(pings, small.first_range_m[0])),
+        ):
+            attributes = dict(file[name].attrs)
+            del file[name]
+            file.create_dataset(name, data=values).attrs.update(attributes)
+        attributes = dict(file["samples"].attrs)
+        del file["samples"]
+        samples = file.create_dataset("samples", (pings, length), np.complex64, chunks=(64, 1000))
+        samples.attrs.update(attributes)
+        samples[first : first + 160, : small.length] = small.samples
+        assert samples.id.get_storage_size() < 4e6 < 1e-3 * samples.nbytes
+    script = textwrap.dedent(
+        """
+        import resource, sys, numpy as np, clsas
+        from test_mosaic import BEAM, GRID, LINES
+        clsas.backproject(LINES, GRID, beam=BEAM, accuracy_db=-70)  # the driver's own
+        before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        image = clsas.mosaic(sys.argv[1], GRID, accuracy_db=-70, beam=BEAM, patches=(2, 4)).image()
+        after = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        np.save(sys.argv[2], image.pixels)
+        print(after - before)
+        """
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", script, tmp_path / "lines.h5", tmp_path / "image.npy"],
+        check=True,
+        capture_output=True,
+        text=True,
+        cwd=os.path.dirname(__file__),
+    )
+    assert int(done.stdout) / 1024 < 500  # MiB, of 30 GB
+    exact = clsas.backproject(LINES, GRID, beam=BEAM, accuracy_db=-80)
+    assert relative_error_db(np.load(tmp_path / "image.npy"), exact.pixels) < -65
+
+
+def test_workers_of_a_machine_take_a_device_each(tmp_path, monkeypatch):
+    """And share them where there are more; what one leaves the next takes."""
+    module = sys.modules["clsas.mosaic"]
+    monkeypatch.setattr(module, "_devices", lambda wish: ("first", "second"))
+    monkeypatch.setattr(module.tempfile, "gettempdir", lambda: str(tmp_path))
+    claim = module._claimed.__wrapped__  # as every process calls it, once
+    workers = [claim() for _ in range(5)]
+    assert [device for device, _ in workers] == ["first", "second", "first", "second", "first"]
+    workers[1][1].close()
+    assert claim()[0] == "second"
