@@ -4,6 +4,9 @@ import json
 import os
 import re
 import shutil
+import signal
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -96,6 +99,36 @@ def test_the_same_command_goes_on(made):
     assert result["patches"] == [2, 2]
     assert result["flags"] == {}
     assert result["predicted_error_db"] <= -40
+
+
+@pytest.mark.parametrize("workers", [(), ("--workers", "2")], ids=["alone", "workers"])
+def test_ctrl_c_keeps_what_is_finished(made, tmp_path, workers):
+    """It ends with 130, and the same command goes on."""
+    command = ["mosaic", made[0] / "scene.toml", "--lines", lines_of(made)]
+    command += ["-o", tmp_path / "a.zarr", "--patches", "10x8", *workers]
+
+    def heed() -> None:
+        """A shell's background jobs, and so what they start, ignore Ctrl-C."""
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+    with subprocess.Popen(
+        [sys.executable, "-m", "clsas", *map(str, command)],
+        stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True, preexec_fn=heed,
+        start_new_session=True,
+    ) as process:  # fmt: skip
+        lines = []
+        while not any(line.startswith("patch ") for line in lines):
+            lines.append(process.stderr.readline())
+            assert lines[-1], lines
+        os.killpg(process.pid, signal.SIGINT)  # as a terminal does, the workers too
+        _, stderr = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert stderr.splitlines()[-1] == "Interrupted"
+    assert "Traceback" not in stderr
+    stdout, _ = run(*command[:-2] if workers else command)
+    there = int(re.search(r"(\d+) were there", stdout).group(1))
+    assert 0 < there < 80
+    assert f"{80 - there} formed in" in stdout
 
 
 def test_another_scene_has_other_lines(made, tmp_path):
