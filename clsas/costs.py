@@ -101,11 +101,11 @@ _AVX2 = Costs(
     sample_tap_ns=0.067,
     given_sample_ns=0.2,
     leaf_channel_ns=9.5,
-    leaf_ns=0.75,
+    leaf_ns=0.85,
     leaf_point_ns=1.1,
     pixel_ns=1.07,
     point_ns=1.35,
-    beam_ns=0.55,
+    beam_ns=0.46,
 )
 
 
