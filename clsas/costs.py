@@ -7,11 +7,11 @@ from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 
 from numpy.typing import ArrayLike
-from platformdirs import user_cache_path
 
 from clsas import validate
 from clsas.device import Device
 from clsas.interpolation import COST
+from clsas.io import cache_folder, replacing
 
 
 @dataclass(frozen=True)
@@ -119,7 +119,7 @@ def defaults(device: Device) -> Costs:
 
 def path() -> Path:
     """Return the file that holds what was measured."""
-    return user_cache_path("clsas") / "costs.json"
+    return cache_folder() / "costs.json"
 
 
 def load(device: Device) -> Costs:
@@ -141,7 +141,8 @@ def save(device: Device, costs: Costs) -> Path:
         stored = {}  # none yet, or not ours
     stored[_key(device)] = asdict(costs)
     file.parent.mkdir(parents=True, exist_ok=True)
-    file.write_text(json.dumps(stored, indent=1))
+    with replacing(file) as temporary:
+        temporary.write_text(json.dumps(stored, indent=1))
     return file
 
 

@@ -8,6 +8,7 @@ import math
 import os
 import re
 import statistics
+import threading
 import warnings
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
@@ -102,7 +103,8 @@ class KernelTimes:
 class Device:
     """An opened device: its context, its queues and the kernels built so far.
 
-    Kernels run in order on `queue`; uploads go through `uploads`, beside them.
+    Kernels run in order on `queue`; uploads go through `uploads`, beside them. Threads may share
+    a device.
     """
 
     info: DeviceInfo
@@ -112,6 +114,8 @@ class Device:
     _kernels: dict[tuple, cl.Kernel] = field(default_factory=dict, repr=False)
     _typed: set[cl.Kernel] = field(default_factory=set, repr=False)
     _events: list[tuple[str, cl.Event]] | None = field(default=None, repr=False)
+    # A kernel holds its arguments from when they are set until it is enqueued.
+    _lock: threading.RLock = field(default_factory=threading.RLock, repr=False)
 
     def kernel(self, source: str, name: str, **options: int) -> cl.Kernel:
         """Return kernel `name` of `cl/<source>.cl`, built once per set of options.
@@ -131,19 +135,20 @@ class Device:
             If the driver's compiler refuses it; the message holds the compiler's log.
         """
         key = (source, name, *sorted(options.items()))
-        if key not in self._kernels:
-            definitions = [f"-D{option}={value}" for option, value in sorted(options.items())]
-            text = kernel_source("common.h") + kernel_source(f"{source}.cl")
-            try:
-                program = _built(self.context, text, ["-cl-mad-enable", *definitions])
-            except cl.RuntimeError as error:
-                raise DeviceError(
-                    f"{self.info.label} could not build {source}.cl with "
-                    f"{' '.join(definitions)}:\n{error}"
-                ) from error
-            for kernel in program.all_kernels():
-                self._kernels[(source, kernel.function_name, *key[2:])] = kernel
-        return self._kernels[key]
+        with self._lock:
+            if key not in self._kernels:
+                definitions = [f"-D{option}={value}" for option, value in sorted(options.items())]
+                text = kernel_source("common.h") + kernel_source(f"{source}.cl")
+                try:
+                    program = _built(self.context, text, ["-cl-mad-enable", *definitions])
+                except cl.RuntimeError as error:
+                    raise DeviceError(
+                        f"{self.info.label} could not build {source}.cl with "
+                        f"{' '.join(definitions)}:\n{error}"
+                    ) from error
+                for kernel in program.all_kernels():
+                    self._kernels[(source, kernel.function_name, *key[2:])] = kernel
+            return self._kernels[key]
 
     def run(
         self,
@@ -162,13 +167,14 @@ class Device:
         """
         if local is None and self.info.width > 1:
             local = (1,) * len(size)
-        if kernel not in self._typed:
-            # Numbers of known types are handed over ten times as fast.
-            kernel.set_scalar_arg_dtypes([_scalar_type(each) for each in arguments])
-            self._typed.add(kernel)
-        event = kernel(self.queue, size, local, *arguments, wait_for=wait_for)
-        if self._events is not None:
-            self._events.append((kernel.function_name, event))
+        with self._lock:
+            if kernel not in self._typed:
+                # Numbers of known types are handed over ten times as fast.
+                kernel.set_scalar_arg_dtypes([_scalar_type(each) for each in arguments])
+                self._typed.add(kernel)
+            event = kernel(self.queue, size, local, *arguments, wait_for=wait_for)
+            if self._events is not None:
+                self._events.append((kernel.function_name, event))
         return event
 
     @contextlib.contextmanager

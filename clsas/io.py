@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 import h5py
 import numpy as np
+from platformdirs import user_cache_path
 
 from clsas import validate
 from clsas.echoes import Echoes
@@ -183,6 +184,11 @@ def replacing(path: str | os.PathLike) -> Iterator[Path]:
         os.replace(temporary, path)
     finally:  # also on Ctrl-C
         temporary.unlink(missing_ok=True)
+
+
+def cache_folder() -> Path:
+    """Return the folder of what is kept from run to run: CLSAS_CACHE, or else the user's cache."""
+    return Path(os.environ.get("CLSAS_CACHE") or user_cache_path("clsas"))
 
 
 def to_xarray(obj: Saved) -> xarray.DataArray | xarray.Dataset:

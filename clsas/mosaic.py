@@ -27,7 +27,14 @@ from numpy.typing import NDArray
 
 from clsas import validate
 from clsas.backproject import BEST_ACCURACY_DB, backproject
-from clsas.device import Device, list_devices, open_device
+from clsas.device import (
+    ENVIRONMENT_VARIABLE,
+    Device,
+    DeviceInfo,
+    choose,
+    list_devices,
+    open_device,
+)
 from clsas.factorize import factorize
 from clsas.geometry import bistatic_range_m
 from clsas.grid import Grid
@@ -91,9 +98,9 @@ class Patch:
 
 @dataclass(frozen=True, eq=False)
 class Mosaic:
-    """A mosaic to be formed once: patch by patch, or whole as `image`.
+    """A mosaic to be formed: patch by patch, or whole as `image`.
 
-    Iterating over it yields each `Patch` when finished.
+    Iterating over it yields each `Patch` when finished; once more, only what the store has not.
 
     Attributes
     ----------
@@ -104,7 +111,7 @@ class Mosaic:
     shape : (rows, columns)
         Patches.
     finished : dict of (row, column) to Record
-        Patches that the store had when the mosaic was opened.
+        Patches that the store has.
     """
 
     grid: Grid
@@ -112,7 +119,7 @@ class Mosaic:
     finished: dict[tuple[int, int], Record]
     _job: _Job
     _inputs: dict[str, Any]
-    _survey: Survey
+    _sight: _Sight
     _source: RangeLines | Path
     _devices: tuple[Device, ...]
     _client: Client | None
@@ -140,13 +147,13 @@ class Mosaic:
         ValueError
             What imaging one patch raises, with its place.
         """
-        survey, sight = self._survey, _Sight.of(self._survey, self._job.beam)
+        sight, survey, inputs = self._sight, self._sight.survey, self._inputs
         todo = [place for place in np.ndindex(self.shape) if place not in self.finished]
         # Of how many channels it is known that a patch, formed, has all it sees of them.
         known = {place: record.survey_channels for place, record in self.finished.items()}
         ended = self._idle_s is None
         last_news = time.monotonic()
-        workers = min(len(self._devices), max(len(todo), 1))
+        workers = max(min(len(self._devices), len(self)), 1)
         # One more than can work: what waits to be taken is held in memory. A cluster holds records.
         most = len(self) if self._client is not None else workers + 1
         executor = self._executor(workers)
@@ -157,8 +164,8 @@ class Mosaic:
                 for place in ready[: max(most - len(running), 0)]:
                     ready.remove(place)
                     todo.remove(place)
-                    job = replace(self._job, files=_files(survey), in_memory=_in_memory(sight))
-                    running[executor.submit(_form, job, *self._window(*place))] = place
+                    future = executor.submit(_form, self._job_on(sight), *self._window(*place))
+                    running[future] = place
                     known[place] = survey.channels
                 if not running and not todo and ended:
                     return
@@ -168,21 +175,29 @@ class Mosaic:
                     return_when=FIRST_COMPLETED,
                 )
                 for future in done:
-                    yield self._finished(running.pop(future), *future.result())
+                    place = running.pop(future)
+                    record, formed = future.result()
+                    if self._job.store is not None:
+                        self.finished[place] = record
+                    yield self._patch(place, record, formed)
+                news = False
                 if not ended:
                     last = has_ended(self._source)  # asked before looking: nothing comes after it
                     paths = files_of(self._source)
                     if paths != survey.parts:
                         before, survey = len(survey.parts), open_files(paths, survey)
                         sight, last_news = _Sight.of(survey, self._job.beam), time.monotonic()
-                        self._grow(survey, before)
+                        inputs = self._grown(inputs, survey, before)
+                        news = True
                     ended = last or time.monotonic() - last_news > self._idle_s
+                    news |= ended
                 # Patches that channels see which came after they were formed.
                 for place in set(known) - set(running.values()) - set(todo):
                     if sight.sees_later(self._window(*place)[0], known[place]):
                         todo.append(place)
+                        news = True
                     known[place] = survey.channels
-                if self._idle_s is not None:
+                if news:
                     ready = self._ready(todo, sight, ended)
         finally:
             for future in running:
@@ -216,7 +231,7 @@ class Mosaic:
             with its place.
         """
         validate.memory("the mosaic", 8 * self.grid.size)
-        stored = (self._finished(place, record, None) for place, record in self.finished.items())
+        stored = [self._patch(place, record, None) for place, record in self.finished.items()]
         pixels: NDArray[np.complex64] | None = None
         for patch in chain(stored, self):
             image = patch.image
@@ -230,12 +245,20 @@ class Mosaic:
                 tell(patch)
         return whole if pixels is None else Image(pixels, self.grid)
 
-    def _grow(self, survey: Survey, first: int) -> None:
-        """Keep in the store what the survey has grown by."""
+    def _job_on(self, sight: _Sight) -> _Job:
+        """Return what patches have in common while a survey is what it is."""
+        if self._client is None:
+            return replace(self._job, sight_here=sight)
+        return replace(self._job, files=_files(sight.survey))
+
+    def _grown(self, inputs: dict[str, Any], survey: Survey, first: int) -> dict[str, Any]:
+        """Keep in the store what the survey has grown by; return the inputs that it has now."""
         store = self._job.opened_store()
-        if store is not None:
-            self._inputs["parts"] += survey.digests(first)
-            store.grow(self._inputs)
+        if store is None:
+            return inputs
+        inputs = inputs | {"parts": [*inputs["parts"], *survey.digests(first)]}
+        store.grow(inputs)
+        return inputs
 
     def _window(self, row: int, column: int) -> tuple[Grid, int, int, slice, slice]:
         parts = []
@@ -243,7 +266,7 @@ class Mosaic:
             parts.append(slice(index * side, min((index + 1) * side, most)))
         return self.grid.window(*parts), row, column, *parts
 
-    def _finished(self, place: tuple[int, int], record: Record, formed: Image | None) -> Patch:
+    def _patch(self, place: tuple[int, int], record: Record, formed: Image | None) -> Patch:
         grid, *where = self._window(*place)
         return Patch(*where, grid, record, formed, self._job.opened_store())
 
@@ -365,7 +388,7 @@ def mosaic(
     if beam is not None:
         validate.instance("beam", beam, BeamWindow)
     if patches is not None:
-        patch_shape = _shape_of(patches, grid)
+        patch_shape = patch_shape_of(patches, grid)
     if memory_bytes is None:
         memory_bytes = MEMORY_BYTES
     memory_bytes = validate.count("memory_bytes", memory_bytes)
@@ -393,7 +416,7 @@ def mosaic(
         raise ValueError(f"source must be a folder where follow_s is given, got {got}")
     if not isinstance(source, RangeLines):
         source = Path(source).resolve()
-    devices = _devices(device)
+    devices = () if client is not None else _devices(device)
     if follows:
         _wait_for_first(source, follow_s)
     survey = open_survey(source)
@@ -407,19 +430,18 @@ def mosaic(
         patch_shape = stored or _choose_shape(sight, grid, memory_bytes)
     job = _Job(
         files=(),
-        in_memory=None,
+        sight_here=None,
         wish=wish,
         beam=beam,
         memory_bytes=memory_bytes,
         store=None if opened is None else opened.path,
-        local=client is None,
     )
     finished: dict[tuple[int, int], Record] = {}
     if opened is not None:
         opened.begin(inputs, grid, patch_shape)
         finished = opened.records()
     found = Mosaic(
-        grid, patch_shape, finished, job, inputs, survey, source, devices, client, follow_s
+        grid, patch_shape, finished, job, inputs, sight, source, devices, client, follow_s
     )
     for place, record in list(finished.items()):
         # Files that were added since may hold channels that see it.
@@ -430,15 +452,17 @@ def mosaic(
 
 @dataclass(frozen=True, eq=False)
 class _Job:
-    """What every patch of a mosaic has in common; small, it travels with each."""
+    """What every patch of a mosaic has in common; small, it travels with each.
+
+    The survey is in this process, or to be opened from files where the patch is formed.
+    """
 
     files: tuple[tuple[Path, tuple[int, int]], ...]
-    in_memory: _Sight | None
+    sight_here: _Sight | None
     wish: dict[str, Any]
     beam: BeamWindow | None
     memory_bytes: int
     store: Path | None
-    local: bool
 
     def accuracy_db(self, pairs: int) -> float | None:
         """Return how exactly to backproject so many pairs of pixel and channel, None to plan."""
@@ -449,9 +473,9 @@ class _Job:
         return tolerance_in_db(*(self.wish.get(name) for name in WISHES[:2]))
 
     def sight(self) -> _Sight:
-        """Return the survey, opened once per process and number of files."""
-        if self.in_memory is not None:
-            return self.in_memory
+        """Return the survey; a worker opens it once per number of files."""
+        if self.sight_here is not None:
+            return self.sight_here
         found = _opened(self.files, _beam_json(self.beam))
         if found.survey.stamps != tuple(stamp for _, stamp in self.files):
             raise ValueError("source must not change while a mosaic is formed: a file of it did")
@@ -521,9 +545,11 @@ class _Sight:
         offset_m = centre_m - self.phase_centres_m[settled - 1]
         direction = self.along[settled - 1]
         extent_m = np.abs(half_m @ direction).sum()
-        low = self.beam.limits[0]
-        distance_m = np.linalg.norm(offset_m) + np.linalg.norm(np.abs(half_m).sum(axis=0))
-        return bool(direction @ offset_m + extent_m < max(low, -1.0) * distance_m)
+        low, away_m = max(self.beam.limits[0], -1.0), np.linalg.norm(offset_m)
+        radius_m = np.linalg.norm(np.abs(half_m).sum(axis=0))
+        # Of a box's points the farthest passes last, with a beam that looks ahead the nearest.
+        distance_m = away_m + radius_m if low < 0 else max(away_m - radius_m, 0.0)
+        return bool(direction @ offset_m + extent_m < low * distance_m)
 
 
 @lru_cache(maxsize=2)
@@ -543,7 +569,7 @@ def _form(
     store = job.opened_store()
     if store is not None:
         store.write(row, column, rows, columns, image.pixels, record)
-    return record, image if job.local else None
+    return record, None if job.sight_here is None else image
 
 
 def _image(job: _Job, sight: _Sight, grid: Grid, device: Device) -> tuple[Record, Image]:
@@ -558,7 +584,11 @@ def _image(job: _Job, sight: _Sight, grid: Grid, device: Device) -> tuple[Record
     known |= {"gap_m": largest_gap_m(lines, missing), "read_seconds": time.perf_counter() - start}
     if missing.all():
         return Record(**known, seconds=time.perf_counter() - start), _empty(grid)
-    beam = None if job.beam is None else replace(job.beam, along=sight.along[seen])
+    along = None if job.beam is None else sight.along[seen]
+    if missing.any():
+        lines = lines.select(~missing)
+        along = None if along is None else along[~missing]
+    beam = None if job.beam is None else replace(job.beam, along=along)
     # A normalising beam multiplies by the number of channels: that of all.
     scale = sight.survey.channels / lines.channels if beam is not None and beam.normalise else 1.0
     host_bytes = _host_bytes(lines.channels, lines.length, grid.size)
@@ -603,7 +633,7 @@ def _choose_shape(sight: _Sight, grid: Grid, memory_bytes: int) -> tuple[int, in
     """Return the pixels of the largest patches that are expected to fit the memory."""
     side = _LARGEST_SIDE
     needed = 0
-    while side >= _SMALLEST_SIDE or side == _LARGEST_SIDE:
+    while side >= _SMALLEST_SIDE:
         # As even as they can be.
         shape = tuple(math.ceil(n / math.ceil(n / side)) for n in grid.shape)
         most = 0
@@ -625,7 +655,7 @@ def _choose_shape(sight: _Sight, grid: Grid, memory_bytes: int) -> tuple[int, in
     )
 
 
-def _shape_of(patches: tuple[int, int], grid: Grid) -> tuple[int, int]:
+def patch_shape_of(patches: tuple[int, int], grid: Grid) -> tuple[int, int]:
     """Return the pixels of a patch where a grid is divided into so many."""
     try:
         counts = tuple(validate.count("every entry of patches", n) for n in patches)
@@ -691,10 +721,6 @@ def _files(survey: Survey) -> tuple[tuple[Path, tuple[int, int]], ...]:
     return tuple((part, stamp) for part, stamp in pairs if isinstance(part, Path))
 
 
-def _in_memory(sight: _Sight) -> _Sight | None:
-    return sight if isinstance(sight.survey.parts[0], RangeLines) else None
-
-
 def _wait_for_first(source: Path, follow_s: float) -> None:
     start = time.monotonic()
     while not files_of(source):
@@ -704,6 +730,14 @@ def _wait_for_first(source: Path, follow_s: float) -> None:
 
 
 _LOCAL = threading.local()
+_CLAIMING = threading.Lock()
+
+
+def _side_by_side() -> list[DeviceInfo]:
+    """Return what works unless a device is asked for: every GPU of several, else what is chosen."""
+    first, _ = choose()
+    alike = [info for info in list_devices() if info.kind == first.kind == "gpu"]
+    return [first] if len(alike) < 2 or os.environ.get(ENVIRONMENT_VARIABLE) else alike
 
 
 def _devices(wish: Any) -> tuple[Device, ...]:
@@ -715,11 +749,7 @@ def _devices(wish: Any) -> tuple[Device, ...]:
     elif wish is not None:
         found = (open_device(wish),)
     else:
-        first = open_device(None)
-        alike = [info for info in list_devices() if info.kind == first.info.kind == "gpu"]
-        found = tuple(open_device(info.index) for info in alike)
-        if len(found) < 2 or "CLSAS_DEVICE" in os.environ:
-            found = (first,)
+        found = tuple(open_device(info.index) for info in _side_by_side())
     names = {device.info.index for device in found}
     if len(names) < len(found):
         raise ValueError(f"device must name each device once, got {wish!r}")
@@ -727,24 +757,30 @@ def _devices(wish: Any) -> tuple[Device, ...]:
 
 
 def _this_device(job: _Job) -> Device:
-    """Return the device of this thread, or of this worker's process."""
-    return _LOCAL.device if job.local else _claimed()[0]
+    """Return the device of this thread, or of this worker's process, whose threads share it."""
+    if job.sight_here is not None:
+        return _LOCAL.device
+    with _CLAIMING:
+        return open_device(_claimed()[0].index)
 
 
 @lru_cache(maxsize=1)
-def _claimed() -> tuple[Device, object]:
-    """Return a device for this process, and the lock that tells others on this machine.
+def _claimed() -> tuple[DeviceInfo, int | None]:
+    """Return a device for this process, and the locked file that tells others on this machine.
 
     Of several devices each worker takes the next; where there are more workers, they share.
     """
     import fcntl
 
-    devices = _devices(None)
-    folder = Path(tempfile.gettempdir())
+    devices = _side_by_side()
     for slot in range(_MOST_WORKERS):
-        lock = (folder / f"clsas-{os.getuid()}-worker-{slot}").open("w")
-        with contextlib.suppress(BlockingIOError):
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        path = Path(tempfile.gettempdir()) / f"clsas-{os.getuid()}-worker-{slot}"
+        with contextlib.suppress(OSError):  # another worker's, or another user's
+            lock = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o600)
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except OSError:
+                os.close(lock)
+                raise
             return devices[slot % len(devices)], lock
-        lock.close()
     return devices[0], None

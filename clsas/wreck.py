@@ -6,7 +6,6 @@ its range lines, which take minutes to simulate and are kept, and the contrast o
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
@@ -14,13 +13,12 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from platformdirs import user_cache_path
 
 from clsas.compress import compress
 from clsas.config import SceneFile, built_in_scene, parse_scene, simulation_digest
 from clsas.grid import Grid
 from clsas.image import Image
-from clsas.io import FileFormatError, load, save
+from clsas.io import FileFormatError, cache_folder, load, save
 from clsas.lines import RangeLines
 from clsas.simulate import simulate
 
@@ -45,7 +43,7 @@ def scene() -> SceneFile:
 def lines(progress: Callable[[int, int], None] | None = None) -> RangeLines:
     """Return the scene's range lines: simulated once, which takes minutes, and kept in the cache.
 
-    The folder is that of `platformdirs.user_cache_path`, or CLSAS_CACHE where that is set.
+    See `clsas.io.cache_folder` for where.
     """
     digest = simulation_digest(built_in_scene("wreck"), Path())
     path = cache_folder() / f"wreck-{digest}.h5"
@@ -62,11 +60,6 @@ def lines(progress: Callable[[int, int], None] | None = None) -> RangeLines:
     path.parent.mkdir(parents=True, exist_ok=True)
     save(path, made)
     return made
-
-
-def cache_folder() -> Path:
-    """Return where lines are kept."""
-    return Path(os.environ.get("CLSAS_CACHE") or user_cache_path("clsas"))
 
 
 @dataclass(frozen=True, eq=False)

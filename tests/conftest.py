@@ -5,7 +5,7 @@ from functools import cache
 
 import pytest
 
-from clsas.device import list_devices, open_device
+from clsas.device import Device, list_devices, open_device
 
 # What other devices have: float lanes (one is what runs on GPUs), and whether kernels may permute.
 # No more lanes are asked for than a compiler has that is driven with several: it may break.
@@ -67,3 +67,21 @@ def platform(request):
 def device(request):
     """Every platform's first device, and a CPU also with other vector widths."""
     return variant(*request.param)
+
+
+@pytest.fixture
+def buffer_bytes(monkeypatch):
+    """Sizes of all buffers that are made, as they are."""
+    sizes = []
+
+    def recorded(make):
+        def made(*args):
+            buffer = make(*args)
+            sizes.append(buffer.size)
+            return buffer
+
+        return made
+
+    for name in ("buffer", "share", "upload", "zeros"):
+        monkeypatch.setattr(Device, name, recorded(getattr(Device, name)))
+    return sizes

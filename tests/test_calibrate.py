@@ -14,7 +14,7 @@ module = sys.modules["clsas.calibrate"]
 @pytest.fixture
 def cache(tmp_path, monkeypatch):
     """An empty cache of the user's."""
-    monkeypatch.setattr(costs, "user_cache_path", lambda _: tmp_path / "cache")
+    monkeypatch.setenv("CLSAS_CACHE", str(tmp_path / "cache"))
     return costs.path()
 
 

@@ -219,7 +219,8 @@ def test_flags_are_told(made, tmp_path):
         (["-o", "no/such/new.zarr"], 1, "no/such"),
         (["--lines", "none.h5"], 2, "'none.h5' does not exist"),
         (["--lines", "scene.toml"], 1, "scene.toml is not an HDF5 file"),
-        (["--idle-s", "-1", "--lines", "folder", "--follow"], 1, "follow_s must be"),
+        (["--idle-s", "-1", "--lines", "folder", "--follow"], 2, "idle_s must be"),
+        (["--accuracy-db", "3"], 2, "accuracy_db must be"),
         (["--idle-s", "0.1", "--lines", "folder", "--follow"], 1, "folder has no file"),
     ],
 )
@@ -231,6 +232,13 @@ def test_errors_are_one_message(made, monkeypatch, args, code, message):
     assert message in stderr
     assert "Traceback" not in stderr
     assert sorted(path.name for path in made[0].iterdir()) == before
+
+
+def test_nothing_is_simulated_for_patches_that_cannot_be(tmp_path):
+    (tmp_path / "scene.toml").write_text(SCENE)
+    _, stderr = run("mosaic", tmp_path / "scene.toml", "--patches", "90x2", code=1)
+    assert "patches must leave each some of 100 pixels" in stderr
+    assert [path.name for path in tmp_path.iterdir()] == ["scene.toml"]
 
 
 def test_a_scheduler_that_is_not_there(made, monkeypatch):

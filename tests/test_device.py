@@ -1,5 +1,7 @@
 import dataclasses
 import re
+import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -115,6 +117,30 @@ def test_a_wish_goes_before_the_environment(monkeypatch):
     assert choose(0)[0].index == 0
     with pytest.raises(DeviceError, match=f"'nothing like it'.*{ENVIRONMENT_VARIABLE}"):
         choose()
+
+
+def test_threads_do_not_set_each_others_arguments(platform):
+    """Of a kernel that is slow to be handed them, as one is between two threads' turns."""
+    entered, most = 0, 0
+
+    class Slow:
+        function_name = "slow"
+
+        def set_scalar_arg_dtypes(self, kinds):
+            pass
+
+        def __call__(self, *args, **kwargs):
+            nonlocal entered, most
+            entered += 1
+            most = max(most, entered)
+            time.sleep(0.01)
+            entered -= 1
+
+    slow = Slow()
+    with ThreadPoolExecutor(4) as threads:
+        for done in [threads.submit(platform.run, slow, (1,), n) for n in range(8)]:
+            done.result()
+    assert most == 1
 
 
 def test_gpus_go_before_cpus(monkeypatch):

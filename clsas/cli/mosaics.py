@@ -22,6 +22,7 @@ from clsas.cli.outputs import progress_bar, report
 from clsas.cli.parameters import COUNTS, INPUT, File, Store, keep_apart
 from clsas.config import DIAL, SceneFile, simulation_digest
 from clsas.device import open_device
+from clsas.mosaic import patch_shape_of
 
 _SCHEDULER_S = 10  # to answer
 
@@ -38,7 +39,10 @@ _SCHEDULER_S = 10  # to answer
 )  # fmt: skip
 @options.axes
 @options.dial
-@click.option("--accuracy-db", type=float, help="Backproject exactly, with this rms error.")
+@click.option(
+    "--accuracy-db", type=float, callback=options.check_accuracy_db,
+    help="Backproject exactly, with this rms error.",
+)  # fmt: skip
 @options.beam
 @click.option("--patches", type=COUNTS, help="Patches along y and x, such as 8x8.")
 @click.option("--memory-mib", type=click.IntRange(1), help="What a patch may take. [default: 1024]")
@@ -47,7 +51,7 @@ _SCHEDULER_S = 10  # to answer
 @click.option("--scheduler", metavar="ADDRESS", help="Work on a Dask cluster: tcp://host:8786.")
 @click.option("--follow", is_flag=True, help="Go on while files are added to the folder --lines.")
 @click.option(
-    "--idle-s", type=float, default=60.0, show_default=True,
+    "--idle-s", type=float, default=60.0, show_default=True, callback=options.check_idle_s,
     help="With --follow: until nothing came for so long, or a file `end` did.",
 )  # fmt: skip
 @options.png("an overview in dB")
@@ -98,6 +102,8 @@ def mosaic(
     if follow and (lines_path is None or not lines_path.is_dir()):
         raise click.UsageError("--follow goes with --lines, a folder")
     patches = patches or in_scene.get("patches")
+    if patches is not None:
+        patch_shape_of(patches, grid)  # before anything is simulated
     memory_mib = memory_mib or in_scene.get("memory_mib")
     if lines_path is None:
         lines_path = _beside(output, scene)

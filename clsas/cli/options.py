@@ -75,6 +75,7 @@ check_tolerance_db = checked(
 check_accuracy_db = checked(
     partial(validate.number, "accuracy_db", unit="dB", least=BEST_ACCURACY_DB, below=0.0)
 )
+check_idle_s = checked(partial(validate.positive, "idle_s", unit="s"))
 dial = _together(
     click.option(
         "--tolerance-db", type=float, callback=check_tolerance_db,

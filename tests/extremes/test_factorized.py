@@ -8,7 +8,6 @@ from cases import along_x
 from test_factorize import EXACT_IS_SLOW, around, exact, made, over, planned, swaying
 
 from clsas.backproject import backproject
-from clsas.device import Device
 from clsas.factorize import factorize
 from clsas.grid import Grid
 from clsas.planner import plan
@@ -57,19 +56,12 @@ def small(platform):
     return dataclasses.replace(platform, info=info)
 
 
-def test_a_small_device_is_enough(small, monkeypatch):
-    sizes, make = [], Device.buffer
-
-    def buffer(device, bytes_):
-        sizes.append(int(bytes_))
-        return make(device, bytes_)
-
-    monkeypatch.setattr(Device, "buffer", buffer)
+def test_a_small_device_is_enough(small, buffer_bytes):
     lines, grid = made(swaying)
     chosen = plan(lines, grid, tolerance_db=-40, device=small, costs=EXACT_IS_SLOW)
     assert not chosen.is_exact
     image = factorize(lines, grid, chosen, device=small)
-    assert max(sizes) <= small.info.max_buffer_bytes
+    assert max(buffer_bytes) <= small.info.max_buffer_bytes
     assert relative_error_db(image, exact(swaying)) <= -40
 
 

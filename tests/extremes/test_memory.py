@@ -7,7 +7,6 @@ import pytest
 from cases import APERTURE, CARRIER, STEP, along_x, noise, patch, thesis_lines
 
 from clsas.backproject import backproject
-from clsas.device import Device
 from clsas.grid import Grid
 from clsas.lines import RangeLines
 from clsas.quality import relative_error_db
@@ -27,20 +26,6 @@ def small(platform):
     return limited
 
 
-@pytest.fixture
-def largest(monkeypatch):
-    """Sizes of the buffers made, largest first."""
-    sizes = []
-    make = Device.buffer
-
-    def buffer(device, bytes_):
-        sizes.append(int(bytes_))
-        return make(device, bytes_)
-
-    monkeypatch.setattr(Device, "buffer", buffer)
-    return sizes
-
-
 @pytest.mark.parametrize("kind", ["plane", "points"])
 def test_an_image_in_bands_is_the_same_bit_for_bit(platform, small, kind):
     grid = patch(1.3, 42, 100, 90)
@@ -57,19 +42,19 @@ def test_an_image_in_bands_is_the_same_bit_for_bit(platform, small, kind):
     np.testing.assert_array_equal(banded.pixels, whole.pixels)
 
 
-def test_one_channel_over_many_points_stays_within_the_device(small, largest):
+def test_one_channel_over_many_points_stays_within_the_device(small, buffer_bytes):
     grid = Grid.points(patch(-1, 42, 400, 400).positions_m())
     track = along_x(1, 1.0)
     lines = RangeLines(noise(1, 1000), 40.0, STEP, track, track, CARRIER, 1500.0)
     backproject(lines, grid, device=small(1 << 20), taps=4, upsampling=3)
-    assert max(largest) <= 1 << 18
+    assert max(buffer_bytes) <= 1 << 18
 
 
-def test_long_lines_stay_within_the_device(small, largest):
+def test_long_lines_stay_within_the_device(small, buffer_bytes):
     """Lines of 4000 samples: 512 of them do not fit at once."""
     grid = patch(1.3, 42, 5, 5)
     track = along_x(520, 0.01)
     lines = RangeLines(noise(520, 4000), 36.0, STEP, track, track, CARRIER, 1500.0)
     image = backproject(lines, grid, device=small(1 << 23), taps=6, upsampling=3)
-    assert max(largest) <= 1 << 21
+    assert max(buffer_bytes) <= 1 << 21
     assert relative_error_db(image, ideal(lines, grid.positions_m())) <= -80
