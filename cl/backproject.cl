@@ -37,6 +37,7 @@
  *              option uses are absent.
  *   centres    float [parts][6]: of tiles or groups, x y z and what float32 leaves of them (m, from
  *              the grid's origin). With the pairs a short distance between far points is exact.
+ *              `expand_tiles` has those of the tiles at work only, `backproject_points` those of all.
  *   ranges     int [parts][3]: the first channel that a tile or group sees, the one after the last,
  *              and the first one's line. What is held per (part, channel) begins with that channel.
  *              The parts at work begin at number first_range.

@@ -102,7 +102,8 @@ __kernel void upsample_lines(__global const float2 *samples, int count, __global
         }
         const int vector = m / WIDTH;
         const int phase = vector % (PHASES / WIDTH) * WIDTH;
-        /* Rounded down; (first + m) step + far is not negative. */
+        /* Rounded down; (first + m) step + far PHASES is not negative. As an int it holds lines of up to
+         * 2^31 / PHASES samples, given ones. */
         const int far = 1 << 20;
         const int place = (first + vector * WIDTH) * step + far * PHASES;
         const int begin = place / PHASES - far + 1 - TAPS / 2;

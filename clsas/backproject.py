@@ -26,9 +26,12 @@ from clsas.window import HARDLY_SEEN, INTERVALS, BeamWindow, channel_ranges, sin
 
 BEST_ACCURACY_DB = -85.0
 """The best accuracy that may be asked for: what float32 allows."""
+ACCURACY_DB = -60.0
+"""What is taken where no accuracy is asked for."""
 
-_EXPANSION_TERMS = 9  # coefficients per (tile, channel)
-_BEAM_TERMS = 10  # further ones with a beam
+VECTOR_ROOM = 16
+"""Channels by which rows are longer in which a vector may begin at the last."""
+
 _LARGEST_DISTANCE_M = 1e9
 _SMALLEST_STEP_M = 1e-9
 _MOST_CYCLES = 1e10  # float64 leaves 1e-6 of a cycle
@@ -75,7 +78,7 @@ def backproject(
     grid: Grid,
     *,
     device: Device | str | int | None = None,
-    accuracy_db: float = -60.0,
+    accuracy_db: float = ACCURACY_DB,
     taps: int | None = None,
     upsampling: float | None = None,
     beam: BeamWindow | None = None,
@@ -163,7 +166,7 @@ def prepare(
     grid: Grid,
     *,
     device: Device | str | int | None = None,
-    accuracy_db: float = -60.0,
+    accuracy_db: float = ACCURACY_DB,
     taps: int | None = None,
     upsampling: float | None = None,
     beam: BeamWindow | None = None,
@@ -355,7 +358,7 @@ def blocks_of(
     pitch = _round_up(resampling.length + 2 * margin, 16)
     if pitch % 256 == 0:  # lines at equal places in cache sets would evict each other
         pitch += 16
-    terms = _EXPANSION_TERMS + (0 if beam is None else _BEAM_TERMS) if tiled else 0
+    terms = expansion_terms(beam) if tiled else 0
     line_bytes = 8 * pitch
     part_bytes = _CHANNELS_AT_ONCE * (16 + 4 * terms) + 12 * part_pixels
     most = device.info.max_buffer_bytes
@@ -464,7 +467,7 @@ class _Run:
                     slot.fill(name, values)
                 pitches = (references["sample"].shape[1], geometry.shape[1])
                 first_part = parts.start - band.start
-                event = self._launch(lines, line_slot, slot, parts, pitches, first_part, pixels)
+                event = self._launch(line_slot, slot, parts, pitches, first_part, pixels)
                 slot.busy = line_slot.busy = event
                 self.p.device.queue.flush()
             self._report((parts.stop - parts.start) * of_all)
@@ -485,7 +488,6 @@ class _Run:
 
     def _launch(
         self,
-        lines: RangeLines,
         line_slot: Slot,
         slot: Slot,
         parts: slice,
@@ -567,7 +569,7 @@ class _Run:
             rows.append((lines.rx_velocity_m_s / lines.sound_speed_m_s).astype(np.float32))
         if self.p.beam is not None:
             rows.append((self.p.along[channels] * self.per_sine).astype(np.float32))
-        pitch = channel_pitch(lines.channels) + 16
+        pitch = channel_pitch(lines.channels) + VECTOR_ROOM
         geometry = np.concatenate(rows, axis=1).T
         return np.pad(geometry, ((0, 0), (0, pitch - lines.channels)), mode="edge")
 
@@ -719,6 +721,11 @@ def lookup_room(taps: int, width: int) -> float:
     float32.
     """
     return width - taps / 2 - 0.05
+
+
+def expansion_terms(beam: BeamWindow | None) -> int:
+    """Return how many numbers `expand_tiles` finds per tile and channel."""
+    return 9 if beam is None else 19
 
 
 def channel_pitch(channels: int) -> int:

@@ -28,7 +28,7 @@ from clsas import validate
 from clsas.backproject import BEST_ACCURACY_DB
 from clsas.compress import check_options as check_compression
 from clsas.grid import Grid
-from clsas.interpolation import TAPS
+from clsas.interpolation import MOST_UPSAMPLING, TAPS
 from clsas.planner import checked_pairs, tolerance_in_db
 from clsas.scene import PointTargets, Seabed, pipeline, rocks, wreck
 from clsas.simulate import Scene
@@ -425,7 +425,7 @@ class _Image(_Table):
             if self.taps is not None and self.taps not in TAPS:
                 raise ValueError(f"taps must be one of {TAPS}, got {self.taps}")
             if self.upsampling is not None:
-                validate.number("upsampling", self.upsampling, least=1.0, most=64.0)
+                validate.number("upsampling", self.upsampling, least=1.0, most=MOST_UPSAMPLING)
         if self.stages is not None:
             options["stages"] = [tuple(stage) for stage in self.stages]
         if self.beam is not None:

@@ -9,6 +9,7 @@ import numpy as np
 
 from clsas import interpolation, layout, phases
 from clsas.backproject import (
+    VECTOR_ROOM,
     Blocks,
     antennas_and_phase,
     band_parts,
@@ -160,7 +161,9 @@ def _memory_bytes(
     if jobs_of_set > 1:
         seen[1] = seen[0]
     part_bytes = 36 + (0 if blocks.terms else 12 * part_pixels)
-    line_bytes = sum(8 * n * blocks.pitch + 4 * rows * (channel_pitch(n) + 16) for n in sets if n)
+    line_bytes = sum(
+        8 * n * blocks.pitch + 4 * rows * (channel_pitch(n) + VECTOR_ROOM) for n in sets if n
+    )
     job_bytes = sum(of_job * (part_bytes + n * (12 + 4 * blocks.terms)) for n in seen if n)
     band_bytes = 8 * (1 + normalise) * of_band * part_pixels
     table_bytes = 0 if beam is None else 16 * INTERVALS

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from clsas import validate
 from clsas.backproject import (
+    VECTOR_ROOM,
     backproject,
     channel_pitch,
     check_numbers,
@@ -386,7 +387,7 @@ def _holds(rms: float) -> bool:
 
 def _pitch(channels: int) -> int:
     """Channels of a row in a table, with room for a vector that begins at the last."""
-    return channel_pitch(channels) + 16
+    return channel_pitch(channels) + VECTOR_ROOM
 
 
 def _padded(values: NDArray) -> NDArray:

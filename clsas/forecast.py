@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from clsas import interpolation, phases
+from clsas.backproject import VECTOR_ROOM, expansion_terms
 from clsas.costs import Costs
 from clsas.device import Device
 from clsas.errors import in_db, leaf_error, power
@@ -263,10 +264,10 @@ def _root_bytes(
     normalise = view.beam is not None and view.beam.normalise
     tables += 40 * channels
     if view.surface.is_plane:
-        terms = 9 if view.beam is None else 19
+        terms = expansion_terms(view.beam)
         parts, slots = _subimages(sides[0], tile), math.prod(sides[0])
         references = 0 if tile == sides[-1] else 12
-        work += parts * ((most + 16) * (references + 4 * terms) + 24)
+        work += parts * ((most + VECTOR_ROOM) * (references + 4 * terms) + 24)
     else:
         slots = view.most_slots(sides[-1], sides[0], width)
         parts = slots / (STACK * width)

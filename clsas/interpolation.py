@@ -15,12 +15,13 @@ from clsas.lines import RangeLines, some_channels
 
 TAPS = (2, 4, 6, 8)
 UPSAMPLINGS = (1.0, 1.25, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0, 12.0, 16.0)
+MOST_UPSAMPLING = 64.0
 
 # Device time per pixel and channel by taps, relative to 4 taps: measured with PoCL and Intel's
 # runtime on an AVX-512 CPU (scripts/bench taps). With AVX2 more taps cost a tenth more.
 COST = {2: 0.75, 4: 1.0, 6: 1.3, 8: 1.55}
-# The same for one upsampled sample: an FFT on the host.
-_UPSAMPLINGCOST = 40.0
+# The same, in such, for one upsampled sample: an FFT on the host.
+_UPSAMPLING_COST = 40.0
 _FREQUENCIES = 128
 Gain = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 """A factor of spectra, by the distance from their centre in cycles per sample."""
@@ -228,7 +229,7 @@ def choose(
     if taps is not None and not (isinstance(taps, (int, np.integer)) and taps in TAPS):
         raise ValueError(f"taps must be one of {TAPS}, got {taps!r}")
     if upsampling is not None:
-        upsampling = validate.number("upsampling", upsampling, least=1.0, most=64.0)
+        upsampling = validate.number("upsampling", upsampling, least=1.0, most=MOST_UPSAMPLING)
     if taps is not None and upsampling is not None:
         return design(taps, upsampling, spectrum)
     power_left = 10 ** (accuracy_db / 10) - other_error**2
@@ -250,7 +251,7 @@ def choose(
 
     def cost(candidate: Interpolator) -> tuple[bool, float]:
         slow = candidate.upsampling > (most_upsampling or {}).get(candidate.taps, np.inf)
-        upsampling_cost = _UPSAMPLINGCOST * candidate.upsampling / pixels_per_sample
+        upsampling_cost = _UPSAMPLING_COST * candidate.upsampling / pixels_per_sample
         return slow, COST[candidate.taps] + upsampling_cost
 
     return min(candidates, key=cost)
@@ -265,10 +266,14 @@ class Resampling:
 
     Attributes
     ----------
+    lead : int
+        Zeros that come before a line.
     period, upsampled_period : int
         Samples that become so many. With an FFT these are its lengths.
     shift : int
         Cycles per period by which lines are turned.
+    first, length : int
+        First upsampled sample that is kept, and how many are.
     """
 
     lead: int

@@ -12,8 +12,10 @@ from numpy.typing import NDArray
 
 from clsas import tree
 from clsas.backproject import (
+    VECTOR_ROOM,
     beam_arguments,
     channel_pitch,
+    expansion_terms,
     float_pairs,
     lookup_options,
     lookup_weights,
@@ -32,7 +34,6 @@ from clsas.window import INTERVALS, sines
 
 _ALL = slice(None)
 _SHARE = 0.02  # of an image's error: what neighbours' weights may be off
-_ROOM = 16  # for a vector that begins at the last channel
 
 Finish = Callable[[], int]
 """To be called to wait for pixels, and to put them in place; returns how many they are."""
@@ -222,7 +223,7 @@ class PlaneLeaves(Leaves):
         plane, samples_per_m = self.surface.plane, self.geometry.samples_per_m
         steps_m = (plane.column_step_m, plane.row_step_m)
         drift = [self.geometry.drift @ step * samples_per_m for step in steps_m]
-        terms = 9 + (10 if chosen.beam is not None else 0)
+        terms = expansion_terms(chosen.beam)
         most = max(pitch, channel_pitch(chosen.most_channels[-1]))
         expansion = slot.buffer("expansion", 4 * terms * tiles * most)
         device.run(
@@ -230,7 +231,7 @@ class PlaneLeaves(Leaves):
             (pitch // self.width, tiles),
             tables["geometry"],
             pitch,
-            sector.nodes[-1].place.size + _ROOM,
+            sector.nodes[-1].place.size + VECTOR_ROOM,
             tables["ranges"],
             first_tile,
             self.centres,
@@ -438,7 +439,7 @@ class SurfaceLeaves(Leaves):
                 self.level.centre,
                 np.append(self.geometry.drift, 0).astype(np.float32),
                 tables["geometry"],
-                sector.nodes[-1].place.size + _ROOM,
+                sector.nodes[-1].place.size + VECTOR_ROOM,
                 0,
                 tables["ranges"],
                 groups.start - first,
@@ -501,4 +502,4 @@ def _shares(sector: Sector) -> NDArray[np.float32]:
 
 def _padded(rows: NDArray[np.float32]) -> NDArray[np.float32]:
     """Return rows in which a vector may begin at any channel."""
-    return np.pad(rows, ((0, 0), (0, _ROOM)), mode="edge")
+    return np.pad(rows, ((0, 0), (0, VECTOR_ROOM)), mode="edge")

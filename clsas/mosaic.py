@@ -41,7 +41,7 @@ from clsas.grid import Grid
 from clsas.image import Image, holds_any
 from clsas.lines import RangeLines
 from clsas.plan import Plan, grid_digest
-from clsas.planner import checked_pairs, plan, tolerance_in_db
+from clsas.planner import TOLERANCE_DB, checked_pairs, plan, tolerance_in_db
 from clsas.store import Record, Store
 from clsas.survey import Survey, files_of, has_ended, largest_gap_m, open_files, open_survey
 from clsas.window import MOST_TRACK_PINGS, BeamWindow, touches_boxes
@@ -55,7 +55,6 @@ MEMORY_BYTES = 1 << 30
 WISHES = ("tolerance_db", "tolerance_wavelengths", "stages", "accuracy_db")
 """How a mosaic may be wished for: at most one of these."""
 
-_TOLERANCE_DB = -50.0
 _LARGEST_SIDE = 4096  # pixels of a patch, where memory allows more: seconds of work
 _SMALLEST_SIDE = 128
 _WORTH_A_PLAN = 5e7  # pixels times channels; fewer are backprojected sooner than planned for
@@ -337,7 +336,8 @@ def mosaic(
         Patches along either axis; those at the end may be smaller. Unless given they are as large
         as memory allows, up to 4096 x 4096 pixels.
     memory_bytes : int, optional
-        What one patch may take on host and device together; 1 GiB unless given.
+        What one patch may take on host and device together; 1 GiB unless given. Backprojected
+        exactly it takes the device's buffers besides, of up to 1024 upsampled lines.
     device : Device, str or int, or a sequence of them, optional
         Devices that work side by side. Unless given, every GPU if there are several, else the one
         that `clsas.device.choose` chooses. Not with a `client`, whose workers each take one.
@@ -379,7 +379,7 @@ def mosaic(
     wish = {name: value for name, value in zip(WISHES, given, strict=True) if value is not None}
     if len(wish) > 1:
         raise ValueError(f"at most one of {', '.join(WISHES)} must be given, got {wish}")
-    wish = wish or {"tolerance_db": _TOLERANCE_DB}
+    wish = wish or {"tolerance_db": TOLERANCE_DB}
     tolerance_in_db(tolerance_db, tolerance_wavelengths)
     if stages is not None:
         checked_pairs(stages)

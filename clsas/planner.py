@@ -10,6 +10,7 @@ from functools import partial
 import numpy as np
 
 from clsas import forecast, interpolation, phases, validate
+from clsas.backproject import ACCURACY_DB
 from clsas.costs import Costs
 from clsas.costs import load as load_costs
 from clsas.device import Device, open_device
@@ -29,8 +30,9 @@ BEST_TOLERANCE_DB = -75.0
 """The tightest tolerance that may be asked for: what float32 leaves of a factorized image."""
 WORST_TOLERANCE_DB = -10.0
 
-EXACT_DB = -60.0
-"""Accuracy of plain backprojection where no tolerance was asked for."""
+TOLERANCE_DB = -50.0
+"""What is taken where nothing is asked of an image."""
+
 NEAREST_UPSAMPLING = 8.0
 """By how much lines are upsampled before the linear interpolation of given stages."""
 
@@ -130,7 +132,7 @@ def plan(
     if memory_bytes is not None:
         memory_bytes = validate.count("memory_bytes", memory_bytes)
     view = View(lines, grid, beam)
-    exact = expect(view, EXACT_DB if tolerance_db is None else tolerance_db - MARGIN_DB, device)
+    exact = expect(view, ACCURACY_DB if tolerance_db is None else tolerance_db - MARGIN_DB, device)
     # Backprojection keeps within a device by itself.
     room = device.info.memory_bytes // 2 if memory_bytes is None else memory_bytes
     exact_fits = memory_bytes is None or exact.memory_bytes <= memory_bytes

@@ -245,9 +245,10 @@ def simulate_lines(
     sound_speed_m_s : float
         Speed of sound.
     first_range_m : array_like, [channels] or scalar, optional
+        Range of each line's first sample, metres; with `length`. Unless given, the lines hold
+        every point with 90 samples or more to spare.
     length : int, optional
-        Range of each line's first sample and number of samples. Both or neither: unless given,
-        the lines hold every point with 90 samples or more to spare.
+        Samples of every line; with `first_range_m`.
     rx_velocity_m_s : array_like, [channels, 3] or [3], optional
         Receivers' velocity during flight; None is stop-and-hop.
     workers, progress

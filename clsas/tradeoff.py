@@ -15,7 +15,7 @@ from itertools import product
 import numpy as np
 
 from clsas import validate
-from clsas.backproject import backproject
+from clsas.backproject import ACCURACY_DB, backproject
 from clsas.device import Device, open_device
 from clsas.factorize import factorize
 from clsas.filters import ALIGN_TAPS, APERTURE_TAPS
@@ -36,8 +36,6 @@ STUDIED_TAPS = tuple(product(ALIGN_TAPS, APERTURE_TAPS))
 STUDIED_DEPTHS = (1, 2, 3, 4)
 """Taps in range and along the aperture, and numbers of stages, of a study."""
 
-EXACT_DB = -60.0
-"""Accuracy of the exact image that is timed, unless a tolerance is tighter."""
 REFERENCE_DB = -85.0
 """Accuracy of the exact image that errors are against."""
 
@@ -284,7 +282,7 @@ def tradeoff(
             continue  # these cannot keep to it
         row = _row(*_name(wish), chosen, time.perf_counter() - start)
         ways.append((row, partial(factorize, lines, grid, chosen, device=device)))
-    accuracy_db = min([EXACT_DB, *tolerances_db])
+    accuracy_db = min([ACCURACY_DB, *tolerances_db])
     exact = partial(backproject, lines, grid, device=device, beam=beam)
     row = _row("exact", "exact", plan(lines, grid, stages=[], beam=beam, device=device), 0.0)
     ways.append(

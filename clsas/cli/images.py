@@ -19,7 +19,7 @@ from clsas.cli.outputs import progress_bar, report
 from clsas.cli.parameters import INPUT
 from clsas.config import DIAL
 from clsas.device import open_device
-from clsas.interpolation import TAPS
+from clsas.interpolation import MOST_UPSAMPLING, TAPS
 from clsas.planner import WORST_TOLERANCE_DB
 from clsas.tradeoff import summary
 
@@ -44,7 +44,9 @@ from clsas.tradeoff import summary
 )
 @click.option(
     "--upsampling", type=float,
-    callback=options.checked(partial(validate.number, "upsampling", least=1.0, most=64.0)),
+    callback=options.checked(
+        partial(validate.number, "upsampling", least=1.0, most=MOST_UPSAMPLING)
+    ),
     help="Fix how much lines are upsampled.",
 )  # fmt: skip
 @options.beam

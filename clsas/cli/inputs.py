@@ -12,8 +12,9 @@ import clsas
 from clsas import config, validate
 from clsas.cli.parameters import keep_apart, written_to
 from clsas.config import DIAL, EXACT, SceneFile
+from clsas.planner import TOLERANCE_DB
 
-DEFAULT_WISH = {"tolerance_db": -50.0}
+DEFAULT_WISH = {"tolerance_db": TOLERANCE_DB}
 
 
 def load(path: Path, kind: type) -> Any:
