@@ -174,6 +174,7 @@ def prepare(
     """Decide how `backproject` forms an image; parameters and errors are its."""
     validate.instance("lines", lines, RangeLines)
     validate.instance("grid", grid, Grid)
+    validate.memory("grid", 8 * grid.size)
     accuracy_db = validate.number(
         "accuracy_db", accuracy_db, "dB", least=BEST_ACCURACY_DB, below=0.0
     )

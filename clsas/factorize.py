@@ -95,6 +95,7 @@ def factorize(
     """
     validate.instance("lines", lines, RangeLines)
     validate.instance("grid", grid, Grid)
+    validate.memory("grid", 8 * grid.size)
     validate.progress(progress)
     device = open_device(device)
     if not isinstance(plan_or_tolerance, Plan):

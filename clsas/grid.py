@@ -273,6 +273,7 @@ def _axis(name: str, axis: tuple[float, float, int]) -> tuple[float, float, int]
     start = validate.number(f"{name} start", start, "m")
     stop = validate.number(f"{name} stop", stop, "m")
     count = validate.count(f"{name} count", count)
+    validate.memory(f"{name} count", 8 * count)
     if count == 1:
         return start, 0.0, count
     if start == stop:

@@ -71,6 +71,7 @@ def save(path: str | os.PathLike, obj: Saved) -> None:
     The file is put together in memory, which thus holds the object once more: HDF5 does not
     recover from a disk that turns out to be full.
     """
+    path = validate.path("path", path)
     validate.instance("obj", obj, *_SAVED)
     with replacing(path) as temporary:
         memory = BytesIO()
@@ -105,7 +106,7 @@ def load(path: str | os.PathLike) -> Saved:
     OSError
         If it does not exist (FileNotFoundError) or cannot be read.
     """
-    with _opened(path) as file:
+    with _opened(validate.path("path", path)) as file:
         obj = _read(file)
         if not isinstance(obj, _SAVED):
             raise FileFormatError(f"holds only a {type(obj).__name__}")
@@ -182,6 +183,11 @@ def replacing(path: str | os.PathLike) -> Iterator[Path]:
     try:
         yield temporary
         os.replace(temporary, path)
+    except OSError as error:
+        # A full disk names no file, and the temporary one says nothing.
+        if error.errno is not None and error.filename in (None, str(temporary), temporary):
+            raise type(error)(error.errno, error.strerror, str(path)) from error
+        raise
     finally:  # also on Ctrl-C
         temporary.unlink(missing_ok=True)
 
@@ -242,7 +248,15 @@ def _samples_of(file: h5py.File) -> h5py.Dataset:
     kind = _attribute(file, "kind")
     if kind != "range_lines":
         raise FileFormatError(f"must hold range lines, got {kind}")
-    return file["samples"]
+    samples = file.get("samples")
+    if not isinstance(samples, h5py.Dataset):
+        raise FileFormatError("lacks samples of the range_lines at /")
+    if samples.dtype.kind != "c" or len(samples.shape or ()) != 2 or not samples.size:
+        raise FileFormatError(
+            "must hold samples that are complex numbers, [channels, samples], got "
+            f"{samples.dtype} of shape {samples.shape}"
+        )
+    return samples
 
 
 def _read(group: h5py.Group, **instead: Any) -> Any:

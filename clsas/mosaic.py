@@ -229,6 +229,8 @@ class Mosaic:
             If the image does not fit into this machine's memory, or what imaging one patch raises,
             with its place.
         """
+        if not (tell is None or callable(tell)):
+            raise TypeError(f"tell must be a function or None, got {tell!r}")
         validate.memory("the mosaic", 8 * self.grid.size)
         stored = [self._patch(place, record, None) for place, record in self.finished.items()]
         pixels: NDArray[np.complex64] | None = None
@@ -752,7 +754,8 @@ def _devices(wish: Any) -> tuple[Device, ...]:
         found = tuple(open_device(info.index) for info in _side_by_side())
     names = {device.info.index for device in found}
     if len(names) < len(found):
-        raise ValueError(f"device must name each device once, got {wish!r}")
+        named = ", ".join(device.info.label for device in found)
+        raise ValueError(f"device must name each device once, got {named}")
     return found
 
 

@@ -177,6 +177,8 @@ class Plan:
             for a, b in zip(large, small, strict=True)
         )
         check(nested, "sides", "pairs of rows and columns that divide each other")
+        asked = self.tolerance_db is None or numbers((self.tolerance_db,), 1, -np.inf)
+        check(asked, "tolerance_db", "a number, or nothing with stages")
         for name in ("predicted_error_db", "predicted_seconds", "exact_seconds"):
             check(numbers((getattr(self, name),), 1, -np.inf), name, "a number")
         for name in ("roots_at_once", "roots_prepared"):

@@ -119,6 +119,7 @@ def plan(
             "exactly one of tolerance_db, tolerance_wavelengths and stages must be given, "
             f"got {tolerance_db}, {tolerance_wavelengths}, {stages}"
         )
+    validate.memory("grid", 8 * grid.size)
     tolerance_db = tolerance_in_db(tolerance_db, tolerance_wavelengths)
     if stages is not None:
         stages = _checked_stages(stages, lines, grid)
@@ -190,7 +191,7 @@ def _allowed(taps: tuple[int, int] | None, depth: int | None) -> Allowed | None:
         if not isinstance(taps, (tuple, list)) or len(taps) != 2:
             raise TypeError(f"taps must be two, in range and along the aperture, got {taps!r}")
         for each in taps:
-            validate.one_of("taps", each, ALIGN_TAPS)
+            validate.one_of("taps", validate.count("every entry of taps", each), ALIGN_TAPS)
         fields = {"align_taps": (taps[0],), "aperture_taps": (taps[1],)}
     if depth is not None:
         validate.one_of("depth", validate.count("depth", depth), range(1, MOST_STAGES + 1))

@@ -230,7 +230,7 @@ def _values(name: str, image: Image | ArrayLike) -> NDArray[np.complex128]:
     values = np.asanyarray(image.pixels if isinstance(image, Image) else image)
     if values.dtype.kind in "iuf":
         values = values.astype(np.complex128)
-    return validate.array(name, values, np.complex128, (None,) * values.ndim)
+    return validate.array(name, values, np.complex128, (None,) * max(values.ndim, 1))
 
 
 def _check_one_grid(image: Grid, reference: Grid) -> None:

@@ -22,6 +22,7 @@ from clsas import validate
 
 _TILE_M = 2.0  # side of what is within the beam or not as a whole
 _CLEAR = -1e30  # elevation where there is no seabed
+_FARTHEST_M = 1e9  # of a point: float64 leaves 1e-7 m of its range
 
 
 class View(NamedTuple):
@@ -58,7 +59,8 @@ class PointTargets:
     Raises
     ------
     TypeError, ValueError
-        If an array has the wrong kind or shape, is empty or not finite.
+        If an array has the wrong kind or shape, is empty or not finite, or a position is beyond
+        1e9 m.
     """
 
     positions_m: NDArray[np.float64]
@@ -67,6 +69,8 @@ class PointTargets:
     def __post_init__(self) -> None:
         """Check every field and convert it."""
         positions = validate.array("positions_m", self.positions_m, np.float64, (None, 3))
+        farthest_m = float(np.abs(positions).max())
+        validate.number("the farthest of positions_m", farthest_m, "m", most=_FARTHEST_M)
         given = np.asarray(self.amplitudes)
         # A real amplitude is a complex one without phase; only numbers are widened.
         given = given.astype(np.complex128) if given.dtype.kind in "iuf" else given

@@ -242,7 +242,7 @@ class Sonar:
 def line_array(receivers: int, spacing_m: float) -> NDArray[np.float64]:
     """Return positions [receivers, 3] along x, centred on the origin."""
     receivers = validate.count("receivers", receivers)
-    validate.memory("receivers", 24 * receivers)
+    validate.memory("receivers", 240 * receivers)  # their paths too, of one ping
     spacing = validate.positive("spacing_m", spacing_m, "m")
     positions = np.zeros((receivers, 3))
     positions[:, 0] = spacing * (np.arange(receivers) - (receivers - 1) / 2)

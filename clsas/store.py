@@ -32,6 +32,7 @@ if TYPE_CHECKING:
 FORMAT = "clsas mosaic"
 VERSION = 1
 
+_OURS = {"zarr.json", "pixels", "patches", "height", "x", "y"}  # what lies in a store
 _OVERVIEW = 1024  # pixels along the longer side, at most
 
 
@@ -172,6 +173,8 @@ class Store:
     def begin(self, inputs: dict[str, Any], grid: Grid, patch_shape: tuple[int, int]) -> None:
         """Create the store, or check that it was made with these inputs.
 
+        One of other inputs in which no patch was finished is made anew.
+
         Raises
         ------
         ValueError
@@ -181,14 +184,15 @@ class Store:
         """
         if not self._is_there():
             self._create(inputs, grid, patch_shape)
-        stored = self._attributes()
-        self._check(stored["inputs"], inputs)
-        if stored["patch_shape"] != list(patch_shape):
-            mine, given = ("{} x {}".format(*s) for s in (stored["patch_shape"], patch_shape))
-            raise ValueError(
-                f"{self.path} was made with other inputs: patches of {mine} pixels there, "
-                f"of {given} given; give it another path or the same inputs"
-            )
+        if differences := self._differences(inputs, patch_shape):
+            if self.records() or {path.name for path in self.path.iterdir()} - _OURS:
+                raise ValueError(
+                    f"{self.path} was made with other inputs: {'; '.join(differences)}; give it "
+                    f"another path or the same inputs"
+                )
+            shutil.rmtree(self.path)
+            self.__dict__.pop("pixels", None)
+            self._create(inputs, grid, patch_shape)
         with tempfile.TemporaryFile(dir=self.path):
             pass  # raises where it cannot be written
         pixels = self.pixels
@@ -364,8 +368,13 @@ class Store:
             raise ValueError(f"{self.path} is damaged: its attributes are not those of a mosaic")
         return attributes
 
-    def _check(self, stored: dict[str, Any], given: dict[str, Any]) -> None:
-        differences = []
+    def _differences(self, given: dict[str, Any], patch_shape: tuple[int, int]) -> list[str]:
+        """Return in what the inputs that the store was made with differ from those given."""
+        attributes, differences = self._attributes(), []
+        stored = attributes["inputs"]
+        if attributes["patch_shape"] != list(patch_shape):
+            mine, theirs = ("{} x {}".format(*s) for s in (attributes["patch_shape"], patch_shape))
+            differences.append(f"patches of {mine} pixels there, of {theirs} given")
         for name in given:
             mine, theirs = stored.get(name), given[name]
             if name == "parts":
@@ -382,11 +391,7 @@ class Store:
                 ]
             elif mine != theirs:
                 differences.append(f"{name} is {mine} there, {theirs} given")
-        if differences:
-            raise ValueError(
-                f"{self.path} was made with other inputs: {'; '.join(differences)}; give it "
-                f"another path or the same inputs"
-            )
+        return differences
 
 
 def _zarr() -> Any:

@@ -263,8 +263,16 @@ def tradeoff(
     validate.instance("grid", grid, Grid)
     validate.count("repeats", repeats)
     validate.progress(progress)
+    validate.instance("study", study, bool)
+    if beam is not None:
+        validate.instance("beam", beam, BeamWindow)
+    tolerances_db = np.atleast_1d(tolerances_db)
+    if tolerances_db.size:
+        tolerances_db = validate.array("tolerances_db", tolerances_db, np.float64, (None,))
+    tolerances_db = tolerances_db.tolist()
+    if not (stages is None or isinstance(stages, Sequence)):
+        raise TypeError(f"stages must be a sequence of plans' (QR, QI), got {stages!r}")
     device = open_device(device)
-    tolerances_db = np.atleast_1d(tolerances_db).tolist()
     wishes: list[dict] = [{"tolerance_db": tolerance_db} for tolerance_db in tolerances_db]
     if study:
         wishes += [
@@ -299,6 +307,8 @@ def tradeoff(
             progress(done, images)
 
     reference = exact(accuracy_db=REFERENCE_DB)
+    if not reference.pixels.any():
+        raise ValueError("grid must lie where the lines hold anything: the exact image is zero")
     step()
     rows = []
     for row, form in ways:  # the first run builds the kernels, and its image is measured

@@ -16,6 +16,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
+_LONGEST = 100  # characters of what was given, in a message
+
 
 class ClsasWarning(UserWarning):
     """A result that is valid but probably not what was meant, with what was done instead."""
@@ -53,7 +55,7 @@ def number(
     scalar = value[()] if getattr(value, "ndim", None) == 0 else value
     if isinstance(scalar, bool) or not isinstance(scalar, Real) or np.ma.is_masked(value):
         kind = f"number in {unit}" if unit else "number"
-        raise TypeError(f"{name} must be one real {kind}, got {value!r}")
+        raise TypeError(f"{name} must be one real {kind}, got {_shown(value)}")
     try:
         result = float(scalar)
     except OverflowError:  # a whole number or fraction beyond float64
@@ -88,7 +90,7 @@ def positive(name: str, value: float, unit: str = "") -> float:
 def count(name: str, value: int, *, least: int = 1) -> int:
     """Return `value` as an int of at least `least`; raises TypeError or ValueError."""
     if isinstance(value, bool) or not isinstance(value, (int, np.integer)):
-        raise TypeError(f"{name} must be a whole number, got {value!r}")
+        raise TypeError(f"{name} must be a whole number, got {_shown(value)}")
     if value < least:
         raise ValueError(f"{name} must be at least {least}, got {value}")
     return int(value)
@@ -97,7 +99,9 @@ def count(name: str, value: int, *, least: int = 1) -> int:
 def one_of(name: str, value: str, allowed: Sequence[str]) -> str:
     """Return `value` if it is one of `allowed`; raises ValueError naming them all."""
     if value not in allowed:
-        raise ValueError(f"{name} must be one of {', '.join(map(repr, allowed))}, got {value!r}")
+        raise ValueError(
+            f"{name} must be one of {', '.join(map(repr, allowed))}, got {_shown(value)}"
+        )
     return value
 
 
@@ -111,7 +115,7 @@ def instance(name: str, value: object, *kinds: type) -> None:
 def path(name: str, value: object) -> Path:
     """Return `value` as a path; raises TypeError unless it is one, ValueError if it is empty."""
     if not isinstance(value, (str, os.PathLike)):
-        raise TypeError(f"{name} must be a path, got {value!r}")
+        raise TypeError(f"{name} must be a path, got {_shown(value)}")
     if not os.fspath(value):
         raise ValueError(f"{name} must be a path, got an empty one")
     return Path(os.fspath(value))
@@ -215,3 +219,9 @@ def array(
 
 def _in(unit: str) -> str:
     return f" {unit}" if unit else ""
+
+
+def _shown(value: object) -> str:
+    """Return what was given as a message shows it: not all of a long text."""
+    text = repr(value)
+    return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 3]}..."

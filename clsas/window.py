@@ -111,10 +111,11 @@ class BeamWindow:
         if self.along is not None:
             shape = (3,) if np.ndim(self.along) == 1 else (None, 3)
             along = validate.array("along", self.along, np.float64, shape)
-            length = np.linalg.norm(along, axis=-1, keepdims=True)
-            if not length.all():
+            largest = np.abs(along).max(axis=-1, keepdims=True)
+            if not largest.all():
                 raise ValueError("along must hold directions of some length, got zeros")
-            fields["along"] = along / length
+            along = along / largest  # so that no square overflows or vanishes
+            fields["along"] = along / np.linalg.norm(along, axis=-1, keepdims=True)
         if self.track_pings is not None:
             fields["track_pings"] = validate.count("track_pings", self.track_pings, least=5)
         if not isinstance(self.normalise, (bool, np.bool_)):
@@ -280,10 +281,13 @@ class BeamWindow:
 
         Raises
         ------
+        TypeError
+            If `lines` is of another type.
         ValueError
             If `along` is of another number of channels, or not given where there is one ping only
             or a track stands still.
         """
+        validate.instance("lines", lines, RangeLines)
         if self.along is not None:
             if self.along.ndim == 2 and len(self.along) != lines.channels:
                 raise ValueError(

@@ -405,6 +405,12 @@ def good():
     [
         ("lines", np.zeros((2, 3), complex), TypeError, "lines must be .*RangeLines.*ndarray"),
         ("grid", (5, 5), TypeError, "grid must be .*Grid.*tuple"),
+        (
+            "grid",
+            Grid.plane((-1, 1, 10**6), (30, 31, 10**6)),
+            ValueError,
+            "grid must ask for at most .* GiB",
+        ),
         ("device", 1.5, TypeError, "device must be .*1.5"),
         ("device", True, TypeError, "device must be .*True"),
         ("accuracy_db", 0, ValueError, "accuracy_db must be .*< 0.*dB.*got 0"),

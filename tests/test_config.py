@@ -259,6 +259,13 @@ def test_bad_track_files(tmp_path, text, message):
     assert "track.csv" in told
 
 
+def test_a_track_file_that_is_no_text(tmp_path):
+    (tmp_path / "track.csv").write_bytes(b"\xff\x00\xfe")
+    told = refused("[track]\nfile = 'track.csv'", tmp_path)
+    assert "[track] file must be text" in told
+    assert "track.csv" in told
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [

@@ -832,6 +832,12 @@ def good():
     [
         ("lines", np.zeros((2, 3), complex), TypeError, "lines must be .*RangeLines.*ndarray"),
         ("grid", (5, 5), TypeError, "grid must be .*Grid.*tuple"),
+        (
+            "grid",
+            Grid.plane((-1, 1, 10**6), (30, 31, 10**6)),
+            ValueError,
+            "grid must ask for at most .* GiB",
+        ),
         ("plan_or_tolerance", -76, ValueError, r"tolerance.* must be .*>= -75 .*dB.*got -76"),
         ("plan_or_tolerance", 0, ValueError, r"tolerance.* must be .*<= -10 dB.*got 0"),
         ("plan_or_tolerance", np.nan, ValueError, "tolerance.* must be finite.*nan"),

@@ -165,6 +165,10 @@ def test_save_names_bad_input(tmp_path):
         save(tmp_path / "none" / "file.h5", PLANE)
     with pytest.raises(IsADirectoryError, match="it is a folder"):
         save(tmp_path, PLANE)
+    with pytest.raises(ValueError, match="path must be a path, got an empty one"):
+        save("", PLANE)
+    with pytest.raises(TypeError, match="path must be a path, got None"):
+        load(None)
     assert os.listdir(tmp_path) == []
 
 

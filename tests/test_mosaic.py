@@ -284,6 +284,27 @@ def test_missing_channels_weigh_nothing(file):
     assert relative_error_db(image.pixels, of_all * reference.pixels) < -65
 
 
+@pytest.mark.parametrize(
+    ("samples", "says"),
+    [
+        (np.ones((160, 9), np.float32), r"samples that are complex numbers.* got float32"),
+        (np.ones((160, 9), np.int16), "got int16"),
+        (np.complex64(1), r"got complex64 of shape \(\)"),
+        ("group", "lacks samples"),
+        (None, "lacks samples"),
+    ],
+)
+def test_lines_without_complex_samples_are_refused(file, samples, says):
+    with h5py.File(file, "r+") as lines:
+        del lines["samples"]
+        if isinstance(samples, str):
+            lines.create_group("samples")
+        elif samples is not None:
+            lines["samples"] = samples
+    with pytest.raises(clsas.FileFormatError, match=says):
+        clsas.mosaic(file, GRID, **WISH)
+
+
 def test_lost_pings_are_flagged():
     lines = LINES.select(np.delete(np.arange(160), slice(70, 80)))
     flags = {patch.record.flags for patch in clsas.mosaic(lines, GRID, **WISH)}
@@ -388,6 +409,22 @@ class TestResuming:
         with pytest.raises(ValueError, match=f"made with other inputs: .*{message}"):
             clsas.mosaic(change.pop("lines"), change.pop("grid"), tmp_path / "a.zarr", **change)
         assert len(Store.opened(tmp_path / "a.zarr").records()) == before
+
+    def test_a_store_without_a_finished_patch_keeps_nobody_from_other_inputs(self, tmp_path):
+        path = tmp_path / "a.zarr"
+        wrong = clsas.mosaic(LINES, GRID, path, stages=[(64, 64)], patches=(2, 4))
+        with pytest.raises(ValueError, match="patch 0,0: stages must leave a line and a pixel"):
+            list(wrong)
+        assert len(list(clsas.mosaic(LINES, GRID, path, **(WISH | {"patches": (3, 4)})))) == 12
+        assert Store.opened(path).patch_shape == (20, 20)
+
+    def test_files_of_others_are_left_alone(self, tmp_path):
+        path = tmp_path / "a.zarr"
+        clsas.mosaic(LINES, GRID, path, **WISH)
+        (path / "notes.txt").write_text("mine")
+        with pytest.raises(ValueError, match="made with other inputs"):
+            clsas.mosaic(LINES, GRID, path, **(WISH | {"accuracy_db": -60}))
+        assert (path / "notes.txt").exists()
 
     def test_a_store_of_an_older_schema_is_refused(self, tmp_path):
         next(iter(clsas.mosaic(LINES, GRID, tmp_path / "a.zarr", **WISH)))

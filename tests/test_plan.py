@@ -109,6 +109,8 @@ def test_text_that_is_no_plan_is_refused(text):
         ("stages", [1]),
         ("beam", 7),
         ("predicted_error_db", "low"),
+        ("tolerance_db", "low"),
+        ("tolerance_db", []),
         ("nearest", ["x"]),
     ],
 )

@@ -386,6 +386,12 @@ def test_bad_wishes_are_named(good, argument, value, error, says):
     [
         ("lines", np.zeros((2, 3), complex), TypeError, "lines must be .*RangeLines.*ndarray"),
         ("grid", (5, 5), TypeError, "grid must be .*Grid.*tuple"),
+        (
+            "grid",
+            Grid.plane((-1, 1, 10**6), (30, 31, 10**6)),
+            ValueError,
+            "grid must ask for at most .* GiB",
+        ),
         ("beam", 20.0, TypeError, "beam must be .*BeamWindow.*float"),
         ("device", 1.5, TypeError, "device must be .*1.5"),
         ("costs", 5, TypeError, "costs must be .*Costs.*int"),
@@ -393,6 +399,7 @@ def test_bad_wishes_are_named(good, argument, value, error, says):
         ("memory_bytes", 1e9, TypeError, "memory_bytes must be a whole number"),
         ("taps", 6, TypeError, "taps must be two, in range and along the aperture, got 6"),
         ("taps", (6, 2), ValueError, "taps must be one of 4, 6, 8, got 2"),
+        ("taps", (4.0, 6), TypeError, "every entry of taps must be a whole number"),
         ("depth", 6, ValueError, "depth must be one of 1, 2, 3, 4, 5, got 6"),
         ("depth", 2.5, TypeError, "depth must be a whole number"),
     ],

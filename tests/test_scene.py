@@ -191,6 +191,13 @@ def test_point_targets_are_always_seen():
 # Built-in seabeds
 
 
+def test_points_too_far_for_a_phase_are_refused():
+    with pytest.raises(
+        ValueError, match=r"farthest of positions_m must be .* <= 1e\+09 m, got 1e\+300"
+    ):
+        PointTargets([[0, 1e300, 0]])
+
+
 def test_the_wreck_has_hull_wheelhouse_and_mast_with_their_shadows():
     wreck = scene.wreck(cell_m=0.2, density_m2=1)
     assert wreck.steps_m == pytest.approx((0.2, 0.2))

@@ -1,4 +1,5 @@
 import csv
+import dataclasses
 import sys
 
 import numpy as np
@@ -115,6 +116,10 @@ def test_default_stages_leave_a_line_and_a_pixel(lines):
         (ValueError, "tolerance_db must be", {"tolerances_db": (-50, -200)}),
         (ValueError, "stages must leave a line and a pixel", {"stages": [[(300, 2)]]}),
         (TypeError, "stages must be a sequence", {"stages": [2]}),
+        (TypeError, "stages must be a sequence", {"stages": 3}),
+        (TypeError, "beam must be of type BeamWindow", {"beam": 3}),
+        (TypeError, "study must be of type bool", {"study": "x"}),
+        (TypeError, "tolerances_db must be real numbers", {"tolerances_db": None}),
         (TypeError, "progress must be a function", {"progress": 3}),
     ],
 )
@@ -123,6 +128,12 @@ def test_bad_input_is_refused_before_any_image(lines, monkeypatch, error, messag
         monkeypatch.setattr(sys.modules["clsas.tradeoff"], imager, pytest.fail)
     with pytest.raises(error, match=message):
         clsas.tradeoff(**{"lines": lines, "grid": GRID} | given)
+
+
+def test_a_grid_without_anything_is_refused(lines):
+    silent = dataclasses.replace(lines, samples=np.zeros_like(lines.samples))
+    with pytest.raises(ValueError, match="grid must lie where the lines hold anything"):
+        clsas.tradeoff(silent, GRID, tolerances_db=[-30], stages=[], repeats=1)
 
 
 def test_the_front_holds_what_nothing_beats():

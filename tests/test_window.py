@@ -184,6 +184,12 @@ def test_a_direction_that_is_given_is_made_a_unit():
 # Which channels are seen
 
 
+@pytest.mark.parametrize("length", [1e-300, 1e300])
+def test_a_direction_may_be_of_any_length(length):
+    along = BeamWindow(20, along=(3 * length, 4 * length, 0)).along
+    np.testing.assert_allclose(along, [0.6, 0.8, 0], rtol=1e-12)
+
+
 def test_ranges_hold_every_channel_that_sees_a_part_and_few_others():
     rng = np.random.default_rng(1)
     track = along_x(1000, 0.05) + rng.normal(0, 0.05, (1000, 3))

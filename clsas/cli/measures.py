@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Collection
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import click
 
 import clsas
+from clsas import validate
 from clsas.cli import options
 from clsas.cli.inputs import load, read_beam, read_grid
 from clsas.cli.outputs import json_able, print_json, progress_bar, report
@@ -21,8 +23,14 @@ from clsas.tradeoff import TOLERANCES_DB
 @click.command()
 @click.argument("image_file", metavar="IMAGE.H5", type=INPUT)
 @click.option("--near", type=PLACE, help="Measure the point near x, y (m).")
-@click.option("--search-m", type=float, help="How far from there its peak may be.")
-@click.option("--extent-m", type=float, help="How far from its peak side lobes are looked for.")
+@click.option(
+    "--search-m", type=float, help="How far from there its peak may be.",
+    callback=options.checked(partial(validate.positive, "search_m", unit="m")),
+)  # fmt: skip
+@click.option(
+    "--extent-m", type=float, help="How far from its peak side lobes are looked for.",
+    callback=options.checked(partial(validate.positive, "extent_m", unit="m")),
+)  # fmt: skip
 @click.option("--reference", type=INPUT, help="Image to give the relative error to.")
 @options.png("cuts through the point")
 @options.as_json

@@ -45,11 +45,15 @@ def _axis(text: str) -> tuple[float, float, int]:
     axis = float(start), float(stop), int(count)
     if not (math.isfinite(axis[0]) and math.isfinite(axis[1]) and axis[2] > 0):
         raise ValueError
+    if axis[2] > 1 and axis[0] == axis[1]:
+        raise ValueError
     return axis
 
 
 def _place(text: str) -> tuple[float, float]:
     x, y = text.split(",")
+    if not (math.isfinite(float(x)) and math.isfinite(float(y))):
+        raise ValueError
     return float(x), float(y)
 
 
@@ -72,7 +76,7 @@ def _counts(text: str) -> tuple[int, int]:
     return rows, columns
 
 
-AXIS = Parsed("START:STOP:N", _axis, "START:STOP:N, metres and a number of pixels, at least 1")
+AXIS = Parsed("START:STOP:N", _axis, "START:STOP:N, two places in metres and a number of pixels")
 PLACE = Parsed("X,Y", _place, "X,Y in metres")
 RATIO = Parsed("NUMBER", _ratio, "a number or a fraction such as 1/30")
 STAGES = Parsed("stages", _stages, "QRxQI for every stage, such as 2x2,2x2")
@@ -89,6 +93,8 @@ class File(click.Path):
 
     def convert(self, value: Any, param: Any, ctx: Any) -> Path:
         """Return the path; a file that is also another of the command's is a usage error."""
+        if not os.fspath(value):
+            self.fail("must be a path, got an empty one", param, ctx)
         path: Any = super().convert(value, param, ctx)
         for other in ctx.command.params:
             # Whichever comes second on the command line finds the first one here.
