@@ -372,7 +372,7 @@ FIXED = ["--taps", "4", "--upsampling", "2"]
         (["image", "lines.h5", "--x", "0:nan:9", *GRID[2:], "-o", "new.h5"], 2, "START:STOP:N"),
         (["plan", "lines.h5", *GRID, "--z", "inf"], 2, "z must be finite m, got inf"),
         (["quality", "image.h5", "--near", "9,9"], 1, "near must be inside the image"),
-        (["quality", "image.h5", "--near", "0,20", "--search-m", "-1"], 1, "search_m must be"),
+        (["quality", "image.h5", "--near", "0,20", "--search-m", "-1"], 2, "search_m must be"),
         (["simulate", "none.toml", "-o", "new.h5"], 2, "'none.toml' does not exist"),
         (["simulate", "scene.toml"], 2, "Missing option '-o'"),
         (["simulate", "scene.toml", "-o", "no/new.h5"], 2, "there is no folder 'no'"),
@@ -389,12 +389,12 @@ FIXED = ["--taps", "4", "--upsampling", "2"]
         (
             ["image", "lines.h5", "--x", "0:1:1000000", "--y", "0:1:1000000", "-o", "new.h5"],
             1,
-            "--x and --y must ask for at most ",
+            "y count must ask for at most ",
         ),
         (
             ["image", "lines.h5", "--x", "0:1:9", "--y", f"0:1:{10**30}", "-o", "new.h5"],
             1,
-            "--x and --y must ask for at most ",
+            "y count must ask for at most ",
         ),
         (
             ["image", "lines.h5", *GRID, "-o", "new.h5", *FIXED, "--accuracy-db", "-60"],
