@@ -136,7 +136,8 @@ def backproject(
     I(x) = sum_i s_i(rho_i(x)) exp(+j 2 k rho_i(x)), with rho half the path from transmitter to
     pixel to receiver and k = 2 pi carrier/c. The lines are taken as band-limited about their
     spectral centre and as zero beyond their ends: a pixel outside a line's range (by more than
-    the taps of one interpolation) gets nothing from it.
+    the taps of one interpolation) gets nothing from it. Where a line does not fade towards an end,
+    what pixels next to it get depends on the taps, and the image there on `accuracy_db`.
 
     With a beam each term is multiplied by its weight. With or without one a pixel behind the
     antennas, at the range of one before them, is its mirror image. Ranges and phases are referred

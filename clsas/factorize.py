@@ -22,9 +22,11 @@ from clsas.backproject import (
     warn_unseen,
 )
 from clsas.device import Device, Slot, aligned, open_device
+from clsas.errors import in_db
 from clsas.filters import edges_gain
 from clsas.grid import Grid
 from clsas.image import Image, holds_any
+from clsas.interpolation import power_outside
 from clsas.leaves import Finish, Level, PlaneLeaves, SurfaceLeaves
 from clsas.lines import RangeLines
 from clsas.plan import CHUNK, GUARD, MARGIN, Plan, padded_length, sample_bytes
@@ -83,6 +85,12 @@ def factorize(
     DeviceError
         If there is no such device.
 
+    Warns
+    -----
+    ClsasWarning
+        If a plan was made for lines of another band, lines cannot be held in half precision as
+        planned, no channel sees anything of the grid, or as `clsas.plan` does.
+
     Notes
     -----
     Aligned on a subimage's centre c, channel n's steering function exp(j 2 k (rho_n(x) - rho_n(c)))
@@ -112,12 +120,13 @@ def factorize(
     else:
         chosen = plan_or_tolerance
         chosen.check(lines, grid)
+        _check_band(lines, chosen)
     if chosen.is_exact:
         return backproject(
             lines,
             grid,
             device=device,
-            accuracy_db=chosen.predicted_error_db,
+            accuracy_db=chosen.accuracy_db,
             beam=chosen.beam,
             progress=progress,
         )
@@ -365,6 +374,20 @@ class _Run:
             GUARD,
             wait_for=table.filled,
             local=(items, 1),
+        )
+
+
+def _check_band(lines: RangeLines, chosen: Plan) -> None:
+    """Warn where a plan was made for lines of another band."""
+    known = chosen.kept.get("geometry")
+    if chosen.band is None or (known is not None and known.lines is lines):
+        return
+    outside_db = in_db(power_outside(lines, *chosen.band))
+    if outside_db > chosen.tolerance_db:
+        validate.warn(
+            f"the lines hold {outside_db:.0f} dB of their power outside the band that the plan was "
+            f"made for, so that the error may be more than {chosen.tolerance_db:g} dB: plan anew "
+            "with clsas.plan"
         )
 
 

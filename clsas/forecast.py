@@ -34,6 +34,7 @@ from clsas.view import View
 
 HALF_ROUNDING = 4e-8
 """Power of the error that rounding lines to half precision once adds: 2^-11/sqrt(6) rms."""
+_OUTSIDE = 0.1  # of the power of the error allowed
 _ROOM = 1.06  # for virtual channels, over the most expected
 _ROUNDING_SHARE = 0.1  # of an image's error
 _MOST_CHUNKS = 16  # that a sum in half precision is made of
@@ -190,7 +191,15 @@ def factorized(
         crowding=way.crowding,
         beam_cycles=way.beam_cycles,
         most_channels=tuple(math.ceil(most) for _, most in most_channels),
+        band=None if nearest else _band(view, _OUTSIDE * power(tolerance_db)),
     )
+
+
+def _band(view: View, outside: float) -> tuple[float, float]:
+    """Return centre and half the width of the band outside of which lies that share of power."""
+    spectrum = view.spectrum
+    bins = np.searchsorted(np.cumsum(spectrum.power), 1 - outside)
+    return spectrum.centre, float(min((bins + 1) / (2 * len(spectrum.power)), 0.5))
 
 
 def _half_rounding(view: View, reach: Sequence[float]) -> float:
@@ -314,6 +323,7 @@ def plain(
         roots_prepared=1,
         stages=(),
         predicted_error_db=exact.accuracy_db,
+        accuracy_db=exact.accuracy_db,
         predicted_seconds=seconds,
         exact_seconds=seconds,
         memory_bytes=exact.memory_bytes,

@@ -23,6 +23,7 @@ COST = {2: 0.75, 4: 1.0, 6: 1.3, 8: 1.55}
 # The same, in such, for one upsampled sample: an FFT on the host.
 _UPSAMPLING_COST = 40.0
 _FREQUENCIES = 128
+_MEASURED, _COMPARED = 256, 32  # channels
 Gain = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 """A factor of spectra, by the distance from their centre in cycles per sample."""
 _POSITIONS = 17
@@ -101,8 +102,30 @@ class Interpolator:
         return np.mean(np.sum(self.weights(nu) * np.cos(2 * np.pi * turns), axis=-1), axis=-1)
 
 
-def measure_spectrum(lines: RangeLines, most_channels: int = 256) -> Spectrum:
+def measure_spectrum(lines: RangeLines) -> Spectrum:
     """Return the mean power spectrum of the lines' channels, of some that hold anything."""
+    frequency, power = _mean_power(lines, _MEASURED)
+    centre = float(np.angle(np.sum(power * np.exp(2j * np.pi * frequency))) / (2 * np.pi))
+    nearest = (2 * _FREQUENCIES * _distance(frequency, centre)).astype(np.int64)
+    share = np.bincount(np.minimum(nearest, _FREQUENCIES - 1), power, _FREQUENCIES)
+    return Spectrum(centre, (np.arange(_FREQUENCIES) + 0.5) / (2 * _FREQUENCIES), share)
+
+
+def power_outside(lines: RangeLines, centre: float, half_width: float) -> float:
+    """Return the share of the lines' power outside a band, in cycles per sample; of some lines."""
+    frequency, power = _mean_power(lines, _COMPARED)
+    return float(power[_distance(frequency, centre) > half_width].sum())
+
+
+def _distance(frequency: NDArray[np.float64], centre: float) -> NDArray[np.float64]:
+    """Return how far frequencies are from a centre, cycles per sample, 0 to 0.5."""
+    return np.abs((frequency - centre + 0.5) % 1.0 - 0.5)
+
+
+def _mean_power(
+    lines: RangeLines, most_channels: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return frequencies, cycles per sample, and the share of the power at each."""
     samples = lines.samples[some_channels(lines.channels, most_channels)]
     largest = _largest_part(samples)
     if largest == 0 and (filled := np.flatnonzero(lines.samples.any(axis=1))).size:
@@ -119,11 +142,7 @@ def measure_spectrum(lines: RangeLines, most_channels: int = 256) -> Spectrum:
     frequency = scipy.fft.fftfreq(length)
     if not power.any():
         power[:] = 1.0
-    centre = float(np.angle(np.sum(power * np.exp(2j * np.pi * frequency))) / (2 * np.pi))
-    distance = np.abs((frequency - centre + 0.5) % 1.0 - 0.5)
-    nearest = np.minimum((2 * _FREQUENCIES * distance).astype(np.int64), _FREQUENCIES - 1)
-    share = np.bincount(nearest, power / power.sum(), _FREQUENCIES)
-    return Spectrum(centre, (np.arange(_FREQUENCIES) + 0.5) / (2 * _FREQUENCIES), share)
+    return frequency, power / power.sum()
 
 
 def _largest_part(samples: NDArray[np.complex64]) -> np.float32:

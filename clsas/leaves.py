@@ -103,7 +103,8 @@ class Leaves:
             sine = sines(centres_m, track.sampled_m[0][places], self.geometry.along[places])
             error = layout.one_cubic_error(chosen.beam, nearest_m, wave_m)
             error /= chosen.beam.fullness(sine, wave_m, places.sum() / self.lines.channels)
-            one_cubic = error**2 < _SHARE * power(chosen.predicted_error_db)
+            allowed_db = min(chosen.predicted_error_db, chosen.tolerance_db or 0.0)
+            one_cubic = error**2 < _SHARE * power(allowed_db)
         return {
             "WIDTH": self.width,
             "TAPS": chosen.final.taps,

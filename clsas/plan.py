@@ -110,6 +110,8 @@ class Plan:
         Whose times these are.
     lines_digest, grid_digest : str
         Of the geometry that this plan was made for.
+    accuracy_db : float or None
+        Of plain backprojection, by itself; None where the image is factorized.
     beam : BeamWindow or None
     limits : (low, high) or None
         Sines of the aspect angle between which channels are used: where the beam weighs anything
@@ -121,6 +123,9 @@ class Plan:
         For how many cycles per edge of the beam the last stage's virtual channels are dense enough.
     most_channels : tuple of int
         Virtual channels of a subimage, stage by stage, that there is room for from the beginning.
+    band : (centre, half width) or None
+        Frequencies, cycles per sample, that filters are made for where the aperture is
+        interpolated.
     """
 
     tolerance_db: float | None
@@ -146,11 +151,13 @@ class Plan:
     device: str
     lines_digest: str
     grid_digest: str
+    accuracy_db: float | None = None
     beam: BeamWindow | None = None
     limits: tuple[float, float] | None = None
     crowding: tuple[float, ...] = ()
     beam_cycles: float = 0.0
     most_channels: tuple[int, ...] = ()
+    band: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
         """Check what sizes buffers and indices."""
@@ -179,6 +186,9 @@ class Plan:
         check(nested, "sides", "pairs of rows and columns that divide each other")
         asked = self.tolerance_db is None or numbers((self.tolerance_db,), 1, -np.inf)
         check(asked, "tolerance_db", "a number, or nothing with stages")
+        exactly = self.accuracy_db is not None and numbers((self.accuracy_db,), 1, -np.inf)
+        wanted = "nothing with sides" if levels else "a number without sides"
+        check(exactly if not levels else self.accuracy_db is None, "accuracy_db", wanted)
         for name in ("predicted_error_db", "predicted_seconds", "exact_seconds"):
             check(numbers((getattr(self, name),), 1, -np.inf), name, "a number")
         for name in ("roots_at_once", "roots_prepared"):
@@ -212,6 +222,9 @@ class Plan:
         if fits and self.limits is not None:
             fits = numbers(self.limits, 2, -3.0) and self.limits[0] < self.limits[1]
         check(fits, "limits", "two ascending sines, with a beam")
+        fits = (self.band is None) == bool(self.nearest)
+        fits = fits and (self.band is None or numbers(self.band, 2, -0.5))
+        check(fits, "band", "centre and half width in cycles per sample")
         if self.nearest:
             fits = numbers(self.nearest, levels, 1) and all(whole(n, 1) for n in self.nearest)
             check(fits, "nearest", "a whole number for every stage")
@@ -353,8 +366,9 @@ class Plan:
                 values["beam"] = BeamWindow(**values["beam"])
             values["sides"] = tuple(map(tuple, values["sides"]))
             values["tile"] = tuple(values["tile"])
-            if values["limits"] is not None:
-                values["limits"] = tuple(values["limits"])
+            for name in ("limits", "band"):
+                if values[name] is not None:
+                    values[name] = tuple(values[name])
             values["half_lengths"] = tuple(values["half_lengths"])
             values["nearest"] = tuple(values["nearest"])
             values["most_channels"] = tuple(values["most_channels"])

@@ -14,7 +14,15 @@ from clsas.backproject import ACCURACY_DB
 from clsas.costs import Costs
 from clsas.costs import load as load_costs
 from clsas.device import Device, open_device
-from clsas.errors import excess_error, in_db, nearest_error, other_errors, power, root_error
+from clsas.errors import (
+    ends_error,
+    excess_error,
+    in_db,
+    nearest_error,
+    other_errors,
+    power,
+    root_error,
+)
 from clsas.exact import Exact, expect
 from clsas.filters import ALIGN_TAPS, Choice, Filters, steering_spectrum
 from clsas.forecast import MARGIN_DB, Way, margin_db
@@ -37,6 +45,7 @@ NEAREST_UPSAMPLING = 8.0
 """By how much lines are upsampled before the linear interpolation of given stages."""
 
 _ROOTS_SHARE, _NODES_SHARE, _EDGES_SHARE = 0.25, 0.2, 0.03  # of the error allowed
+_MOST_OF_ENDS, _LEAST_OF_ENDS = 0.5, 1e-3  # of the power of the error allowed
 _CARRIERS = 16  # frequencies of lines
 _WORTH = 0.95  # of the time of an exact image
 _LEAST_CROWDED, _MOST_CROWDING = 1.05, 2.0  # more nodes at a time, and altogether
@@ -108,6 +117,12 @@ def plan(
         names what the least demanding one needs.
     DeviceError
         If there is no such device.
+
+    Warns
+    -----
+    ClsasWarning
+        If the grid reaches ends of lines that do not fade there, so that the tolerance may be
+        missed.
     """
     validate.instance("lines", lines, RangeLines)
     validate.instance("grid", grid, Grid)
@@ -133,6 +148,32 @@ def plan(
     if memory_bytes is not None:
         memory_bytes = validate.count("memory_bytes", memory_bytes)
     view = View(lines, grid, beam)
+    ends, wanted_db = ends_error(view), tolerance_db
+    if tolerance_db is not None and ends > _MOST_OF_ENDS * power(tolerance_db):
+        validate.warn(
+            "the grid reaches ends of lines that do not fade: what pixels within five samples of "
+            "an end get depends on how lines are interpolated, so that the error may be "
+            f"{in_db(power(tolerance_db) + ends):.0f} dB in place of {tolerance_db:g} dB; let the "
+            "grid end before the lines, or the lines fade"
+        )
+    elif tolerance_db is not None and ends > _LEAST_OF_ENDS * power(tolerance_db):
+        wanted_db = in_db(power(tolerance_db) - ends)
+    found = _chosen(view, wanted_db, stages, device, costs, memory_bytes, allowed)
+    error_db = in_db(power(found.predicted_error_db) + ends)
+    return replace(found, tolerance_db=tolerance_db, predicted_error_db=error_db)
+
+
+def _chosen(
+    view: View,
+    tolerance_db: float | None,
+    stages: list[tuple[int, int]] | None,
+    device: Device,
+    costs: Costs,
+    memory_bytes: int | None,
+    allowed: Allowed | None,
+) -> Plan:
+    """Return the plan of checked wishes."""
+    beam = view.beam
     exact = expect(view, ACCURACY_DB if tolerance_db is None else tolerance_db - MARGIN_DB, device)
     # Backprojection keeps within a device by itself.
     room = device.info.memory_bytes // 2 if memory_bytes is None else memory_bytes

@@ -769,6 +769,21 @@ def test_a_plan_serves_other_samples(half, factor):
     assert relative_error_db(loud / factor, image) <= -100
 
 
+def test_a_plan_for_another_band_warns():
+    """Lines with nothing outside its band are as good as its own."""
+    lines, grid = made(straight)
+    chosen = planned(straight, -50)
+    time = np.arange(lines.length)
+    narrow = sum(np.roll(lines.samples, n, axis=1) for n in range(4)) / 4
+    image = factorize(dataclasses.replace(lines, samples=narrow), grid, chosen)
+    assert np.abs(image.pixels).max() > 0
+    shifted = dataclasses.replace(lines, samples=lines.samples * np.exp(2j * np.pi * 0.3 * time))
+    with pytest.warns(ClsasWarning, match="outside the band that the plan was made for"):
+        wrong = factorize(shifted, grid, chosen)
+    right = backproject(shifted, grid, accuracy_db=-80)
+    assert relative_error_db(wrong, right) > -50  # indeed
+
+
 def test_a_plan_serves_another_device(device):
     """Made for devices of any width."""
     lines, grid = made(straight)

@@ -91,7 +91,7 @@ def image(
         results["plan_seconds"] = time.perf_counter() - start
         _warn_of_error(chosen)
         if chosen.is_exact:
-            wish = {"accuracy_db": chosen.predicted_error_db}
+            wish = {"accuracy_db": chosen.accuracy_db}
             why, chosen = f"exact: nothing faster within {chosen.tolerance_db:.4g} dB; ", None
     with (
         progress_bar("imaging") as progress,
