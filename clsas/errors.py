@@ -63,8 +63,8 @@ def ends_error(view: View) -> float:
     grid reaches.
     """
     lines, grid, beam = view.lines, view.grid, view.beam
-    some = some_channels(lines.channels, _CHANNELS)
-    places = [np.unique(np.linspace(0, n - 1, _PIXELS).round().astype(int)) for n in grid.shape]
+    some = some_channels(lines.channels, _CHANNELS // 2)
+    places = [np.unique(np.linspace(0, n - 1, 16).round().astype(int)) for n in grid.shape]
     points_m = grid.at(np.ravel_multi_index(np.ix_(*places), grid.shape).ravel())
     velocity = lines.rx_velocity_m_s
     range_m = pairwise_range_m(

@@ -25,7 +25,7 @@ _RATES = tuple(np.geomspace(1, 12, 16))  # where errors are looked at
 _FINENESS = 64
 
 
-def steering_spectrum(of_highest: ArrayLike = 1.0) -> Spectrum:
+def steering_spectrum(of_highest: ArrayLike = 1.0, power: ArrayLike = 1.0) -> Spectrum:
     """Return the power spectrum of steering functions along the aperture.
 
     Virtual channels are counted by the turns of the fastest phase that there may be: at a corner
@@ -35,14 +35,16 @@ def steering_spectrum(of_highest: ArrayLike = 1.0) -> Spectrum:
     Parameters
     ----------
     of_highest : float [n]
-        Frequencies that hold as much of the lines' power each, over the highest.
+        Frequencies of the lines, over the highest.
+    power : float [n]
+        Share of the lines' power that each holds.
     """
     edges = np.linspace(0, 1, _FINENESS + 1) / np.asarray(of_highest).reshape(-1, 1)
     # What lies below: of a density like 1 - x^2 up to the fastest phase, and of an even one.
     inside = np.minimum(edges, 1) * (3 - np.minimum(edges, 1) ** 2) / 2
     corners = np.clip((edges - _CORNERS_FROM) / (1 - _CORNERS_FROM), 0, 1)
     both = (1 - _CORNERS_SHARE) * inside + _CORNERS_SHARE * corners
-    share = np.diff(both, axis=1).mean(axis=0)
+    share = np.broadcast_to(power, len(both)) @ np.diff(both, axis=1)
     return Spectrum(0.0, (np.arange(_FINENESS) + 0.5) / (2 * _FINENESS), share / share.sum())
 
 

@@ -45,8 +45,10 @@ NEAREST_UPSAMPLING = 8.0
 """By how much lines are upsampled before the linear interpolation of given stages."""
 
 _ROOTS_SHARE, _NODES_SHARE, _EDGES_SHARE = 0.25, 0.2, 0.03  # of the error allowed
+_OUTSIDE = (
+    0.1  # of the power of the error allowed: what lines may hold beyond the highest frequency
+)
 _MOST_OF_ENDS, _LEAST_OF_ENDS = 0.5, 1e-3  # of the power of the error allowed
-_CARRIERS = 16  # frequencies of lines
 _WORTH = 0.95  # of the time of an exact image
 _LEAST_CROWDED, _MOST_CROWDING = 1.05, 2.0  # more nodes at a time, and altogether
 _CROWDING_POWER = 0.08  # of an error that more nodes are to mend
@@ -147,7 +149,7 @@ def plan(
     costs = costs or load_costs(device)
     if memory_bytes is not None:
         memory_bytes = validate.count("memory_bytes", memory_bytes)
-    view = View(lines, grid, beam)
+    view = View(lines, grid, beam, _OUTSIDE * power(tolerance_db or 0.0))
     ends, wanted_db = ends_error(view), tolerance_db
     if tolerance_db is not None and ends > _MOST_OF_ENDS * power(tolerance_db):
         validate.warn(
@@ -283,7 +285,8 @@ def _fastest(
     tree: Tree | None = None
     designed: tuple[Choice, float] | None = None
     leaf_pixels = 1
-    steering = steering_spectrum(view.carriers(_CARRIERS) / view.highest_cycles_per_m)
+    frequencies, share = view.frequencies
+    steering = steering_spectrum(frequencies / view.highest_cycles_per_m, share)
     while most is not None:
         # Roots are often smaller than they might be.
         roots = root_error(view, most if tree is None else tree.sides[0])

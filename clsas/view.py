@@ -30,6 +30,7 @@ _OF_SPOTS = np.array([0.135, 0.24, 0.25, 0.24, 0.135])  # what these stand for
 _SHARES = np.outer(_OF_SPOTS, _OF_SPOTS).ravel() / _OF_SPOTS.sum() ** 2
 _EVERYWHERE = np.linspace(0, 1, 17)  # parts of rows and columns
 _BINS = 512  # of a beam
+_MOST_OUTSIDE = 1e-6  # of the lines' power, beyond what counts as their highest frequency
 _MOST_TURNED = 1 / 16  # of a beam, from one channel to the next
 _COARSER = 4  # of the track's samples: where roots are compared
 
@@ -55,13 +56,23 @@ class View:
         Cycles per row, column and metre of relief, and per unit of the track's parameter.
     kept : dict
         What was found out about this view before.
+
+    It is made with the share of the lines' power that may lie `outside` of what counts as their
+    band.
     """
 
-    def __init__(self, lines: RangeLines, grid: Grid, beam: BeamWindow | None) -> None:
+    def __init__(
+        self,
+        lines: RangeLines,
+        grid: Grid,
+        beam: BeamWindow | None,
+        outside: float = _MOST_OUTSIDE,
+    ) -> None:
         self.lines, self.grid, self.beam = lines, grid, beam
         self.kept: dict[Hashable, Any] = {}
         self.spectrum = interpolation.measure_spectrum(lines)
-        occupied = self.spectrum.frequency[np.cumsum(self.spectrum.power) < 1 - 1e-6]
+        outside = min(outside, _MOST_OUTSIDE)
+        occupied = self.spectrum.frequency[np.cumsum(self.spectrum.power) < 1 - outside]
         half_band = (occupied[-1] if len(occupied) else 0.5) / lines.range_step_m
         centre = interpolation.cycles_per_m(lines, self.spectrum.centre)
         self.highest_cycles_per_m = float(abs(centre) + half_band)
@@ -95,17 +106,23 @@ class View:
             self.beam_rates = beam_rate(beam, self.track, self.along, self.spots_m)
         self.rates = self._rates(np.zeros(len(self.surface.steps_m)), self.spots_m)
 
-    def carriers(self, count: int) -> NDArray[np.float64]:
-        """Return so many frequencies that all hold as much of the lines' power, cycles per m.
+    @property
+    def frequencies(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Frequencies of the lines, cycles per m, and the share of their power that each holds.
 
         That is phase per metre of range, whatever its sign, and above 0.
         """
-        power = self.spectrum.power
-        frequency = np.concatenate([-self.spectrum.frequency[::-1], self.spectrum.frequency])
-        share = np.cumsum(np.concatenate([power[::-1], power])) / 2
-        found = np.interp((np.arange(count) + 0.5) / count, share, frequency)
-        carriers = interpolation.cycles_per_m(self.lines, self.spectrum.centre + found)
-        return np.maximum(np.abs(carriers), 1e-3 * self.highest_cycles_per_m)
+        found, power = self.spectrum.frequency, self.spectrum.power
+        found = self.spectrum.centre + np.concatenate([-found[::-1], found])
+        cycles_per_m = np.abs(interpolation.cycles_per_m(self.lines, found))
+        share = np.concatenate([power[::-1], power]) / 2
+        return np.maximum(cycles_per_m, 1e-3 * self.highest_cycles_per_m), share
+
+    def carriers(self, count: int) -> NDArray[np.float64]:
+        """Return so many of these frequencies that all hold as much of the power."""
+        cycles_per_m, share = self.frequencies
+        place = np.interp((np.arange(count) + 0.5) / count, np.cumsum(share), np.arange(len(share)))
+        return np.interp(place, np.arange(len(share)), cycles_per_m)
 
     @property
     def sweeps_once(self) -> bool:

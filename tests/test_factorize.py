@@ -16,6 +16,7 @@ from clsas.factorize import factorize
 from clsas.forecast import HALF_ROUNDING
 from clsas.grid import Grid
 from clsas.image import Image
+from clsas.lines import RangeLines
 from clsas.plan import Plan
 from clsas.quality import relative_error_db
 from clsas.scene import PointTargets
@@ -757,6 +758,24 @@ def test_a_plan_holds_its_beam():
     image = factorize(lines, grid, Plan.from_json(chosen.to_json()))
     reference = backproject(lines, grid, accuracy_db=-85, beam=beam)
     assert relative_error_db(image, reference) <= -40
+
+
+@pytest.mark.parametrize("tolerance_db", [-50, -75])
+def test_a_noise_floor_far_above_the_band(tolerance_db):
+    """Sampled at 96 kHz, carrier kept, a sonar of 15 to 25 kHz; noise of -26 dB up to 48 kHz."""
+    track = along_x(300, 1 / 30)
+    grid = Grid.plane((-4, 4, 160), (38, 46, 300))
+    step_m = 1500 / 2 / 96e3
+    length = int(13 / step_m)
+    echoes, floor = (noise(300, length, occupied=band, seed=n) for n, band in ((1, 0.1), (2, 0.5)))
+    floor *= 0.05 * np.linalg.norm(echoes) / np.linalg.norm(floor)
+    index = np.arange(length)
+    samples = echoes * np.exp(2j * np.pi * 20 / 96 * index) + floor * np.exp(0.5j * np.pi * index)
+    lines = RangeLines(samples, 36.0, step_m, track, track, 0.0, 1500.0)
+    chosen = plan(lines, grid, tolerance_db=tolerance_db, costs=EXACT_IS_SLOW)
+    assert not chosen.is_exact
+    reference = backproject(lines, grid, accuracy_db=-85)
+    assert relative_error_db(factorize(lines, grid, chosen), reference) <= tolerance_db
 
 
 @pytest.mark.parametrize(("half", "factor"), [(False, 1e3), (True, 1024)])
