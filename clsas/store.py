@@ -86,6 +86,16 @@ class Record:
         return self.channels == self.missing_channels
 
     @property
+    def is_whole(self) -> bool:
+        """Whether every number is one, as a record from a file may not have them."""
+        return all(
+            isinstance(getattr(self, field.name), (int, float))
+            or (field.type == "float | None" and getattr(self, field.name) is None)
+            for field in fields(self)
+            if field.type in ("int", "float", "float | None")
+        )
+
+    @property
     def flags(self) -> tuple[str, ...]:
         """What a user should know, in words; nothing if all is well."""
         found = []
@@ -275,6 +285,8 @@ class Store:
                 record = Record(**{k: v for k, v in stored.items() if k in known})
             except (OSError, ValueError, KeyError, TypeError):
                 continue  # cut off while it was written
+            if not record.is_whole:
+                continue
             chunk = self.path / "pixels" / "c" / name[1] / name[2]
             # Zarr leaves out a chunk that is all zero.
             size = chunk.stat().st_size if chunk.exists() else 0

@@ -426,6 +426,19 @@ class TestResuming:
             clsas.mosaic(LINES, GRID, path, **(WISH | {"accuracy_db": -60}))
         assert (path / "notes.txt").exists()
 
+    @pytest.mark.parametrize(
+        ("name", "value"), [("predicted_error_db", "x"), ("seconds", None), ("channels", "9")]
+    )
+    def test_a_patch_with_a_damaged_record_is_formed_again(self, tmp_path, name, value):
+        path = tmp_path / "a.zarr"
+        assert len(list(clsas.mosaic(LINES, GRID, path, **WISH))) == 8
+        record = path / "patches" / "1.2" / "zarr.json"
+        stored = json.loads(record.read_text())
+        stored["attributes"][name] = value
+        record.write_text(json.dumps(stored))
+        again = list(clsas.mosaic(LINES, GRID, path, **WISH))
+        assert [(patch.row, patch.column) for patch in again] == [(1, 2)]
+
     def test_a_store_of_an_older_schema_is_refused(self, tmp_path):
         next(iter(clsas.mosaic(LINES, GRID, tmp_path / "a.zarr", **WISH)))
         header = tmp_path / "a.zarr" / "zarr.json"

@@ -13,6 +13,7 @@ from clsas.cli import options
 from clsas.cli.inputs import load, read_scene, warn_of_sampling
 from clsas.cli.outputs import progress_bar, report
 from clsas.cli.parameters import INPUT
+from clsas.compress import check_options
 
 
 @click.command()
@@ -49,8 +50,14 @@ def simulate(scene_file: Path, output: Path, png: Path | None, as_json: bool) ->
 @click.argument("echoes_file", metavar="ECHOES.H5", type=INPUT)
 @options.output("Range lines")
 @options.scene
-@click.option("--window", help="Band window: none, hamming, taylor, ... [default: none]")
-@click.option("--oversampling", type=float, help="Samples per bandwidth. [default: 2]")
+@click.option(
+    "--window", help="Band window: none, hamming, taylor, ... [default: none]",
+    callback=options.checked(lambda window: check_options(window=window)),
+)  # fmt: skip
+@click.option(
+    "--oversampling", type=float, help="Samples per bandwidth. [default: 2]",
+    callback=options.checked(lambda rate: check_options(oversampling=rate)),
+)  # fmt: skip
 @options.png("the lines")
 @options.as_json
 def compress(

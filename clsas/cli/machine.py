@@ -11,7 +11,7 @@ import clsas
 from clsas import demo as demonstration
 from clsas.cli import options
 from clsas.cli.outputs import print_json, progress_bar, report
-from clsas.cli.parameters import need_matplotlib
+from clsas.cli.parameters import File, need_matplotlib
 from clsas.device import choose, open_device
 
 
@@ -66,7 +66,7 @@ def calibrate(device: str | None, as_json: bool) -> None:
 
 @click.command()
 @click.option(
-    "--out", type=click.Path(file_okay=False, path_type=Path), default="clsas-demo",
+    "--out", type=File(file_okay=False), default="clsas-demo",
     show_default=True, help="Folder for the files, new or of a demo.",
 )  # fmt: skip
 @options.device
