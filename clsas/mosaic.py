@@ -60,6 +60,7 @@ _SMALLEST_SIDE = 128
 _WORTH_A_PLAN = 5e7  # pixels times channels; fewer are backprojected sooner than planned for
 _POLL_S = 0.5
 _MOST_WORKERS = 1024  # of one machine
+_LOCAL = threading.local()  # a thread's own: `device`, and on a worker the `survey` opened last
 
 
 @dataclass(frozen=True, eq=False)
@@ -556,7 +557,11 @@ class _Sight:
 
 @lru_cache(maxsize=2)
 def _opened(files: tuple[tuple[Path, tuple[int, int]], ...], beam: str | None) -> _Sight:
-    survey = open_files(tuple(path for path, _ in files))
+    # Of a survey that has grown only the new files are opened.
+    before = getattr(_LOCAL, "survey", None)
+    if before is not None and files[: len(before.parts)] != _files(before):
+        before = None
+    survey = _LOCAL.survey = open_files(tuple(path for path, _ in files), before)
     return _Sight.of(survey, None if beam is None else BeamWindow(**json.loads(beam)))
 
 
@@ -731,7 +736,6 @@ def _wait_for_first(source: Path, follow_s: float) -> None:
         time.sleep(_POLL_S)
 
 
-_LOCAL = threading.local()
 _CLAIMING = threading.Lock()
 
 

@@ -721,6 +721,29 @@ class TestFollowing:
         np.testing.assert_array_equal(image.pixels, store.image().pixels)
         assert not list(clsas.mosaic(folder, self.GRID, path, **self.WISH))
 
+    def test_a_worker_opens_every_file_once(self, lines, record, monkeypatch):
+        """But again should it be another one meanwhile."""
+        mosaic, survey = sys.modules["clsas.mosaic"], sys.modules["clsas.survey"]
+        read, opened = survey.read_geometry, []
+        monkeypatch.setattr(
+            survey, "read_geometry", lambda path: opened.append(path.name) or read(path)
+        )
+        folder, add = record
+
+        def seen():
+            """Return the channels that a worker knows, and the files that it opened for it."""
+            files = mosaic._files(survey.open_survey(folder))
+            opened.clear()
+            return mosaic._opened(files, None).survey.channels, list(opened)
+
+        add(range(2))
+        assert seen() == (400, ["0.h5", "1.h5"])
+        add(range(2, 4))
+        assert seen() == (800, ["2.h5", "3.h5"])
+        clsas.save(folder / "0.h5", lines.select(slice(0, 100)))
+        add([4])
+        assert seen() == (900, [f"{n}.h5" for n in range(5)])
+
     def test_a_folder_that_stays_empty(self, tmp_path):
         (tmp_path / "none").mkdir()
         with pytest.raises(ValueError, match="has no file"):
