@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import BSpline, make_lsq_spline
 
+from clsas.geometry import pairwise_range_m
 from clsas.grid import Grid
 from clsas.lines import RangeLines
 from clsas.surface import Surface
@@ -63,35 +64,43 @@ class MeanTrack:
         return self.positions_m(self.samples), self.tangents_m(self.samples)
 
     def places_seen_from(
-        self, points_m: NDArray[np.float64], phase_centres_m: NDArray[np.float64]
+        self,
+        points_m: NDArray[np.float64],
+        phase_centres_m: NDArray[np.float64],
+        own_drift: NDArray[np.float64] | None = None,
     ) -> NDArray[np.float64]:
         """Return where phase centres appear on the curve when seen from some points.
 
         A channel off the curve is replaced by the point of the curve in the same direction: what
-        is left is a difference of distance, which matters least.
+        is left is a difference of distance, which matters least. What a receiver moves by during
+        flight moves the phase centre by half as much.
 
         Parameters
         ----------
         points_m : float64 [points, 3]
         phase_centres_m : float64 [channels, 3]
             The channels of `place`.
+        own_drift : float64 [channels, 3], optional
+            See `own_drift`.
 
         Returns
         -------
         float64 [points, channels]
         """
         curve_m = self.positions_m(self.place)
-        off_m = phase_centres_m - curve_m
+        off_m = (phase_centres_m - curve_m)[None]
         shape = (len(points_m), len(self.place))
-        if not np.abs(off_m).max() > 1e-9:
+        if own_drift is None and not np.abs(off_m).max() > 1e-9:
             return np.broadcast_to(self.place, shape)
         tangent = self.tangents_m(self.place)
         sight = points_m[:, None] - phase_centres_m
         square = np.einsum("pci,pci->pc", sight, sight)
         square = np.maximum(square, 1e-30)
+        if own_drift is not None:
+            off_m = off_m + np.sqrt(square)[..., None] * own_drift
         along = np.einsum("pci,ci->pc", sight, tangent)
-        across = np.einsum("pci,ci->pc", sight, off_m)
-        both = np.einsum("ci,ci->c", tangent, off_m) - along * across / square
+        across = np.sum(sight * off_m, axis=-1)
+        both = np.sum(tangent * off_m, axis=-1) - along * across / square
         length = np.einsum("ci,ci->c", tangent, tangent)
         # Where the curve leads towards the point, direction says nothing about the place.
         seen = np.maximum(length - along**2 / square, 0.01 * length)
@@ -135,20 +144,29 @@ def mean_track(lines: RangeLines) -> MeanTrack | None:
 def stretches(
     tx_m: NDArray[np.float64],
     rx_m: NDArray[np.float64],
+    rx_velocity_m_s: NDArray[np.float64] | None,
+    sound_speed_m_s: float,
+    drift: NDArray[np.float64],
     plane: Grid,
     points_m: NDArray[np.float64],
     virtual_m: NDArray[np.float64],
 ) -> NDArray[np.float64]:
     """Return by how much faster channels' ranges grow than those of places that stand for them.
 
-    Across the plane the range of a channel grows along its gradient there, the mean of the
-    unit vectors from transmitter and receiver. Of what that differs from the gradient g of the
-    place on the track, the part along g is a stretch of the range line about the point, and can be
-    made up for; places_seen_from leaves little across it. Drift is common to both.
+    The range of a channel grows along its gradient, that of a place on the track along the unit
+    vector from there less the drift. Of what these differ by, the part along g, the unit vector
+    within the plane, is a stretch of the range line about the point, and can be made up for;
+    places_seen_from leaves little across it. Of a receiver in motion, where it is when an echo
+    arrives counts, and the later that is the further it has come: with unit vectors u from both,
+
+        gradient = (u_tx + u_rx) / 2 / (1 + u_rx . velocity / c).
 
     Parameters
     ----------
-    tx_m, rx_m : float64 [channels, 3]
+    tx_m, rx_m, rx_velocity_m_s, sound_speed_m_s
+        Of the channels, as in RangeLines.
+    drift : float64 [3]
+        See `drift`.
     points_m : float64 [points, 3]
     virtual_m : float64 [points, channels, 3]
         For every channel a place on the track.
@@ -165,7 +183,14 @@ def stretches(
         return way / np.maximum(np.linalg.norm(way, axis=-1, keepdims=True), 1e-30)
 
     along = sight(virtual_m)
-    more = (sight(tx_m) + sight(rx_m)) / 2 - along
+    if rx_velocity_m_s is None:
+        more = (sight(tx_m) + sight(rx_m)) / 2 - along
+    else:
+        range_m = pairwise_range_m(points_m, tx_m, rx_m, rx_velocity_m_s, sound_speed_m_s)
+        speed = rx_velocity_m_s / sound_speed_m_s
+        from_rx = sight(rx_m + 2 * range_m[..., None] * speed)
+        later = 1 + np.einsum("pci,ci->pc", from_rx, speed)
+        more = (sight(tx_m) + from_rx) / 2 / later[..., None] - along + drift
     along = along - (along @ normal)[..., None] * normal
     square = np.einsum("pci,pci->pc", along, along)
     # Right below the track ranges do not grow at all.
@@ -181,6 +206,14 @@ def drift(lines: RangeLines) -> NDArray[np.float64]:
     if lines.rx_velocity_m_s is None:
         return np.zeros(3)
     return lines.rx_velocity_m_s.mean(axis=0) / lines.sound_speed_m_s
+
+
+def own_drift(lines: RangeLines) -> NDArray[np.float64] | None:
+    """Return by how much every channel's drift differs from their mean, [channels, 3], if any."""
+    if lines.rx_velocity_m_s is None:
+        return None
+    own = lines.rx_velocity_m_s / lines.sound_speed_m_s - drift(lines)
+    return own if np.abs(own).max() > 1e-12 else None
 
 
 def cycles_per_extent(

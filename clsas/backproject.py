@@ -8,6 +8,7 @@ import os
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pyopencl as cl
@@ -16,6 +17,7 @@ from numpy.typing import NDArray
 
 from clsas import interpolation, phases, validate
 from clsas.device import Device, Slot, aligned, open_device
+from clsas.ends import besides_ends, ends_error, warn_of_ends
 from clsas.geometry import bistatic_range_m, pairwise_range_m
 from clsas.grid import Grid
 from clsas.image import Image, holds_any
@@ -61,6 +63,19 @@ class Preparation:
     """The track's unit direction for every channel, [channels, 3]; None without a beam."""
     one_cubic: bool = False
     """Whether one cubic of the beam's weights serves a work-item of a tile, a block of points."""
+    wanted_db: float = 0.0
+    """What the image may err by; with a fixed interpolator anything."""
+    ends_error: float = 0.0
+    """The power of what it errs by at the ends of lines: see `clsas.ends`."""
+
+    @property
+    def predicted_error_db(self) -> float:
+        """Relative rms error of interpolation and at the ends of lines, dB."""
+        return 10 * math.log10(10 ** (self.interpolator.error_db / 10) + self.ends_error)
+
+    def warn_of_ends(self) -> None:
+        """Warn where ends of lines may keep the image from what is wanted."""
+        warn_of_ends("accuracy_db", self.wanted_db, self.ends_error)
 
     @property
     def samples_per_m(self) -> float:
@@ -129,7 +144,8 @@ def backproject(
     Warns
     -----
     ClsasWarning
-        If no pixel lies within any line's range, or the beam, so that the lines add nothing.
+        If no pixel lies within any line's range, or the beam, so that the lines add nothing; or if
+        the grid reaches ends of lines that do not fade there, so that `accuracy_db` may be missed.
 
     Notes
     -----
@@ -156,6 +172,7 @@ def backproject(
         _check_same_grid(accumulate, grid)
         if beam is not None and beam.normalise:
             raise ValueError("accumulate must be None with a beam that normalises: it is a mean")
+    preparation.warn_of_ends()
     image = execute(preparation, progress=progress)
     if accumulate is None:
         return image
@@ -184,6 +201,7 @@ def prepare(
     check_numbers(lines, beam)
     along = None if beam is None else beam.directions(lines)
     fullness = 1.0 if beam is None else fullness_of(lines, grid, beam, along)
+    ends = ends_error(lines, grid, beam, along)
     device = open_device(device)
     spectrum = interpolation.measure_spectrum(lines)
     antennas_m, cycles_per_m = antennas_and_phase(lines, spectrum, beam)
@@ -203,7 +221,7 @@ def prepare(
     terms = phases.TERMS[-1] if fixed else phases.terms_within(accuracy_db)
     interpolator = interpolation.choose(
         spectrum,
-        accuracy_db,
+        besides_ends(accuracy_db, ends),
         taps=taps,
         upsampling=upsampling,
         other_error=math.hypot(geometry_error, phases.error(terms)),
@@ -217,8 +235,30 @@ def prepare(
         error = layout.one_cubic_error(beam, nearest_m, wavelength_m(lines))
         one_cubic = error <= geometry_error * fullness
     return Preparation(
-        device, lines, grid, layout, interpolator, resampling, terms, beam, along, one_cubic
+        device,
+        lines,
+        grid,
+        layout,
+        interpolator,
+        resampling,
+        terms,
+        beam,
+        along,
+        one_cubic,
+        wanted_db=0.0 if fixed else accuracy_db,
+        ends_error=ends,
     )
+
+
+def form_exactly(
+    lines: RangeLines,
+    grid: Grid,
+    *,
+    progress: Callable[[int, int], None] | None = None,
+    **wish: Any,
+) -> Image:
+    """Form an image as `backproject` does where ends of lines have been warned of, or are known."""
+    return execute(prepare(lines, grid, **wish), progress=progress)
 
 
 def antennas_and_phase(

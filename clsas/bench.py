@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsas import reference, validate, wreck
-from clsas.backproject import backproject, execute, prepare
+from clsas.backproject import execute, form_exactly, prepare
 from clsas.device import Device, open_device
 from clsas.factorize import factorize
 from clsas.grid import Grid
@@ -277,7 +277,7 @@ def run_factorized(
     chosen = plan(lines, grid, tolerance_db=tolerance_db, beam=case.beam, device=device)
     plan_seconds = time.perf_counter() - start
     fast = partial(factorize, lines, grid, device=device)
-    exact = partial(backproject, lines, grid, beam=case.beam, device=device)
+    exact = partial(form_exactly, lines, grid, beam=case.beam, device=device)
     error_db = relative_error_db(fast(chosen), exact(accuracy_db=REFERENCE_DB))
     ways = [
         *_OFTEN * [("first", lambda: fast(replace(chosen)))],  # a copy has kept nothing
@@ -356,7 +356,7 @@ def run_mosaic(
         wanted = mosaic(lines, grid, tolerance_db=tolerance_db, beam=beam, device=device)
         return wanted.image(lambda patch: records.append(patch.record)), records
 
-    exact = partial(backproject, lines, grid, device=device)
+    exact = partial(form_exactly, lines, grid, device=device)
     formed, records = form()
     reference_image = exact(beam=beam, accuracy_db=REFERENCE_DB)
     shadow = wreck.Shadow(wreck.scene())

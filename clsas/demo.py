@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsas import plot
-from clsas.backproject import execute, prepare
+from clsas.backproject import form_exactly
 from clsas.compress import compress
 from clsas.config import built_in_scene, read_scene
 from clsas.device import open_device
@@ -103,7 +103,7 @@ def run(
 
     def form(step: str, on: Grid) -> Any:
         def work(callback: Progress) -> Any:
-            return execute(prepare(lines, on, device=opened, **scene.image), progress=callback)
+            return form_exactly(lines, on, device=opened, **scene.image, progress=callback)
 
         image = timed(step, work)
         say(

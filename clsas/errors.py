@@ -27,7 +27,6 @@ from clsas.window import sines
 
 _FLOAT32 = 4.5e-8  # rms error of a phase in the stages over the phase across a root: measured
 _CHANNELS, _FURTHEST, _PLACES, _PIXELS = 128, 32, 160, 24  # at which errors are evaluated
-_OF_AN_END, _END = 0.03, 4  # measured on noise of 40 to 90 % of the sampled band; samples
 _SOME_SPOTS = (0, 7, 14, 16, 23)  # of 5 by 5, in every row and column one
 
 
@@ -52,45 +51,6 @@ def power(error_db: float) -> float:
 def in_db(power: float) -> float:
     """Return a relative rms error from its power."""
     return 10 * math.log10(max(power, 1e-30))
-
-
-@_kept
-def ends_error(view: View) -> float:
-    """Return the power of what images differ by at the ends of lines that do not fade there.
-
-    What lies beyond an end is not known: pixels of up to five samples around it get what filters
-    make of the cut, each another. That is `_OF_AN_END` of a sample's power for every end that the
-    grid reaches.
-    """
-    lines, grid, beam = view.lines, view.grid, view.beam
-    some = some_channels(lines.channels, _CHANNELS // 2)
-    places = [np.unique(np.linspace(0, n - 1, 16).round().astype(int)) for n in grid.shape]
-    points_m = grid.at(np.ravel_multi_index(np.ix_(*places), grid.shape).ravel())
-    velocity = lines.rx_velocity_m_s
-    range_m = pairwise_range_m(
-        points_m,
-        lines.tx_m[some],
-        lines.rx_m[some],
-        velocity if velocity is None else velocity[some],
-        lines.sound_speed_m_s,
-    )
-    place = (range_m - lines.first_range_m[some]) / lines.range_step_m
-    seen = np.ones(place.shape, bool)
-    if beam is not None:
-        low, high = beam.limits
-        sine = sines(points_m, lines.phase_centres_m[some], view.channels_along[some]).T
-        seen = (sine > low) & (sine < high)
-    nearest = np.where(seen, place, np.inf).min(axis=0)
-    farthest = np.where(seen, place, -np.inf).max(axis=0)
-    at_ends, total = 0.0, 0.0
-    for channel, near, far in zip(some, nearest, farthest, strict=True):
-        first, last = (int(np.clip(at, -1, lines.length)) for at in (near, far))
-        line = lines.samples[channel].astype(np.complex128)
-        total += np.vdot(line[max(first, 0) : last + 1], line[max(first, 0) : last + 1]).real
-        for end, reached in ((line[:_END], near < 0), (line[-_END:], far > lines.length - 1)):
-            if reached and near <= far:
-                at_ends += np.vdot(end, end).real / len(end)
-    return _OF_AN_END * at_ends / total if total else 0.0
 
 
 def leaf_error(view: View, sides: NDArray[np.int64], device: Device) -> NDArray[np.float64]:
@@ -203,6 +163,8 @@ def _off_track(view: View, side: tuple[int, int], extents: NDArray[np.float64]) 
     tx_m, rx_m, middle_m = (each[index] for each in (lines.tx_m, lines.rx_m, lines.phase_centres_m))
     velocity = lines.rx_velocity_m_s
     moving = velocity if velocity is None else velocity[index]
+    own = view.own_drift if view.own_drift is None else view.own_drift[index]
+    antennas = tx_m, rx_m, moving, lines.sound_speed_m_s
     seen = np.stack([np.interp(part.place, track.samples, each) for each in seen]) > 0
     somewhere = seen.any(axis=1)
     spots, seen = spots[somewhere], seen[somewhere]
@@ -212,13 +174,13 @@ def _off_track(view: View, side: tuple[int, int], extents: NDArray[np.float64]) 
     pixels_m = np.stack([_pixels_m(view, extents, spot)[0] for spot in spots])
     points_m = view.spots_m[spots, None] + pixels_m
     centres_m, all_m = points_m[:, 0], points_m.reshape(-1, 3)
-    range_m = pairwise_range_m(all_m, tx_m, rx_m, moving, lines.sound_speed_m_s)
+    range_m = pairwise_range_m(all_m, *antennas)
     range_m = range_m.reshape(*points_m.shape[:2], -1)
-    virtual_m = track.positions_m(part.places_seen_from(centres_m, middle_m))
+    virtual_m = track.positions_m(part.places_seen_from(centres_m, middle_m, own))
     on_track_m = np.stack([cdist(*each) for each in zip(points_m, virtual_m, strict=True)])
     on_track_m -= (points_m @ drift(lines))[..., None]
     range_m, on_track_m = (each[:, 1:] - each[:, :1] for each in (range_m, on_track_m))
-    stretch = stretches(tx_m, rx_m, view.surface.plane, centres_m, virtual_m)[:, None]
+    stretch = stretches(*antennas, drift(lines), view.surface.plane, centres_m, virtual_m)[:, None]
     stretched_m = on_track_m * stretch
     wrong = (2 * np.pi * view.highest_cycles_per_m * (range_m - on_track_m - stretched_m)) ** 2
     # Lines are stretched by turning their phase; their envelope stays.

@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from clsas import validate
 from clsas.backproject import (
     VECTOR_ROOM,
-    backproject,
     channel_pitch,
     check_numbers,
+    form_exactly,
     upsampled_lines,
     warn_unseen,
 )
@@ -122,14 +122,9 @@ def factorize(
         chosen.check(lines, grid)
         _check_band(lines, chosen)
     if chosen.is_exact:
-        return backproject(
-            lines,
-            grid,
-            device=device,
-            accuracy_db=chosen.accuracy_db,
-            beam=chosen.beam,
-            progress=progress,
-        )
+        # The plan has warned of ends of lines.
+        wish = {"accuracy_db": chosen.accuracy_db, "beam": chosen.beam}
+        return form_exactly(lines, grid, device=device, **wish, progress=progress)
     largest = check_numbers(lines, chosen.beam)
     pixels, done = aligned(np.empty, grid.shape, np.complex64), 0
     try:

@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsas import validate
-from clsas.backproject import BEST_ACCURACY_DB, backproject
+from clsas.backproject import BEST_ACCURACY_DB, execute, prepare
 from clsas.device import (
     ENVIRONMENT_VARIABLE,
     Device,
@@ -607,8 +607,12 @@ def _image(job: _Job, sight: _Sight, grid: Grid, device: Device) -> tuple[Record
         )
     accuracy_db = job.accuracy_db(lines.channels * grid.size)
     if accuracy_db is not None:
-        image = backproject(lines, grid, accuracy_db=accuracy_db, beam=beam, device=device)
-        known |= {"predicted_error_db": accuracy_db, "memory_bytes": host_bytes}
+        wish = {"accuracy_db": accuracy_db, "beam": beam}
+        preparation = prepare(lines, grid, **wish, device=device)
+        preparation.warn_of_ends()
+        image = execute(preparation)
+        error_db = max(accuracy_db, preparation.predicted_error_db)
+        known |= {"predicted_error_db": error_db, "memory_bytes": host_bytes}
     else:
         before = time.perf_counter()
         room = min(job.memory_bytes - host_bytes, device.info.memory_bytes // 2)

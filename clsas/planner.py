@@ -14,8 +14,8 @@ from clsas.backproject import ACCURACY_DB
 from clsas.costs import Costs
 from clsas.costs import load as load_costs
 from clsas.device import Device, open_device
+from clsas.ends import besides_ends, warn_of_ends
 from clsas.errors import (
-    ends_error,
     excess_error,
     in_db,
     nearest_error,
@@ -48,7 +48,6 @@ _ROOTS_SHARE, _NODES_SHARE, _EDGES_SHARE = 0.25, 0.2, 0.03  # of the error allow
 _OUTSIDE = (
     0.1  # of the power of the error allowed: what lines may hold beyond the highest frequency
 )
-_MOST_OF_ENDS, _LEAST_OF_ENDS = 0.5, 1e-3  # of the power of the error allowed
 _WORTH = 0.95  # of the time of an exact image
 _LEAST_CROWDED, _MOST_CROWDING = 1.05, 2.0  # more nodes at a time, and altogether
 _CROWDING_POWER = 0.08  # of an error that more nodes are to mend
@@ -150,16 +149,10 @@ def plan(
     if memory_bytes is not None:
         memory_bytes = validate.count("memory_bytes", memory_bytes)
     view = View(lines, grid, beam, _OUTSIDE * power(tolerance_db or 0.0))
-    ends, wanted_db = ends_error(view), tolerance_db
-    if tolerance_db is not None and ends > _MOST_OF_ENDS * power(tolerance_db):
-        validate.warn(
-            "the grid reaches ends of lines that do not fade: what pixels within five samples of "
-            "an end get depends on how lines are interpolated, so that the error may be "
-            f"{in_db(power(tolerance_db) + ends):.0f} dB in place of {tolerance_db:g} dB; let the "
-            "grid end before the lines, or the lines fade"
-        )
-    elif tolerance_db is not None and ends > _LEAST_OF_ENDS * power(tolerance_db):
-        wanted_db = in_db(power(tolerance_db) - ends)
+    ends, wanted_db = view.ends_error, tolerance_db
+    if tolerance_db is not None:
+        warn_of_ends("tolerance_db", tolerance_db, ends)
+        wanted_db = besides_ends(tolerance_db, ends)
     found = _chosen(view, wanted_db, stages, device, costs, memory_bytes, allowed)
     error_db = in_db(power(found.predicted_error_db) + ends)
     return replace(found, tolerance_db=tolerance_db, predicted_error_db=error_db)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
 from clsas import tree
-from clsas.aperture import cycles_per_extent, drift, mean_track, stretches
+from clsas.aperture import cycles_per_extent, drift, mean_track, own_drift, stretches
 from clsas.geometry import pairwise_range_m
 from clsas.lines import RangeLines, some_channels
 from clsas.plan import MARGIN, Plan
@@ -108,12 +108,16 @@ class Geometry:
             along = chosen.beam.directions(lines)[self.channels]
             self.along = tree.beam_directions(along, self.track, track.samples)
         self.phase_centres_m = lines.phase_centres_m[self.channels]
-        self.drift = drift(lines)
+        self.drift, own = drift(lines), own_drift(lines)
+        self.own_drift = own if own is None else own[self.channels]
         self._seen = Division(surface, (chosen.sides[0], self._together(), chosen.sides[-1]))
         # The thesis's method has none; on the track itself there is nothing to make up for.
         off_m = np.abs(self.phase_centres_m - self.track.positions_m(self.track.place)).max()
         wavelength_m = lines.sound_speed_m_s / max(lines.carrier_hz, 1.0)
-        away = not np.array_equal(lines.tx_m, lines.rx_m) or off_m > _ON_TRACK * wavelength_m
+        if own is not None:
+            off_m += np.linalg.norm(own, axis=1).max() * np.abs(lines.last_range_m).max()
+        apart = lines.rx_velocity_m_s is not None or not np.array_equal(lines.tx_m, lines.rx_m)
+        away = apart or off_m > _ON_TRACK * wavelength_m
         self.ramps = bool(away and not chosen.nearest)
         # From elsewhere a channel off the track appears at another place.
         way_m = np.linalg.norm(self.track.sampled_m[1], axis=1)
@@ -214,7 +218,8 @@ class Geometry:
         channels = self._used(*(each[inside] for each in seen))
         centres_m = self.phase_centres_m[channels]
         some = replace(track, place=track.place[channels])
-        seen_at = place = some.places_seen_from(root_m, centres_m)
+        own = None if self.own_drift is None else self.own_drift[channels]
+        seen_at = place = some.places_seen_from(root_m, centres_m, own)
         nodes = []
         if chosen.nearest:
             position_m = np.broadcast_to(centres_m, (*place.shape, 3))
@@ -292,9 +297,8 @@ class Geometry:
     def _ramp(self, sector: Sector) -> NDArray[np.float64]:
         """Return by how many cycles per sample the phase of channels grows beyond their place's."""
         virtual_m = self.track.positions_m(sector.place)
-        stretch = stretches(
-            *self._antennas(sector)[:2], self.surface.plane, sector.root_m, virtual_m
-        )
+        antennas, plane = self._antennas(sector), self.surface.plane
+        stretch = stretches(*antennas, self.drift, plane, sector.root_m, virtual_m)
         return stretch * self.cycles_per_m / self.samples_per_m
 
 

@@ -15,7 +15,7 @@ from itertools import product
 import numpy as np
 
 from clsas import validate
-from clsas.backproject import ACCURACY_DB, backproject
+from clsas.backproject import ACCURACY_DB, form_exactly
 from clsas.device import Device, open_device
 from clsas.factorize import factorize
 from clsas.filters import ALIGN_TAPS, APERTURE_TAPS
@@ -291,7 +291,7 @@ def tradeoff(
         row = _row(*_name(wish), chosen, time.perf_counter() - start)
         ways.append((row, partial(factorize, lines, grid, chosen, device=device)))
     accuracy_db = min([ACCURACY_DB, *tolerances_db])
-    exact = partial(backproject, lines, grid, device=device, beam=beam)
+    exact = partial(form_exactly, lines, grid, device=device, beam=beam)
     row = _row("exact", "exact", plan(lines, grid, stages=[], beam=beam, device=device), 0.0)
     ways.append(
         (replace(row, predicted_error_db=accuracy_db), partial(exact, accuracy_db=accuracy_db))

@@ -13,8 +13,9 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import KDTree
 
 from clsas import interpolation
-from clsas.aperture import cycles_per_extent, mean_track
+from clsas.aperture import cycles_per_extent, mean_track, own_drift
 from clsas.backproject import wavelength_m
+from clsas.ends import ends_error
 from clsas.grid import Grid
 from clsas.interpolation import Interpolator, Resampling
 from clsas.layout import STACK
@@ -201,6 +202,11 @@ class View:
         return float(((seen > 0) & (seen < 1)).mean())
 
     @functools.cached_property
+    def ends_error(self) -> float:
+        """Power of what images differ by at the ends of lines: see `clsas.ends`."""
+        return ends_error(self.lines, self.grid, self.beam, self.channels_along)
+
+    @functools.cached_property
     def _everywhere_m(self) -> NDArray[np.float64]:
         return self._pixels_m(_EVERYWHERE)
 
@@ -215,7 +221,15 @@ class View:
     def off_track_m(self) -> NDArray[np.float64]:
         """How far channels are off the mean track, [channels]."""
         away_m = self.lines.phase_centres_m - self.track.positions_m(self.track.place)
-        return np.linalg.norm(away_m, axis=1)
+        off_m = np.linalg.norm(away_m, axis=1)
+        if self.own_drift is not None:
+            off_m += np.linalg.norm(self.own_drift, axis=1) * np.median(self.distance_m)
+        return off_m
+
+    @functools.cached_property
+    def own_drift(self) -> NDArray[np.float64] | None:
+        """See `clsas.aperture.own_drift`."""
+        return own_drift(self.lines)
 
     @functools.cached_property
     def densest(self) -> float:

@@ -4,7 +4,8 @@ from cases import along_x, beside
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from clsas.aperture import cycles_per_extent, drift, mean_track, turned
+from clsas.aperture import cycles_per_extent, drift, mean_track, own_drift, stretches, turned
+from clsas.geometry import pairwise_range_m
 from clsas.grid import Grid
 from clsas.lines import RangeLines
 from clsas.surface import surface_of
@@ -143,6 +144,38 @@ def test_drift_is_the_mean_speed_of_receivers():
     assert not drift(lines_of(tx)).any()
     velocity = [[1.5, 0, 0], [3.0, 0, 3], [1.5, 0, 0], [0.0, 0, -3]]
     np.testing.assert_allclose(drift(lines_of(tx, velocity=velocity)), [1e-3, 0, 0])
+
+
+@pytest.mark.parametrize("speed", [0.0, 20.0])
+def test_ranges_grow_as_those_of_places_do_once_stretched(speed):
+    """Also where every receiver moves otherwise during flight."""
+    rng, length_m = np.random.default_rng(7), 1e-3
+    tx = along_x(200, 0.03)
+    rx = tx + rng.normal(0, 0.1, 3)
+    velocity = speed * rng.normal(0, 1, (200, 3)) if speed else None
+    lines = lines_of(tx, rx, velocity=velocity)
+    track = mean_track(lines)
+    point_m = np.array([[3.0, 40.0, -8.0]])
+    place = track.places_seen_from(point_m, lines.phase_centres_m, own_drift(lines))
+    virtual_m = track.positions_m(place)
+    plane = Grid.plane((0, 1, 2), (0, 1, 2))
+    antennas = tx, rx, velocity, 1500.0
+    found = stretches(*antennas, drift(lines), plane, point_m, virtual_m)[0]
+    sight = point_m - virtual_m[0]
+    sight /= np.linalg.norm(sight, axis=1, keepdims=True)
+    within = sight * [1, 1, 0]
+    size = np.linalg.norm(within, axis=1)
+    aside = np.cross(within / size[:, None], [0, 0, 1])
+    of_motion = np.abs(np.sum(own_drift(lines) * aside, axis=1)).max() if speed else 0.0
+    little = 2e-5 + 0.1 * of_motion
+    for way, stretch, most in ((within / size[:, None], found * size, 1e-7), (aside, 0.0, little)):
+        ends = [
+            np.diag(pairwise_range_m(point_m + sign * length_m * way, *antennas))
+            for sign in (-0.5, 0.5)
+        ]
+        grown = (ends[1] - ends[0]) / length_m
+        of_place = np.sum((sight - drift(lines)) * way, axis=1)
+        assert np.abs(grown - of_place - stretch).max() < most
 
 
 @settings(max_examples=40, deadline=None)

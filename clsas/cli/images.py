@@ -108,16 +108,19 @@ def image(
             }
         else:
             preparation = prepare(lines, grid, device=opened, beam=beam, **wish)
+            if not why:  # else the plan has warned
+                preparation.warn_of_ends()
             formed = execute(preparation, progress=progress)
             interpolator, ratio = preparation.interpolator, preparation.resampling.ratio
             how = (
                 f"{why}{interpolator.taps} taps on lines upsampled {ratio:.3g} times, "
-                f"{interpolator.error_db:.0f} dB"
+                f"{preparation.predicted_error_db:.0f} dB"
             )
             results |= {
                 "taps": interpolator.taps,
                 "upsampling": ratio,
                 "interpolation_error_db": interpolator.error_db,
+                "predicted_error_db": preparation.predicted_error_db,
             }
         seconds = time.perf_counter() - start
     clsas.save(output, formed)

@@ -1,0 +1,61 @@
+"""Ends of lines that do not fade, in images of both imagers."""
+
+import pytest
+from cases import TAPER, along_x, noise
+
+import clsas
+from clsas.backproject import execute, prepare
+from clsas.grid import Grid
+from clsas.lines import RangeLines
+from clsas.quality import relative_error_db
+from clsas.validate import ClsasWarning
+
+
+@pytest.fixture(scope="module")
+def cut_off():
+    """Lines that end amid their noise, from 20 m to 30 m, and the exact images of two grids."""
+    samples = noise(200, 1001 + 2 * TAPER)[:, TAPER:-TAPER]
+    track = along_x(200, 0.01)
+    lines = RangeLines(samples, 20.0, 0.01, track, track, 100e3, 1500.0)
+    grids = [Grid.plane((-0.4, 0.4, 100), (a, b, 1000)) for a, b in ((19.5, 30.5), (20.2, 29.8))]
+    return lines, [(grid, execute(prepare(lines, grid, accuracy_db=-85))) for grid in grids]
+
+
+@pytest.mark.parametrize("tolerance_db", [-50, -60, -70])
+def test_what_is_made_of_ends_that_do_not_fade_is_predicted(cut_off, tolerance_db):
+    lines, ((grid, exact), _) = cut_off
+    with pytest.warns(ClsasWarning, match="the grid reaches ends of lines that do not fade"):
+        chosen = clsas.plan(lines, grid, tolerance_db=tolerance_db)
+    found_db = relative_error_db(clsas.factorize(lines, grid, chosen), exact)
+    assert tolerance_db < chosen.predicted_error_db < -35
+    assert found_db <= chosen.predicted_error_db
+    assert chosen.tolerance_db == tolerance_db
+
+
+@pytest.mark.parametrize(("which", "tolerance_db"), [(0, -30), (1, -30), (1, -50), (1, -70)])
+def test_ends_that_matter_little_or_are_not_reached_keep_the_tolerance(
+    cut_off, which, tolerance_db
+):
+    lines, images = cut_off
+    grid, exact = images[which]
+    chosen = clsas.plan(lines, grid, tolerance_db=tolerance_db)
+    found_db = relative_error_db(clsas.factorize(lines, grid, chosen), exact)
+    assert found_db <= chosen.predicted_error_db <= tolerance_db
+
+
+@pytest.mark.parametrize("accuracy_db", [-50, -60, -70])
+def test_exact_images_too_tell_of_ends_that_do_not_fade(cut_off, accuracy_db):
+    lines, ((grid, exact), _) = cut_off
+    with pytest.warns(ClsasWarning, match=f"do not fade.* in place of accuracy_db {accuracy_db}"):
+        image = clsas.backproject(lines, grid, accuracy_db=accuracy_db)
+    predicted_db = prepare(lines, grid, accuracy_db=accuracy_db).predicted_error_db
+    assert accuracy_db < predicted_db < -35
+    assert relative_error_db(image, exact) <= predicted_db
+
+
+@pytest.mark.parametrize(("which", "accuracy_db"), [(0, -30), (1, -30), (1, -50), (1, -70)])
+def test_exact_images_keep_their_accuracy_where_ends_matter_little(cut_off, which, accuracy_db):
+    lines, images = cut_off
+    grid, exact = images[which]
+    image = clsas.backproject(lines, grid, accuracy_db=accuracy_db)
+    assert relative_error_db(image, exact) <= accuracy_db
