@@ -124,7 +124,7 @@ def test_default_stages_leave_a_line_and_a_pixel(lines):
     ],
 )
 def test_bad_input_is_refused_before_any_image(lines, monkeypatch, error, message, given):
-    for imager in ("factorize", "backproject"):
+    for imager in ("factorize", "form_exactly"):
         monkeypatch.setattr(sys.modules["clsas.tradeoff"], imager, pytest.fail)
     with pytest.raises(error, match=message):
         clsas.tradeoff(**{"lines": lines, "grid": GRID} | given)
