@@ -115,7 +115,8 @@ def parse_scene(text: bytes, *, name: str, folder: Path) -> SceneFile:
     try:
         tables = tomllib.loads(text.decode())
     except ValueError as error:  # TOML's and UTF-8's
-        raise ValueError(f"{name}: is not TOML: {error}") from None
+        kind = "an HDF5 file, not a scene" if text.startswith(b"\x89HDF") else f"not TOML: {error}"
+        raise ValueError(f"{name}: is {kind}") from None
     try:
         return _Scene.model_validate(tables).build(name, folder)
     except ValidationError as error:
@@ -396,6 +397,7 @@ class _Beam(_Table):
     taper: float = 0.5
     element_length_m: float | None = None
     normalise: bool = False
+    track_pings: int | None = None
 
     def build(self) -> BeamWindow:
         with _in("[image.beam]"):

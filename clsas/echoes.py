@@ -87,6 +87,13 @@ class Echoes:
                     f"got {self.carrier_hz:g} Hz"
                 )
 
+    def __repr__(self) -> str:
+        """Return sizes and rates: the arrays are long."""
+        return (
+            f"Echoes({self.channels} channels of {self.length} samples at "
+            f"{self.sample_rate_hz:.6g} Hz, carrier {self.pulse.carrier_hz:.6g} Hz)"
+        )
+
     @property
     def channels(self) -> int:
         """Number of channels."""

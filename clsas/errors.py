@@ -398,10 +398,17 @@ def _pixels_m(
     return np.concatenate([np.zeros((1, 3)), pixels_m]), places[:, -1]
 
 
-def nearest_error(view: View, stages: Sequence[tuple[int, int]]) -> float:
-    """Return the power of the error of nearest beams: THESIS [45], spread evenly."""
+def nearest_errors(view: View, stages: Sequence[tuple[int, int]]) -> tuple[float, list[float]]:
+    """Return the power of the error of nearest beams, THESIS [45], spread evenly, and by stage.
+
+    Range errors of stages are added, not their powers.
+    """
     centres_m = view.lines.phase_centres_m[np.argsort(view.track.place)]
     spacing_m = np.linalg.norm(np.diff(centres_m, axis=0), axis=1).mean()
     image_m = np.max(np.array(view.grid.shape) * np.linalg.norm(view.surface.steps_m, axis=1))
-    total_m = sum(stage_errors_m(stages, spacing_m, image_m, view.nearest_m))
-    return (2 * math.pi * view.lines.carrier_cycles_per_m * total_m) ** 2 / 3
+    errors_m = stage_errors_m(stages, spacing_m, image_m, view.nearest_m)
+
+    def power_of(error_m: float) -> float:
+        return (2 * math.pi * view.lines.carrier_cycles_per_m * error_m) ** 2 / 3
+
+    return power_of(sum(errors_m)), [power_of(error_m) for error_m in errors_m]

@@ -90,6 +90,14 @@ class RangeLines:
                 "the speed of rx_velocity_m_s", fastest, "m/s", below=self.sound_speed_m_s
             )
 
+    def __repr__(self) -> str:
+        """Return sizes and extents: the arrays are long."""
+        return (
+            f"RangeLines({self.channels} channels of {self.length} samples, "
+            f"{self.first_range_m.min():.6g} m to {self.last_range_m.max():.6g} m in steps of "
+            f"{self.range_step_m:.4g} m, carrier {self.carrier_hz:.6g} Hz)"
+        )
+
     @property
     def channels(self) -> int:
         """Number of channels."""

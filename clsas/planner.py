@@ -18,7 +18,7 @@ from clsas.ends import besides_ends, warn_of_ends
 from clsas.errors import (
     excess_error,
     in_db,
-    nearest_error,
+    nearest_errors,
     other_errors,
     power,
     root_error,
@@ -195,7 +195,7 @@ def _chosen(
     if not exact_fits:
         raise ValueError(
             f"memory_bytes must be at least {math.ceil(10 * least / 2**20) / 10:.1f} MiB for this "
-            f"image, got {room / 2**20:.1f} MiB"
+            f"image, got {room / 2**20:.3g} MiB"
         )
     return forecast.plain(view, tolerance_db, exact, device, costs)
 
@@ -379,8 +379,14 @@ def _nearest(
     linear = interpolation.design(2, NEAREST_UPSAMPLING, view.spectrum)
     filters = Filters(linear, Interpolator(1, 1.0, np.zeros((0, 2, 0)), 0.0, 0.0), linear)
     way = Way(tuple(sides[::-1]), filters, nearest=tuple(beams for beams, _ in stages))
-    error = nearest_error(view, stages)
-    return forecast.factorized(view, way, error, None, exact, device, costs, memory_bytes)
+    error, by_stage = nearest_errors(view, stages)
+    found = forecast.factorized(view, way, error, None, exact, device, costs, memory_bytes)
+    *divided, last = found.stages
+    divided = [
+        replace(stage, error_db=in_db(power(stage.error_db) + of_beams))
+        for stage, of_beams in zip(divided, by_stage, strict=True)
+    ]
+    return replace(found, stages=(*divided, last))
 
 
 def checked_pairs(stages: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:

@@ -134,7 +134,7 @@ def geometry(lines: RangeLines | Echoes, grid: Grid | None = None) -> Figure:
         ("receiver", lines.rx_m, "."),
         ("transmitter", lines.tx_m, "x"),
     ):
-        places = np.unique(position_m[:, :2], axis=0)
+        places = np.unique(position_m[:, :2].round(6), axis=0)  # micrometres
         axes.plot(*places.T, marker, markersize=5, label=f"{name} ({len(places)} places)")
     if grid is not None:
         validate.instance("grid", grid, Grid)

@@ -13,6 +13,8 @@ from clsas.grid import Grid
 from clsas.sonar import Sonar
 from clsas.track import Track, channels
 
+_SLACK = 0.01  # by which a spacing may exceed its limit
+
 
 @dataclass(frozen=True)
 class Finding:
@@ -84,8 +86,8 @@ def _check_spacing(
         spread = float(np.ptp(sine, axis=0).max())
         limit = wavelength / (2 * spread) if spread else np.inf
         meaning = "what keeps grating lobes off the grid"
-    # A spacing that is exactly the limit must pass whatever its last bits.
-    if spacing <= limit * (1 + 1e-6):
+    # A sway by a few centimetres turns the course a little: grating lobes hardly change.
+    if spacing <= limit * (1 + _SLACK):
         return []
     near, far = ranges.min(), ranges.max()
     lobes = [grating_lobe_m(wavelength, spacing, distance) for distance in (near, far)]

@@ -62,6 +62,7 @@ _BEAM_BLOCK = 1 << 15
 _LOOK = 8
 # Nearer to an element than this a point has no direction.
 _TOUCHING_M = 1e-9
+_NO_ECHO = "no echo falls within the receive window, from where elements look: every sample is zero"
 
 
 def simulate(
@@ -636,7 +637,7 @@ def _record(
             if progress is not None:
                 progress(channel + 1, paths.channels)
     if not samples.any():
-        validate.warn("no echo falls within the receive window: every sample is zero")
+        validate.warn(_NO_ECHO)
     return samples
 
 
@@ -673,7 +674,7 @@ def _channels(tx_m: ArrayLike, rx_m: ArrayLike, rx_velocity_m_s: ArrayLike | Non
 def _add_noise(samples: NDArray[np.complex64], snr_db: float, seed: int) -> None:
     peak = np.max([np.abs(line).max() for line in samples])
     if peak == 0:
-        raise ValueError("snr_db needs an echo to refer to, but every sample is zero")
+        raise ValueError(f"snr_db needs an echo to refer to: {_NO_ECHO}")
     # The deviation of each of the two parts.
     deviation = np.float32(peak * 10 ** (-snr_db / 20) / np.sqrt(2))
     random = np.random.default_rng(seed)

@@ -100,7 +100,7 @@ class Record:
         """What a user should know, in words; nothing if all is well."""
         found = []
         if not self.channels:
-            found.append("empty: no channel sees it")
+            found.append("empty: in no channel's beam and range")
         elif self.missing_channels:
             found.append(f"{self.missing_channels} of {self.channels} channels have no samples")
         if self.gap_m:

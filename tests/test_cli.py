@@ -359,7 +359,7 @@ FIXED = ["--taps", "4", "--upsampling", "2"]
             "image.h5 must hold Echoes (clsas simulate makes them), got Image",
         ),
         (["quality", "scene.toml"], 1, "scene.toml is not an HDF5 file"),
-        (["simulate", "lines.h5", "-o", "new.h5"], 1, "lines.h5: is not TOML"),
+        (["simulate", "lines.h5", "-o", "new.h5"], 1, "lines.h5: is an HDF5 file, not a scene"),
         (["simulate", "typo.toml", "-o", "new.h5"], 1, "in [grid]: did you mean 'z_m'?"),
         (["simulate", "grid.toml", "-o", "new.h5"], 1, "grid.toml: missing table [sonar]"),
         (["compress", "echoes.h5", "-o", "new.h5", "--window", "bay"], 2, "bay"),
@@ -426,6 +426,13 @@ FIXED = ["--taps", "4", "--upsampling", "2"]
         (["plan", "lines.h5", *GRID, "--stages", "2x0"], 2, "'2x0' must be QRxQI for every"),
         (["plan", "lines.h5", *GRID, "--squint-deg", "3"], 2, "go with --beam-deg"),
         (["plan", "lines.h5", *GRID, "--element-length-m", "1"], 2, "go with --beam-deg"),
+        (["plan", "lines.h5", *GRID, "--track-pings", "9"], 2, "go with --beam-deg"),
+        (["plan", "lines.h5", *GRID, "--beam-deg", "9", "--track-pings", "1"], 2, "at least 5"),
+        (
+            ["plan", "lines.h5", *GRID, "--beam-deg", "9", "--element-length-m", "1"],
+            2,
+            "--element-length-m goes with --beam-shape inverse, got rectangular",
+        ),
         (
             ["plan", "lines.h5", *GRID, "--beam-deg", "9", "--beam-shape", "inverse"],
             2,

@@ -193,7 +193,7 @@ def test_flags_are_told(made, tmp_path):
         "mosaic", made[0] / "scene.toml", "--lines", lines_of(made),
         "--x", "100:104:20", "--y", "56:61:100", "-o", tmp_path / "a.zarr",
     )  # fmt: skip
-    assert stdout.count("empty: no channel sees it") == 4
+    assert "  patch 0,0; 0,1; 1,0 and 1 more: empty: in no channel's beam and range" in stdout
 
 
 @pytest.mark.parametrize(
@@ -221,6 +221,7 @@ def test_flags_are_told(made, tmp_path):
         (["--lines", "scene.toml"], 1, "scene.toml is not an HDF5 file"),
         (["--idle-s", "-1", "--lines", "folder", "--follow"], 2, "idle_s must be"),
         (["--accuracy-db", "3"], 2, "accuracy_db must be"),
+        (["--idle-s", "5"], 2, "--idle-s goes with --follow"),
         (["--idle-s", "0.1", "--lines", "folder", "--follow"], 1, "folder has no file"),
     ],
 )

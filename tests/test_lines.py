@@ -126,3 +126,9 @@ def with_bad(shape, value):
 def test_bad_input_is_named(changes, error, words):
     with pytest.raises(error, match=words):
         make(**changes)
+
+
+def test_it_is_shown_in_one_line():
+    text = repr(make())
+    assert text.startswith("RangeLines(4 channels of ")
+    assert len(text) < 200

@@ -244,7 +244,7 @@ def test_a_patch_that_no_channel_sees_is_empty_and_flagged(tmp_path):
     assert [patch.record.is_empty for patch in patches] == [False, True, True, True]
     for patch in patches[1:]:
         assert not patch.image.pixels.any()
-        assert patch.record.flags == ("empty: no channel sees it",)
+        assert patch.record.flags == ("empty: in no channel's beam and range",)
         assert patch.record.predicted_error_db is None
 
 

@@ -146,6 +146,9 @@ def test_given_stages_are_those_given():
     assert rows == 3 * fewer_rows
     assert columns == 3 * fewer_columns
     assert [stage.channels for stage in chosen.stages] == [150, 50, 50]
+    # Range errors of stages add up to what nearest beams err by.
+    powers = [10 ** (stage.error_db / 20) for stage in chosen.stages[:2]]
+    assert 20 * np.log10(sum(powers)) == pytest.approx(chosen.predicted_error_db, abs=0.1)
 
 
 @pytest.mark.parametrize("taps", [(4, 8), (8, 4)])

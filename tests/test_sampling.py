@@ -105,6 +105,16 @@ def test_spacing_finding_carries_its_numbers():
     assert float(lobes[3]) == pytest.approx(grating_lobe_m(1.5e-3, 8.25e-3, ranges[1]), rel=1e-3)
 
 
+def test_sway_of_a_course_hardly_changes_its_spacing():
+    """At exactly the limit the course's direction, turned a little by sway, decides nothing."""
+    sonar = replace(WIDE, rx_m=line_array(64, 15e-3))
+    for sway_m in (0.0, 0.005):
+        survey = Track.straight(
+            [0, 0, 0], [2.4, 0, 0], 10, 0.2, sway_m=lambda t, most=sway_m: most * np.sin(3 * t)
+        )
+        assert check_sampling(sonar, survey, GRID) == []
+
+
 def test_gap_between_pings_is_found_on_any_course():
     sonar = replace(WIDE, rx_m=line_array(64, 15e-3))
     for course in ([1, 0, 0], [0, 1, 0], [0.6, -0.8, 0]):

@@ -92,16 +92,21 @@ def read_beam(described: SceneFile, given: dict[str, Any]) -> clsas.BeamWindow |
     """Return a scene file's beam, changed by what is given, or the beam that is."""
     beam = described.image.get("beam")
     options = {"width_deg": "beam_deg", "shape": "beam_shape", "squint_deg": "squint_deg"}
-    options["element_length_m"] = "element_length_m"
+    options |= {"element_length_m": "element_length_m", "track_pings": "track_pings"}
     changes = {key: given[name] for key, name in options.items() if given[name] is not None}
     if not changes:
         return beam
     if beam is None and "width_deg" not in changes:
         raise click.UsageError(
-            "--beam-shape, --squint-deg and --element-length-m go with --beam-deg"
+            "--beam-shape, --squint-deg, --element-length-m and --track-pings go with --beam-deg"
         )
     try:
-        return replace(beam, **changes) if beam is not None else clsas.BeamWindow(**changes)
+        changed = replace(beam, **changes) if beam is not None else clsas.BeamWindow(**changes)
+        if "element_length_m" in changes and changed.shape != "inverse":
+            raise ValueError(
+                f"--element-length-m goes with --beam-shape inverse, got {changed.shape}"
+            )
+        return changed
     except ValueError as error:  # the scene's own was checked when it was read
         raise click.UsageError(str(error)) from error
 

@@ -25,6 +25,8 @@ from clsas.device import open_device
 from clsas.mosaic import patch_shape_of
 
 _SCHEDULER_S = 10  # to answer
+_IDLE_S = 60.0  # after which nothing more is expected to come
+_LISTED = 3  # patches of one kind, at most
 
 
 @click.command()
@@ -51,8 +53,8 @@ _SCHEDULER_S = 10  # to answer
 @click.option("--scheduler", metavar="ADDRESS", help="Work on a Dask cluster: tcp://host:8786.")
 @click.option("--follow", is_flag=True, help="Go on while files are added to the folder --lines.")
 @click.option(
-    "--idle-s", type=float, default=60.0, show_default=True, callback=options.check_idle_s,
-    help="With --follow: until nothing came for so long, or a file `end` did.",
+    "--idle-s", type=float, callback=options.check_idle_s,
+    help="With --follow: until nothing came for so long, or a file `end` did. [default: 60]",
 )  # fmt: skip
 @options.png("an overview in dB")
 @options.dynamic_range
@@ -67,7 +69,7 @@ def mosaic(
     workers: int | None,
     scheduler: str | None,
     follow: bool,
-    idle_s: float,
+    idle_s: float | None,
     png: Path | None,
     dynamic_range_db: float,
     as_json: bool,
@@ -75,7 +77,8 @@ def mosaic(
 ) -> None:
     """Form an image of any size patch by patch, into a Zarr store.
 
-    Grid, dial and beam as for `clsas image`. The same command goes on where it was interrupted, by
+    Grid, dial and beam as for `clsas image`, but an exact image is asked for by --accuracy-db. The
+    same command goes on where it was interrupted, by
     Ctrl-C or by anything else. A scene without --lines is simulated first.
 
     \b
@@ -101,6 +104,8 @@ def mosaic(
     keep_apart("the range lines", lines_path, "the store", output)
     if follow and (lines_path is None or not lines_path.is_dir()):
         raise click.UsageError("--follow goes with --lines, a folder")
+    if idle_s is not None and not follow:
+        raise click.UsageError("--idle-s goes with --follow")
     patches = patches or in_scene.get("patches")
     if patches is not None:
         patch_shape_of(patches, grid)  # before anything is simulated
@@ -114,7 +119,7 @@ def mosaic(
         formed = clsas.mosaic(
             lines_path, grid, output, **wish, beam=beam, patches=patches,
             memory_bytes=memory_mib and memory_mib << 20, device=devices,
-            client=client, follow_s=idle_s if follow else None,
+            client=client, follow_s=(idle_s or _IDLE_S) if follow else None,
         )  # fmt: skip
         before, count, pixels = len(formed.finished), 0, 0
         with _patch_progress(output.name, len(formed), before) as tell:
@@ -143,7 +148,14 @@ def mosaic(
         + (f", {before} were there" if before else "")
         + ("" if worst is None else f"; error predicted {worst:.1f} dB at most")
     ]
-    text += [f"  patch {row},{column}: {'; '.join(f)}" for (row, column), f in flagged.items()]
+    alike: dict[str, list[str]] = {}
+    for (row, column), flags in flagged.items():
+        alike.setdefault("; ".join(flags), []).append(f"{row},{column}")
+    for flags, where in alike.items():
+        which = "; ".join(where[:_LISTED])
+        if len(where) > _LISTED:
+            which += f" and {len(where) - _LISTED} more"
+        text.append(f"  patch {which}: {flags}")
     report(
         as_json,
         "\n".join(text),

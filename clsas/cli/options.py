@@ -63,7 +63,7 @@ axes = _together(
     click.option("--y", type=AXIS, help="The same along y."),
     click.option(
         "--z", type=float, callback=checked(partial(validate.number, "z", unit="m")),
-        help="Height of the plane (m). [default: 0]",
+        help="Height of the plane (m), with --x and --y. [default: 0]",
     ),
 )  # fmt: skip
 grid = _together(scene, axes)
@@ -106,5 +106,10 @@ beam = _together(
     click.option(
         "--element-length-m", type=float,
         help="For the shape 'inverse', which divides by the two-way pattern of such elements.",
+    ),
+    click.option(
+        "--track-pings", type=int,
+        help="Over how many pings the track's direction is smoothed. [default: a quarter, 101 at "
+        "most]",
     ),
 )  # fmt: skip

@@ -77,7 +77,7 @@ def _counts(text: str) -> tuple[int, int]:
 
 
 AXIS = Parsed("START:STOP:N", _axis, "START:STOP:N, two places in metres and a number of pixels")
-PLACE = Parsed("X,Y", _place, "X,Y in metres")
+PLACE = Parsed("X,Y", _place, "X,Y in metres, without a space, such as 0,42.5")
 RATIO = Parsed("NUMBER", _ratio, "a number or a fraction such as 1/30")
 STAGES = Parsed("stages", _stages, "QRxQI for every stage, such as 2x2,2x2")
 COUNTS = Parsed("ROWSxCOLUMNS", _counts, "ROWSxCOLUMNS, at least 1x1, such as 8x8")
