@@ -256,7 +256,8 @@ def save_png(figure: Figure, path: str | os.PathLike, *, dpi: float = 150.0) -> 
     validate.instance("figure", figure, _figure_class())
     validate.positive("dpi", dpi, "pixels per inch")
     with replacing(path) as temporary:
-        figure.savefig(temporary, format="png", dpi=dpi)
+        # What the layout leaves outside, as labels beside square axes, is drawn too.
+        figure.savefig(temporary, format="png", dpi=dpi, bbox_inches="tight")
 
 
 def _label_beside(axes: Axes, rows: list[Row], color: str) -> None:
