@@ -14,6 +14,7 @@ from clsas.lines import RangeLines, some_channels
 from clsas.window import BeamWindow, sines
 
 _OF_AN_END, _END = 0.03, 4  # measured on noise of 40 to 90 % of the sampled band; samples
+_BESIDE = 5  # samples
 _CHANNELS, _PLACES = 64, 16  # looked at: channels, and pixels along either side of a grid
 _MOST, _LEAST = 0.5, 1e-3  # of the power of the error allowed: made up for by the rest of it
 
@@ -25,7 +26,7 @@ def ends_error(
 
     What lies beyond an end is not known: pixels of up to five samples around it get what filters
     make of the cut, each another. That is `_OF_AN_END` of a sample's power for every end that the
-    grid reaches. `along` are the track's directions for a beam, [channels, 3].
+    grid comes so near to. `along` are the track's directions for a beam, [channels, 3].
     """
     some = some_channels(lines.channels, _CHANNELS)
     places = [np.unique(np.linspace(0, n - 1, _PLACES).round().astype(int)) for n in grid.shape]
@@ -51,8 +52,8 @@ def ends_error(
         first, last = (int(np.clip(at, -1, lines.length)) for at in (near, far))
         line = lines.samples[channel].astype(np.complex128)
         total += np.vdot(line[max(first, 0) : last + 1], line[max(first, 0) : last + 1]).real
-        for end, reached in ((line[:_END], near < 0), (line[-_END:], far > lines.length - 1)):
-            if reached and near <= far:
+        for end, place_of_end in ((line[:_END], 0), (line[-_END:], lines.length - 1)):
+            if near < place_of_end + _BESIDE and far > place_of_end - _BESIDE:
                 at_ends += np.vdot(end, end).real / len(end)
     return _OF_AN_END * at_ends / total if total else 0.0
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+import weakref
 from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -26,7 +27,7 @@ from clsas.errors import in_db
 from clsas.filters import edges_gain
 from clsas.grid import Grid
 from clsas.image import Image, holds_any
-from clsas.interpolation import power_outside
+from clsas.interpolation import FEW_CHANNELS, MEASURED_CHANNELS, power_outside
 from clsas.leaves import Finish, Level, PlaneLeaves, SurfaceLeaves
 from clsas.lines import RangeLines
 from clsas.plan import CHUNK, GUARD, MARGIN, Plan, padded_length, sample_bytes
@@ -374,11 +375,16 @@ class _Run:
 
 def _check_band(lines: RangeLines, chosen: Plan) -> None:
     """Warn where a plan was made for lines of another band."""
-    known = chosen.kept.get("geometry")
-    if chosen.band is None or (known is not None and known.lines is lines):
+    known = chosen.kept.get("lines")
+    if chosen.band is None or (known is not None and known() is lines):
         return
-    outside_db = in_db(power_outside(lines, *chosen.band))
-    if outside_db > chosen.tolerance_db:
+    outside_db = -math.inf
+    for channels in (FEW_CHANNELS, MEASURED_CHANNELS):
+        outside_db = in_db(power_outside(lines, *chosen.band, channels))
+        if outside_db <= chosen.tolerance_db:
+            chosen.kept["lines"] = weakref.ref(lines)
+            return
+    if lines.samples.any():
         validate.warn(
             f"the lines hold {outside_db:.0f} dB of their power outside the band that the plan was "
             f"made for, so that the error may be more than {chosen.tolerance_db:g} dB: plan anew "

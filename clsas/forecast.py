@@ -34,11 +34,11 @@ from clsas.view import View
 
 HALF_ROUNDING = 4e-8
 """Power of the error that rounding lines to half precision once adds: 2^-11/sqrt(6) rms."""
-_OUTSIDE = 0.1  # of the power of the error allowed
 _ROOM = 1.06  # for virtual channels, over the most expected
 _ROUNDING_SHARE = 0.1  # of an image's error
 _MOST_CHUNKS = 16  # that a sum in half precision is made of
 MARGIN_DB = 1.0  # between prediction and tolerance, for what measured errors scatter
+OUTSIDE = 0.1  # of the power of the error allowed: what may lie beyond the highest frequency
 _FEW_CHANNELS = 7.0, 30.0  # where no more see a pixel errors scatter much; with steps
 _CACHED_BYTES, _BATCH_BYTES = 16 << 20, 256 << 20  # of a batch, on CPUs and elsewhere
 _MOST_TABLE_BYTES = 64 << 20
@@ -191,7 +191,7 @@ def factorized(
         crowding=way.crowding,
         beam_cycles=way.beam_cycles,
         most_channels=tuple(math.ceil(most) for _, most in most_channels),
-        band=None if nearest else _band(view, _OUTSIDE * power(tolerance_db)),
+        band=None if nearest else _band(view, OUTSIDE * power(tolerance_db)),
     )
 
 

@@ -23,7 +23,7 @@ COST = {2: 0.75, 4: 1.0, 6: 1.3, 8: 1.55}
 # The same, in such, for one upsampled sample: an FFT on the host.
 _UPSAMPLING_COST = 40.0
 _FREQUENCIES = 128
-_MEASURED, _COMPARED = 256, 32  # channels
+MEASURED_CHANNELS, FEW_CHANNELS = 256, 32  # of which a spectrum is taken: with care, in haste
 Gain = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 """A factor of spectra, by the distance from their centre in cycles per sample."""
 _POSITIONS = 17
@@ -104,16 +104,16 @@ class Interpolator:
 
 def measure_spectrum(lines: RangeLines) -> Spectrum:
     """Return the mean power spectrum of the lines' channels, of some that hold anything."""
-    frequency, power = _mean_power(lines, _MEASURED)
+    frequency, power = _mean_power(lines, MEASURED_CHANNELS)
     centre = float(np.angle(np.sum(power * np.exp(2j * np.pi * frequency))) / (2 * np.pi))
     nearest = (2 * _FREQUENCIES * _distance(frequency, centre)).astype(np.int64)
     share = np.bincount(np.minimum(nearest, _FREQUENCIES - 1), power, _FREQUENCIES)
     return Spectrum(centre, (np.arange(_FREQUENCIES) + 0.5) / (2 * _FREQUENCIES), share)
 
 
-def power_outside(lines: RangeLines, centre: float, half_width: float) -> float:
+def power_outside(lines: RangeLines, centre: float, half_width: float, most_channels: int) -> float:
     """Return the share of the lines' power outside a band, in cycles per sample; of some lines."""
-    frequency, power = _mean_power(lines, _COMPARED)
+    frequency, power = _mean_power(lines, most_channels)
     return float(power[_distance(frequency, centre) > half_width].sum())
 
 

@@ -60,7 +60,9 @@ _SMALLEST_SIDE = 128
 _WORTH_A_PLAN = 5e7  # pixels times channels; fewer are backprojected sooner than planned for
 _POLL_S = 0.5
 _MOST_WORKERS = 1024  # of one machine
-_LOCAL = threading.local()  # a thread's own: `device`, and on a worker the `survey` opened last
+_LOCAL = threading.local()  # a thread's own: its `device`
+_OPENING = threading.Lock()
+_LATEST: list[Survey] = []  # what this worker's threads opened last
 
 
 @dataclass(frozen=True, eq=False)
@@ -204,6 +206,10 @@ class Mosaic:
                 future.cancel()
             # Patches begun are finished here; workers may have been lost.
             executor.shutdown(wait=self._client is None)
+            if self._client is None and self._job.store is not None:
+                for future, place in running.items():
+                    if not future.cancelled() and future.exception() is None:
+                        self.finished[place] = future.result()[0]
 
     def image(self, tell: Callable[[Patch], object] | None = None) -> Image:
         """Form what is not finished and return the whole image.
@@ -479,7 +485,8 @@ class _Job:
         """Return the survey; a worker opens it once per number of files."""
         if self.sight_here is not None:
             return self.sight_here
-        found = _opened(self.files, _beam_json(self.beam))
+        with _OPENING:
+            found = _opened(self.files, _beam_json(self.beam))
         if found.survey.stamps != tuple(stamp for _, stamp in self.files):
             raise ValueError("source must not change while a mosaic is formed: a file of it did")
         return found
@@ -558,10 +565,9 @@ class _Sight:
 @lru_cache(maxsize=2)
 def _opened(files: tuple[tuple[Path, tuple[int, int]], ...], beam: str | None) -> _Sight:
     # Of a survey that has grown only the new files are opened.
-    before = getattr(_LOCAL, "survey", None)
-    if before is not None and files[: len(before.parts)] != _files(before):
-        before = None
-    survey = _LOCAL.survey = open_files(tuple(path for path, _ in files), before)
+    before = next((s for s in _LATEST if files[: len(s.parts)] == _files(s)), None)
+    survey = open_files(tuple(path for path, _ in files), before)
+    _LATEST[:] = [survey]
     return _Sight.of(survey, None if beam is None else BeamWindow(**json.loads(beam)))
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import weakref
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
@@ -25,7 +26,7 @@ from clsas.errors import (
 )
 from clsas.exact import Exact, expect
 from clsas.filters import ALIGN_TAPS, Choice, Filters, steering_spectrum
-from clsas.forecast import MARGIN_DB, Way, margin_db
+from clsas.forecast import MARGIN_DB, OUTSIDE, Way, margin_db
 from clsas.grid import Grid
 from clsas.interpolation import Interpolator
 from clsas.lines import RangeLines
@@ -45,9 +46,6 @@ NEAREST_UPSAMPLING = 8.0
 """By how much lines are upsampled before the linear interpolation of given stages."""
 
 _ROOTS_SHARE, _NODES_SHARE, _EDGES_SHARE = 0.25, 0.2, 0.03  # of the error allowed
-_OUTSIDE = (
-    0.1  # of the power of the error allowed: what lines may hold beyond the highest frequency
-)
 _WORTH = 0.95  # of the time of an exact image
 _LEAST_CROWDED, _MOST_CROWDING = 1.05, 2.0  # more nodes at a time, and altogether
 _CROWDING_POWER = 0.08  # of an error that more nodes are to mend
@@ -148,14 +146,16 @@ def plan(
     costs = costs or load_costs(device)
     if memory_bytes is not None:
         memory_bytes = validate.count("memory_bytes", memory_bytes)
-    view = View(lines, grid, beam, _OUTSIDE * power(tolerance_db or 0.0))
+    view = View(lines, grid, beam, OUTSIDE * power(tolerance_db or 0.0))
     ends, wanted_db = view.ends_error, tolerance_db
     if tolerance_db is not None:
         warn_of_ends("tolerance_db", tolerance_db, ends)
         wanted_db = besides_ends(tolerance_db, ends)
     found = _chosen(view, wanted_db, stages, device, costs, memory_bytes, allowed)
     error_db = in_db(power(found.predicted_error_db) + ends)
-    return replace(found, tolerance_db=tolerance_db, predicted_error_db=error_db)
+    found = replace(found, tolerance_db=tolerance_db, predicted_error_db=error_db)
+    found.kept["lines"] = weakref.ref(lines)
+    return found
 
 
 def _chosen(

@@ -32,7 +32,6 @@ if TYPE_CHECKING:
 FORMAT = "clsas mosaic"
 VERSION = 1
 
-_OURS = {"zarr.json", "pixels", "patches", "height", "x", "y"}  # what lies in a store
 _OVERVIEW = 1024  # pixels along the longer side, at most
 
 
@@ -88,11 +87,15 @@ class Record:
     @property
     def is_whole(self) -> bool:
         """Whether every number is one, as a record from a file may not have them."""
-        return all(
-            isinstance(getattr(self, field.name), (int, float))
-            or (field.type == "float | None" and getattr(self, field.name) is None)
+        allowed = {"int": (int,), "float": (int, float), "float | None": (int, float, type(None))}
+        numbers = [
+            (getattr(self, field.name), allowed[str(field.type)])
             for field in fields(self)
-            if field.type in ("int", "float", "float | None")
+            if field.type in allowed
+        ]
+        return all(
+            type(value) in kinds and (value is None or math.isfinite(value))
+            for value, kinds in numbers
         )
 
     @property
@@ -183,8 +186,6 @@ class Store:
     def begin(self, inputs: dict[str, Any], grid: Grid, patch_shape: tuple[int, int]) -> None:
         """Create the store, or check that it was made with these inputs.
 
-        One of other inputs in which no patch was finished is made anew.
-
         Raises
         ------
         ValueError
@@ -195,14 +196,12 @@ class Store:
         if not self._is_there():
             self._create(inputs, grid, patch_shape)
         if differences := self._differences(inputs, patch_shape):
-            if self.records() or {path.name for path in self.path.iterdir()} - _OURS:
-                raise ValueError(
-                    f"{self.path} was made with other inputs: {'; '.join(differences)}; give it "
-                    f"another path or the same inputs"
-                )
-            shutil.rmtree(self.path)
-            self.__dict__.pop("pixels", None)
-            self._create(inputs, grid, patch_shape)
+            ways = "give it another path or the same inputs"
+            if not self.records():
+                ways += ", or delete it: no patch of it was finished"
+            raise ValueError(
+                f"{self.path} was made with other inputs: {'; '.join(differences)}; {ways}"
+            )
         with tempfile.TemporaryFile(dir=self.path):
             pass  # raises where it cannot be written
         pixels = self.pixels

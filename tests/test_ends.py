@@ -32,6 +32,17 @@ def test_what_is_made_of_ends_that_do_not_fade_is_predicted(cut_off, tolerance_d
     assert chosen.tolerance_db == tolerance_db
 
 
+@pytest.mark.parametrize("tolerance_db", [-40, -60])
+@pytest.mark.parametrize("inside_m", [0.005, 0.04])
+def test_a_grid_that_begins_within_five_samples_of_an_end_is_told_too(
+    cut_off, inside_m, tolerance_db
+):
+    lines, _ = cut_off
+    grid = Grid.plane((-0.4, 0.4, 100), (20 + inside_m, 20.5, 100))
+    with pytest.warns(ClsasWarning, match="the grid reaches ends of lines that do not fade"):
+        clsas.plan(lines, grid, tolerance_db=tolerance_db)
+
+
 @pytest.mark.parametrize(("which", "tolerance_db"), [(0, -30), (1, -30), (1, -50), (1, -70)])
 def test_ends_that_matter_little_or_are_not_reached_keep_the_tolerance(
     cut_off, which, tolerance_db

@@ -16,7 +16,7 @@ from clsas.factorize import factorize
 from clsas.forecast import HALF_ROUNDING
 from clsas.grid import Grid
 from clsas.image import Image
-from clsas.lines import RangeLines
+from clsas.lines import RangeLines, some_channels
 from clsas.plan import Plan
 from clsas.quality import relative_error_db
 from clsas.scene import PointTargets
@@ -814,13 +814,29 @@ def test_a_plan_for_another_band_warns():
     chosen = planned(straight, -50)
     time = np.arange(lines.length)
     narrow = sum(np.roll(lines.samples, n, axis=1) for n in range(4)) / 4
-    image = factorize(dataclasses.replace(lines, samples=narrow), grid, chosen)
-    assert np.abs(image.pixels).max() > 0
+    narrower = dataclasses.replace(lines, samples=narrow)
+    image = factorize(narrower, grid, chosen)
+    assert relative_error_db(image, backproject(narrower, grid, accuracy_db=-80)) <= -50
+    silent = dataclasses.replace(lines, samples=np.zeros_like(lines.samples))
+    assert not factorize(silent, grid, chosen).pixels.any()
     shifted = dataclasses.replace(lines, samples=lines.samples * np.exp(2j * np.pi * 0.3 * time))
     with pytest.warns(ClsasWarning, match="outside the band that the plan was made for"):
         wrong = factorize(shifted, grid, chosen)
     right = backproject(shifted, grid, accuracy_db=-80)
     assert relative_error_db(wrong, right) > -50  # indeed
+
+
+def test_a_plan_for_lines_of_which_few_are_loud_knows_them():
+    """The noise of the others fills the band, but holds next to nothing."""
+    lines, grid = made(straight)
+    loud = np.full((lines.channels, 1), 1e-4)
+    loud[some_channels(lines.channels, 256)[100:104]] = 1.0
+    rng = np.random.default_rng(5)
+    noise = rng.normal(size=lines.samples.shape) * np.hanning(lines.length)
+    few = dataclasses.replace(lines, samples=loud * lines.samples + 1e-5 * noise)
+    chosen = plan(few, grid, tolerance_db=-50, costs=EXACT_IS_SLOW)
+    factorize(few, grid, chosen)
+    factorize(dataclasses.replace(few), grid, chosen)
 
 
 def test_a_plan_serves_another_device(device):

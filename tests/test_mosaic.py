@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -267,8 +268,10 @@ def test_missing_samples_are_flagged(file, tmp_path):
     assert "a gap of 0.25 m" in flagged[0].record.flags[1]
 
 
-def test_missing_channels_weigh_nothing(file):
+@pytest.mark.parametrize("wish", [{}, {"accuracy_db": None, "tolerance_db": -65}])
+def test_missing_channels_weigh_nothing(file, wish, monkeypatch):
     """Neither with a beam that divides by what channels weigh, nor in a plan."""
+    monkeypatch.setattr(sys.modules["clsas.mosaic"], "_WORTH_A_PLAN", 0)
     beam = BeamWindow(8.0, "hann", normalise=True)
     kept = np.random.default_rng(1).random(160) > 0.2
     with h5py.File(file, "r+") as lines:
@@ -278,7 +281,7 @@ def test_missing_channels_weigh_nothing(file):
     reference = clsas.backproject(
         LINES.select(kept), GRID, beam=dataclasses.replace(beam, along=along), accuracy_db=-80
     )
-    image = clsas.mosaic(file, GRID, **(WISH | {"beam": beam})).image()
+    image = clsas.mosaic(file, GRID, **(WISH | {"beam": beam} | wish)).image()
     # It is a mean times the number of all channels.
     of_all = 160 / np.count_nonzero(kept)
     assert relative_error_db(image.pixels, of_all * reference.pixels) < -65
@@ -318,6 +321,8 @@ class TestOnceMore:
         first = next(running)
         running.close()
         assert (first.row, first.column) in mosaic.finished
+        # Also what was begun when the loop was left.
+        assert mosaic.finished == Store.opened(tmp_path / "a.zarr").records()
         left = 8 - len(mosaic.finished)
         assert len(list(mosaic)) == left
         assert len(mosaic.finished) == 8
@@ -410,24 +415,28 @@ class TestResuming:
             clsas.mosaic(change.pop("lines"), change.pop("grid"), tmp_path / "a.zarr", **change)
         assert len(Store.opened(tmp_path / "a.zarr").records()) == before
 
-    def test_a_store_without_a_finished_patch_keeps_nobody_from_other_inputs(self, tmp_path):
+    def test_a_store_without_a_finished_patch_may_be_deleted(self, tmp_path):
+        """By the user: another process may be about to write to it."""
         path = tmp_path / "a.zarr"
         wrong = clsas.mosaic(LINES, GRID, path, stages=[(64, 64)], patches=(2, 4))
         with pytest.raises(ValueError, match="patch 0,0: stages must leave a line and a pixel"):
             list(wrong)
-        assert len(list(clsas.mosaic(LINES, GRID, path, **(WISH | {"patches": (3, 4)})))) == 12
-        assert Store.opened(path).patch_shape == (20, 20)
-
-    def test_files_of_others_are_left_alone(self, tmp_path):
-        path = tmp_path / "a.zarr"
-        clsas.mosaic(LINES, GRID, path, **WISH)
-        (path / "notes.txt").write_text("mine")
-        with pytest.raises(ValueError, match="made with other inputs"):
-            clsas.mosaic(LINES, GRID, path, **(WISH | {"accuracy_db": -60}))
-        assert (path / "notes.txt").exists()
+        other = WISH | {"patches": (3, 4)}
+        with pytest.raises(ValueError, match="or delete it: no patch of it was finished"):
+            clsas.mosaic(LINES, GRID, path, **other)
+        assert path.exists()
+        shutil.rmtree(path)
+        assert len(list(clsas.mosaic(LINES, GRID, path, **other))) == 12
 
     @pytest.mark.parametrize(
-        ("name", "value"), [("predicted_error_db", "x"), ("seconds", None), ("channels", "9")]
+        ("name", "value"),
+        [
+            ("predicted_error_db", "x"),
+            ("predicted_error_db", float("nan")),
+            ("seconds", None),
+            ("channels", "9"),
+            ("survey_channels", 5.0),
+        ],
     )
     def test_a_patch_with_a_damaged_record_is_formed_again(self, tmp_path, name, value):
         path = tmp_path / "a.zarr"
@@ -656,12 +665,12 @@ class TestFollowing:
         assert len(patches) == 10
         assert not (folder / END).exists()
 
-    @pytest.mark.parametrize("squint_deg", [0.0, 40.0, -40.0])
-    def test_no_patch_is_formed_too_early(self, lines, squint_deg):
+    @pytest.mark.parametrize(("squint_deg", "column"), [(0.0, 160), (40.0, 160), (-40.0, 0)])
+    def test_no_patch_is_formed_too_early(self, lines, squint_deg, column):
         """Not either with a beam that looks ahead, or back."""
         module = sys.modules["clsas.mosaic"]
         beam = BeamWindow(8.0, "hann", squint_deg=squint_deg, along=(1.0, 0.0, 0.0))
-        patch = self.GRID.window(slice(0, 12), slice(160, 170))
+        patch = self.GRID.window(slice(0, 12), slice(column, column + 10))
         counts = np.arange(20, 1201, 20)
         sights = [
             module._Sight.of(module.open_survey(lines.select(slice(0, n))), beam) for n in counts
@@ -669,8 +678,8 @@ class TestFollowing:
         last = np.flatnonzero(sights[-1].sees(patch))[-1]
         passed = [sight.has_passed(patch, sight.settled) for sight in sights]
         assert not any(passed[: np.searchsorted(counts, last + 1)])
-        if last < 1000:
-            assert passed[np.searchsorted(counts, last + 200)]  # and soon
+        assert last < 1000
+        assert passed[np.searchsorted(counts, last + 200)]  # and soon
 
     def test_a_survey_is_followed_once_more(self, record, tmp_path):
         """Files are in the store's inputs once, whoever looked when they came."""
@@ -684,6 +693,20 @@ class TestFollowing:
         assert not list(mosaic)
         again = clsas.mosaic(folder, self.GRID, tmp_path / "a.zarr", **self.WISH, follow_s=1)
         assert len(again.finished) == 10
+
+    def test_a_survey_that_grew_twice_goes_on(self, record, tmp_path):
+        """The store's inputs hold every file in its order."""
+        folder, add = record
+        add(range(2))
+        path = tmp_path / "a.zarr"
+        mosaic = clsas.mosaic(folder, self.GRID, path, **self.WISH, follow_s=3)
+        add([2])
+        later = threading.Timer(1.5, add, ([3],))
+        later.start()
+        list(mosaic)
+        later.join()
+        assert len(Store.opened(path)._attributes()["inputs"]["parts"]) == 4
+        assert len(clsas.mosaic(folder, self.GRID, path, **self.WISH).finished) == 10
 
     def test_later_channels_make_a_patch_anew(self, lines, record, tmp_path):
         folder, add = record
