@@ -448,6 +448,8 @@ class _Mosaic(_Table):
         with _in("[mosaic]"):
             for name in ("lines", "store"):
                 if name in options:
+                    if not options[name]:
+                        raise ValueError(f"{name} must be a path, got an empty one")
                     options[name] = folder / options[name]
             if "lines" in options and not options["lines"].exists():
                 raise ValueError(f"lines must be a file or folder, there is no {options['lines']}")

@@ -104,7 +104,7 @@ class Device:
     """An opened device: its context, its queues and the kernels built so far.
 
     Kernels run in order on `queue`; uploads go through `uploads`, beside them. Threads may share
-    a device.
+    a device; `profile` then counts what all of them run.
     """
 
     info: DeviceInfo

@@ -270,6 +270,7 @@ def test_a_track_file_that_is_no_text(tmp_path):
     ("text", "message"),
     [
         ("sonar = [", "is not TOML: "),
+        ("[mosaic]\nstore = ''", "[mosaic] store must be a path, got an empty one"),
         ("[sonr]", "unknown table [sonr]: did you mean 'sonar'?"),
         ("[lake]", "unknown table [lake]; allowed are sonar, track, targets, seabed, grid, "),
         (
