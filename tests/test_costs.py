@@ -1,4 +1,5 @@
 import dataclasses
+import errno
 import json
 
 import numpy as np
@@ -120,3 +121,18 @@ def test_a_beam_costs_what_it_is_told_to():
     )
     pixels = (dear - free) / 1e-9 / lines.channels
     assert grid.size <= pixels * (1 + 1e-9) <= 192 * 192 * (1 + 1e-6)  # padded to whole tiles
+
+
+def test_a_full_disk_leaves_what_was_stored(cache, platform, monkeypatch):
+    costs.save(platform, OTHER)
+    before = cache.read_text()
+
+    def full(path, text):
+        path.touch()
+        path.open("w").close()  # what a full disk leaves of a file
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("pathlib.Path.write_text", full)
+    with pytest.raises(OSError, match="No space left"):
+        costs.save(platform, costs.defaults(platform))
+    assert cache.read_text() == before

@@ -1,10 +1,13 @@
 """Ends of lines that do not fade, in images of both imagers."""
 
+import math
+
 import pytest
 from cases import TAPER, along_x, noise
 
 import clsas
 from clsas.backproject import execute, prepare
+from clsas.ends import ends_error
 from clsas.grid import Grid
 from clsas.lines import RangeLines
 from clsas.quality import relative_error_db
@@ -70,3 +73,14 @@ def test_exact_images_keep_their_accuracy_where_ends_matter_little(cut_off, whic
     grid, exact = images[which]
     image = clsas.backproject(lines, grid, accuracy_db=accuracy_db)
     assert relative_error_db(image, exact) <= accuracy_db
+
+
+@pytest.mark.parametrize("share", [0.1, 0.45])
+def test_the_rest_makes_up_for_ends_that_take_some_of_what_is_allowed(cut_off, share):
+    """Predictions with the ends stay within the tolerance, without a warning."""
+    lines, ((grid, exact), _) = cut_off
+    tolerance_db = 10 * math.log10(ends_error(lines, grid, None, None) / share)
+    chosen = clsas.plan(lines, grid, tolerance_db=tolerance_db)
+    assert chosen.predicted_error_db <= tolerance_db
+    assert prepare(lines, grid, accuracy_db=tolerance_db).predicted_error_db <= tolerance_db
+    assert relative_error_db(clsas.factorize(lines, grid, chosen), exact) <= tolerance_db

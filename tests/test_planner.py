@@ -427,3 +427,18 @@ def test_stages_off_a_plane_are_refused(good):
     grid = Grid.points(good["grid"].positions_m())
     with pytest.raises(ValueError, match="grid must be a plane for stages"):
         plan(good["lines"], grid, stages=[(2, 2)])
+
+
+def test_the_highest_frequency_leaves_out_as_little_as_is_allowed():
+    """Of lines with a noise floor of -70 dB over all that is sampled, above the echoes' band."""
+    lines, grid = made(straight)
+    floor = np.random.default_rng(3).normal(size=(2, *lines.samples.shape))
+    floor = (floor[0] + 1j * floor[1]) * np.abs(lines.samples).max() * 1e-4
+    noisy = dataclasses.replace(lines, samples=lines.samples + floor)
+    highest, bin_m = [], 1 / (256 * lines.range_step_m)
+    for outside in (1e-6, 1e-9, 1e-11):
+        view = View(noisy, grid, None, outside)
+        cycles_per_m, share = view.frequencies
+        assert share[cycles_per_m > view.highest_cycles_per_m + bin_m].sum() <= outside
+        highest.append(view.highest_cycles_per_m)
+    assert highest[2] > highest[0]
