@@ -16,6 +16,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from clsas import interpolation, phases, validate
+from clsas.decibels import in_db, power
 from clsas.device import Device, Slot, aligned, open_device
 from clsas.ends import besides_ends, ends_error, warn_of_ends
 from clsas.geometry import bistatic_range_m, pairwise_range_m
@@ -71,7 +72,7 @@ class Preparation:
     @property
     def predicted_error_db(self) -> float:
         """Relative rms error of interpolation and at the ends of lines, dB."""
-        return 10 * math.log10(10 ** (self.interpolator.error_db / 10) + self.ends_error)
+        return in_db(power(self.interpolator.error_db) + self.ends_error)
 
     def warn_of_ends(self) -> None:
         """Warn where ends of lines may keep the image from what is wanted."""
@@ -283,9 +284,7 @@ def fullness_of(
 ) -> float:
     """Return `BeamWindow.fullness` of some channels at points all over a grid, its edges too."""
     some = some_channels(lines.channels, _CHANNELS)
-    places = [np.unique(np.linspace(0, n - 1, _PLACES).round().astype(int)) for n in grid.shape]
-    index = np.ravel_multi_index(np.ix_(*places), grid.shape).ravel()
-    sine = sines(grid.at(index), lines.phase_centres_m[some], along[some])
+    sine = sines(grid.spread(_PLACES), lines.phase_centres_m[some], along[some])
     return beam.fullness(sine, wavelength_m(lines), len(some) / lines.channels)
 
 

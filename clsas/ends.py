@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 from numpy.typing import NDArray
 
 from clsas import validate
+from clsas.decibels import in_db, power
 from clsas.geometry import pairwise_range_m
 from clsas.grid import Grid
 from clsas.lines import RangeLines, some_channels
@@ -29,29 +28,24 @@ def ends_error(
     grid comes so near to. `along` are the track's directions for a beam, [channels, 3].
     """
     some = some_channels(lines.channels, _CHANNELS)
-    places = [np.unique(np.linspace(0, n - 1, _PLACES).round().astype(int)) for n in grid.shape]
-    points_m = grid.at(np.ravel_multi_index(np.ix_(*places), grid.shape).ravel())
-    velocity = lines.rx_velocity_m_s
+    part, points_m = lines.select(some), grid.spread(_PLACES)
     range_m = pairwise_range_m(
-        points_m,
-        lines.tx_m[some],
-        lines.rx_m[some],
-        velocity if velocity is None else velocity[some],
-        lines.sound_speed_m_s,
+        points_m, part.tx_m, part.rx_m, part.rx_velocity_m_s, part.sound_speed_m_s
     )
-    place = (range_m - lines.first_range_m[some]) / lines.range_step_m
+    place = (range_m - part.first_range_m) / part.range_step_m
     seen = np.ones(place.shape, bool)
     if beam is not None:
         low, high = beam.limits
-        sine = sines(points_m, lines.phase_centres_m[some], along[some]).T
+        sine = sines(points_m, part.phase_centres_m, along[some]).T
         seen = (sine > low) & (sine < high)
     nearest = np.where(seen, place, np.inf).min(axis=0)
     farthest = np.where(seen, place, -np.inf).max(axis=0)
     at_ends, total = 0.0, 0.0
-    for channel, near, far in zip(some, nearest, farthest, strict=True):
+    for samples, near, far in zip(part.samples, nearest, farthest, strict=True):
         first, last = (int(np.clip(at, -1, lines.length)) for at in (near, far))
-        line = lines.samples[channel].astype(np.complex128)
-        total += np.vdot(line[max(first, 0) : last + 1], line[max(first, 0) : last + 1]).real
+        line = samples.astype(np.complex128)
+        within = line[max(first, 0) : last + 1]
+        total += np.vdot(within, within).real
         for end, place_of_end in ((line[:_END], 0), (line[-_END:], lines.length - 1)):
             if near < place_of_end + _BESIDE and far > place_of_end - _BESIDE:
                 at_ends += np.vdot(end, end).real / len(end)
@@ -63,19 +57,19 @@ def besides_ends(wanted_db: float, ends: float) -> float:
 
     Where they alone err by too much for that, it is what is wanted, and `warn_of_ends` warns.
     """
-    wanted = 10 ** (wanted_db / 10)
+    wanted = power(wanted_db)
     if _LEAST * wanted < ends <= _MOST * wanted:
-        return 10 * math.log10(wanted - ends)
+        return in_db(wanted - ends)
     return wanted_db
 
 
 def warn_of_ends(name: str, wanted_db: float, ends: float) -> None:
     """Warn where ends alone err by so much that what is wanted, of this name, may be missed."""
-    wanted = 10 ** (wanted_db / 10)
+    wanted = power(wanted_db)
     if ends > _MOST * wanted:
         validate.warn(
             "the grid reaches ends of lines that do not fade: what pixels within five samples of "
             "an end get depends on how lines are interpolated, so that the error may be "
-            f"{10 * math.log10(wanted + ends):.0f} dB in place of {name} {wanted_db:.3g} dB; let "
+            f"{in_db(wanted + ends):.0f} dB in place of {name} {wanted_db:.3g} dB; let "
             "the grid end before the lines, or the lines fade"
         )

@@ -15,6 +15,7 @@ from scipy.spatial.distance import cdist
 
 from clsas.aperture import drift, stretches
 from clsas.backproject import wavelength_m
+from clsas.decibels import power
 from clsas.device import Device
 from clsas.geometry import pairwise_range_m
 from clsas.interpolation import Interpolator
@@ -41,16 +42,6 @@ def _kept(function: Callable[..., Any]) -> Callable[..., Any]:
         return view.kept[key]
 
     return kept
-
-
-def power(error_db: float) -> float:
-    """Return the power of a relative rms error."""
-    return 10 ** (error_db / 10)
-
-
-def in_db(power: float) -> float:
-    """Return a relative rms error from its power."""
-    return 10 * math.log10(max(power, 1e-30))
 
 
 def leaf_error(view: View, sides: NDArray[np.int64], device: Device) -> NDArray[np.float64]:

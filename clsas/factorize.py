@@ -22,8 +22,8 @@ from clsas.backproject import (
     upsampled_lines,
     warn_unseen,
 )
+from clsas.decibels import in_db
 from clsas.device import Device, Slot, aligned, open_device
-from clsas.errors import in_db
 from clsas.filters import edges_gain
 from clsas.grid import Grid
 from clsas.image import Image, holds_any
@@ -124,8 +124,14 @@ def factorize(
         _check_band(lines, chosen)
     if chosen.is_exact:
         # The plan has warned of ends of lines.
-        wish = {"accuracy_db": chosen.accuracy_db, "beam": chosen.beam}
-        return form_exactly(lines, grid, device=device, **wish, progress=progress)
+        return form_exactly(
+            lines,
+            grid,
+            device=device,
+            accuracy_db=chosen.accuracy_db,
+            beam=chosen.beam,
+            progress=progress,
+        )
     largest = check_numbers(lines, chosen.beam)
     pixels, done = aligned(np.empty, grid.shape, np.complex64), 0
     try:
@@ -378,7 +384,6 @@ def _check_band(lines: RangeLines, chosen: Plan) -> None:
     known = chosen.kept.get("lines")
     if chosen.band is None or (known is not None and known() is lines):
         return
-    outside_db = -math.inf
     for channels in (FEW_CHANNELS, MEASURED_CHANNELS):
         outside_db = in_db(power_outside(lines, *chosen.band, channels))
         if outside_db <= chosen.tolerance_db:

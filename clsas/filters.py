@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from clsas import interpolation
-from clsas.errors import in_db, power
+from clsas.decibels import in_db, power
 from clsas.interpolation import PHASES, Gain, Interpolator, Spectrum
 
 ALIGN_TAPS = APERTURE_TAPS = (4, 6, 8)

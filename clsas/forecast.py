@@ -11,8 +11,9 @@ import numpy as np
 from clsas import interpolation, phases
 from clsas.backproject import VECTOR_ROOM, expansion_terms
 from clsas.costs import Costs
+from clsas.decibels import in_db, power
 from clsas.device import Device
-from clsas.errors import in_db, leaf_error, power
+from clsas.errors import leaf_error
 from clsas.exact import Exact
 from clsas.filters import UPSAMPLING_SHARE, Filters, edges_gain
 from clsas.interpolation import PHASES

@@ -224,6 +224,11 @@ class Grid:
             positions[..., 2] += self.height_m.reshape(-1)[index]
         return positions
 
+    def spread(self, most: int) -> NDArray[np.float64]:
+        """Return some pixels all over the grid, its edges too, [n, 3]: so many a side at most."""
+        places = [np.unique(np.linspace(0, n - 1, most).round().astype(int)) for n in self.shape]
+        return self.at(np.ravel_multi_index(np.ix_(*places), self.shape).ravel())
+
     def window(self, rows: slice = _ALL, columns: slice = _ALL) -> Self:
         """Return the sub-grid of some rows and columns (the first two axes of points).
 

@@ -22,8 +22,8 @@ from clsas.backproject import (
     normalising,
     wavelength_m,
 )
+from clsas.decibels import power
 from clsas.device import Device, Slot
-from clsas.errors import power
 from clsas.geometry import bistatic_range_m
 from clsas.layout import BLOCKS, STACK, Groups, Tiles, groups_within
 from clsas.lines import RangeLines

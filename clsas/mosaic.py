@@ -613,8 +613,7 @@ def _image(job: _Job, sight: _Sight, grid: Grid, device: Device) -> tuple[Record
         )
     accuracy_db = job.accuracy_db(lines.channels * grid.size)
     if accuracy_db is not None:
-        wish = {"accuracy_db": accuracy_db, "beam": beam}
-        preparation = prepare(lines, grid, **wish, device=device)
+        preparation = prepare(lines, grid, accuracy_db=accuracy_db, beam=beam, device=device)
         preparation.warn_of_ends()
         image = execute(preparation)
         error_db = max(accuracy_db, preparation.predicted_error_db)

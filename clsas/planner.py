@@ -14,16 +14,10 @@ from clsas import forecast, interpolation, phases, validate
 from clsas.backproject import ACCURACY_DB
 from clsas.costs import Costs
 from clsas.costs import load as load_costs
+from clsas.decibels import in_db, power
 from clsas.device import Device, open_device
 from clsas.ends import besides_ends, warn_of_ends
-from clsas.errors import (
-    excess_error,
-    in_db,
-    nearest_errors,
-    other_errors,
-    power,
-    root_error,
-)
+from clsas.errors import excess_error, nearest_errors, other_errors, root_error
 from clsas.exact import Exact, expect
 from clsas.filters import ALIGN_TAPS, Choice, Filters, steering_spectrum
 from clsas.forecast import MARGIN_DB, OUTSIDE, Way, margin_db

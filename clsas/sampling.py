@@ -41,8 +41,8 @@ def check_sampling(sonar: Sonar, track: Track, grid: Grid) -> list[Finding]:
 
     Checked are the spacing of the phase centres along the track against half an element
     (THESIS [27], [31]; for elements without a length against what keeps the grating lobes of
-    anything on the grid off the grid), and the ping rate against the last echo from the grid
-    ([24]).
+    anything on the grid off the grid), which it may exceed by 1 %, and the ping rate against the
+    last echo from the grid ([24]).
 
     Parameters
     ----------

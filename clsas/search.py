@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsas.costs import Costs
+from clsas.decibels import in_db, power
 from clsas.device import Device
-from clsas.errors import in_db, leaf_error, power, root_error
+from clsas.errors import leaf_error, root_error
 from clsas.filters import ALIGN_TAPS, APERTURE_TAPS, UPSAMPLING_SHARE, Choice, choose
 from clsas.interpolation import PHASES, Spectrum, upsampler
 from clsas.plan import LEAST_BATCH

@@ -10,8 +10,8 @@ from cases import along_x, beside, lines_over, noise, patch, thesis_lines
 from clsas import plan
 from clsas.backproject import backproject, form_exactly
 from clsas.costs import Costs
+from clsas.decibels import in_db
 from clsas.device import open_device
-from clsas.errors import in_db
 from clsas.factorize import factorize
 from clsas.forecast import HALF_ROUNDING
 from clsas.grid import Grid

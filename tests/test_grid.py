@@ -222,3 +222,12 @@ def test_image_names_bad_input():
         Image(np.full(grid.shape, np.nan + 0j), grid)
     with pytest.raises(TypeError, match="grid must be of type Grid, got tuple"):
         Image(np.ones(grid.shape, complex), (3, 5))
+
+
+def test_some_pixels_reach_every_edge():
+    grid = Grid.plane((0, 4, 100), (10, 12, 3), z=-1.0)
+    found = grid.spread(5)
+    assert found.shape == (15, 3)
+    for axis, ends in enumerate(((0, 4), (10, 12))):
+        assert (found[:, axis].min(), found[:, axis].max()) == ends
+    assert (found[:, 2] == -1).all()

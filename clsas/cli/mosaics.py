@@ -78,8 +78,8 @@ def mosaic(
     """Form an image of any size patch by patch, into a Zarr store.
 
     Grid, dial and beam as for `clsas image`, but an exact image is asked for by --accuracy-db. The
-    same command goes on where it was interrupted, by
-    Ctrl-C or by anything else. A scene without --lines is simulated first.
+    same command goes on where it was interrupted, by Ctrl-C or by anything else. A scene without
+    --lines is simulated first.
 
     \b
     Example:  clsas mosaic scene.toml --lines lines.h5 -o image.zarr --png image.png
