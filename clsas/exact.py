@@ -93,7 +93,10 @@ def expect(view: View, accuracy_db: float, device: Device) -> Exact:
     else:
         part_pixels, across = STACK * width, 1
         parts = -(-grid.size // part_pixels)
-        radius_m = min(layout.largest_radius_m(cycles_per_m), lines.length * lines.range_step_m)
+        radius_m = min(
+            layout.largest_radius_m(cycles_per_m, len(antennas_m)),
+            lines.length * lines.range_step_m,
+        )
     block_m = Tiles(grid, 16, width).lookup_radius_m if grid.is_planar else 0.0
     interpolator = interpolation.choose(
         view.spectrum,
