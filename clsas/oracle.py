@@ -95,7 +95,7 @@ def pulse(offset_m: ArrayLike, bands: Sequence[Band]) -> NDArray[np.complex128]:
     total = np.zeros(offset.shape, np.complex128)
     for band in bands:
         growth = np.log(10) / 20 * band.tilt_db / band.width if band.tilt_db else 0.0
-        shifted = offset - 1j * growth / (2 * np.pi)
+        shifted = offset - 1j * growth / (2 * np.pi) if growth else offset
         envelope = np.sinc(band.width * shifted) * np.exp(-2 * (np.pi * band.edge * shifted) ** 2)
         total += band.level * envelope * np.exp(2j * np.pi * band.centre * offset)
     return total
