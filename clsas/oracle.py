@@ -1,0 +1,146 @@
+"""Analytic echoes and their ideal image in float64: what every imager is held to.
+
+This module shares nothing with the library that it judges: it imports NumPy and nothing else. An
+echo is a function known at every range. Sampling it gives range lines; evaluating it at the range
+of a pixel gives the ideal image. No sample is interpolated and no spectrum is measured.
+
+Frequencies are cycles per metre of range: f hertz are 2 f / c, because range is half the path.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+_ITERATIONS = 16  # of a delay: each gains a factor speed / |velocity|, 20 or more
+
+
+@dataclass(frozen=True)
+class Band:
+    """Part of a pulse's spectrum: flat or tilted over a width, with Gaussian edges.
+
+    Attributes
+    ----------
+    centre, width : float
+        Centre and width, cycles per metre of range. The centre includes the carrier. A width of 0
+        is a tone under a Gaussian envelope.
+    edge : float
+        Standard deviation of the edges, cycles per metre. The pulse fades like the Gaussian of
+        standard deviation 1 / (2 pi edge) metres.
+    level : complex
+        Value of the pulse at its peak, without the tilt.
+    tilt_db : float
+        Rise of the spectrum over the width, dB.
+    """
+
+    centre: float | NDArray[np.float64]
+    width: float
+    edge: float
+    level: complex = 1.0
+    tilt_db: float = 0.0
+
+
+@dataclass(frozen=True)
+class Echo:
+    """One pulse, received by every channel from one or more ranges.
+
+    Attributes
+    ----------
+    range_m : array_like of float, shape [channels, echoes]
+    amplitude : array_like of complex, broadcasts with [channels, echoes]
+    bands : sequence of Band
+        The pulse's spectrum is their sum. Their centres may have shape [channels, 1].
+    """
+
+    range_m: NDArray[np.float64]
+    amplitude: ArrayLike
+    bands: Sequence[Band]
+
+
+def ranges_m(
+    points_m: ArrayLike,
+    tx_m: ArrayLike,
+    rx_m: ArrayLike,
+    speed_m_s: float = 1.0,
+    rx_velocity_m_s: ArrayLike = 0.0,
+) -> NDArray[np.float64]:
+    """Half the paths from transmitters over points to receivers, metres, [channels, points].
+
+    `rx_m` is where receivers are at transmission. The delay of a moving one is found by iteration:
+    c tau = |x - tx| + |x - rx - v tau|.
+    """
+    points = np.reshape(points_m, (1, -1, 3)).astype(np.float64)
+    tx, rx, velocity = (
+        np.reshape(np.asarray(each, np.float64) * np.ones(3), (-1, 1, 3))
+        for each in (tx_m, rx_m, rx_velocity_m_s)
+    )
+    outward = np.linalg.norm(points - tx, axis=-1)
+    delay_s = np.zeros(np.broadcast_shapes(outward.shape, (len(rx), 1)))
+    for _ in range(_ITERATIONS if velocity.any() else 1):
+        moved = (points - rx) - velocity * delay_s[..., None]
+        delay_s = (outward + np.linalg.norm(moved, axis=-1)) / speed_m_s
+    return speed_m_s * delay_s / 2
+
+
+def pulse(offset_m: ArrayLike, bands: Sequence[Band]) -> NDArray[np.complex128]:
+    """Value of a pulse at some ranges from its peak, its carrier included.
+
+    The transform of a box is a sinc; Gaussian edges multiply it by a Gaussian. A spectrum times
+    exp(a f) is the pulse at the complex range r - j a / (2 pi).
+    """
+    offset = np.asarray(offset_m, np.float64)
+    total = np.zeros(offset.shape, np.complex128)
+    for band in bands:
+        growth = np.log(10) / 20 * band.tilt_db / band.width if band.tilt_db else 0.0
+        shifted = offset - 1j * growth / (2 * np.pi) if growth else offset
+        envelope = np.sinc(band.width * shifted) * np.exp(-2 * (np.pi * band.edge * shifted) ** 2)
+        total += band.level * envelope * np.exp(2j * np.pi * band.centre * offset)
+    return total
+
+
+def samples(
+    echoes: Sequence[Echo],
+    first_range_m: ArrayLike,
+    range_step_m: float,
+    length: int,
+    carrier_cycles_per_m: float,
+) -> NDArray[np.complex128]:
+    """Range lines of echoes with their carrier mixed out, [channels, length].
+
+    A pulse u(r - rho) is received as u(r - rho) exp(-j 2 pi K r) at range r, with K the carrier.
+    """
+    channels = len(echoes[0].range_m)
+    first = np.broadcast_to(np.asarray(first_range_m, np.float64), (channels,))
+    at_m = first[:, None] + range_step_m * np.arange(length)
+    return received(echoes, at_m) * np.exp(-2j * np.pi * carrier_cycles_per_m * at_m)
+
+
+def image(
+    echoes: Sequence[Echo], range_m: NDArray[np.float64], weights: ArrayLike = 1.0
+) -> NDArray[np.complex128]:
+    """Ideal image at pixels of some ranges [channels, pixels]: the weighted sum over channels.
+
+    Restoring the carrier's phase, exp(+j 2 pi K rho), cancels what `samples` mixed out.
+    """
+    return np.sum(weights * received(echoes, range_m), axis=0)
+
+
+def received(echoes: Sequence[Echo], at_m: NDArray[np.float64]) -> NDArray[np.complex128]:
+    """Return what every channel receives from ranges [channels, n], carrier included."""
+    total = np.zeros(at_m.shape, np.complex128)
+    for echo in echoes:
+        amplitude = np.broadcast_to(echo.amplitude, np.shape(echo.range_m))
+        for number in range(amplitude.shape[1]):
+            offset = at_m - echo.range_m[:, number, None]
+            total += amplitude[:, number, None] * pulse(offset, echo.bands)
+    return total
+
+
+def error_db(pixels: ArrayLike, wanted: ArrayLike) -> float:
+    """Relative rms error of an image, dB."""
+    wanted = np.ravel(wanted)
+    difference = np.ravel(pixels).astype(np.complex128) - wanted
+    return float(20 * np.log10(np.linalg.norm(difference) / np.linalg.norm(wanted) + 1e-300))

@@ -1,0 +1,192 @@
+"""Every imager held to an oracle that shares nothing with them, at the extremes."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+from clsas import wavenumber as form_wavenumber
+from clsas.backproject import execute, prepare
+from clsas.costs import Costs
+from clsas.extremes import LIGHT_M_S, along_x, circle, scene
+from clsas.factorize import factorize
+from clsas.mosaic import mosaic
+from clsas.oracle import Band
+from clsas.planner import plan
+from clsas.window import BeamWindow
+
+SLOW = Costs(pixel_ns=1e3, point_ns=1e3)  # plans for small images divide them
+FAR = (1e7, -1e7, 1e7)
+HANN = BeamWindow(12, "hann", along=[1, 0, 0])
+
+
+def ultrasonic(channels=160, **options):
+    """1 MHz, 100 kHz at 42.5 m: the thesis's wide beam, thinned."""
+    defaults = {
+        "carrier_hz": 1e6, "bandwidth_hz": 1e5, "pixel_m": (4e-3, 4e-3), "shape": (48, 48),
+    }  # fmt: skip
+    track = options.pop("track", along_x(channels, 8.25e-3))
+    return scene(track, (0.3, 42.5, 0), **(defaults | options))
+
+
+def steps(centre, width):
+    """A spectrum of three bands at 0, -15 and -30 dB."""
+    return [
+        Band(centre + shift * width, 0.28 * width, 0.01 * width, 10 ** (level_db / 20))
+        for shift, level_db in ((-0.3, 0), (0, -15), (0.3, -30))
+    ]
+
+
+def line_in_the_spectrum(centre, width):
+    """A weak flat band and a tone at its edge, 20 dB above it."""
+    return [
+        Band(centre, 0.9 * width, 0.01 * width, 0.1),
+        Band(centre + 0.42 * width, 0.0, 0.01 * width, 1.0),
+    ]
+
+
+def raw(channels=96, targets=60, oversampling=8, **options):
+    """30 kHz, 8 kHz on the carrier, sampled at 64 kHz and turned analytic."""
+    return scene(
+        along_x(channels, 0.025), (0.2, 12, 0), carrier_hz=3e4, bandwidth_hz=8e3,
+        pixel_m=(0.03, 0.03), on_carrier=True, targets=targets, oversampling=oversampling,
+        **options,
+    )  # fmt: skip
+
+
+def at_1_khz(**options):
+    return scene(
+        along_x(80, 0.7), (0, 1500, -200), carrier_hz=1e3, bandwidth_hz=200, pixel_m=(6.0, 1.5),
+        **options,
+    )  # fmt: skip
+
+
+def radar(**options):
+    """10 GHz, 600 MHz, from an aircraft 8 km away."""
+    return scene(
+        along_x(128, 2.0, sway_m=0.3), (20, 7000, -4000), carrier_hz=1e10, bandwidth_hz=6e8,
+        pixel_m=(0.15, 0.1), speed_m_s=LIGHT_M_S, **options,
+    )  # fmt: skip
+
+
+def closed(**options):
+    """100 kHz from a circle of 8 m all around the grid."""
+    return scene(
+        circle(300, 8.0, 3.0), (0.1, 0.05, 0), carrier_hz=1e5, bandwidth_hz=2e4,
+        pixel_m=(3e-3, 3e-3), **options,
+    )  # fmt: skip
+
+
+def array(moving):
+    """Eight receivers beside one transmitter per ping, that stand still or move."""
+    rx = along_x(160, 8.25e-3)
+    tx = np.repeat(rx[::8], 8, axis=0) + [0.3, 0.1, -0.2]
+    velocity = np.random.default_rng(3).uniform(-10, 10, rx.shape) if moving else None
+    return ultrasonic(track=tx, rx_m=rx, rx_velocity_m_s=velocity)
+
+
+CASES = {
+    "flat": lambda: ultrasonic(),
+    "tilted": lambda: ultrasonic(tilt_db=-20),
+    "steps": lambda: ultrasonic(colour=steps),
+    "a line": lambda: ultrasonic(colour=line_in_the_spectrum),
+    **{
+        f"oversampling {rate} tilted {tilt_db}": lambda rate=rate, tilt_db=tilt_db: ultrasonic(
+            oversampling=rate, tilt_db=tilt_db
+        )
+        for rate in (2.0, 1.4, 1.25, 1.1, 1.05)
+        for tilt_db in (0, 10, -20)
+    },
+    "oversampling 1.25 steps": lambda: ultrasonic(oversampling=1.25, colour=steps),
+    "oversampling 1.1 line": lambda: ultrasonic(oversampling=1.1, colour=line_in_the_spectrum),
+    "noise -40 dB": lambda: ultrasonic(noise=0.01),
+    "noise -10 dB": lambda: ultrasonic(noise=0.3),
+    "noise +10 dB": lambda: ultrasonic(noise=3.0),
+    "noise -20 dB, oversampling 1.25, tilted": lambda: ultrasonic(
+        noise=0.1, oversampling=1.25, tilt_db=10
+    ),
+    "on carrier": lambda: raw(),
+    "on carrier, 1 % offset": lambda: raw(offset=0.01),
+    "on carrier, 5 % offset": lambda: raw(offset=0.05),
+    "on carrier, 10 % offset, many channels": lambda: raw(300, oversampling=12.5, offset=0.1),
+    "on carrier, offset larger than echoes": lambda: raw(offset=3.0),
+    "on carrier, 5 % tail": lambda: raw(tail=0.05),
+    "on carrier, noise": lambda: raw(noise=0.05),
+    "far": lambda: ultrasonic(origin_m=FAR),
+    "far, own starts": lambda: ultrasonic(origin_m=FAR, own_starts=True),
+    "1 kHz": lambda: at_1_khz(),
+    "10 GHz": lambda: radar(),
+    "10 GHz, far": lambda: radar(origin_m=FAR),
+    "one channel": lambda: ultrasonic(channels=1),
+    "two channels": lambda: ultrasonic(channels=2),
+    "5000 channels": lambda: ultrasonic(channels=5000, shape=(24, 24), targets=2),
+    "sway": lambda: ultrasonic(track=along_x(160, 8.25e-3, sway_m=0.02)),
+    "closed": lambda: closed(),
+    "bistatic": lambda: array(moving=False),
+    "moving": lambda: array(moving=True),
+    "narrow band": lambda: ultrasonic(bandwidth_hz=2e4, pixel_m=(4e-3, 2e-2)),
+    "one target": lambda: ultrasonic(targets=1),
+    "Hann beam": lambda: ultrasonic(track=along_x(600, 0.02), beam=HANN),
+    "Hann beam, normalised": lambda: ultrasonic(
+        track=along_x(600, 0.02),
+        beam=BeamWindow(12, "hann", squint_deg=3, along=[1, 0, 0], normalise=True),
+    ),
+}
+
+
+@cache
+def made(name):
+    return CASES[name]()
+
+
+def promised(asked_db, predicted_db, records):
+    """What an image may err by: what is asked, or what a warning says instead."""
+    warned = any("error" in str(record.message) for record in records)
+    return max(asked_db, predicted_db) if warned else asked_db
+
+
+@pytest.mark.parametrize("asked_db", [-80, -50, -30])
+@pytest.mark.parametrize("name", CASES)
+@pytest.mark.filterwarnings("always::clsas.validate.ClsasWarning")
+def test_exact(name, asked_db, platform, recwarn):
+    known = made(name)
+    prepared = prepare(
+        known.lines, known.grid, device=platform, accuracy_db=asked_db, beam=known.beam
+    )
+    bound_db = promised(asked_db, prepared.predicted_error_db, recwarn)
+    assert known.error_db(execute(prepared).pixels) <= bound_db
+
+
+@pytest.mark.parametrize("asked_db", [-65, -35])
+@pytest.mark.parametrize("name", CASES)
+@pytest.mark.filterwarnings("always::clsas.validate.ClsasWarning")
+def test_factorized(name, asked_db, platform, recwarn):
+    known = made(name)
+    chosen = plan(
+        known.lines, known.grid, tolerance_db=asked_db, beam=known.beam, device=platform,
+        costs=SLOW,
+    )  # fmt: skip
+    image = factorize(known.lines, known.grid, chosen, device=platform)
+    bound_db = promised(asked_db, chosen.predicted_error_db, recwarn)
+    assert known.error_db(image.pixels) <= bound_db
+
+
+@pytest.mark.parametrize("name", ["tilted", "oversampling 1.25 tilted 10", "far", "Hann beam"])
+@pytest.mark.parametrize("how", [{"accuracy_db": -60}, {"tolerance_db": -50}])
+def test_mosaic(name, how, platform):
+    known = made(name)
+    patches = mosaic(
+        known.lines, known.grid, patches=(2, 3), device=platform, beam=known.beam, **how
+    )
+    assert known.error_db(patches.image().pixels) <= next(iter(how.values()))
+
+
+@pytest.mark.parametrize("options", [{}, {"tilt_db": 10}, {"origin_m": FAR}, {"noise": 0.1}])
+@pytest.mark.parametrize("oversampling", [1.5, 1.25, 1.1])
+def test_wavenumber(options, oversampling):
+    """A Hann window of 12 degrees has no edges that would be diffracted."""
+    known = ultrasonic(
+        track=along_x(480, 0.025), beam=HANN, oversampling=oversampling, shape=(24, 24), **options
+    )
+    pixels = form_wavenumber(known.lines, known.grid, beam=HANN).pixels
+    assert known.error_db(pixels) <= -60
