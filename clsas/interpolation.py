@@ -34,7 +34,9 @@ NEEDED_OVERSAMPLING = 1.05
 """Sample rate over occupied bandwidth from which on a guard band keeps the band's edges apart."""
 _FLOOR_WIDTH = 1 / 64  # cycles per sample: the quietest stretch, which is taken as noise
 _FLOOR_MARGIN = 2.0  # the mean of few periodograms scatters by as much
-_OUTSIDE_BAND = 1e-4  # of the signal's power: tails of windows and of finite lines
+_OUTSIDE_BAND = (1e-8, 1e-6, 1e-4)  # of the signal's power: tails of windows and finite lines
+_SCATTER_DB = 0.5
+_FEW_FREQUENCIES = 4.0  # a band as wide as one of `_FREQUENCIES` may err by 5 times as predicted
 _CLOSING = 1 / 1024  # cycles per sample to either side of where the circle closes
 _COHERENT_CYCLES = 2.0  # of phase over the aperture, up to which common parts add up
 _COHERENT_CHANNELS, _COHERENT_PLACES, _COHERENT_FREQUENCIES = 128, 3, 256  # sampled
@@ -134,13 +136,12 @@ def measure_spectrum(lines: RangeLines, grid: Grid | None = None) -> Spectrum:
     frequency, power, faded = _mean_power(samples, lines.length)
     centre, width = _occupied_band(frequency, faded)
     distance = _distance(frequency, centre)
-    nearest = np.minimum((2 * _FREQUENCIES * distance).astype(np.int64), _FREQUENCIES - 1)
     if grid is not None:
         power = np.maximum(power, _image_power(lines, grid, frequency, power))
     return Spectrum(
         centre,
         (np.arange(_FREQUENCIES) + 0.5) / (2 * _FREQUENCIES),
-        np.bincount(nearest, power, _FREQUENCIES),
+        _histogram(distance, power),
         oversampling=1 / width,
         aliasing=_aliasing(distance, faded, width),
     )
@@ -153,7 +154,8 @@ def _occupied_band(
 
     Frequencies farther than half a cycle per sample from the middle alias. The band is therefore
     the narrowest arc of the frequency circle that holds nearly all power above the noise floor: the
-    opposite point lies in the middle of the guard band, however the spectrum is shaped.
+    opposite point lies in the middle of the guard band, however the spectrum is shaped. As little
+    is left outside as a guard band allows.
     """
     count = len(power)
     smoothed = uniform_filter1d(power, max(round(_FLOOR_WIDTH * count), 1), mode="wrap")
@@ -161,11 +163,27 @@ def _occupied_band(
     if not signal.any():  # white: no arc is better than another
         return float(np.angle(power @ np.exp(2j * np.pi * frequency)) / (2 * np.pi)), 0.5
     held = np.append(0.0, np.cumsum(np.tile(signal, 2)))
-    ends = np.searchsorted(held, held[:count] + (1 - _OUTSIDE_BAND) * held[count])
-    bins = ends - np.arange(count)
-    first = int(np.argmin(bins))
+    for outside in _OUTSIDE_BAND:
+        ends = np.searchsorted(held, held[:count] + (1 - outside) * held[count])
+        bins = ends - np.arange(count)
+        first = int(np.argmin(bins))
+        if bins[first] * NEEDED_OVERSAMPLING <= count:
+            break
     middle = (first + (bins[first] - 1) / 2) / count
     return float((middle + 0.5) % 1.0 - 0.5), float(bins[first] / count)
+
+
+def _histogram(distance: NDArray[np.float64], power: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Power at the `frequency` of a `Spectrum`, shared between the two nearest.
+
+    A filter that fits one frequency only would miss a narrow line beside it.
+    """
+    place = np.clip(2 * _FREQUENCIES * distance - 0.5, 0, _FREQUENCIES - 1)
+    lower = np.minimum(place.astype(np.int64), _FREQUENCIES - 2)
+    above = power * (place - lower)
+    return np.bincount(lower, power - above, _FREQUENCIES) + np.bincount(
+        lower + 1, above, _FREQUENCIES
+    )
 
 
 def _aliasing(distance: NDArray[np.float64], power: NDArray[np.float64], width: float) -> float:
@@ -352,7 +370,8 @@ def choose(
 ) -> Interpolator:
     """Return the cheapest interpolator that keeps the error below `accuracy_db`.
 
-    Half a decibel is left for the scatter of measured errors about the predicted one.
+    Half a decibel is left for the scatter of measured errors about the predicted one, and up to
+    four where the power lies at few frequencies, so that errors do not average out.
 
     Parameters
     ----------
@@ -382,7 +401,8 @@ def choose(
     if taps is not None and upsampling is not None:
         return design(taps, upsampling, spectrum)
     power_left = 10 ** (accuracy_db / 10) - other_error**2
-    target_db = 10 * np.log10(max(power_left, 1e-30)) - 0.5
+    few = _FEW_FREQUENCIES * float(np.sum(spectrum.share**2))
+    target_db = 10 * np.log10(max(power_left, 1e-30) / (1 + few)) - _SCATTER_DB
     rates: Sequence[float] = UPSAMPLINGS if upsampling is None else (upsampling,)
     candidates = []
     for each_taps in TAPS if taps is None else (taps,):
