@@ -243,20 +243,22 @@ def test_samples_whose_sum_overflows_are_refused():
         backproject(huge, grid)
 
 
-@pytest.mark.parametrize("squint", [0.0, 0.7, 2.3])
-@pytest.mark.parametrize(("rows", "columns"), [(4.0, 0.94), (4.0, 3.2), (1.0, 1.0)])
-def test_one_channel_rounds_no_more_than_many(device, rows, columns, squint):
+@pytest.mark.parametrize("step_m", [0.0065, 0.02, 0.22])
+@pytest.mark.parametrize("bearing_rad", [0.0, 1.57])
+def test_one_channel_rounds_no_more_than_many(device, bearing_rad, step_m):
     """Coefficients are rounded once per tile and channel: one channel alone averages nothing."""
     wavelength_m = 0.01
-    distance_m = 18_700 * wavelength_m
-    centre_m = distance_m * np.array([np.cos(squint), np.sin(squint), 0.05])
+    bearing = np.array([np.cos(bearing_rad), np.sin(bearing_rad), 0.05])
     grid = Grid.oriented(
-        FAR + centre_m, [0, rows * wavelength_m, 0], [columns * wavelength_m, 0, 0], (96, 70)
+        FAR + 18_700 * wavelength_m * bearing,
+        [0, 4 * wavelength_m, 0],
+        [0.94 * wavelength_m, 0, 0],
+        (162, 130),
     )
     lines = lines_over(
-        grid, FAR[None], FAR[None] + 3.0, carrier_hz=150e3, step_m=0.02,
+        grid, FAR[None], FAR[None] + 3.0, carrier_hz=150e3, step_m=step_m,
         velocity=np.array([[3.0, -4.0, 1.0]]),
     )  # fmt: skip
     prepared = prepare(lines, grid, device=device, accuracy_db=-85)
     reference = partial(same_interpolator, prepared)
-    assert sampled_error_db(execute(prepared), reference) <= -89.5
+    assert sampled_error_db(execute(prepared), reference) <= -89
