@@ -25,6 +25,7 @@ from clsas.grid import Grid
 from clsas.interpolation import Interpolator
 from clsas.lines import RangeLines
 from clsas.plan import Plan
+from clsas.reach import warn_unreached
 from clsas.search import MOST_STAGES, Allowed, Tree, root_limits, search
 from clsas.view import View
 from clsas.window import BeamWindow
@@ -115,7 +116,8 @@ def plan(
     -----
     ClsasWarning
         If the grid reaches ends of lines that do not fade there, so that the tolerance may be
-        missed.
+        missed; or if no pixel lies within any line's range, or the beam, so that the image will be
+        zero.
     """
     validate.instance("lines", lines, RangeLines)
     validate.instance("grid", grid, Grid)
@@ -149,6 +151,8 @@ def plan(
     error_db = in_db(power(found.predicted_error_db) + ends)
     found = replace(found, tolerance_db=tolerance_db, predicted_error_db=error_db)
     found.kept["lines"] = weakref.ref(lines)
+    # Who forms the image next need not warn again.
+    found.kept["warned"] = warn_unreached(lines, grid, beam, view.channels_along)
     return found
 
 

@@ -84,12 +84,13 @@ def image(
     lines = load(lines_file, clsas.RangeLines)
     opened = open_device(device)
     results: dict[str, Any] = {"method": "exact"}
-    chosen, why = None, ""
+    chosen, why, warned = None, "", False
     if wish.keys() & set(DIAL):
         start = time.perf_counter()
         chosen = clsas.plan(lines, grid, **wish, beam=beam, device=opened)
         results["plan_seconds"] = time.perf_counter() - start
         _warn_of_error(chosen)
+        warned = chosen.kept["warned"]
         if chosen.is_exact:
             wish = {"accuracy_db": chosen.accuracy_db}
             why, chosen = f"exact: nothing faster within {chosen.tolerance_db:.4g} dB; ", None
@@ -110,7 +111,7 @@ def image(
             preparation = prepare(lines, grid, device=opened, beam=beam, **wish)
             if not why:  # else the plan has warned
                 preparation.warn_of_ends()
-            formed = execute(preparation, progress=progress)
+            formed = execute(preparation, progress=progress, warned=warned)
             interpolator, ratio = preparation.interpolator, preparation.resampling.ratio
             how = (
                 f"{why}{interpolator.taps} taps on lines upsampled {ratio:.3g} times, "
