@@ -13,7 +13,8 @@ import numpy as np
 from clsas import forecast, interpolation, phases, validate
 from clsas.backproject import ACCURACY_DB
 from clsas.costs import Costs
-from clsas.costs import load as load_costs
+from clsas.costs import defaults as default_costs
+from clsas.costs import measured as measured_costs
 from clsas.decibels import in_db, power
 from clsas.device import Device, open_device
 from clsas.ends import besides_ends, warn_of_ends
@@ -139,7 +140,8 @@ def plan(
     if costs is not None:
         validate.instance("costs", costs, Costs)
     device = open_device(device)
-    costs = costs or load_costs(device)
+    costs = costs or measured_costs(device)
+    calibrated, costs = costs is not None, costs or default_costs(device)
     if memory_bytes is not None:
         memory_bytes = validate.count("memory_bytes", memory_bytes)
     view = View(lines, grid, beam, OUTSIDE * power(tolerance_db or 0.0))
@@ -149,7 +151,9 @@ def plan(
         wanted_db = besides_ends(tolerance_db, ends)
     found = _chosen(view, wanted_db, stages, device, costs, memory_bytes, allowed)
     error_db = in_db(power(found.predicted_error_db) + ends)
-    found = replace(found, tolerance_db=tolerance_db, predicted_error_db=error_db)
+    found = replace(
+        found, tolerance_db=tolerance_db, predicted_error_db=error_db, calibrated=calibrated
+    )
     found.kept["lines"] = weakref.ref(lines)
     # Who forms the image next need not warn again.
     found.kept["warned"] = warn_unreached(lines, grid, beam, view.channels_along)
