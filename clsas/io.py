@@ -42,6 +42,9 @@ _KINDS = {
 }
 _SAVED = (Grid, RangeLines, Image, Echoes)
 
+SUFFIXES = (".h5", ".hdf5", ".he5")
+"""What names of files may end in."""
+
 Saved = Grid | RangeLines | Image | Echoes
 
 
@@ -55,7 +58,7 @@ def save(path: str | os.PathLike, obj: Saved) -> None:
     Parameters
     ----------
     path : path-like
-        The file. Its folder must exist.
+        The file: its name ends in one of `SUFFIXES` or has none. Its folder must exist.
     obj : Grid, RangeLines, Image or Echoes
         What to write; `load` returns it bit for bit.
 
@@ -63,6 +66,8 @@ def save(path: str | os.PathLike, obj: Saved) -> None:
     ------
     TypeError
         If `obj` is of another type.
+    ValueError
+        If the file's name ends as one of another format, such as .tif.
     OSError
         If the folder does not exist or the file cannot be written, as on a full disk.
 
@@ -72,6 +77,7 @@ def save(path: str | os.PathLike, obj: Saved) -> None:
     recover from a disk that turns out to be full.
     """
     path = validate.path("path", path)
+    validate.suffix("path", path, *SUFFIXES)
     validate.instance("obj", obj, *_SAVED)
     with replacing(path) as temporary:
         memory = BytesIO()

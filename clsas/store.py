@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsas import validate
+from clsas.extras import install_command
 from clsas.grid import Grid
 from clsas.image import Image
 
@@ -409,5 +410,5 @@ def _zarr() -> Any:
     try:
         import zarr
     except ImportError:
-        raise ImportError("stores of mosaics need Zarr: pip install 'clsas[mosaic]'") from None
+        raise ImportError(f"stores of mosaics need Zarr: {install_command('mosaic')}") from None
     return zarr

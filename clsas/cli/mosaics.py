@@ -22,6 +22,7 @@ from clsas.cli.outputs import progress_bar, report
 from clsas.cli.parameters import COUNTS, INPUT, File, Store, keep_apart
 from clsas.config import DIAL, SceneFile, simulation_digest
 from clsas.device import open_device
+from clsas.extras import install_command
 from clsas.mosaic import patch_shape_of
 
 _SCHEDULER_S = 10  # to answer
@@ -201,7 +202,7 @@ def _cluster(workers: int | None, scheduler: str | None) -> Iterator[Any]:
         from distributed.scheduler import KilledWorker
     except ImportError:
         raise ImportError(
-            "--workers and --scheduler need Dask: pip install 'clsas[mosaic]'"
+            f"--workers and --scheduler need Dask: {install_command('mosaic')}"
         ) from None
     with ExitStack() as opened:
         if scheduler is not None:
