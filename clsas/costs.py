@@ -9,9 +9,10 @@ from pathlib import Path
 from numpy.typing import ArrayLike
 
 from clsas import validate
+from clsas.atomic import replacing
 from clsas.device import Device
 from clsas.interpolation import COST
-from clsas.io import cache_folder, replacing
+from clsas.io import cache_folder
 
 
 @dataclass(frozen=True)

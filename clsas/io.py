@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 import os
-import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import fields, is_dataclass
@@ -22,6 +21,7 @@ import numpy as np
 from platformdirs import user_cache_path
 
 from clsas import validate
+from clsas.atomic import replacing
 from clsas.echoes import Echoes
 from clsas.grid import Grid
 from clsas.image import Image
@@ -86,10 +86,7 @@ def save(path: str | os.PathLike, obj: Saved) -> None:
             _set(content, "format", FORMAT)
             content.attrs["version"] = VERSION
             _write(content, obj)
-        with temporary.open("xb") as file:
-            file.write(memory.getbuffer())
-            file.flush()
-            os.fsync(file.fileno())
+        temporary.write_bytes(memory.getbuffer())
 
 
 def load(path: str | os.PathLike) -> Saved:
@@ -169,33 +166,6 @@ def _opened(path: str | os.PathLike) -> Iterator[h5py.File]:
     # HDF5 reports damage by any of these, depending on what it met first.
     except (OSError, RuntimeError, LookupError, ValueError, TypeError) as error:
         raise FileFormatError(f"{path} is damaged: {error}") from error
-
-
-@contextmanager
-def replacing(path: str | os.PathLike) -> Iterator[Path]:
-    """Give a temporary path beside `path`; rename it to `path` on success, else remove it.
-
-    Raises
-    ------
-    OSError
-        If the folder of `path` does not exist, or `path` is a folder.
-    """
-    path = Path(path)
-    if not path.parent.is_dir():
-        raise FileNotFoundError(f"cannot write {path}: there is no folder {path.parent}")
-    if path.is_dir():
-        raise IsADirectoryError(f"cannot write {path}: it is a folder")
-    temporary = path.with_name(f".{uuid.uuid4().hex}.part")
-    try:
-        yield temporary
-        os.replace(temporary, path)
-    except OSError as error:
-        # A full disk names no file, and the temporary one says nothing.
-        if error.errno is not None and error.filename in (None, str(temporary), temporary):
-            raise type(error)(error.errno, error.strerror, str(path)) from error
-        raise
-    finally:  # also on Ctrl-C
-        temporary.unlink(missing_ok=True)
 
 
 def cache_folder() -> Path:

@@ -13,11 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsas import validate
+from clsas.atomic import replacing
 from clsas.echoes import Echoes
 from clsas.extras import install_command
 from clsas.grid import Grid
 from clsas.image import Image
-from clsas.io import replacing
 from clsas.lines import RangeLines
 from clsas.quality import Cut, PointResponse
 from clsas.tradeoff import Row, Tradeoff

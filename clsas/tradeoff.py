@@ -15,13 +15,13 @@ from itertools import product
 import numpy as np
 
 from clsas import validate
+from clsas.atomic import replacing
 from clsas.backproject import ACCURACY_DB, form_exactly
 from clsas.device import Device, open_device
 from clsas.factorize import factorize
 from clsas.filters import ALIGN_TAPS, APERTURE_TAPS
 from clsas.grid import Grid
 from clsas.image import Image
-from clsas.io import replacing
 from clsas.lines import RangeLines
 from clsas.plan import Plan
 from clsas.planner import plan
