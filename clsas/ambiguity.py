@@ -15,8 +15,8 @@ from clsas import validate
 from clsas.decibels import in_db, power
 from clsas.geometry import pairwise_range_m
 from clsas.grid import Grid
-from clsas.interpolation import NEEDED_OVERSAMPLING, Spectrum
 from clsas.lines import RangeLines, some_channels
+from clsas.spectrum import NEEDED_OVERSAMPLING, Spectrum
 from clsas.window import BeamWindow, sines
 
 _AT_END, _END = 0.03, 4  # measured on noise that fills 40 to 90 % of the sampled band; samples

@@ -22,10 +22,11 @@ from clsas.device import Device, Slot, aligned, open_device
 from clsas.geometry import bistatic_range_m, pairwise_range_m
 from clsas.grid import Grid
 from clsas.image import Image, holds_any
-from clsas.interpolation import Gain, Interpolator, Resampling, Spectrum
+from clsas.interpolation import Gain, Interpolator, Resampling
 from clsas.layout import GEOMETRY_ERROR, STACK, Groups, Tiles, allowed, lay_out
 from clsas.lines import RangeLines, some_channels
 from clsas.reach import warn_unseen
+from clsas.spectrum import Spectrum, cycles_per_m_at, measure_spectrum
 from clsas.window import HARDLY_SEEN, INTERVALS, BeamWindow, channel_ranges, sines
 
 BEST_ACCURACY_DB = -85.0
@@ -203,7 +204,7 @@ def prepare(
     along = None if beam is None else beam.directions(lines)
     fullness = 1.0 if beam is None else fullness_of(lines, grid, beam, along)
     device = open_device(device)
-    spectrum = interpolation.measure_spectrum(lines, grid)
+    spectrum = measure_spectrum(lines, grid)
     left_open = ambiguity(lines, grid, spectrum, beam, along)
     antennas_m, cycles_per_m = antennas_and_phase(lines, spectrum, beam)
     fixed = taps is not None and upsampling is not None  # then accuracy_db plays no part
@@ -279,7 +280,7 @@ def antennas_and_phase(
         antennas_m = np.unique(np.concatenate([lines.tx_m, lines.rx_m]), axis=0)
     if beam is not None:
         antennas_m = np.concatenate([antennas_m, lines.phase_centres_m])
-    of_phase = interpolation.cycles_per_m(lines, spectrum.centre)
+    of_phase = cycles_per_m_at(lines, spectrum.centre)
     return antennas_m, math.hypot(of_phase, 0.3 / lines.range_step_m)
 
 

@@ -27,13 +27,13 @@ from clsas.device import Device, Slot, aligned, open_device
 from clsas.filters import edges_gain
 from clsas.grid import Grid
 from clsas.image import Image, holds_any
-from clsas.interpolation import FEW_CHANNELS, MEASURED_CHANNELS, power_outside
 from clsas.leaves import Finish, Level, PlaneLeaves, SurfaceLeaves
 from clsas.lines import RangeLines
 from clsas.plan import CHUNK, GUARD, MARGIN, Plan, padded_length, sample_bytes
 from clsas.planner import BEST_TOLERANCE_DB, WORST_TOLERANCE_DB, plan
 from clsas.reach import warn_unseen
 from clsas.sector import Geometry, Sector
+from clsas.spectrum import FEW_CHANNELS, MEASURED_CHANNELS, power_outside
 from clsas.surface import surface_of
 from clsas.upsample import upsample
 from clsas.window import BeamWindow

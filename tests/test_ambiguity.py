@@ -11,9 +11,9 @@ import clsas
 from clsas.ambiguity import ends_error
 from clsas.backproject import execute, prepare
 from clsas.grid import Grid
-from clsas.interpolation import measure_spectrum
 from clsas.lines import RangeLines
 from clsas.quality import relative_error_db
+from clsas.spectrum import measure_spectrum
 from clsas.validate import ClsasWarning
 
 
