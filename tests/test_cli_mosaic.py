@@ -261,7 +261,7 @@ def test_lines_that_were_simulated_are_not_written_over(made, monkeypatch):
 @pytest.mark.parametrize(
     ("mosaic", "args", "message"),
     [
-        ("", ["-o", "a.png", "--png", "a.png"], "--png and -o must be two files"),
+        ("", ["-o", "a.png", "--png", "a.png"], "-o and --png must be two files"),
         ('store = "a.png"', ["--png", "a.png"], "--png and the store must be two files"),
         ('lines = "folder"', ["-o", "folder"], "mosaic.lines and -o must be two files"),
         ('lines = "a"', ["--png", "./a"], "mosaic.lines and --png must be two files"),
