@@ -207,7 +207,7 @@ def test_flags_are_told(made, tmp_path):
         (["--lines", "folder", "-o", "./folder"], 2, "--lines and -o must be two files"),
         (["-o", "new", "--png", "new"], 2, "-o and --png must be two files"),
         (
-            ["-o", "scene.zarr", "--png", "scene.zarr/zarr.json"],
+            ["-o", "scene.zarr", "--png", "scene.zarr/all.png"],
             2,
             "--png must not lie in the store",
         ),
@@ -254,17 +254,17 @@ def test_lines_that_were_simulated_are_not_written_over(made, monkeypatch):
     name = lines_of(made).name
     before = lines_of(made).read_bytes()
     _, stderr = run("mosaic", "scene.toml", "--png", name, code=2)
-    assert "--png and the simulated range lines must be two files" in stderr
+    assert f"the file's name must end in .png, got {name!r}" in stderr
     assert lines_of(made).read_bytes() == before
 
 
 @pytest.mark.parametrize(
     ("mosaic", "args", "message"),
     [
-        ("", ["--png", "scene.zarr"], "--png and the store must be two files"),
-        ('store = "a.zarr"', ["--png", "a.zarr"], "--png and the store must be two files"),
+        ("", ["-o", "a.png", "--png", "a.png"], "-o and --png must be two files"),
+        ('store = "a.png"', ["--png", "a.png"], "--png and the store must be two files"),
         ('lines = "folder"', ["-o", "folder"], "mosaic.lines and -o must be two files"),
-        ('lines = "a.h5"', ["--png", "./a.h5"], "mosaic.lines and --png must be two files"),
+        ('lines = "a"', ["--png", "./a"], "mosaic.lines and --png must be two files"),
         ('lines = "folder"\nstore = "folder"', [], "the range lines and the store must be two"),
     ],
 )
@@ -272,10 +272,10 @@ def test_what_a_scene_names_is_not_written_over(tmp_path, monkeypatch, mosaic, a
     monkeypatch.chdir(tmp_path)
     (tmp_path / "scene.toml").write_text(SCENE + mosaic)
     (tmp_path / "folder").mkdir()
-    (tmp_path / "a.h5").touch()
+    (tmp_path / "a").touch()
     _, stderr = run("mosaic", "scene.toml", *args, code=2)
     assert message in stderr
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.h5", "folder", "scene.toml"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a", "folder", "scene.toml"]
 
 
 @pytest.mark.parametrize(
