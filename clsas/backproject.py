@@ -25,6 +25,7 @@ from clsas.image import Image, holds_any
 from clsas.interpolation import Gain, Interpolator, Resampling, Spectrum
 from clsas.layout import GEOMETRY_ERROR, STACK, Groups, Tiles, allowed, lay_out
 from clsas.lines import RangeLines, some_channels
+from clsas.simplify import Model, simplify
 from clsas.window import HARDLY_SEEN, INTERVALS, BeamWindow, channel_ranges, sines
 
 BEST_ACCURACY_DB = -85.0
@@ -68,11 +69,17 @@ class Preparation:
     """What the image may err by; with a fixed interpolator anything."""
     ends_error: float = 0.0
     """The power of what it errs by at the ends of lines: see `clsas.ends`."""
+    given_grid: Grid | None = None
+    """The grid asked for, where `grid` leaves out its relief."""
+    left_out: tuple[str, ...] = ()
+    """Effects that `lines` and `grid` do without: see `clsas.simplify`."""
+    left_out_error: float = 0.0
+    """The power of the error that this adds."""
 
     @property
     def predicted_error_db(self) -> float:
-        """Relative rms error of interpolation and at the ends of lines, dB."""
-        return in_db(power(self.interpolator.error_db) + self.ends_error)
+        """Relative rms error of interpolation, at the ends of lines and by what is left out, dB."""
+        return in_db(power(self.interpolator.error_db) + self.ends_error + self.left_out_error)
 
     def warn_of_ends(self) -> None:
         """Warn where ends of lines may keep the image from what is wanted."""
@@ -156,6 +163,9 @@ def backproject(
     the taps of one interpolation) gets nothing from it. Where a line does not fade towards an end,
     what pixels next to it get depends on the taps, and the image there on `accuracy_db`.
 
+    Motion during flight, the distance between transmitter and receiver and a grid's relief are left
+    out where the error that this adds lies far below `accuracy_db` (docs/assess.md).
+
     With a beam each term is multiplied by its weight. With or without one a pixel behind the
     antennas, at the range of one before them, is its mirror image. Ranges and phases are referred
     in float64 to centres near the pixels; the device sees float32 differences only.
@@ -189,8 +199,13 @@ def prepare(
     taps: int | None = None,
     upsampling: float | None = None,
     beam: BeamWindow | None = None,
+    full_model: bool = False,
 ) -> Preparation:
-    """Decide how `backproject` forms an image; parameters and errors are its."""
+    """Decide how `backproject` forms an image; parameters and errors are its.
+
+    Effects far below `accuracy_db` are left out unless `full_model` is set, or the interpolator is
+    fixed so that `accuracy_db` plays no part.
+    """
     validate.instance("lines", lines, RangeLines)
     validate.instance("grid", grid, Grid)
     validate.memory("grid", 8 * grid.size)
@@ -200,13 +215,18 @@ def prepare(
     if beam is not None:
         validate.instance("beam", beam, BeamWindow)
     check_numbers(lines, beam)
+    fixed = taps is not None and upsampling is not None  # then accuracy_db plays no part
+    given_grid = grid
+    model = Model(lines, grid, beam)
+    if not (fixed or full_model):
+        model = simplify(lines, grid, beam, accuracy_db)
+    lines, grid, beam = model.lines, model.grid, model.beam
     along = None if beam is None else beam.directions(lines)
     fullness = 1.0 if beam is None else fullness_of(lines, grid, beam, along)
     ends = ends_error(lines, grid, beam, along)
     device = open_device(device)
     spectrum = interpolation.measure_spectrum(lines)
     antennas_m, cycles_per_m = antennas_and_phase(lines, spectrum, beam)
-    fixed = taps is not None and upsampling is not None  # then accuracy_db plays no part
     geometry_error = GEOMETRY_ERROR if fixed else allowed(accuracy_db)
     layout = lay_out(
         grid,
@@ -222,7 +242,7 @@ def prepare(
     terms = phases.TERMS[-1] if fixed else phases.terms_within(accuracy_db)
     interpolator = interpolation.choose(
         spectrum,
-        besides_ends(accuracy_db, ends),
+        besides_ends(accuracy_db, ends + model.error),
         taps=taps,
         upsampling=upsampling,
         other_error=math.hypot(geometry_error, phases.error(terms)),
@@ -248,6 +268,9 @@ def prepare(
         one_cubic,
         wanted_db=0.0 if fixed else accuracy_db,
         ends_error=ends,
+        given_grid=given_grid,
+        left_out=model.left_out,
+        left_out_error=model.error,
     )
 
 
@@ -326,7 +349,7 @@ def execute(
                 pixels[part] *= normalising(sums.real, p.lines.channels)
     finally:
         device.finish()  # an interrupted run leaves nothing in use
-    image = Image(layout.collect(pixels), p.grid)
+    image = Image(layout.collect(pixels), p.given_grid or p.grid)
     if not holds_any(image.pixels) and p.lines.samples.any():
         warn_unseen(p.lines, layout.centres_m(slice(None)), p.beam, p.along)
     return image

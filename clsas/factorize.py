@@ -7,7 +7,7 @@ import math
 import weakref
 from collections import deque
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pyopencl as cl
@@ -30,9 +30,19 @@ from clsas.image import Image, holds_any
 from clsas.interpolation import FEW_CHANNELS, MEASURED_CHANNELS, power_outside
 from clsas.leaves import Finish, Level, PlaneLeaves, SurfaceLeaves
 from clsas.lines import RangeLines
-from clsas.plan import CHUNK, GUARD, MARGIN, Plan, padded_length, sample_bytes
+from clsas.plan import (
+    CHUNK,
+    GUARD,
+    MARGIN,
+    Plan,
+    grid_digest,
+    lines_digest,
+    padded_length,
+    sample_bytes,
+)
 from clsas.planner import BEST_TOLERANCE_DB, WORST_TOLERANCE_DB, plan
 from clsas.sector import Geometry, Sector
+from clsas.simplify import leave_out
 from clsas.surface import surface_of
 from clsas.upsample import upsample
 from clsas.window import BeamWindow
@@ -122,6 +132,8 @@ def factorize(
         chosen = plan_or_tolerance
         chosen.check(lines, grid)
         _check_band(lines, chosen)
+    if chosen.left_out:
+        return _form_without(lines, grid, chosen, device, progress)
     if chosen.is_exact:
         # The plan has warned of ends of lines.
         return form_exactly(
@@ -148,6 +160,29 @@ def factorize(
         along = None if chosen.beam is None else chosen.beam.directions(lines)
         warn_unseen(lines, corners_m, chosen.beam, along)
     return image
+
+
+def _form_without(
+    lines: RangeLines,
+    grid: Grid,
+    chosen: Plan,
+    device: Device,
+    progress: Callable[[int, int], None] | None,
+) -> Image:
+    """Form the image of a plan that leaves out effects: by the same plan of the simpler model."""
+    if "model" not in chosen.kept:
+        model = leave_out(lines, grid, chosen.beam, chosen.left_out)
+        digests = {
+            "lines_digest": lines_digest(model.lines),
+            "grid_digest": grid_digest(model.grid),
+        }
+        simpler = replace(chosen, left_out=(), beam=model.beam, **digests)
+        chosen.kept["model"] = model.lines.without_samples(), model.grid, simpler
+    geometry, plane, simpler = chosen.kept["model"]
+    simple_lines = replace(geometry, samples=lines.samples)
+    simpler.kept["lines"] = weakref.ref(simple_lines)  # whose band has been checked
+    image = factorize(simple_lines, plane, simpler, device=device, progress=progress)
+    return Image(image.pixels, grid)
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,6 +16,7 @@ from clsas import phases
 from clsas.grid import Grid
 from clsas.interpolation import PHASES, UPSAMPLING_TAPS, Interpolator, Resampling, Upsampler
 from clsas.lines import RangeLines
+from clsas.simplify import EFFECTS
 from clsas.window import BeamWindow
 
 GIVEN_BYTES = 64 << 20
@@ -126,6 +127,9 @@ class Plan:
     band : (centre, half width) or None
         Frequencies, cycles per sample, that filters are made for where the aperture is
         interpolated.
+    left_out : tuple of str
+        Effects that the image does without, since their error lies far below the tolerance: see
+        `clsas.simplify`.
     """
 
     tolerance_db: float | None
@@ -158,6 +162,7 @@ class Plan:
     beam_cycles: float = 0.0
     most_channels: tuple[int, ...] = ()
     band: tuple[float, float] | None = None
+    left_out: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         """Check what sizes buffers and indices."""
@@ -176,6 +181,8 @@ class Plan:
                 and all(isinstance(v, (int, float)) and least <= v < np.inf for v in values)
             )
 
+        known = isinstance(self.left_out, tuple) and set(self.left_out) <= set(EFFECTS)
+        check(known, "left_out", f"some of {', '.join(EFFECTS)}")
         levels = len(self.sides)
         pairs = (*self.sides, self.tile) if levels else self.sides
         nested = all(numbers(p, 2, 1) and all(whole(n, 1) for n in p) for p in pairs) and all(
@@ -289,10 +296,13 @@ class Plan:
             f"{_seconds(self.predicted_seconds)} on {self.device} "
             f"(exact: {_seconds(self.exact_seconds)}), {self.memory_bytes / 2**20:.0f} MiB"
         ]
+        if not self.is_exact:
+            lines[0] += f", {'half' if self.half_precision else 'single'} precision"
+        if self.left_out:
+            lines[0] += f"\nLeft out, far below the tolerance: {', '.join(self.left_out)}"
         if self.is_exact:
             reason = "" if self.tolerance_db is None else ": no factorization is faster within it"
             return f"{lines[0]}\nPlain backprojection{reason}."
-        lines[0] += f", {'half' if self.half_precision else 'single'} precision"
         taps = f"{self.align.taps} taps in range at {self.resampling.ratio:.2f} x the lines' rate"
         if self.nearest:
             beams = f"sums of {', '.join(map(str, self.nearest))} neighbours"
@@ -373,6 +383,7 @@ class Plan:
             values["nearest"] = tuple(values["nearest"])
             values["most_channels"] = tuple(values["most_channels"])
             values["crowding"] = tuple(values["crowding"])
+            values["left_out"] = tuple(values.get("left_out", ()))
             values["stages"] = tuple(Stage(**stage) for stage in values["stages"])
             return cls(**values)
         except (TypeError, KeyError, AttributeError, json.JSONDecodeError) as error:

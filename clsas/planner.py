@@ -24,8 +24,9 @@ from clsas.forecast import MARGIN_DB, OUTSIDE, Way, margin_db
 from clsas.grid import Grid
 from clsas.interpolation import Interpolator
 from clsas.lines import RangeLines
-from clsas.plan import Plan
+from clsas.plan import Plan, grid_digest, lines_digest
 from clsas.search import MOST_STAGES, Allowed, Tree, root_limits, search
+from clsas.simplify import Model, simplify
 from clsas.view import View
 from clsas.window import BeamWindow
 
@@ -62,6 +63,7 @@ def plan(
     costs: Costs | None = None,
     taps: tuple[int, int] | None = None,
     depth: int | None = None,
+    full_model: bool = False,
 ) -> Plan:
     """Choose the fastest way to an image of a given error.
 
@@ -96,6 +98,8 @@ def plan(
         image takes, instead of the fastest.
     depth : int, optional
         The same of the number of stages, 1 to 5.
+    full_model : bool
+        For study: model every effect, also those whose error lies far below the tolerance.
 
     Returns
     -------
@@ -140,14 +144,19 @@ def plan(
     costs = costs or load_costs(device)
     if memory_bytes is not None:
         memory_bytes = validate.count("memory_bytes", memory_bytes)
-    view = View(lines, grid, beam, OUTSIDE * power(tolerance_db or 0.0))
+    model = Model(lines, grid, beam) if full_model else simplify(lines, grid, beam, tolerance_db)
+    view = View(model.lines, model.grid, model.beam, OUTSIDE * power(tolerance_db or 0.0))
     ends, wanted_db = view.ends_error, tolerance_db
     if tolerance_db is not None:
         warn_of_ends("tolerance_db", tolerance_db, ends)
-        wanted_db = besides_ends(tolerance_db, ends)
+        wanted_db = besides_ends(tolerance_db, ends + model.error)
     found = _chosen(view, wanted_db, stages, device, costs, memory_bytes, allowed)
-    error_db = in_db(power(found.predicted_error_db) + ends)
+    error_db = in_db(power(found.predicted_error_db) + ends + model.error)
     found = replace(found, tolerance_db=tolerance_db, predicted_error_db=error_db)
+    if model.left_out:
+        # A plan is for what was given; `factorize` leaves out the same.
+        digests = {"lines_digest": lines_digest(lines), "grid_digest": grid_digest(grid)}
+        found = replace(found, left_out=model.left_out, beam=beam, **digests)
     found.kept["lines"] = weakref.ref(lines)
     return found
 
