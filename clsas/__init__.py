@@ -1,5 +1,6 @@
 """Synthetic aperture sonar images in the time domain, exact or fast, on any OpenCL device."""
 
+from clsas.assess import Assessment, Effect, assess, survey_lines
 from clsas.backproject import backproject
 from clsas.compress import compress
 from clsas.device import DeviceError, list_devices
@@ -27,10 +28,12 @@ from clsas.window import BeamWindow
 __version__ = "0.1.0"
 
 __all__ = [
+    "Assessment",
     "BeamWindow",
     "ClsasWarning",
     "DeviceError",
     "Echoes",
+    "Effect",
     "FileFormatError",
     "Grid",
     "Image",
@@ -46,6 +49,7 @@ __all__ = [
     "Store",
     "Track",
     "Tradeoff",
+    "assess",
     "backproject",
     "channels",
     "check_sampling",
@@ -62,6 +66,7 @@ __all__ = [
     "save",
     "simulate",
     "simulate_lines",
+    "survey_lines",
     "to_xarray",
     "tradeoff",
     "wavenumber",

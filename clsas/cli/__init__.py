@@ -13,7 +13,7 @@ import click
 import pyopencl
 
 import clsas
-from clsas.cli import images, lines, machine, measures, mosaics
+from clsas.cli import assess, images, lines, machine, measures, mosaics
 
 # What users cause, and what machines lack.
 _ERRORS = (
@@ -56,6 +56,7 @@ class _Commands(click.Group):
         lines.compress,
         images.image,
         images.plan,
+        assess.assess,
         mosaics.mosaic,
         measures.quality,
         measures.tradeoff,
