@@ -7,7 +7,7 @@ import math
 import weakref
 from collections import deque
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import pyopencl as cl
@@ -35,14 +35,12 @@ from clsas.plan import (
     GUARD,
     MARGIN,
     Plan,
-    grid_digest,
-    lines_digest,
     padded_length,
     sample_bytes,
+    without_left_out,
 )
 from clsas.planner import BEST_TOLERANCE_DB, WORST_TOLERANCE_DB, plan
 from clsas.sector import Geometry, Sector
-from clsas.simplify import leave_out
 from clsas.surface import surface_of
 from clsas.upsample import upsample
 from clsas.window import BeamWindow
@@ -133,7 +131,9 @@ def factorize(
         chosen.check(lines, grid)
         _check_band(lines, chosen)
     if chosen.left_out:
-        return _form_without(lines, grid, chosen, device, progress)
+        simple_lines, simple_grid, simpler = without_left_out(chosen, lines, grid)
+        formed = factorize(simple_lines, simple_grid, simpler, device=device, progress=progress)
+        return Image(formed.pixels, grid)
     if chosen.is_exact:
         # The plan has warned of ends of lines.
         return form_exactly(
@@ -160,29 +160,6 @@ def factorize(
         along = None if chosen.beam is None else chosen.beam.directions(lines)
         warn_unseen(lines, corners_m, chosen.beam, along)
     return image
-
-
-def _form_without(
-    lines: RangeLines,
-    grid: Grid,
-    chosen: Plan,
-    device: Device,
-    progress: Callable[[int, int], None] | None,
-) -> Image:
-    """Form the image of a plan that leaves out effects: by the same plan of the simpler model."""
-    if "model" not in chosen.kept:
-        model = leave_out(lines, grid, chosen.beam, chosen.left_out)
-        digests = {
-            "lines_digest": lines_digest(model.lines),
-            "grid_digest": grid_digest(model.grid),
-        }
-        simpler = replace(chosen, left_out=(), beam=model.beam, **digests)
-        chosen.kept["model"] = model.lines.without_samples(), model.grid, simpler
-    geometry, plane, simpler = chosen.kept["model"]
-    simple_lines = replace(geometry, samples=lines.samples)
-    simpler.kept["lines"] = weakref.ref(simple_lines)  # whose band has been checked
-    image = factorize(simple_lines, plane, simpler, device=device, progress=progress)
-    return Image(image.pixels, grid)
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,7 +5,8 @@ from __future__ import annotations
 import functools
 import hashlib
 import json
-from dataclasses import asdict, dataclass
+import weakref
+from dataclasses import asdict, dataclass, replace
 from itertools import pairwise
 from typing import Any
 
@@ -16,7 +17,7 @@ from clsas import phases
 from clsas.grid import Grid
 from clsas.interpolation import PHASES, UPSAMPLING_TAPS, Interpolator, Resampling, Upsampler
 from clsas.lines import RangeLines
-from clsas.simplify import EFFECTS
+from clsas.simplify import EFFECTS, Model, leave_out
 from clsas.window import BeamWindow
 
 GIVEN_BYTES = 64 << 20
@@ -401,6 +402,38 @@ class Plan:
                     f"the plan was made for another {name.removesuffix('s')} geometry than that "
                     f"of {name}; plan anew with clsas.plan"
                 )
+
+
+def with_left_out(
+    simpler: Plan, model: Model, lines: RangeLines, grid: Grid, beam: BeamWindow | None
+) -> Plan:
+    """Return the plan for given lines that leaves out effects as their model does.
+
+    `simpler` is the plan of the model; it is kept for the image.
+    """
+    digests = {"lines_digest": lines_digest(lines), "grid_digest": grid_digest(grid)}
+    plan = replace(simpler, left_out=model.left_out, beam=beam, **digests)
+    plan.kept["model"] = model.lines.without_samples(), model.grid, simpler
+    return plan
+
+
+def without_left_out(plan: Plan, lines: RangeLines, grid: Grid) -> tuple[RangeLines, Grid, Plan]:
+    """Return lines, grid and plan of the same image where nothing is left to leave out.
+
+    The geometry of both is kept for the next image of the plan.
+    """
+    if "model" not in plan.kept:
+        model = leave_out(lines, grid, plan.beam, plan.left_out)
+        digests = {
+            "lines_digest": lines_digest(model.lines),
+            "grid_digest": grid_digest(model.grid),
+        }
+        simpler = replace(plan, left_out=(), beam=model.beam, **digests)
+        plan.kept["model"] = model.lines.without_samples(), model.grid, simpler
+    geometry, simple_grid, simpler = plan.kept["model"]
+    simple_lines = replace(geometry, samples=lines.samples)
+    simpler.kept["lines"] = weakref.ref(simple_lines)  # whose band is that of the lines given
+    return simple_lines, simple_grid, simpler
 
 
 def sample_bytes(half_precision: bool) -> int:

@@ -24,7 +24,7 @@ from clsas.forecast import MARGIN_DB, OUTSIDE, Way, margin_db
 from clsas.grid import Grid
 from clsas.interpolation import Interpolator
 from clsas.lines import RangeLines
-from clsas.plan import Plan, grid_digest, lines_digest
+from clsas.plan import Plan, with_left_out
 from clsas.search import MOST_STAGES, Allowed, Tree, root_limits, search
 from clsas.simplify import Model, simplify
 from clsas.view import View
@@ -154,9 +154,7 @@ def plan(
     error_db = in_db(power(found.predicted_error_db) + ends + model.error)
     found = replace(found, tolerance_db=tolerance_db, predicted_error_db=error_db)
     if model.left_out:
-        # A plan is for what was given; `factorize` leaves out the same.
-        digests = {"lines_digest": lines_digest(lines), "grid_digest": grid_digest(grid)}
-        found = replace(found, left_out=model.left_out, beam=beam, **digests)
+        found = with_left_out(found, model, lines, grid, beam)
     found.kept["lines"] = weakref.ref(lines)
     return found
 

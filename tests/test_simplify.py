@@ -15,15 +15,22 @@ from clsas.grid import Grid
 from clsas.plan import Plan
 from clsas.quality import relative_error_db
 from clsas.reference import ideal
-from clsas.simplify import APART, LEAST_PIXELS, MOTION, RELIEF, SHARE, leave_out, simplify
+from clsas.simplify import APART, MOTION, RELIEF, SHARE, leave_out, simplify
 from clsas.window import BeamWindow
 
+LEAST_PIXELS = 1 << 15
 CHANNELS, CARRIER, STEP = 96, 300e3, 0.012
 APERTURE = along_x(CHANNELS, 0.02)
 FLAT = Grid.plane((-0.9, 0.9, 192), (20.0, 21.8, 192))
 DEEP = Grid.plane((-0.9, 0.9, 192), (20.0, 21.8, 192), -8.0)
 BUMPS = np.random.default_rng(1).uniform(-1, 1, (192, 192))
 PIXELS = np.random.default_rng(0).permutation(FLAT.size)[:250]
+
+
+@pytest.fixture(autouse=True)
+def small_images_count(monkeypatch):
+    """Images as large as are worth it take long to check."""
+    monkeypatch.setattr("clsas.simplify.LEAST_PIXELS", LEAST_PIXELS)
 
 
 def lines_on(grid, tx, rx=None, **others):
