@@ -2,7 +2,7 @@
 
 The thesis's case and the wreck are assessed as surveys, the two recordings as lines. Of the radar
 also with what is known of it and does not matter: that the aircraft flies on during flight, and
-that the car park has a height everywhere, which is none.
+that every pixel has a height, the same. The thesis's case also over a sloping seabed.
 
     python scripts/real/effects.py [CASE ...] [--device NAME] [--repeats 5]
 """
@@ -10,6 +10,8 @@ that the car park has a height everywhere, which is none.
 from __future__ import annotations
 
 import argparse
+import statistics
+import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -23,6 +25,8 @@ import ultrasound
 import clsas
 from clsas import config
 from clsas.assess import Assessment
+from clsas.backproject import execute, prepare
+from clsas.device import open_device
 
 AIRCRAFT_M_S = 100.0
 """About what the aircraft flew: its positions are known, their times are not."""
@@ -56,7 +60,7 @@ def recorded_car_park() -> dict[str, Any]:
 
 
 def car_park_in_full() -> dict[str, Any]:
-    """Return the same with velocities, a receiver beside the transmitter, and a height map."""
+    """Return the same with velocities and a height map."""
     given = recorded_car_park()
     lines, grid = given["lines"], given["grid"]
     course = np.gradient(lines.tx_m, axis=0)
@@ -68,12 +72,23 @@ def car_park_in_full() -> dict[str, Any]:
     }
 
 
+def thesis_over_a_slope() -> dict[str, Any]:
+    """Return the thesis's case 8 m above a seabed that falls by 5 %, which is given as heights."""
+    given = survey("thesis_wide_beam")
+    x_m, y_m = given["grid"].axes_m
+    heights_m = np.broadcast_to(-8.0 - 0.05 * (y_m[:, None] - 40.0), (len(y_m), len(x_m)))
+    grid = given["grid"].with_height(np.ascontiguousarray(heights_m))
+    scene = config.parse_scene(config.built_in_scene("thesis_wide_beam"), name="", folder=Path())
+    return given | {"grid": grid, "lines": clsas.survey_lines(scene.sonar, scene.track, grid)}
+
+
 CASES: dict[str, Callable[[], dict[str, Any]]] = {
     "thesis": lambda: survey("thesis_wide_beam", motion_in_flight=True),
     "wreck": lambda: survey("wreck", motion_in_flight=True),
     "ultrasound": recorded_block,
     "radar": recorded_car_park,
     "radar-in-full": car_park_in_full,
+    "thesis-slope": thesis_over_a_slope,
 }
 
 
@@ -97,6 +112,29 @@ def show(name: str, found: Assessment) -> None:
         print("| " + " | ".join((*cells, "yes" if e.left_out else "")) + " |", flush=True)
 
 
+def show_exact(given: dict[str, Any], device: str | None, repeats: int) -> None:
+    """Print what the exact image takes with all that is modelled and as it is formed, in turns."""
+    seconds: dict[bool, list[float]] = {True: [], False: []}
+    opened = open_device(device)
+    for turn in range(repeats + 1):
+        for full_model, times in seconds.items():
+            start = time.perf_counter()
+            preparation = prepare(
+                given["lines"],
+                given["grid"],
+                beam=given.get("beam"),
+                device=opened,
+                accuracy_db=given.get("tolerance_db", -50.0),
+                full_model=full_model,
+            )
+            execute(preparation)
+            if turn:
+                times.append(time.perf_counter() - start)
+    full, simple = (statistics.median(times) for times in seconds.values())
+    left_out = ", ".join(preparation.left_out) or "nothing"
+    print(f"\nExact: {full:.2f} s with all, {simple:.2f} s as it is formed (without {left_out})")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("case", nargs="*", help=f"of {', '.join(CASES)} (default: all)")
@@ -111,6 +149,8 @@ def main() -> None:
         if arguments.tolerance_db is not None:
             given["tolerance_db"] = arguments.tolerance_db
         show(name, clsas.assess(**given, device=arguments.device, repeats=arguments.repeats))
+        if arguments.repeats:
+            show_exact(given, arguments.device, arguments.repeats)
 
 
 if __name__ == "__main__":
