@@ -12,11 +12,12 @@ from clsas.backproject import backproject, execute, prepare
 from clsas.decibels import in_db, power
 from clsas.geometry import pairwise_range_m
 from clsas.grid import Grid
+from clsas.lines import RangeLines
 from clsas.plan import Plan
 from clsas.quality import relative_error_db
 from clsas.reference import ideal
 from clsas.simplify import APART, MOTION, RELIEF, SHARE, leave_out, simplify
-from clsas.window import BeamWindow
+from clsas.window import BeamWindow, sines
 
 LEAST_PIXELS = 1 << 15
 CHANNELS, CARRIER, STEP = 96, 300e3, 0.012
@@ -314,3 +315,77 @@ def test_images_in_pieces_still_add_up(platform):
             lines.select(part), grid, accuracy_db=-30, accumulate=total, device=platform
         )
     assert true_error_db(apart, total) <= -30
+
+
+def random_survey(seed):
+    """Antennas, motion and a grid of any kind and size, in metres up to thousands, and a beam."""
+    random = np.random.default_rng(seed)
+
+    def magnitude(least, most):
+        return 10 ** random.uniform(least, most)
+
+    count, extent_m = int(random.integers(2, 120)), magnitude(-1, 1.5)
+    away_m = extent_m * magnitude(-0.7, 1.5)
+    tx_m = np.zeros((count, 3))
+    tx_m[:, 0] = np.sort(random.uniform(-extent_m / 2, extent_m / 2, count))
+    if random.random() < 0.2:
+        turn = np.linspace(0, random.uniform(0.5, 6), count)
+        tx_m = extent_m * np.stack([np.cos(turn), np.sin(turn), 0 * turn], axis=-1)
+    tx_m += random.normal(size=(count, 3)) * extent_m * magnitude(-5, -1)
+    each = random.random() < 0.3
+    rx_m = tx_m + random.normal(size=(count, 3) if each else 3) * extent_m * magnitude(-6, -0.5)
+    rx_m = tx_m if random.random() < 0.15 else rx_m
+    velocity = None
+    if random.random() < 0.6:
+        velocity = random.normal(size=3) * magnitude(-5, 1)
+        velocity = velocity + random.normal(size=(count, 3)) * magnitude(-6, -1)
+    sides_m = away_m * 10 ** random.uniform(-2.5, 0.2, 2)
+    columns, rows = (-sides_m[0] / 2, sides_m[0] / 2, 50), (away_m, away_m + sides_m[1], 60)
+    grid = Grid.plane(columns, rows, -away_m * random.uniform(0, 0.7))
+    if random.random() < 0.5:
+        axes = np.linalg.qr(random.normal(size=(3, 3)))[0]
+        steps_m = axes[0] * sides_m[0] / 60, axes[1] * sides_m[1] / 50
+        grid = Grid.oriented(2 * away_m * axes[2], *steps_m, (60, 50))
+    if random.random() < 0.4:
+        slope_m = np.linspace(0, sides_m[1] * random.uniform(-0.3, 0.3), 60)
+        bumps_m = random.normal(size=(60, 50)) * away_m * magnitude(-9, -3)
+        grid = grid.with_height(slope_m[:, None] + bumps_m)
+    elif random.random() < 0.2:
+        bumps_m = random.normal(size=(60, 50, 3)) * away_m * magnitude(-9, -4)
+        grid = Grid.points(grid.positions_m() + bumps_m)
+    wave_m = away_m * magnitude(-4.5, -1.5)
+    carrier_hz = 1500 / wave_m if random.random() < 0.9 else 0.0
+    samples = np.zeros((count, 4), np.complex64)
+    lines = RangeLines(
+        samples, away_m, wave_m * random.uniform(0.4, 5), tx_m, rx_m, carrier_hz, 1500.0, velocity
+    )
+    beam = None
+    if random.random() < 0.3:
+        shape = random.choice(["hann", "rectangular", "tukey"])
+        beam = BeamWindow(random.uniform(1, 60), str(shape), along=[1, 0, 0])
+    return lines, grid, beam, random.uniform(-85, -10)
+
+
+def test_no_geometry_leaves_out_more_than_is_allowed(monkeypatch):
+    """Every pixel and channel that see each other, of surveys that nobody would make."""
+    monkeypatch.setattr("clsas.simplify.LEAST_PIXELS", 1000)
+    left_out = set()
+    for seed in range(150):
+        lines, grid, beam, allowed_db = random_survey(seed)
+        model = simplify(lines, grid, beam, allowed_db)
+        left_out.add(model.left_out)
+        range_m, simple_m = (
+            pairwise_range_m(
+                on.positions_m().reshape(-1, 3), of.tx_m, of.rx_m, of.rx_velocity_m_s, 1500.0
+            )
+            for of, on in ((lines, grid), (model.lines, model.grid))
+        )
+        seen = np.ones(range_m.shape, bool)
+        if beam is not None:
+            points_m = grid.positions_m().reshape(-1, 3)
+            sine = sines(points_m, lines.phase_centres_m, beam.directions(lines)).T
+            seen = (sine > beam.limits[0]) & (sine < beam.limits[1])
+        highest = lines.carrier_cycles_per_m + 0.5 / lines.range_step_m
+        off_m = np.abs(range_m - simple_m).max(where=seen, initial=0)
+        assert (2 * np.pi * highest * off_m) ** 2 <= SHARE * power(allowed_db), seed
+    assert len(left_out) >= 7  # every way, and none
