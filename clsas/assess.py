@@ -562,7 +562,7 @@ def _variants(lines: RangeLines, grid: Grid, beam: BeamWindow | None) -> dict[st
         variants[APART] = replace(lines, tx_m=middle_m, rx_m=middle_m), grid, beam
     if not grid.is_planar and len(grid.shape) == 2:
         flat = leave_out(lines, grid, beam, (RELIEF,)).grid
-        if flat is not None:
+        if flat.is_planar:
             variants[RELIEF] = lines, flat, beam
     off_m = track_errors_m(lines)
     if off_m.any():

@@ -136,7 +136,7 @@ def leave_out(
         beam = _with_directions(beam, lines)
         lines = replace(lines, tx_m=tx_m, rx_m=rx_m, rx_velocity_m_s=None)
     if RELIEF in effects:
-        grid = _plane(grid)
+        grid = _plane(grid) or grid
     return Model(lines, grid, beam, effects)
 
 
