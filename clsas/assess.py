@@ -292,7 +292,11 @@ def assess(
 
     plans = _plans(variants, tolerance_db, device, costs)
     taken = {name: each.predicted_seconds for name, each in plans.items()}
+    fast = plans[_FULL]
     if repeats:
+        if fast.half_precision:
+            variants[SINGLE] = variants[_FULL]
+            plans[SINGLE] = replace(fast, half_precision=False)
         taken = _measured(variants, plans, device, repeats)
     known: dict[str, tuple[float, float | None, float | None]] = {
         name: sample.error_of_ranges(range_m, in_full) for name, range_m in moved.items()
@@ -301,7 +305,6 @@ def assess(
     if ends:
         along = None if beam is None else beam.directions(lines)
         known[ENDS] = in_db(ends_error(lines, grid, beam, along)), None, None
-    fast = plans[_FULL]
     if not fast.is_exact and not fast.nearest and device.info.half_precision:
         # Lines are rounded when they are upsampled and by every stage, there as half of sums too.
         rounding = HALF_ROUNDING * (1 + 1.5 * len(fast.sides))
@@ -324,6 +327,8 @@ def assess(
         if name == SINGLE and error_db is not None:
             needed = not fast.half_precision
         costs_s = taken[_FULL] - taken[name] if name in taken else None
+        if name == SINGLE and costs_s is not None:
+            costs_s = -costs_s  # the image is formed without it
         effects.append(
             Effect(
                 name, modelled[name], error_db, rms, most, needed, name in left_out, costs_s, key

@@ -174,6 +174,9 @@ def test_imagers_leave_out_what_the_table_says():
     found = assess(lines, grid, tolerance_db=-40, repeats=1)
     assert found[APART].left_out
     assert found.measured
+    assert (found[SINGLE].seconds is None) == (
+        not clsas.plan(lines, grid, tolerance_db=-40).half_precision
+    )
     assert found.simple_seconds > 0
     assert "measured" in found.describe()
     assert clsas.plan(lines, grid, tolerance_db=-40).left_out == (APART,)
