@@ -10,24 +10,13 @@ from click.testing import CliRunner
 
 import clsas
 from clsas import config
-from clsas.assess import (
-    APART,
-    BEAM,
-    ENDS,
-    KEYS,
-    MOTION,
-    PATTERN,
-    RELIEF,
-    SINGLE,
-    SWAY,
-    assess,
-    survey_lines,
-    track_errors_m,
-)
+from clsas.assess import assess, survey_lines
 from clsas.cli import main
+from clsas.effects import BEAM, ENDS, KEYS, PATTERN, SINGLE, SWAY, track_errors_m
 from clsas.grid import Grid
 from clsas.quality import relative_error_db
 from clsas.reference import ideal
+from clsas.simplify import APART, MOTION, RELIEF
 from clsas.window import BeamWindow
 
 CHANNELS, CARRIER, STEP = 96, 300e3, 0.012
