@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import statistics
 import time
 import warnings
 from dataclasses import dataclass, replace
@@ -202,7 +201,7 @@ def assess(
     costs : Costs, optional
         Instead of those stored for the device.
     repeats : int
-        Form the image with and without every effect so many times, in turns, and tell the median
+        Form the image with and without every effect so many times, in turns, and tell the least
         times instead of predicted ones.
     ends : bool
         Whether the lines' ends are those of data.
@@ -412,7 +411,7 @@ def _images(
 
 
 def _measured(images: dict[str, _Image], device: Device, repeats: int) -> dict[str, float]:
-    """Return the median time of every image, formed in turns after an untimed one."""
+    """Return the least time of every image, formed in turns after an untimed one."""
     seconds: dict[str, list[float]] = {name: [] for name in images}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", validate.ClsasWarning)
@@ -422,7 +421,7 @@ def _measured(images: dict[str, _Image], device: Device, repeats: int) -> dict[s
                 image.form(device)
                 if turn:
                     seconds[name].append(time.perf_counter() - start)
-    return {name: statistics.median(each) for name, each in seconds.items()}
+    return {name: min(each) for name, each in seconds.items()}
 
 
 def _decibels(error_db: float | None) -> str:
