@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from clsas import plot
+    from clsas.assess import Assessment, Effect, assess, survey_lines
     from clsas.backproject import backproject
     from clsas.compress import compress
     from clsas.device import DeviceError, list_devices
@@ -36,10 +37,12 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 __all__ = [
+    "Assessment",
     "BeamWindow",
     "ClsasWarning",
     "DeviceError",
     "Echoes",
+    "Effect",
     "FileFormatError",
     "Grid",
     "Image",
@@ -55,6 +58,7 @@ __all__ = [
     "Store",
     "Track",
     "Tradeoff",
+    "assess",
     "backproject",
     "channels",
     "check_sampling",
@@ -72,12 +76,14 @@ __all__ = [
     "save",
     "simulate",
     "simulate_lines",
+    "survey_lines",
     "to_xarray",
     "tradeoff",
     "wavenumber",
 ]
 
 _MODULES = {
+    "assess": "Assessment Effect assess survey_lines",
     "backproject": "backproject",
     "compress": "compress",
     "device": "DeviceError list_devices",

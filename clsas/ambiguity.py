@@ -49,14 +49,15 @@ class Ambiguity:
         """All of it."""
         return self.ends + self.aliasing
 
-    def rest_db(self, wanted_db: float) -> float:
+    def rest_db(self, wanted_db: float, other_error: float = 0.0) -> float:
         """Error left to everything else, dB, so that the whole image keeps `wanted_db`.
 
-        Where the ambiguity alone takes too much for that, it is `wanted_db`; `warn` then warns.
+        `other_error` is power that is spent too. Where both take too much for that, it is
+        `wanted_db`; `warn` then warns.
         """
-        wanted = power(wanted_db)
-        if _LEAST * wanted < self.error_power <= _MOST * wanted:
-            return in_db(wanted - self.error_power)
+        wanted, spent = power(wanted_db), self.error_power + other_error
+        if _LEAST * wanted < spent <= _MOST * wanted:
+            return in_db(wanted - spent)
         return wanted_db
 
     def warn(self, name: str, wanted_db: float) -> None:

@@ -26,6 +26,7 @@ from clsas.interpolation import Gain, Interpolator, Resampling
 from clsas.layout import GEOMETRY_ERROR, STACK, Groups, Tiles, allowed, lay_out
 from clsas.lines import RangeLines, some_channels
 from clsas.reach import warn_unseen
+from clsas.simplify import Model, simplify
 from clsas.spectrum import Spectrum, cycles_per_m_at, measure_spectrum
 from clsas.window import HARDLY_SEEN, INTERVALS, BeamWindow, channel_ranges, sines
 
@@ -70,11 +71,18 @@ class Preparation:
     """What the image may err by; with a fixed interpolator anything."""
     ambiguity: Ambiguity = field(default_factory=Ambiguity)
     """Errors that the lines themselves leave open."""
+    given_grid: Grid | None = None
+    """The grid asked for, where `grid` leaves out its relief."""
+    left_out: tuple[str, ...] = ()
+    """Effects that `lines` and `grid` do without: see `clsas.simplify`."""
+    left_out_error: float = 0.0
+    """The power of the error that this adds."""
 
     @property
     def predicted_error_db(self) -> float:
-        """Relative rms error of interpolation and of what the lines leave open, dB."""
-        return in_db(power(self.interpolator.error_db) + self.ambiguity.error_power)
+        """Relative rms error of interpolation, of what lines leave open and effects left out, dB."""
+        error = power(self.interpolator.error_db) + self.ambiguity.error_power
+        return in_db(error + self.left_out_error)
 
     def warn_of_ambiguity(self) -> None:
         """Warn where the lines themselves may keep the image from the accuracy asked for."""
@@ -159,6 +167,9 @@ def backproject(
     the taps of one interpolation) gets nothing from it. Where a line does not fade towards an end,
     what pixels next to it get depends on the taps, and the image there on `accuracy_db`.
 
+    Motion during flight, the distance between transmitter and receiver and a grid's relief are left
+    out where the error that this adds lies far below `accuracy_db` (docs/assess.md).
+
     With a beam each term is multiplied by its weight. With or without one a pixel behind the
     antennas, at the range of one before them, is its mirror image. Ranges and phases are referred
     in float64 to centres near the pixels; the device sees float32 differences only.
@@ -190,8 +201,13 @@ def prepare(
     taps: int | None = None,
     upsampling: float | None = None,
     beam: BeamWindow | None = None,
+    full_model: bool = False,
 ) -> Preparation:
-    """Decide how `backproject` forms an image; parameters and errors are its."""
+    """Decide how `backproject` forms an image; parameters and errors are its.
+
+    Effects far below `accuracy_db` are left out unless `full_model` is set, or the interpolator is
+    fixed so that `accuracy_db` plays no part.
+    """
     validate.instance("lines", lines, RangeLines)
     validate.instance("grid", grid, Grid)
     validate.memory("grid", 8 * grid.size)
@@ -201,13 +217,18 @@ def prepare(
     if beam is not None:
         validate.instance("beam", beam, BeamWindow)
     check_numbers(lines, beam)
+    fixed = taps is not None and upsampling is not None  # then accuracy_db plays no part
+    given_grid = grid
+    model = Model(lines, grid, beam)
+    if not (fixed or full_model):
+        model = simplify(lines, grid, beam, accuracy_db)
+    lines, grid, beam = model.lines, model.grid, model.beam
     along = None if beam is None else beam.directions(lines)
     fullness = 1.0 if beam is None else fullness_of(lines, grid, beam, along)
     device = open_device(device)
     spectrum = measure_spectrum(lines, grid)
     left_open = ambiguity(lines, grid, spectrum, beam, along)
     antennas_m, cycles_per_m = antennas_and_phase(lines, spectrum, beam)
-    fixed = taps is not None and upsampling is not None  # then accuracy_db plays no part
     geometry_error = GEOMETRY_ERROR if fixed else allowed(accuracy_db)
     layout = lay_out(
         grid,
@@ -223,7 +244,7 @@ def prepare(
     terms = phases.TERMS[-1] if fixed else phases.terms_within(accuracy_db)
     interpolator = interpolation.choose(
         spectrum,
-        left_open.rest_db(accuracy_db),
+        left_open.rest_db(accuracy_db, model.error),
         taps=taps,
         upsampling=upsampling,
         other_error=math.hypot(geometry_error, phases.error(terms)),
@@ -249,6 +270,9 @@ def prepare(
         one_cubic,
         wanted_db=0.0 if fixed else accuracy_db,
         ambiguity=left_open,
+        given_grid=given_grid,
+        left_out=model.left_out,
+        left_out_error=model.error,
     )
 
 
@@ -334,7 +358,7 @@ def execute(
                 pixels[part] *= normalising(sums.real, p.lines.channels)
     finally:
         device.finish()  # an interrupted run leaves nothing in use
-    image = Image(layout.collect(pixels), p.grid)
+    image = Image(layout.collect(pixels), p.given_grid or p.grid)
     if not warned and not holds_any(image.pixels) and p.lines.samples.any():
         warn_unseen(p.lines, layout.centres_m(slice(None)), p.beam, p.along)
     return image

@@ -363,6 +363,8 @@ class _Pointing(_Table):
 class _Simulate(_Table):
     spreading: bool = False
     motion_in_flight: bool = False
+    element_pattern: bool = True
+    phase_centres: bool = False
     range_m: Annotated[list[float], Field(min_length=2, max_length=2)] | None = None
     snr_db: float | None = None
     seed: int = 0

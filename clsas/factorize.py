@@ -29,7 +29,15 @@ from clsas.grid import Grid
 from clsas.image import Image, holds_any
 from clsas.leaves import Finish, Level, PlaneLeaves, SurfaceLeaves
 from clsas.lines import RangeLines
-from clsas.plan import CHUNK, GUARD, MARGIN, Plan, padded_length, sample_bytes
+from clsas.plan import (
+    CHUNK,
+    GUARD,
+    MARGIN,
+    Plan,
+    padded_length,
+    sample_bytes,
+    without_left_out,
+)
 from clsas.planner import BEST_TOLERANCE_DB, WORST_TOLERANCE_DB, plan
 from clsas.reach import warn_unseen
 from clsas.sector import Geometry, Sector
@@ -130,7 +138,10 @@ def factorize(
         _check_band(lines, chosen)
     if accumulate is not None:
         check_accumulate(accumulate, grid, chosen.beam)
-    image = _form(lines, grid, chosen, device, progress)
+    if chosen.left_out:
+        image = Image(_form(*without_left_out(chosen, lines, grid), device, progress).pixels, grid)
+    else:
+        image = _form(lines, grid, chosen, device, progress)
     return image if accumulate is None else Image(image.pixels + accumulate.pixels, grid)
 
 

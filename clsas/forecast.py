@@ -203,6 +203,14 @@ def _band(view: View, outside: float) -> tuple[float, float]:
     return spectrum.centre, float(min((bins + 1) / (2 * len(spectrum.power)), 0.5))
 
 
+def half_precision_error(stages: int) -> float:
+    """Return the power of the error of half precision through some stages, at least.
+
+    Where virtual channels are sums of many it is more: see `_half_rounding`.
+    """
+    return HALF_ROUNDING * (1 + 1.5 * stages)
+
+
 def _half_rounding(view: View, reach: Sequence[float]) -> float:
     """Return the power of the error that rounding lines to half precision adds.
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import functools
 import hashlib
 import json
-from dataclasses import asdict, dataclass
+import weakref
+from dataclasses import asdict, dataclass, replace
 from itertools import pairwise
 from typing import Any
 
@@ -16,6 +17,7 @@ from clsas import phases
 from clsas.grid import Grid
 from clsas.interpolation import PHASES, UPSAMPLING_TAPS, Interpolator, Resampling, Upsampler
 from clsas.lines import RangeLines
+from clsas.simplify import EFFECTS, Model, leave_out
 from clsas.window import BeamWindow
 
 GIVEN_BYTES = 64 << 20
@@ -129,6 +131,9 @@ class Plan:
     calibrated : bool
         Whether times follow from costs that were measured on this device or given, and not from
         defaults.
+    left_out : tuple of str
+        Effects that the image does without, since their error lies far below the tolerance: see
+        `clsas.simplify`.
     """
 
     tolerance_db: float | None
@@ -162,6 +167,7 @@ class Plan:
     most_channels: tuple[int, ...] = ()
     band: tuple[float, float] | None = None
     calibrated: bool = True
+    left_out: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         """Check what sizes buffers and indices."""
@@ -180,6 +186,8 @@ class Plan:
                 and all(isinstance(v, (int, float)) and least <= v < np.inf for v in values)
             )
 
+        known = isinstance(self.left_out, tuple) and set(self.left_out) <= set(EFFECTS)
+        check(known, "left_out", f"some of {', '.join(EFFECTS)}")
         levels = len(self.sides)
         pairs = (*self.sides, self.tile) if levels else self.sides
         nested = all(numbers(p, 2, 1) and all(whole(n, 1) for n in p) for p in pairs) and all(
@@ -293,6 +301,10 @@ class Plan:
             f"{_seconds(self.predicted_seconds)} on {self.device} "
             f"(exact: {_seconds(self.exact_seconds)}), {self.memory_bytes / 2**20:.0f} MiB"
         ]
+        if not self.is_exact:
+            lines[0] += f", {'half' if self.half_precision else 'single'} precision"
+        if self.left_out:
+            lines.append(f"Left out, far below the tolerance: {', '.join(self.left_out)}")
         usual = (
             []
             if self.calibrated
@@ -304,7 +316,6 @@ class Plan:
         if self.is_exact:
             reason = "" if self.tolerance_db is None else ": no factorization is faster within it"
             return "\n".join([*lines, f"Plain backprojection{reason}.", *usual])
-        lines[0] += f", {'half' if self.half_precision else 'single'} precision"
         taps = f"{self.align.taps} taps in range at {self.resampling.ratio:.2f} x the lines' rate"
         if self.nearest:
             beams = f"sums of {', '.join(map(str, self.nearest))} neighbours"
@@ -396,6 +407,7 @@ class Plan:
             values["nearest"] = tuple(values["nearest"])
             values["most_channels"] = tuple(values["most_channels"])
             values["crowding"] = tuple(values["crowding"])
+            values["left_out"] = tuple(values.get("left_out", ()))
             values["stages"] = tuple(Stage(**stage) for stage in values["stages"])
             return cls(**values)
         except (TypeError, KeyError, AttributeError, json.JSONDecodeError) as error:
@@ -413,6 +425,39 @@ class Plan:
                     f"the plan was made for another {name.removesuffix('s')} geometry than that "
                     f"of {name}; plan anew with clsas.plan"
                 )
+
+
+def with_left_out(
+    simpler: Plan, model: Model, lines: RangeLines, grid: Grid, beam: BeamWindow | None
+) -> Plan:
+    """Return the plan for given lines that leaves out effects as their model does.
+
+    `simpler` is the plan of the model; it is kept for the image.
+    """
+    digests = {"lines_digest": lines_digest(lines), "grid_digest": grid_digest(grid)}
+    plan = replace(simpler, left_out=model.left_out, beam=beam, **digests)
+    plan.kept["model"] = model.lines.without_samples(), model.grid, simpler
+    return plan
+
+
+def without_left_out(plan: Plan, lines: RangeLines, grid: Grid) -> tuple[RangeLines, Grid, Plan]:
+    """Return lines, grid and plan of the same image where nothing is left to leave out.
+
+    The geometry of both is kept for the next image of the plan.
+    """
+    if "model" not in plan.kept:
+        model = leave_out(lines, grid, plan.beam, plan.left_out)
+        digests = {
+            "lines_digest": lines_digest(model.lines),
+            "grid_digest": grid_digest(model.grid),
+        }
+        simpler = replace(plan, left_out=(), beam=model.beam, **digests)
+        plan.kept["model"] = model.lines.without_samples(), model.grid, simpler
+    geometry, simple_grid, simpler = plan.kept["model"]
+    simple_lines = replace(geometry, samples=lines.samples)
+    simpler.kept["lines"] = weakref.ref(simple_lines)  # whose band is that of the lines given
+    simpler.kept["warned"] = plan.kept.get("warned", False)
+    return simple_lines, simple_grid, simpler
 
 
 def sample_bytes(half_precision: bool) -> int:

@@ -24,9 +24,10 @@ from clsas.forecast import MARGIN_DB, OUTSIDE, Way, margin_db
 from clsas.grid import Grid
 from clsas.interpolation import Interpolator
 from clsas.lines import RangeLines
-from clsas.plan import Plan
+from clsas.plan import Plan, with_left_out
 from clsas.reach import warn_unreached
 from clsas.search import MOST_STAGES, Allowed, Tree, root_limits, search
+from clsas.simplify import Model, simplify
 from clsas.view import View
 from clsas.window import BeamWindow
 
@@ -63,6 +64,7 @@ def plan(
     costs: Costs | None = None,
     taps: tuple[int, int] | None = None,
     depth: int | None = None,
+    full_model: bool = False,
 ) -> Plan:
     """Choose the fastest way to an image of a given error.
 
@@ -97,6 +99,8 @@ def plan(
         image takes, instead of the fastest.
     depth : int, optional
         The same of the number of stages, 1 to 5.
+    full_model : bool
+        For study: model every effect, also those whose error lies far below the tolerance.
 
     Returns
     -------
@@ -143,16 +147,19 @@ def plan(
     calibrated, costs = costs is not None, costs or default_costs(device)
     if memory_bytes is not None:
         memory_bytes = validate.count("memory_bytes", memory_bytes)
-    view = View(lines, grid, beam, OUTSIDE * power(tolerance_db or 0.0))
+    model = Model(lines, grid, beam) if full_model else simplify(lines, grid, beam, tolerance_db)
+    view = View(model.lines, model.grid, model.beam, OUTSIDE * power(tolerance_db or 0.0))
     rest_db = tolerance_db
     if tolerance_db is not None:
         view.ambiguity.warn("tolerance_db", tolerance_db)
-        rest_db = view.ambiguity.rest_db(tolerance_db)
+        rest_db = view.ambiguity.rest_db(tolerance_db, model.error)
     found = _chosen(view, rest_db, stages, device, costs, memory_bytes, allowed)
-    error_db = in_db(power(found.predicted_error_db) + view.ambiguity.error_power)
+    error = power(found.predicted_error_db) + view.ambiguity.error_power + model.error
     found = replace(
-        found, tolerance_db=tolerance_db, predicted_error_db=error_db, calibrated=calibrated
+        found, tolerance_db=tolerance_db, predicted_error_db=in_db(error), calibrated=calibrated
     )
+    if model.left_out:
+        found = with_left_out(found, model, lines, grid, beam)
     found.kept["lines"] = weakref.ref(lines)
     # Who forms the image next need not warn again.
     found.kept["warned"] = warn_unreached(lines, grid, beam, view.channels_along)

@@ -73,6 +73,8 @@ def simulate(
     pointing: Pointing | None = None,
     spreading: bool = False,
     motion_in_flight: bool = False,
+    element_pattern: bool = True,
+    phase_centres: bool = False,
     range_m: tuple[float, float] | None = None,
     snr_db: float | None = None,
     seed: int = 0,
@@ -96,6 +98,12 @@ def simulate(
     motion_in_flight : bool
         Let the receivers move at the track's velocity while the sound travels. Otherwise the
         platform stops and hops.
+    element_pattern : bool
+        Apply the patterns of elements that have sizes; without them every element is taken as
+        omnidirectional, and nothing is baffled.
+    phase_centres : bool
+        Put transmitter and receiver of every channel where their phase centre is: the echoes of a
+        monostatic sonar with as many channels.
     range_m : (near, far), optional
         Receive window: from the delay of range `near` to that of `far` plus the pulse's duration
         (THESIS [22], [23]), the same for every channel. What falls outside is cut. Unless given,
@@ -139,16 +147,21 @@ def simulate(
     validate.progress(progress)
     check_options(
         pointing=pointing, spreading=spreading, motion_in_flight=motion_in_flight,
+        element_pattern=element_pattern, phase_centres=phase_centres,
         range_m=range_m, snr_db=snr_db, seed=seed,
     )  # fmt: skip
     parts = _parts(scene)
     beams = None
-    if not sonar.is_omnidirectional:
+    if not sonar.is_omnidirectional and element_pattern:
         beams = _Beams(sonar, (pointing or Pointing.broadside()).axes(track))
     elif pointing is not None:
-        raise ValueError("pointing has nothing to act on: the sonar's elements have no sizes")
+        why = "the sonar's elements have no sizes" if element_pattern else "element_pattern is off"
+        raise ValueError(f"pointing has nothing to act on: {why}")
     pulse, rate, sound = sonar.pulse, sonar.sample_rate_hz, sonar.sound_speed_m_s
     geometry = channels(sonar, track, motion_in_flight=motion_in_flight)
+    if phase_centres:
+        middle_m = (geometry.tx_m + geometry.rx_m) / 2
+        geometry = geometry._replace(tx_m=middle_m, rx_m=middle_m)
     paths = _Paths(parts, geometry, sound, spreading, beams, sonar.receivers)
     ringing = _RINGING / rate
     if range_m is None:
@@ -191,6 +204,8 @@ def check_options(
     pointing: Pointing | None = None,
     spreading: bool = False,
     motion_in_flight: bool = False,
+    element_pattern: bool = True,
+    phase_centres: bool = False,
     range_m: ArrayLike | None = None,
     snr_db: float | None = None,
     seed: int = 0,
@@ -199,6 +214,8 @@ def check_options(
     validate.instance("pointing", pointing, Pointing, type(None))
     validate.instance("spreading", spreading, bool)
     validate.instance("motion_in_flight", motion_in_flight, bool)
+    validate.instance("element_pattern", element_pattern, bool)
+    validate.instance("phase_centres", phase_centres, bool)
     if range_m is not None:
         near, far = validate.array("range_m", range_m, np.float64, (2,))
         if not 0 <= near < far:
@@ -471,7 +488,7 @@ class _Paths:
         """Return where channels of one ping look from."""
         tx, rx, velocity = self.geometry
         tx, rx = tx[some], rx[some]
-        middle = (tx[0] + rx.mean(axis=0)) / 2
+        middle = (tx.mean(axis=0) + rx.mean(axis=0)) / 2
         if self.beams is None:
             return View(middle)
         reach = max(np.linalg.norm(end - middle, axis=1).max() for end in (tx, rx))

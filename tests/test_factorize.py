@@ -676,9 +676,11 @@ def test_lines_of_zeros_give_zeros(platform):
 def test_a_grid_that_no_line_reaches_warns_and_is_zero():
     lines, _ = made(straight)
     grid = around(0, 400)
-    chosen = plan(lines, grid, tolerance_db=-40, costs=EXACT_IS_SLOW)
     with pytest.warns(ClsasWarning, match="no pixel"):
-        image = factorize(lines, grid, chosen)
+        chosen = plan(lines, grid, tolerance_db=-40, costs=EXACT_IS_SLOW)
+    assert not factorize(lines, grid, chosen).pixels.any()
+    with pytest.warns(ClsasWarning, match="no pixel"):
+        image = factorize(lines, grid, Plan.from_json(chosen.to_json()))
     assert not image.pixels.any()
 
 

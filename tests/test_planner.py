@@ -94,8 +94,9 @@ def test_relief_takes_virtual_channels_and_samples():
     grid = around(0, 40, z=-12)
     row, column = np.indices(grid.shape)
     tilt, waves = 0.01 * row - 0.005 * column, np.sin(row / 9) * np.sin(column / 9)
+    wish = {"tolerance_db": -40, "costs": EXACT_IS_SLOW, "depth": 2, "full_model": True}
     plans = [
-        plan(lines, grid.with_height(height_m), tolerance_db=-40, costs=EXACT_IS_SLOW, depth=2)
+        plan(lines, grid.with_height(height_m), **wish)
         for height_m in (0 * row, tilt, tilt + 0.5 * waves, tilt + 3 * waves)
     ]
     flat, tilted, low, high = (p.predicted_seconds for p in plans)

@@ -56,6 +56,35 @@ def test_motion_in_flight_matters():
     assert db(still.samples - moving.samples) > -40
 
 
+def test_antennas_at_phase_centres_are_those_of_a_monostatic_sonar():
+    echoes = simulate(SMOOTH, TRACK, SCENE, phase_centres=True, motion_in_flight=True)
+    apart = channels(SMOOTH, TRACK)
+    assert np.array_equal(echoes.tx_m, echoes.rx_m)
+    assert np.array_equal(echoes.tx_m, (apart.tx_m + apart.rx_m) / 2)
+    assert db(echoes.samples - closed_form(echoes, SCENE), 1.0) < -100
+
+
+def test_a_seabed_looks_the_same_from_phase_centres():
+    """From the middle between antennas nothing else is lit or in shadow; ranges differ a little."""
+    options = {"range_m": (25, 45)}
+    apart, together = (
+        simulate(SMOOTH, TRACK, box_on_sand(), phase_centres=on, **options) for on in (False, True)
+    )
+    strength = [np.linalg.norm(each.samples) for each in (apart, together)]
+    assert strength[0] == pytest.approx(strength[1], rel=0.05)
+
+
+def test_without_element_patterns_elements_have_no_sizes():
+    sized = replace(SMOOTH, tx_length_m=0.015, rx_length_m=0.015, rx_height_m=0.01)
+    without = simulate(sized, TRACK, SCENE, element_pattern=False)
+    assert np.array_equal(without.samples, simulate(SMOOTH, TRACK, SCENE).samples)
+    with pytest.raises(ValueError, match="nothing to act on: element_pattern is off"):
+        simulate(sized, TRACK, SCENE, element_pattern=False, pointing=Pointing.squint(0.1))
+    for name in ("element_pattern", "phase_centres"):
+        with pytest.raises(TypeError, match=f"{name} must be of type bool"):
+            simulate(sized, TRACK, SCENE, **{name: 1})
+
+
 @pytest.mark.parametrize("rate", [125e3, 200e3, 317e3])
 def test_rectangular_chirp_through_the_receivers_filter(rate):
     """The stated spectrum, by Fresnel integrals, summed over frequency with period 50 ms."""

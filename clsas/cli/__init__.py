@@ -25,6 +25,10 @@ _COMMANDS = {
         "images",
         "Show how an image would be formed, how long it takes and how much it errs.",
     ),
+    "assess": (
+        "assess",
+        "Tell which effects an image needs, what error leaving each out adds, and what it costs.",
+    ),
     "mosaic": ("mosaics", "Form an image of any size patch by patch, into a Zarr store."),
     "quality": (
         "measures",

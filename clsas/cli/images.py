@@ -104,6 +104,7 @@ def image(
         if chosen is not None:
             formed = clsas.factorize(lines, grid, chosen, device=opened, progress=progress)
             how = f"{summary(chosen)}; error predicted {chosen.predicted_error_db:.0f} dB"
+            left_out = chosen.left_out
             results |= {
                 "method": "stages" if chosen.nearest else "factorized",
                 "predicted_error_db": chosen.predicted_error_db,
@@ -115,6 +116,7 @@ def image(
                 preparation.warn_of_ambiguity()
             formed = execute(preparation, progress=progress, warned=warned)
             interpolator, ratio = preparation.interpolator, preparation.resampling.ratio
+            left_out = preparation.left_out
             how = (
                 f"{why}{interpolator.taps} taps on lines upsampled {ratio:.3g} times, "
                 f"{preparation.predicted_error_db:.0f} dB"
@@ -126,6 +128,8 @@ def image(
                 "predicted_error_db": preparation.predicted_error_db,
             }
         seconds = time.perf_counter() - start
+    results["left_out"] = left_out
+    how += f"; without {', '.join(left_out)}, far below the error allowed" if left_out else ""
     clsas.save(output, formed)
     if png is not None:
         from clsas import plot
