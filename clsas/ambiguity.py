@@ -21,6 +21,7 @@ from clsas.window import BeamWindow, sines
 
 _AT_END, _END = 0.03, 4  # measured on noise that fills 40 to 90 % of the sampled band; samples
 _BESIDE = 5  # samples
+_CUT, _FADING = 0.01, 16  # a line fades if its last sample has less power than so many before it
 _THIN = 0.42  # cycles per sample: with a narrower half band, cuts are not felt beyond `_BESIDE`
 _CHANNELS, _PLACES = 64, 16  # sampled channels, and pixels along either side of a grid
 _MOST, _LEAST = 0.5, 1e-3  # shares of the allowed error power: above, warn; below, ignore
@@ -112,7 +113,7 @@ def ends_error(
     samples from the end, the sinc interpolation of a component at distance d from the spectral
     centre errs by 1/(2 pi m cos(pi d)) of its amplitude. Summed over the samples from `near` to
     `far`, and over what a flat band of half width h holds beyond `_THIN`, that makes of an end
-    sample's power
+    sample's power, unless lines fade
 
         S/pi^2 (1/near - 1/far),  S = (tan(pi h) - tan(pi _THIN))/(4 pi h).
     """
@@ -139,14 +140,17 @@ def ends_error(
         within = line[max(int(np.clip(near, 0, last)), 0) : int(np.clip(far, -1, last)) + 1]
         if not within.size:
             continue
-        total += np.vdot(within, within).real
-        for end, first, beyond in (
-            (line[:_END], near, far),
-            (line[-_END:], last - far, last - near),
-        ):
-            # Samples from the end to the nearest and the farthest pixel.
+        total += _power(within) * len(within)
+        # From either end: its samples, and how far off the nearest and the farthest pixel are.
+        for end, first, beyond in ((line, near, far), (line[::-1], last - far, last - near)):
             share = _AT_END if first < _BESIDE and beyond > -_BESIDE else 0.0
-            first = max(first, _BESIDE)
-            share += inside * max(1 / first - 1 / max(beyond, first), 0.0)
-            at_ends += share * np.vdot(end, end).real / len(end)
+            if _power(end[:1]) > _CUT * _power(end[:_FADING]):
+                first = max(first, _BESIDE)
+                share += inside * max(1 / first - 1 / max(beyond, first), 0.0)
+            at_ends += share * _power(end[:_END])
     return at_ends / total if total else 0.0
+
+
+def _power(samples: NDArray[np.complex128]) -> float:
+    """Mean power of samples."""
+    return float(np.vdot(samples, samples).real) / len(samples)

@@ -80,7 +80,7 @@ class Preparation:
 
     @property
     def predicted_error_db(self) -> float:
-        """Relative rms error of interpolation, of what lines leave open and effects left out, dB."""
+        """Relative rms error, dB: of interpolation, what lines leave open and what is left out."""
         error = power(self.interpolator.error_db) + self.ambiguity.error_power
         return in_db(error + self.left_out_error)
 

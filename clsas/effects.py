@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from clsas.ambiguity import ends_error
 from clsas.backproject import wavelength_m
 from clsas.decibels import in_db
-from clsas.ends import ends_error
 from clsas.geometry import pairwise_range_m
 from clsas.grid import Grid
 from clsas.lines import RangeLines, some_channels
@@ -133,7 +133,9 @@ def errors_without(survey: Survey) -> dict[str, ErrorWithout]:
         errors[BEAM] = _error_of_weights(with_it, without)
     if survey.has_ends:
         along = None if beam is None else beam.directions(lines)
-        errors[ENDS] = ErrorWithout(in_db(ends_error(lines, survey.grid, beam, along)))
+        errors[ENDS] = ErrorWithout(
+            in_db(ends_error(lines, survey.grid, measure_spectrum(lines), beam, along))
+        )
     return errors
 
 
@@ -231,7 +233,7 @@ class _Sample:
         spectrum = measure_spectrum(lines)
         away = np.interp(
             (np.arange(_FREQUENCIES // 2) + 0.5) / (_FREQUENCIES // 2),
-            np.cumsum(spectrum.power),
+            np.cumsum(spectrum.share),
             spectrum.frequency,
         )
         centre = cycles_per_m_at(lines, spectrum.centre)

@@ -5,7 +5,7 @@ from __future__ import annotations
 PACKAGES = {
     "pocl": ("pyopencl[pocl]>=2024.1",),
     "plot": ("matplotlib>=3.8",),
-    "mosaic": ("zarr>=3.1.3", "distributed>=2024.1", "xarray>=2024.1"),
+    "mosaic": ("zarr>=3.1.3", "distributed>=2024.1", "cryptography>=42.0", "xarray>=2024.1"),
 }
 """Requirements of every extra, as `pyproject.toml` has them."""
 
