@@ -13,7 +13,7 @@ import click
 import pyopencl
 
 import clsas
-from clsas.cli import images, lines, machine, measures, mosaics
+from clsas.cli import images, lines, machine, measures, mosaics, selftest
 
 # What users cause, and what machines lack.
 _ERRORS = (
@@ -62,6 +62,7 @@ class _Commands(click.Group):
         measures.bench,
         machine.demo,
         machine.calibrate,
+        selftest.selftest,
     ],
     context_settings={"help_option_names": ["-h", "--help"]},
 )
