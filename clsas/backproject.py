@@ -7,7 +7,7 @@ import math
 import os
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -16,9 +16,9 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from clsas import interpolation, phases, validate
+from clsas.ambiguity import Ambiguity, ambiguity
 from clsas.decibels import in_db, power
 from clsas.device import Device, Slot, aligned, open_device
-from clsas.ends import besides_ends, ends_error, warn_of_ends
 from clsas.geometry import bistatic_range_m, pairwise_range_m
 from clsas.grid import Grid
 from clsas.image import Image, holds_any
@@ -66,17 +66,17 @@ class Preparation:
     """Whether one cubic of the beam's weights serves a work-item of a tile, a block of points."""
     wanted_db: float = 0.0
     """What the image may err by; with a fixed interpolator anything."""
-    ends_error: float = 0.0
-    """The power of what it errs by at the ends of lines: see `clsas.ends`."""
+    ambiguity: Ambiguity = field(default_factory=Ambiguity)
+    """Errors that the lines themselves leave open."""
 
     @property
     def predicted_error_db(self) -> float:
-        """Relative rms error of interpolation and at the ends of lines, dB."""
-        return in_db(power(self.interpolator.error_db) + self.ends_error)
+        """Relative rms error of interpolation and of what the lines leave open, dB."""
+        return in_db(power(self.interpolator.error_db) + self.ambiguity.error_power)
 
-    def warn_of_ends(self) -> None:
-        """Warn where ends of lines may keep the image from what is wanted."""
-        warn_of_ends("accuracy_db", self.wanted_db, self.ends_error)
+    def warn_of_ambiguity(self) -> None:
+        """Warn where the lines themselves may keep the image from the accuracy asked for."""
+        self.ambiguity.warn("accuracy_db", self.wanted_db)
 
     @property
     def samples_per_m(self) -> float:
@@ -146,7 +146,8 @@ def backproject(
     -----
     ClsasWarning
         If no pixel lies within any line's range, or the beam, so that the lines add nothing; or if
-        the grid reaches ends of lines that do not fade there, so that `accuracy_db` may be missed.
+        `accuracy_db` may be missed because the grid reaches ends of lines that do not fade, or
+        because the lines' band fills all that is sampled.
 
     Notes
     -----
@@ -173,7 +174,7 @@ def backproject(
         _check_same_grid(accumulate, grid)
         if beam is not None and beam.normalise:
             raise ValueError("accumulate must be None with a beam that normalises: it is a mean")
-    preparation.warn_of_ends()
+    preparation.warn_of_ambiguity()
     image = execute(preparation, progress=progress)
     if accumulate is None:
         return image
@@ -202,9 +203,9 @@ def prepare(
     check_numbers(lines, beam)
     along = None if beam is None else beam.directions(lines)
     fullness = 1.0 if beam is None else fullness_of(lines, grid, beam, along)
-    ends = ends_error(lines, grid, beam, along)
     device = open_device(device)
-    spectrum = interpolation.measure_spectrum(lines)
+    spectrum = interpolation.measure_spectrum(lines, grid)
+    left_open = ambiguity(lines, grid, spectrum, beam, along)
     antennas_m, cycles_per_m = antennas_and_phase(lines, spectrum, beam)
     fixed = taps is not None and upsampling is not None  # then accuracy_db plays no part
     geometry_error = GEOMETRY_ERROR if fixed else allowed(accuracy_db)
@@ -222,7 +223,7 @@ def prepare(
     terms = phases.TERMS[-1] if fixed else phases.terms_within(accuracy_db)
     interpolator = interpolation.choose(
         spectrum,
-        besides_ends(accuracy_db, ends),
+        left_open.rest_db(accuracy_db),
         taps=taps,
         upsampling=upsampling,
         other_error=math.hypot(geometry_error, phases.error(terms)),
@@ -247,7 +248,7 @@ def prepare(
         along,
         one_cubic,
         wanted_db=0.0 if fixed else accuracy_db,
-        ends_error=ends,
+        ambiguity=left_open,
     )
 
 
@@ -258,7 +259,7 @@ def form_exactly(
     progress: Callable[[int, int], None] | None = None,
     **wish: Any,
 ) -> Image:
-    """Form an image as `backproject` does where ends of lines have been warned of, or are known."""
+    """Form an image as `backproject` does, without its warnings of what the lines leave open."""
     return execute(prepare(lines, grid, **wish), progress=progress)
 
 

@@ -21,7 +21,6 @@ from clsas.backproject import (
 )
 from clsas.costs import Costs
 from clsas.device import Device
-from clsas.ends import besides_ends
 from clsas.layout import STACK, Tiles
 from clsas.view import View
 from clsas.window import INTERVALS
@@ -94,11 +93,14 @@ def expect(view: View, accuracy_db: float, device: Device) -> Exact:
     else:
         part_pixels, across = STACK * width, 1
         parts = -(-grid.size // part_pixels)
-        radius_m = min(layout.largest_radius_m(cycles_per_m), lines.length * lines.range_step_m)
+        radius_m = min(
+            layout.largest_radius_m(cycles_per_m, len(antennas_m)),
+            lines.length * lines.range_step_m,
+        )
     block_m = Tiles(grid, 16, width).lookup_radius_m if grid.is_planar else 0.0
     interpolator = interpolation.choose(
         view.spectrum,
-        besides_ends(accuracy_db, view.ends_error),
+        view.ambiguity.rest_db(accuracy_db),
         other_error=math.hypot(error, phases.error(phases.terms_within(accuracy_db))),
         pixels_per_sample=grid.size / lines.length,
         most_upsampling=most_upsampling(device, lines, block_m),

@@ -199,7 +199,7 @@ def factorized(
 def _band(view: View, outside: float) -> tuple[float, float]:
     """Return centre and half the width of the band outside of which lies that share of power."""
     spectrum = view.spectrum
-    bins = np.searchsorted(np.cumsum(spectrum.power), 1 - outside)
+    bins = np.searchsorted(np.cumsum(spectrum.share), 1 - outside)
     return spectrum.centre, float(min((bins + 1) / (2 * len(spectrum.power)), 0.5))
 
 

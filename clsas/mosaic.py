@@ -614,7 +614,7 @@ def _image(job: _Job, sight: _Sight, grid: Grid, device: Device) -> tuple[Record
     accuracy_db = job.accuracy_db(lines.channels * grid.size)
     if accuracy_db is not None:
         preparation = prepare(lines, grid, accuracy_db=accuracy_db, beam=beam, device=device)
-        preparation.warn_of_ends()
+        preparation.warn_of_ambiguity()
         image = execute(preparation)
         error_db = max(accuracy_db, preparation.predicted_error_db)
         known |= {"predicted_error_db": error_db, "memory_bytes": host_bytes}

@@ -16,7 +16,6 @@ from clsas.costs import Costs
 from clsas.costs import load as load_costs
 from clsas.decibels import in_db, power
 from clsas.device import Device, open_device
-from clsas.ends import besides_ends, warn_of_ends
 from clsas.errors import excess_error, nearest_errors, other_errors, root_error
 from clsas.exact import Exact, expect
 from clsas.filters import ALIGN_TAPS, Choice, Filters, steering_spectrum
@@ -114,8 +113,8 @@ def plan(
     Warns
     -----
     ClsasWarning
-        If the grid reaches ends of lines that do not fade there, so that the tolerance may be
-        missed.
+        If the tolerance may be missed because the grid reaches ends of lines that do not fade, or
+        because the lines' band fills all that is sampled.
     """
     validate.instance("lines", lines, RangeLines)
     validate.instance("grid", grid, Grid)
@@ -141,12 +140,12 @@ def plan(
     if memory_bytes is not None:
         memory_bytes = validate.count("memory_bytes", memory_bytes)
     view = View(lines, grid, beam, OUTSIDE * power(tolerance_db or 0.0))
-    ends, wanted_db = view.ends_error, tolerance_db
+    rest_db = tolerance_db
     if tolerance_db is not None:
-        warn_of_ends("tolerance_db", tolerance_db, ends)
-        wanted_db = besides_ends(tolerance_db, ends)
-    found = _chosen(view, wanted_db, stages, device, costs, memory_bytes, allowed)
-    error_db = in_db(power(found.predicted_error_db) + ends)
+        view.ambiguity.warn("tolerance_db", tolerance_db)
+        rest_db = view.ambiguity.rest_db(tolerance_db)
+    found = _chosen(view, rest_db, stages, device, costs, memory_bytes, allowed)
+    error_db = in_db(power(found.predicted_error_db) + view.ambiguity.error_power)
     found = replace(found, tolerance_db=tolerance_db, predicted_error_db=error_db)
     found.kept["lines"] = weakref.ref(lines)
     return found

@@ -13,9 +13,9 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import KDTree
 
 from clsas import interpolation
+from clsas.ambiguity import Ambiguity, ambiguity
 from clsas.aperture import cycles_per_extent, mean_track, own_drift
 from clsas.backproject import wavelength_m
-from clsas.ends import ends_error
 from clsas.grid import Grid
 from clsas.interpolation import Interpolator, Resampling
 from clsas.layout import STACK
@@ -71,13 +71,13 @@ class View:
     ) -> None:
         self.lines, self.grid, self.beam = lines, grid, beam
         self.kept: dict[Hashable, Any] = {}
-        self.spectrum = interpolation.measure_spectrum(lines)
+        self.spectrum = interpolation.measure_spectrum(lines, grid)
         outside = min(outside, _MOST_OUTSIDE)
-        occupied = self.spectrum.frequency[np.cumsum(self.spectrum.power) < 1 - outside]
+        occupied = self.spectrum.frequency[np.cumsum(self.spectrum.share) < 1 - outside]
         half_band = (occupied[-1] if len(occupied) else 0.5) / lines.range_step_m
         centre = interpolation.cycles_per_m(lines, self.spectrum.centre)
         self.highest_cycles_per_m = float(abs(centre) + half_band)
-        mean_square = self.spectrum.power @ self.spectrum.frequency**2
+        mean_square = self.spectrum.share @ self.spectrum.frequency**2
         self.rms_cycles_per_m = float(np.sqrt(mean_square)) / lines.range_step_m  # of the band
         self.track, self.limits = mean_track(lines), None if beam is None else beam.limits
         self.along, self.channels_along = None, None if beam is None else beam.directions(lines)
@@ -113,7 +113,7 @@ class View:
 
         That is phase per metre of range, whatever its sign, and above 0.
         """
-        found, power = self.spectrum.frequency, self.spectrum.power
+        found, power = self.spectrum.frequency, self.spectrum.share
         found = self.spectrum.centre + np.concatenate([-found[::-1], found])
         cycles_per_m = np.abs(interpolation.cycles_per_m(self.lines, found))
         share = np.concatenate([power[::-1], power]) / 2
@@ -202,9 +202,9 @@ class View:
         return float(((seen > 0) & (seen < 1)).mean())
 
     @functools.cached_property
-    def ends_error(self) -> float:
-        """Power of what images differ by at the ends of lines: see `clsas.ends`."""
-        return ends_error(self.lines, self.grid, self.beam, self.channels_along)
+    def ambiguity(self) -> Ambiguity:
+        """Errors that the lines themselves leave open."""
+        return ambiguity(self.lines, self.grid, self.spectrum, self.beam, self.channels_along)
 
     @functools.cached_property
     def _everywhere_m(self) -> NDArray[np.float64]:

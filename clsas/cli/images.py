@@ -109,7 +109,7 @@ def image(
         else:
             preparation = prepare(lines, grid, device=opened, beam=beam, **wish)
             if not why:  # else the plan has warned
-                preparation.warn_of_ends()
+                preparation.warn_of_ambiguity()
             formed = execute(preparation, progress=progress)
             interpolator, ratio = preparation.interpolator, preparation.resampling.ratio
             how = (

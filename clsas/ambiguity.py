@@ -1,0 +1,151 @@
+"""Errors that no imager can avoid, because the lines do not hold what an image needs.
+
+Samples beyond the ends of a line are unknown, and so is which side of the guard band the energy in
+it belongs to. Every imager adds these errors to its prediction and warns where they are too large.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsas import validate
+from clsas.decibels import in_db, power
+from clsas.geometry import pairwise_range_m
+from clsas.grid import Grid
+from clsas.interpolation import NEEDED_OVERSAMPLING, Spectrum
+from clsas.lines import RangeLines, some_channels
+from clsas.window import BeamWindow, sines
+
+_AT_END, _END = 0.03, 4  # measured on noise that fills 40 to 90 % of the sampled band; samples
+_BESIDE = 5  # samples
+_THIN = 0.4  # cycles per sample: with a narrower half band, cuts are not felt beyond `_BESIDE`
+_CHANNELS, _PLACES = 64, 16  # sampled channels, and pixels along either side of a grid
+_MOST, _LEAST = 0.5, 1e-3  # shares of the allowed error power: above, warn; below, ignore
+
+
+@dataclass(frozen=True)
+class Ambiguity:
+    """Relative error power of an image that the lines themselves leave open.
+
+    Attributes
+    ----------
+    ends : float
+        From samples beyond the ends of lines that do not fade.
+    aliasing : float
+        From a band that fills all that is sampled: its edges cannot be told apart.
+    oversampling : float
+        Sample rate over the width of the occupied band.
+    """
+
+    ends: float = 0.0
+    aliasing: float = 0.0
+    oversampling: float = np.inf
+
+    @property
+    def error_power(self) -> float:
+        """All of it."""
+        return self.ends + self.aliasing
+
+    def rest_db(self, wanted_db: float) -> float:
+        """Error left to everything else, dB, so that the whole image keeps `wanted_db`.
+
+        Where the ambiguity alone takes too much for that, it is `wanted_db`; `warn` then warns.
+        """
+        wanted = power(wanted_db)
+        if _LEAST * wanted < self.error_power <= _MOST * wanted:
+            return in_db(wanted - self.error_power)
+        return wanted_db
+
+    def warn(self, name: str, wanted_db: float) -> None:
+        """Warn where the error asked for by the argument `name` may be missed."""
+        wanted = power(wanted_db)
+        outcome = (
+            f"the error may be {in_db(wanted + self.error_power):.0f} dB in place of {name} "
+            f"{wanted_db:.3g} dB"
+        )
+        if self.ends > _MOST * wanted:
+            validate.warn(
+                "the grid reaches ends of lines that do not fade: what pixels near an end get "
+                f"depends on how lines are interpolated, so that {outcome}; let the grid end "
+                "before the lines, let the lines fade, or sample them more finely"
+            )
+        if self.aliasing > _MOST * wanted:
+            validate.warn(
+                "the lines' band fills all that is sampled, so that its edges alias: "
+                f"oversampling is {self.oversampling:.3g}, at least {NEEDED_OVERSAMPLING:.3g} is "
+                f"needed; {outcome}; sample more finely (compress(oversampling=...))"
+            )
+
+
+def ambiguity(
+    lines: RangeLines,
+    grid: Grid,
+    spectrum: Spectrum,
+    beam: BeamWindow | None = None,
+    along: NDArray[np.float64] | None = None,
+) -> Ambiguity:
+    """Error power that lines leave open in an image on a grid.
+
+    `along` are the track's directions for a beam, [channels, 3].
+    """
+    ends = ends_error(lines, grid, spectrum, beam, along)
+    return Ambiguity(ends, spectrum.aliasing, spectrum.oversampling)
+
+
+def ends_error(
+    lines: RangeLines,
+    grid: Grid,
+    spectrum: Spectrum,
+    beam: BeamWindow | None,
+    along: NDArray[np.float64] | None,
+) -> float:
+    """Relative error power from truncated lines: the samples beyond an end are unknown.
+
+    Notes
+    -----
+    Pixels within five samples of an end get what filters make of the cut, every filter another:
+    `_AT_END` of an end sample's power altogether. A thin guard band carries the cut farther: at m
+    samples from the end, the sinc interpolation of a component at distance d from the spectral
+    centre errs by 1/(2 pi m cos(pi d)) of its amplitude. Summed over the samples from `near` to
+    `far`, and over what a flat band of half width h holds beyond `_THIN`, that makes of an end
+    sample's power
+
+        S/pi^2 (1/near - 1/far),  S = (tan(pi h) - tan(pi _THIN))/(4 pi h).
+    """
+    some = some_channels(lines.channels, _CHANNELS)
+    part, points_m = lines.select(some), grid.spread(_PLACES)
+    range_m = pairwise_range_m(
+        points_m, part.tx_m, part.rx_m, part.rx_velocity_m_s, part.sound_speed_m_s
+    )
+    place = (range_m - part.first_range_m) / part.range_step_m
+    seen = np.ones(place.shape, bool)
+    if beam is not None:
+        low, high = beam.limits
+        sine = sines(points_m, part.phase_centres_m, along[some]).T
+        seen = (sine > low) & (sine < high)
+    nearest = np.where(seen, place, np.inf).min(axis=0)
+    farthest = np.where(seen, place, -np.inf).max(axis=0)
+    half_width = np.clip(0.5 / spectrum.oversampling, _THIN, 0.499)
+    steepness = np.tan(np.pi * half_width) - np.tan(np.pi * _THIN)
+    inside = steepness / (4 * np.pi**3 * half_width)
+    last = lines.length - 1
+    at_ends, total = 0.0, 0.0
+    for samples, near, far in zip(part.samples, nearest, farthest, strict=True):
+        line = samples.astype(np.complex128)
+        within = line[max(int(np.clip(near, 0, last)), 0) : int(np.clip(far, -1, last)) + 1]
+        if not within.size:
+            continue
+        total += np.vdot(within, within).real
+        for end, first, beyond in (
+            (line[:_END], near, far),
+            (line[-_END:], last - far, last - near),
+        ):
+            # Samples from the end to the nearest and the farthest pixel.
+            share = _AT_END if first < _BESIDE and beyond > -_BESIDE else 0.0
+            first = max(first, _BESIDE)
+            share += inside * max(1 / first - 1 / max(beyond, first), 0.0)
+            at_ends += share * np.vdot(end, end).real / len(end)
+    return at_ends / total if total else 0.0
