@@ -85,6 +85,7 @@ def scene(
     noise: float = 0.0,
     origin_m: Sequence[float] = (0.0, 0.0, 0.0),
     own_starts: bool = False,
+    relief_m: float = 0.0,
     seed: int = 0,
 ) -> Known:
     """Return points at random in a horizontal grid, as one sonar receives them.
@@ -121,6 +122,8 @@ def scene(
         What is added to all coordinates.
     own_starts : bool
         Whether every line begins at another range.
+    relief_m : float
+        Standard deviation of the pixels' heights over the grid's plane, each another.
     seed : int
 
     Returns
@@ -139,6 +142,8 @@ def scene(
     pixels = corner + np.stack(
         np.broadcast_arrays(x_m - x_m[0], (y_m - y_m[0])[:, None], 0.0), axis=-1
     )
+    height_m = relief_m * np.random.default_rng(seed).normal(size=shape)
+    pixels[..., 2] += height_m
     # Points keep off the border, so that the image holds their main lobes.
     points = corner + rng.uniform(0.1, 0.9, (targets, 3)) * [np.ptp(x_m), np.ptp(y_m), 0]
     amplitude = rng.normal(size=(targets, 2)) @ [1, 1j]
@@ -177,6 +182,9 @@ def scene(
 
     weights = 1.0 if beam is None else _weights(beam, pixels, (tx + rx) / 2)
     origin = np.asarray(origin_m, np.float64)
+    grid = Grid.oriented(corner + origin, [0, pixel_m[1], 0], [pixel_m[0], 0, 0], shape)
+    if relief_m:
+        grid = grid.with_height(height_m)
     return Known(
         RangeLines(
             values,
@@ -188,7 +196,7 @@ def scene(
             speed_m_s,
             rx_velocity_m_s,
         ),
-        Grid.oriented(corner + origin, [0, pixel_m[1], 0], [pixel_m[0], 0, 0], shape),
+        grid,
         oracle.image(echoes, of_pixels_m, weights).reshape(shape),
         beam,
     )
@@ -203,9 +211,9 @@ def ultrasonic(channels: int = 160, track: NDArray | None = None, **options: Any
     return scene(track, (0.3, 42.5, 0), **(defaults | options))
 
 
-def array(*, moving: bool, **options: Any) -> Known:
+def array(*, moving: bool, channels: int = 160, **options: Any) -> Known:
     """Eight receivers beside one transmitter per ping, that stand still or move at up to 17 m/s."""
-    rx = along_x(160, 8.25e-3)
+    rx = along_x(channels, 8.25e-3)
     tx = np.repeat(rx[::8], 8, axis=0) + [0.3, 0.1, -0.2]
     velocity = np.random.default_rng(3).uniform(-10, 10, rx.shape) if moving else None
     return ultrasonic(track=tx, rx_m=rx, rx_velocity_m_s=velocity, **options)

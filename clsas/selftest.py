@@ -101,13 +101,18 @@ def run(
         with warnings.catch_warnings():
             # What counts is the error found, whether or not the library warned of it.
             warnings.simplefilter("ignore", validate.ClsasWarning)
-            image = _IMAGERS[imager](known, asked_db, used)
+            image = form(imager, known, asked_db, used)
         bound_db = _WAVENUMBER_DB if asked_db is None else asked_db
         case = f"{scene}, {imager}{variant}"
         results.append(Result(case, asked_db, known.error_db(image.pixels), bound_db))
     if progress is not None:
         progress(len(checks), len(checks))
     return tuple(results)
+
+
+def form(imager: str, known: Known, asked_db: float | None, device: Device) -> Image:
+    """Return the image of a scene by one of `IMAGERS`."""
+    return IMAGERS[imager](known, asked_db, device)
 
 
 def forced_ways(info: DeviceInfo) -> list[tuple[int, bool]]:
@@ -176,7 +181,7 @@ def _wavenumber(known: Known, asked_db: float | None, device: Device) -> Image:
     return wavenumber(known.lines, known.grid, beam=known.beam)
 
 
-_IMAGERS = {
+IMAGERS = {
     "exact": _exact,
     "factorized": _factorized,
     "half precision": _in_half_precision,

@@ -62,18 +62,27 @@ def darkest_pixels(image: NDArray[np.complexfloating], darkest: float) -> NDArra
     TypeError, ValueError
         If `darkest` is not allowed, or the image is zero everywhere.
     """
-    from scipy import ndimage  # takes a while, and few need it
-
     darkest = validate.number("darkest", darkest, above=0.0, most=1.0)
     imaged = image != 0
     if not imaged.any():
         raise ValueError("the image must not be zero everywhere: it has no darkest part")
-    amplitude = np.abs(image)
-    level = (amplitude / amplitude.max()) ** 2
-    if level.ndim > 1:
-        level = ndimage.uniform_filter(level, _AROUND, mode="nearest")
+    level = levels(image)
     count = max(round(darkest * np.count_nonzero(imaged)), 1)
     order = np.argsort(np.where(imaged, level, np.inf), axis=None, kind="stable")
     chosen = np.zeros(image.size, bool)
     chosen[order[:count]] = True
     return chosen.reshape(image.shape)
+
+
+def levels(image: NDArray[np.complexfloating]) -> NDArray[np.float64]:
+    """Return the mean intensity around every pixel, over that of the brightest pixel.
+
+    The image must not be zero everywhere.
+    """
+    from scipy import ndimage  # takes a while to import, and few need it
+
+    amplitude = np.abs(image)
+    intensity = (amplitude / amplitude.max()) ** 2
+    if intensity.ndim == 1:
+        return intensity
+    return ndimage.uniform_filter(intensity, _AROUND, mode="nearest")

@@ -62,7 +62,7 @@ def test_the_command_prints_a_table(small):
 
 
 def test_a_miss_is_told_and_is_exit_code_1(small, monkeypatch):
-    monkeypatch.setattr(selftest, "_IMAGERS", selftest._IMAGERS | {"exact": _doubled})
+    monkeypatch.setattr(selftest, "IMAGERS", selftest.IMAGERS | {"exact": _doubled})
     result = CliRunner().invoke(main, ["selftest", "--json"])
     assert result.exit_code == 1
     found = json.loads(result.stdout)

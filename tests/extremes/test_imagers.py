@@ -68,6 +68,7 @@ CASES = {
     "bistatic": lambda: array(moving=False),
     "moving": lambda: array(moving=True),
     "narrow band": lambda: ultrasonic(bandwidth_hz=2e4, pixel_m=(4e-3, 2e-2)),
+    "relief": lambda: ultrasonic(relief_m=0.1, track=along_x(160, 8.25e-3) + [0, 0, 20]),
     "one target": lambda: ultrasonic(targets=1),
     "Hann beam": lambda: ultrasonic(track=along_x(600, 0.02), beam=HANN),
     "Hann beam, normalised": lambda: ultrasonic(
