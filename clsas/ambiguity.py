@@ -15,13 +15,13 @@ from clsas import validate
 from clsas.decibels import in_db, power
 from clsas.geometry import pairwise_range_m
 from clsas.grid import Grid
-from clsas.interpolation import NEEDED_OVERSAMPLING, Spectrum
 from clsas.lines import RangeLines, some_channels
+from clsas.spectrum import NEEDED_OVERSAMPLING, Spectrum
 from clsas.window import BeamWindow, sines
 
 _AT_END, _END = 0.03, 4  # measured on noise that fills 40 to 90 % of the sampled band; samples
 _BESIDE = 5  # samples
-_THIN = 0.4  # cycles per sample: with a narrower half band, cuts are not felt beyond `_BESIDE`
+_THIN = 0.42  # cycles per sample: with a narrower half band, cuts are not felt beyond `_BESIDE`
 _CHANNELS, _PLACES = 64, 16  # sampled channels, and pixels along either side of a grid
 _MOST, _LEAST = 0.5, 1e-3  # shares of the allowed error power: above, warn; below, ignore
 

@@ -22,9 +22,11 @@ from clsas.device import Device, Slot, aligned, open_device
 from clsas.geometry import bistatic_range_m, pairwise_range_m
 from clsas.grid import Grid
 from clsas.image import Image, holds_any
-from clsas.interpolation import Gain, Interpolator, Resampling, Spectrum
+from clsas.interpolation import Gain, Interpolator, Resampling
 from clsas.layout import GEOMETRY_ERROR, STACK, Groups, Tiles, allowed, lay_out
 from clsas.lines import RangeLines, some_channels
+from clsas.reach import warn_unseen
+from clsas.spectrum import Spectrum, cycles_per_m_at, measure_spectrum
 from clsas.window import HARDLY_SEEN, INTERVALS, BeamWindow, channel_ranges, sines
 
 BEST_ACCURACY_DB = -85.0
@@ -171,9 +173,7 @@ def backproject(
         beam=beam,
     )
     if accumulate is not None:
-        _check_same_grid(accumulate, grid)
-        if beam is not None and beam.normalise:
-            raise ValueError("accumulate must be None with a beam that normalises: it is a mean")
+        check_accumulate(accumulate, grid, beam)
     preparation.warn_of_ambiguity()
     image = execute(preparation, progress=progress)
     if accumulate is None:
@@ -204,7 +204,7 @@ def prepare(
     along = None if beam is None else beam.directions(lines)
     fullness = 1.0 if beam is None else fullness_of(lines, grid, beam, along)
     device = open_device(device)
-    spectrum = interpolation.measure_spectrum(lines, grid)
+    spectrum = measure_spectrum(lines, grid)
     left_open = ambiguity(lines, grid, spectrum, beam, along)
     antennas_m, cycles_per_m = antennas_and_phase(lines, spectrum, beam)
     fixed = taps is not None and upsampling is not None  # then accuracy_db plays no part
@@ -257,10 +257,14 @@ def form_exactly(
     grid: Grid,
     *,
     progress: Callable[[int, int], None] | None = None,
+    warned: bool = False,
     **wish: Any,
 ) -> Image:
-    """Form an image as `backproject` does, without its warnings of what the lines leave open."""
-    return execute(prepare(lines, grid, **wish), progress=progress)
+    """Form an image as `backproject` does, without its warnings of what the lines leave open.
+
+    `warned` is whether an image of zeros has been warned of too.
+    """
+    return execute(prepare(lines, grid, **wish), progress=progress, warned=warned)
 
 
 def antennas_and_phase(
@@ -276,7 +280,7 @@ def antennas_and_phase(
         antennas_m = np.unique(np.concatenate([lines.tx_m, lines.rx_m]), axis=0)
     if beam is not None:
         antennas_m = np.concatenate([antennas_m, lines.phase_centres_m])
-    of_phase = interpolation.cycles_per_m(lines, spectrum.centre)
+    of_phase = cycles_per_m_at(lines, spectrum.centre)
     return antennas_m, math.hypot(of_phase, 0.3 / lines.range_step_m)
 
 
@@ -299,9 +303,12 @@ def most_upsampling(device: Device, lines: RangeLines, lookup_radius_m: float) -
 
 
 def execute(
-    preparation: Preparation, *, progress: Callable[[int, int], None] | None = None
+    preparation: Preparation,
+    *,
+    progress: Callable[[int, int], None] | None = None,
+    warned: bool = False,
 ) -> Image:
-    """Form the image that was prepared.
+    """Form the image that was prepared; `warned` is whether one of zeros has been warned of.
 
     The image is formed in bands that fit the device, each from blocks of channels, each block in
     jobs of so many (part, channel) pairs; a job is prepared on the host while the one before runs.
@@ -328,7 +335,7 @@ def execute(
     finally:
         device.finish()  # an interrupted run leaves nothing in use
     image = Image(layout.collect(pixels), p.grid)
-    if not holds_any(image.pixels) and p.lines.samples.any():
+    if not warned and not holds_any(image.pixels) and p.lines.samples.any():
         warn_unseen(p.lines, layout.centres_m(slice(None)), p.beam, p.along)
     return image
 
@@ -791,10 +798,13 @@ def band_parts(device: Device, part_pixels: int, across: int, normalise: bool) -
     return max(most // (8 * (1 + normalise) * part_pixels) // across, 1) * across
 
 
-def _check_same_grid(image: Image, grid: Grid) -> None:
+def check_accumulate(image: Image, grid: Grid, beam: BeamWindow | None) -> None:
+    """Refuse an image that another one on a grid cannot be added to."""
     validate.instance("accumulate", image, Image)
     if image.grid is not grid and not np.array_equal(image.grid.positions_m(), grid.positions_m()):
         raise ValueError("accumulate must be an image on the same grid")
+    if beam is not None and beam.normalise:
+        raise ValueError("accumulate must be None with a beam that normalises: it is a mean")
 
 
 def check_numbers(lines: RangeLines, beam: BeamWindow | None) -> float:
@@ -850,41 +860,3 @@ def _check_distances(antennas_m: NDArray[np.float64], layout: Tiles | Groups) ->
             f"lines and grid must lie within {_LARGEST_DISTANCE_M:g} m of each other, "
             f"got {extent_m:g} m"
         )
-
-
-def warn_unseen(
-    lines: RangeLines,
-    centres_m: NDArray[np.float64],
-    beam: BeamWindow | None,
-    along: NDArray[np.float64] | None,
-) -> None:
-    """Warn that lines add nothing to parts of a grid with centres [parts, 3]."""
-    some = lines.select(slice(None, None, max(lines.channels // 64, 1)))
-    range_m = pairwise_range_m(
-        centres_m[:: max(len(centres_m) // 1024, 1)],
-        some.tx_m,
-        some.rx_m,
-        some.rx_velocity_m_s,
-        some.sound_speed_m_s,
-    )
-    spans = (
-        f"the lines span {lines.first_range_m.min():.6g} to {lines.last_range_m.max():.6g} m, the "
-        f"grid lies at {range_m.min():.6g} to {range_m.max():.6g} m"
-    )
-    if beam is None:
-        validate.warn(
-            f"no pixel of the grid lies within any line's range, so the image is zero: {spans}"
-        )
-        return
-    sine = sines(
-        centres_m[:: max(len(centres_m) // 1024, 1)],
-        some.phase_centres_m,
-        along[:: max(lines.channels // 64, 1)],
-    )
-    low, high = np.degrees(np.arcsin(np.clip([sine.min(), sine.max()], -1, 1)))
-    first, last = np.degrees(beam.limits_rad)
-    validate.warn(
-        f"no pixel of the grid lies within the beam and the range of any line, so the image is "
-        f"zero: the beam spans {first:.4g} to {last:.4g} degrees, the grid lies at {low:.4g} to "
-        f"{high:.4g} degrees; {spans}"
-    )

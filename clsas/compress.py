@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 from scipy.interpolate import CubicSpline
-from scipy.signal import get_window
 
 from clsas import validate
 from clsas.echoes import Echoes
@@ -159,6 +158,8 @@ def band_window(
     """
     if isinstance(window, str) and window == "none":
         return np.ones_like
+    from scipy.signal import get_window  # slow to import
+
     count = 4097
     try:
         values = get_window(window, count, fftbins=False)

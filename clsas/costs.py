@@ -9,9 +9,10 @@ from pathlib import Path
 from numpy.typing import ArrayLike
 
 from clsas import validate
+from clsas.atomic import replacing
 from clsas.device import Device
 from clsas.interpolation import COST
-from clsas.io import cache_folder, replacing
+from clsas.io import cache_folder
 
 
 @dataclass(frozen=True)
@@ -124,12 +125,17 @@ def path() -> Path:
 
 def load(device: Device) -> Costs:
     """Return what was measured for a device and its driver, or else `defaults`."""
+    return measured(device) or defaults(device)
+
+
+def measured(device: Device) -> Costs | None:
+    """Return what was measured for a device and its driver, if anything was."""
     names = {field.name for field in fields(Costs)}
     try:
         stored = json.loads(path().read_text())[_key(device)]
         return Costs(**{name: float(stored[name]) for name in names})
     except (OSError, ValueError, KeyError, TypeError):
-        return defaults(device)
+        return None
 
 
 def save(device: Device, costs: Costs) -> Path:

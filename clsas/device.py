@@ -20,12 +20,18 @@ import numpy as np
 import pyopencl as cl
 from numpy.typing import DTypeLike
 
+from clsas.extras import install_command
+
 ENVIRONMENT_VARIABLE = "CLSAS_DEVICE"
+KINDS = ("gpu", "cpu", "accelerator")
+"""Kinds of device, from the one that is chosen first."""
+_PLATFORMS = {"pocl": "portable computing language"}
+"""Names of platforms that people use and that are no part of the full one, in lower case."""
 _ALIGNMENT = 4096  # bytes: of pages
 
 _HOW_TO_GET_A_DEVICE = """\
 No OpenCL device was found. Any one of these gives one:
-  - a CPU driver from PyPI:  pip install "clsas[pocl]"
+  - a CPU driver from PyPI:  {command}
   - the vendor's driver of your GPU or CPU, which installs an .icd file in /etc/OpenCL/vendors;
     PyOpenCL's wheel looks there and in {folder}
     (copy or write an .icd file there when the driver lives in your Python environment:
@@ -378,9 +384,12 @@ def choose(wish: str | int | None = None) -> tuple[DeviceInfo, str]:
     Parameters
     ----------
     wish : str or int, optional
-        An index of `list_devices()`, or a part of "platform: name" in any case. None takes the
-        environment variable CLSAS_DEVICE, and without it the first GPU, then the CPU with the
-        widest vectors.
+        An index of `list_devices()`, a kind ("gpu", "cpu" or "accelerator"), a platform or part
+        of its name ("pocl", "intel", "nvidia", "amd"), or a part of "platform: name"; in any case.
+        What comes first in this list and matches counts: "intel" is Intel's platform also where
+        other platforms drive an Intel CPU. None takes the environment variable CLSAS_DEVICE.
+        Of several devices that match, or without a wish, the first GPU is chosen, then the CPU
+        with the widest vectors.
 
     Raises
     ------
@@ -390,14 +399,15 @@ def choose(wish: str | int | None = None) -> tuple[DeviceInfo, str]:
     devices = list_devices()
     if not devices:
         folder = Path(cl.__file__).parent / ".libs"
-        raise DeviceError(_HOW_TO_GET_A_DEVICE.format(folder=folder))
-    source = "asked for"
+        raise DeviceError(
+            _HOW_TO_GET_A_DEVICE.format(folder=folder, command=install_command("pocl"))
+        )
+    source = ""
     if wish is None and os.environ.get(ENVIRONMENT_VARIABLE):
         wish = os.environ[ENVIRONMENT_VARIABLE]
-        source = f"asked for by {ENVIRONMENT_VARIABLE}"
+        source = f" by {ENVIRONMENT_VARIABLE}"
     if wish is None:
-        order = ("gpu", "cpu", "accelerator")
-        chosen = min(devices, key=lambda info: (order.index(info.kind), -info.width, info.index))
+        chosen = _first(devices)
         if chosen.kind == "gpu":
             return chosen, "the first GPU"
         widest = f" with vectors of {chosen.width}" if chosen.width > 1 else ""
@@ -407,14 +417,33 @@ def choose(wish: str | int | None = None) -> tuple[DeviceInfo, str]:
     if isinstance(wish, (int, np.integer)) and not isinstance(wish, bool):
         fitting = [info for info in devices if info.index == wish]
     elif isinstance(wish, str):
-        part = wish.strip().lower()
-        fitting = [info for info in devices if part and part in info.label.lower()]
+        fitting = _named(wish.strip().lower(), devices)
     else:
         raise TypeError(f"device must be a name, an index or None, got {wish!r}")
     if not fitting:
-        have = "; ".join(f"{info.index} = {info.label}" for info in devices)
-        raise DeviceError(f"device {wish!r}, {source}, is not here; there are: {have}")
-    return fitting[0], f"{source} as {wish!r}"
+        have = "; ".join(f"{info.index}: {info.label}" for info in devices)
+        raise DeviceError(f"No device matches {wish!r}, asked for{source}. Available: {have}")
+    return _first(fitting), f"asked for{source} as {wish!r}"
+
+
+def _first(devices: Sequence[DeviceInfo]) -> DeviceInfo:
+    """Return the device that is chosen of several: a GPU, else the CPU of the widest vectors."""
+    return min(devices, key=lambda info: (KINDS.index(info.kind), -info.width, info.index))
+
+
+def _named(name: str, devices: Sequence[DeviceInfo]) -> list[DeviceInfo]:
+    """Return the devices of a kind, else of a platform, else those whose label holds a name."""
+    if not name:
+        return []
+    names = name, _PLATFORMS.get(name, name)
+    for fits in (
+        lambda info: info.kind == name,
+        lambda info: any(each in info.platform.lower() for each in names),
+        lambda info: any(each in info.label.lower() for each in names),
+    ):
+        if fitting := [info for info in devices if fits(info)]:
+            return fitting
+    return []
 
 
 @functools.cache

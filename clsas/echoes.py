@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from clsas import validate
 from clsas.sonar import Pulse
@@ -57,6 +58,21 @@ class Echoes:
     pulse: Pulse | None = None
     rx_velocity_m_s: NDArray[np.float64] | None = None
 
+    if TYPE_CHECKING:  # arrays are converted: the constructor takes what holds numbers
+
+        def __init__(
+            self,
+            samples: ArrayLike,
+            start_time_s: ArrayLike,
+            sample_rate_hz: float,
+            carrier_hz: float,
+            tx_m: ArrayLike,
+            rx_m: ArrayLike,
+            sound_speed_m_s: float,
+            pulse: Pulse | None = None,
+            rx_velocity_m_s: ArrayLike | None = None,
+        ) -> None: ...
+
     def __post_init__(self) -> None:
         """Check every field and convert it."""
 
@@ -91,7 +107,7 @@ class Echoes:
         """Return sizes and rates: the arrays are long."""
         return (
             f"Echoes({self.channels} channels of {self.length} samples at "
-            f"{self.sample_rate_hz:.6g} Hz, carrier {self.pulse.carrier_hz:.6g} Hz)"
+            f"{self.sample_rate_hz:.6g} Hz, carrier {self.carrier_hz:.6g} Hz)"
         )
 
     @property

@@ -17,22 +17,23 @@ from clsas import validate
 from clsas.backproject import (
     VECTOR_ROOM,
     channel_pitch,
+    check_accumulate,
     check_numbers,
     form_exactly,
     upsampled_lines,
-    warn_unseen,
 )
 from clsas.decibels import in_db
 from clsas.device import Device, Slot, aligned, open_device
 from clsas.filters import edges_gain
 from clsas.grid import Grid
 from clsas.image import Image, holds_any
-from clsas.interpolation import FEW_CHANNELS, MEASURED_CHANNELS, power_outside
 from clsas.leaves import Finish, Level, PlaneLeaves, SurfaceLeaves
 from clsas.lines import RangeLines
 from clsas.plan import CHUNK, GUARD, MARGIN, Plan, padded_length, sample_bytes
 from clsas.planner import BEST_TOLERANCE_DB, WORST_TOLERANCE_DB, plan
+from clsas.reach import warn_unseen
 from clsas.sector import Geometry, Sector
+from clsas.spectrum import FEW_CHANNELS, MEASURED_CHANNELS, power_outside
 from clsas.surface import surface_of
 from clsas.upsample import upsample
 from clsas.window import BeamWindow
@@ -53,6 +54,7 @@ def factorize(
     *,
     beam: BeamWindow | None = None,
     device: Device | str | int | None = None,
+    accumulate: Image | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Image:
     """Form the image of range lines fast, to a tolerance.
@@ -70,6 +72,9 @@ def factorize(
         Weights of the channels; a plan holds its own.
     device : Device, str or int, optional
         See `clsas.device.choose`.
+    accumulate : Image, optional
+        Image on the same grid that this one is added to, so that data may arrive in pieces. The
+        tolerance is of this image alone.
     progress : callable, optional
         Called as progress(done, total).
 
@@ -82,7 +87,8 @@ def factorize(
     ------
     TypeError, ValueError
         If an argument is not what is allowed, the plan was made for other lines or another grid,
-        or `beam` is given beside a plan.
+        `beam` is given beside a plan, or `accumulate` is on another grid or beside a beam that
+        normalises.
     DeviceError
         If there is no such device.
 
@@ -122,6 +128,21 @@ def factorize(
         chosen = plan_or_tolerance
         chosen.check(lines, grid)
         _check_band(lines, chosen)
+    if accumulate is not None:
+        check_accumulate(accumulate, grid, chosen.beam)
+    image = _form(lines, grid, chosen, device, progress)
+    return image if accumulate is None else Image(image.pixels + accumulate.pixels, grid)
+
+
+def _form(
+    lines: RangeLines,
+    grid: Grid,
+    chosen: Plan,
+    device: Device,
+    progress: Callable[[int, int], None] | None,
+) -> Image:
+    """Return the image by a checked plan."""
+    warned = chosen.kept.get("warned", False)  # not where the plan comes from a file
     if chosen.is_exact:
         # The plan has warned of ends of lines.
         return form_exactly(
@@ -131,6 +152,7 @@ def factorize(
             accuracy_db=chosen.accuracy_db,
             beam=chosen.beam,
             progress=progress,
+            warned=warned,
         )
     largest = check_numbers(lines, chosen.beam)
     pixels, done = aligned(np.empty, grid.shape, np.complex64), 0
@@ -143,7 +165,7 @@ def factorize(
     finally:
         device.finish()  # an interrupted run leaves nothing in use
     image = Image(pixels, grid)
-    if not holds_any(pixels) and lines.samples.any():
+    if not warned and not holds_any(pixels) and lines.samples.any():
         corners_m = run.division.centres_m(0, run.division.roots)
         along = None if chosen.beam is None else chosen.beam.directions(lines)
         warn_unseen(lines, corners_m, chosen.beam, along)

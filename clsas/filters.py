@@ -11,7 +11,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from clsas import interpolation
 from clsas.decibels import in_db, power
-from clsas.interpolation import PHASES, Gain, Interpolator, Spectrum
+from clsas.interpolation import PHASES, Gain, Interpolator
+from clsas.spectrum import Spectrum
 
 ALIGN_TAPS = APERTURE_TAPS = (4, 6, 8)
 _FINAL_TAPS = (2, 4, 6, 8)

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Self
+from typing import TYPE_CHECKING, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -13,6 +14,27 @@ from clsas import validate
 
 _ALL = slice(None)
 _PARALLEL = 1e-12  # sine of the angle between steps: float64 leaves 1e-16
+
+
+class Axis(NamedTuple):
+    """One side of a plane: along which coordinate it runs, and where its pixels lie.
+
+    Attributes
+    ----------
+    name : str
+        "x", "y" or "z" where the side is parallel to that coordinate, else "along columns" or
+        "along rows".
+    places_m : ndarray of float64
+        That coordinate of every column (or row); else its distance from the first one. Metres.
+    """
+
+    name: str
+    places_m: NDArray[np.float64]
+
+    @property
+    def step_m(self) -> float:
+        """Distance from one place to the next, metres: negative where the coordinate falls."""
+        return float(self.places_m[-1] - self.places_m[0]) / max(len(self.places_m) - 1, 1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,6 +67,18 @@ class Grid:
     shape: tuple[int, ...]
     height_m: NDArray[np.float64] | None = None
     points_m: NDArray[np.float64] | None = None
+
+    if TYPE_CHECKING:  # arrays are converted: the constructor takes what holds numbers
+
+        def __init__(
+            self,
+            origin_m: ArrayLike | None,
+            row_step_m: ArrayLike | None,
+            column_step_m: ArrayLike | None,
+            shape: Sequence[int],
+            height_m: ArrayLike | None = None,
+            points_m: ArrayLike | None = None,
+        ) -> None: ...
 
     def __post_init__(self) -> None:
         """Check every field and convert it."""
@@ -196,6 +230,31 @@ class Grid:
             self.origin_m[0] + np.arange(columns) * self.column_step_m[0],
             self.origin_m[1] + np.arange(rows) * self.row_step_m[1],
         )
+
+    @property
+    def sides(self) -> tuple[Axis, Axis]:
+        """The axes of a plane or height map: what runs along its columns, and along its rows.
+
+        Raises
+        ------
+        ValueError
+            If the grid holds arbitrary points.
+        """
+        if self.points_m is not None:
+            raise ValueError("grid must be a plane or height map to have axes, got points")
+        rows, columns = self.shape
+        across = self._side("along columns", self.column_step_m, columns, free="xyz")
+        taken = across.name if len(across.name) == 1 else ""
+        free = [name for name in "yxz" if name != taken]
+        return across, self._side("along rows", self.row_step_m, rows, free="".join(free))
+
+    def _side(self, name: str, step_m: NDArray[np.float64], count: int, free: str) -> Axis:
+        """Return the axis of some steps; without any it is that of the first `free` coordinate."""
+        along = np.flatnonzero(np.abs(step_m) > _PARALLEL * np.abs(step_m).max())
+        if len(along) > 1:
+            return Axis(name, np.arange(count) * float(np.linalg.norm(step_m)))
+        index = along[0] if len(along) else "xyz".index(free[0])
+        return Axis("xyz"[index], self.origin_m[index] + np.arange(count) * step_m[index])
 
     def positions_m(self, rows: slice = _ALL, columns: slice = _ALL) -> NDArray[np.float64]:
         """Return pixel positions, float64 [..., 3], metres.

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from clsas import validate
 from clsas.grid import Grid
@@ -40,11 +41,36 @@ class Image:
     pixels: NDArray[np.complex64]
     grid: Grid
 
+    if TYPE_CHECKING:  # arrays are converted: the constructor takes what holds numbers
+
+        def __init__(
+            self,
+            pixels: ArrayLike,
+            grid: Grid,
+        ) -> None: ...
+
     def __post_init__(self) -> None:
         """Check every field and convert it."""
         validate.instance("grid", self.grid, Grid)
         pixels = validate.array("pixels", self.pixels, np.complex64, self.grid.shape)
         object.__setattr__(self, "pixels", pixels)
+
+    def __array__(self, dtype: DTypeLike | None = None, copy: bool | None = None) -> NDArray:
+        """Return the pixels, so that NumPy's functions take an image.
+
+        Parameters
+        ----------
+        dtype : dtype, optional
+            complex64 unless given. Real ones are refused: they would lose the phase.
+        copy : bool, optional
+            True copies, False raises ValueError where a copy is needed, None copies only then.
+        """
+        wanted = np.dtype(np.complex64 if dtype is None else dtype)
+        if wanted.kind != "c":
+            raise TypeError(f"dtype must be complex, as pixels are, got {wanted}: take np.abs")
+        if copy is False and wanted != self.pixels.dtype:
+            raise ValueError(f"copy must not be False where complex64 becomes {wanted}")
+        return self.pixels.astype(wanted, copy=bool(copy))
 
 
 def holds_any(pixels: NDArray[np.complex64]) -> bool:

@@ -9,12 +9,10 @@ import numpy as np
 import scipy.fft
 from numpy.typing import NDArray
 from scipy.linalg import lstsq
-from scipy.ndimage import uniform_filter1d
 
 from clsas import validate
-from clsas.geometry import pairwise_range_m
-from clsas.grid import Grid
-from clsas.lines import RangeLines, some_channels
+from clsas.lines import RangeLines
+from clsas.spectrum import Spectrum, cycles_per_m_at
 
 TAPS = (2, 4, 6, 8)
 UPSAMPLINGS = (1.0, 1.25, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0, 12.0, 16.0)
@@ -25,51 +23,11 @@ MOST_UPSAMPLING = 64.0
 COST = {2: 0.75, 4: 1.0, 6: 1.3, 8: 1.55}
 # The same, in such, for one upsampled sample: an FFT on the host.
 _UPSAMPLING_COST = 40.0
-_FREQUENCIES = 128
-MEASURED_CHANNELS, FEW_CHANNELS = 256, 32  # of which a spectrum is taken: with care, in haste
 Gain = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 """A factor of spectra, by the distance from their centre in cycles per sample."""
 _POSITIONS = 17
-NEEDED_OVERSAMPLING = 1.05
-"""Sample rate over occupied bandwidth from which on a guard band keeps the band's edges apart."""
-_FLOOR_WIDTH = 1 / 64  # cycles per sample: the quietest stretch, which is taken as noise
-_FLOOR_MARGIN = 2.0  # the mean of few periodograms scatters by as much
-_OUTSIDE_BAND = 1e-4  # of the signal's power: tails of windows and of finite lines
-_CLOSING = 1 / 1024  # cycles per sample to either side of where the circle closes
-_COHERENT_CYCLES = 2.0  # of phase over the aperture, up to which common parts add up
-_COHERENT_CHANNELS, _COHERENT_PLACES, _COHERENT_FREQUENCIES = 128, 3, 256  # sampled
-_LINES_TOGETHER = 8  # that are transformed
-
-
-@dataclass(frozen=True, eq=False)
-class Spectrum:
-    """Mean power spectrum of a set of lines, seen from its own centre.
-
-    Attributes
-    ----------
-    centre : float
-        Centre of the occupied band, cycles per sample, in [-0.5, 0.5).
-    frequency : float64 [n]
-        Distance from the centre, cycles per sample, 0 to 0.5.
-    power : float64 [n]
-        Weight of the errors at that distance, both sides together: share of the power of the lines
-        or, where that is more, of the image. Sums to 1 to 2.
-    oversampling : float
-        Sample rate over the width of the occupied band.
-    aliasing : float
-        Share of the power that may have aliased, since the band fills all that is sampled.
-    """
-
-    centre: float
-    frequency: NDArray[np.float64]
-    power: NDArray[np.float64]
-    oversampling: float = np.inf
-    aliasing: float = 0.0
-
-    @property
-    def share(self) -> NDArray[np.float64]:
-        """Power that sums to 1."""
-        return self.power / self.power.sum()
+_SCATTER_DB = 0.5
+_FEW_FREQUENCIES = 4.0  # power at one frequency of a spectrum may err by 5 times as predicted
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,167 +81,6 @@ class Interpolator:
         away = place - nu[:, None]
         turns = np.asarray(frequency)[..., None, None] * away
         return np.mean(np.sum(self.weights(nu) * np.cos(2 * np.pi * turns), axis=-1), axis=-1)
-
-
-def measure_spectrum(lines: RangeLines, grid: Grid | None = None) -> Spectrum:
-    """Mean power spectrum of the lines, about the middle of their occupied band.
-
-    With a grid, frequencies that add up coherently in its image weigh as much as they do there.
-    """
-    samples = _sampled_lines(lines, MEASURED_CHANNELS)
-    frequency, power, faded = _mean_power(samples, lines.length)
-    centre, width = _occupied_band(frequency, faded)
-    distance = _distance(frequency, centre)
-    nearest = np.minimum((2 * _FREQUENCIES * distance).astype(np.int64), _FREQUENCIES - 1)
-    if grid is not None:
-        power = np.maximum(power, _image_power(lines, grid, frequency, power))
-    return Spectrum(
-        centre,
-        (np.arange(_FREQUENCIES) + 0.5) / (2 * _FREQUENCIES),
-        np.bincount(nearest, power, _FREQUENCIES),
-        oversampling=1 / width,
-        aliasing=_aliasing(distance, faded, width),
-    )
-
-
-def _occupied_band(
-    frequency: NDArray[np.float64], power: NDArray[np.float64]
-) -> tuple[float, float]:
-    """Middle and width of the occupied band, cycles per sample.
-
-    Frequencies farther than half a cycle per sample from the middle alias. The band is therefore
-    the narrowest arc of the frequency circle that holds nearly all power above the noise floor: the
-    opposite point lies in the middle of the guard band, however the spectrum is shaped.
-    """
-    count = len(power)
-    smoothed = uniform_filter1d(power, max(round(_FLOOR_WIDTH * count), 1), mode="wrap")
-    signal = np.maximum(power - _FLOOR_MARGIN * smoothed.min(), 0.0)
-    if not signal.any():  # white: no arc is better than another
-        return float(np.angle(power @ np.exp(2j * np.pi * frequency)) / (2 * np.pi)), 0.5
-    held = np.append(0.0, np.cumsum(np.tile(signal, 2)))
-    ends = np.searchsorted(held, held[:count] + (1 - _OUTSIDE_BAND) * held[count])
-    bins = ends - np.arange(count)
-    first = int(np.argmin(bins))
-    middle = (first + (bins[first] - 1) / 2) / count
-    return float((middle + 0.5) % 1.0 - 0.5), float(bins[first] / count)
-
-
-def _aliasing(distance: NDArray[np.float64], power: NDArray[np.float64], width: float) -> float:
-    """Share of the power that may have aliased: what lies where the circle closes, if it is full.
-
-    With a guard band it is noise, on either side alike.
-    """
-    if width <= 1 / NEEDED_OVERSAMPLING:
-        return 0.0
-    closing = max(_CLOSING, 1.5 / len(power))
-    return float(power[distance > 0.5 - closing].sum())
-
-
-def power_outside(lines: RangeLines, centre: float, half_width: float, most_channels: int) -> float:
-    """Share of the lines' power outside a band, in cycles per sample; of some lines."""
-    frequency, power, _ = _mean_power(_sampled_lines(lines, most_channels), lines.length)
-    return float(power[_distance(frequency, centre) > half_width].sum())
-
-
-def _distance(frequency: NDArray[np.float64], centre: float) -> NDArray[np.float64]:
-    """Return how far frequencies are from a centre, cycles per sample, 0 to 0.5."""
-    return np.abs((frequency - centre + 0.5) % 1.0 - 0.5)
-
-
-def _sampled_lines(lines: RangeLines, most_channels: int) -> NDArray[np.complex64]:
-    """Take the samples of some channels that hold anything."""
-    samples = lines.samples[some_channels(lines.channels, most_channels)]
-    if _largest_part(samples) == 0 and (filled := np.flatnonzero(lines.samples.any(axis=1))).size:
-        samples = lines.samples[filled[some_channels(len(filled), most_channels)]]
-    return samples
-
-
-def _mean_power(
-    samples: NDArray[np.complex64], line_length: int
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Frequencies, cycles per sample, and the share of the power at each, of lines as they are.
-
-    The last is the share of lines that fade to both ends: it shows the band without the leakage of
-    lines that are cut.
-    """
-    largest = _largest_part(samples) or samples.real.dtype.type(1)
-    length = scipy.fft.next_fast_len(2 * line_length)
-    power, faded = np.zeros(length), np.zeros(length)
-    parts = samples.view(samples.real.dtype)
-    # So few together that they stay in the processor's caches.
-    for block in np.array_split(parts, -(-len(parts) // _LINES_TOGETHER)):
-        amplitude = scipy.fft.fft((block / largest).view(samples.dtype), length)
-        power += _column_power(amplitude)
-        # A Hann window over half of the FFT's length, where the lines lie.
-        faded += _column_power(
-            amplitude - (np.roll(amplitude, 2, axis=1) + np.roll(amplitude, -2, axis=1)) / 2
-        )
-    frequency = scipy.fft.fftfreq(length)
-    if not power.any():
-        power[:] = 1.0
-    if not faded.any():
-        faded = power
-    return frequency, power / power.sum(), faded / faded.sum()
-
-
-def _column_power(amplitude: NDArray[np.complexfloating]) -> NDArray[np.float64]:
-    """Power of every column, summed in double precision."""
-    return np.sum(amplitude.real**2 + amplitude.imag**2, axis=0, dtype=np.float64)
-
-
-def _image_power(
-    lines: RangeLines, grid: Grid, frequency: NDArray[np.float64], power: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Share of an image's power that every frequency of its lines brings.
-
-    What channels have in common near 0 Hz on the carrier, such as a constant offset, adds up in
-    phase over the whole image: its power grows as the square of the channels, that of echoes from
-    all over the scene as their number. The gain is measured by summing some channels in phase at
-    some pixels, and extrapolated to all channels.
-    """
-    some = some_channels(lines.channels, _COHERENT_CHANNELS)
-    if len(some) < 2:
-        return power
-    part = lines.select(some)
-    range_m = pairwise_range_m(
-        grid.spread(_COHERENT_PLACES),
-        part.tx_m,
-        part.rx_m,
-        part.rx_velocity_m_s,
-        part.sound_speed_m_s,
-    )
-    phase_per_m = cycles_per_m(lines, frequency)
-    spread_m = float(np.ptp(range_m, axis=1).max())
-    coherent = np.flatnonzero(np.abs(phase_per_m) * spread_m < _COHERENT_CYCLES)
-    if not coherent.size or coherent.size == len(power):
-        return power
-    strongest = np.argsort(power[coherent])[::-1][:_COHERENT_FREQUENCIES]
-    coherent = coherent[strongest]
-    # Samples about a range near all of them keep phases small.
-    scale = _largest_part(part.samples) or 1.0
-    turns = np.exp(-2j * np.pi * np.outer(np.arange(lines.length), frequency[coherent]))
-    spectra = (part.samples / scale) @ turns
-    spectra *= np.exp(-2j * np.pi * np.outer(part.first_range_m, phase_per_m[coherent]))
-    spectra *= np.exp(2j * np.pi * part.carrier_cycles_per_m * part.first_range_m)[:, None]
-    steering = np.exp(2j * np.pi * range_m[..., None] * phase_per_m[coherent])
-    summed = np.mean(np.abs(np.einsum("pcf,cf->pf", steering, spectra)) ** 2, axis=0)
-    alone = np.sum(np.abs(spectra) ** 2, axis=0)
-    gain = np.divide(summed, alone, out=np.ones_like(summed), where=alone > 0) - 1
-    gain = 1 + gain * (lines.channels - 1) / (len(some) - 1)
-    found = power.copy()
-    found[coherent] *= np.maximum(gain, 0.0)
-    return found / found.sum()
-
-
-def _largest_part(samples: NDArray[np.complex64]) -> np.float32:
-    """Return the largest real or imaginary part; magnitudes might overflow."""
-    parts = samples.view(samples.real.dtype)
-    return max(parts.max(initial=0.0), -parts.min(initial=0.0))
-
-
-def cycles_per_m(lines: RangeLines, frequency: float) -> float:
-    """Return the phase per metre of range, cycles, at a frequency in cycles per sample."""
-    return lines.carrier_cycles_per_m + frequency / lines.range_step_m
 
 
 def design(taps: int, upsampling: float, spectrum: Spectrum) -> Interpolator:
@@ -352,7 +149,8 @@ def choose(
 ) -> Interpolator:
     """Return the cheapest interpolator that keeps the error below `accuracy_db`.
 
-    Half a decibel is left for the scatter of measured errors about the predicted one.
+    Half a decibel is left for the scatter of measured errors about the predicted one, and up to
+    four where the power lies at few frequencies, so that errors do not average out.
 
     Parameters
     ----------
@@ -382,7 +180,8 @@ def choose(
     if taps is not None and upsampling is not None:
         return design(taps, upsampling, spectrum)
     power_left = 10 ** (accuracy_db / 10) - other_error**2
-    target_db = 10 * np.log10(max(power_left, 1e-30)) - 0.5
+    few = _FEW_FREQUENCIES * float(np.sum(spectrum.share**2))
+    target_db = 10 * np.log10(max(power_left, 1e-30) / (1 + few)) - _SCATTER_DB
     rates: Sequence[float] = UPSAMPLINGS if upsampling is None else (upsampling,)
     candidates = []
     for each_taps in TAPS if taps is None else (taps,):
@@ -448,7 +247,7 @@ class Resampling:
 
     def cycles_per_m(self, lines: RangeLines) -> float:
         """Return the phase per metre of range at the spectral centre, cycles."""
-        return cycles_per_m(lines, self.centre_cycles_per_sample)
+        return cycles_per_m_at(lines, self.centre_cycles_per_sample)
 
     @property
     def frequency(self) -> NDArray[np.float64]:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 import os
-import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import fields, is_dataclass
@@ -22,6 +21,7 @@ import numpy as np
 from platformdirs import user_cache_path
 
 from clsas import validate
+from clsas.atomic import replacing
 from clsas.echoes import Echoes
 from clsas.grid import Grid
 from clsas.image import Image
@@ -42,6 +42,9 @@ _KINDS = {
 }
 _SAVED = (Grid, RangeLines, Image, Echoes)
 
+SUFFIXES = (".h5", ".hdf5", ".he5")
+"""What names of files may end in."""
+
 Saved = Grid | RangeLines | Image | Echoes
 
 
@@ -55,7 +58,7 @@ def save(path: str | os.PathLike, obj: Saved) -> None:
     Parameters
     ----------
     path : path-like
-        The file. Its folder must exist.
+        The file: its name ends in one of `SUFFIXES` or has none. Its folder must exist.
     obj : Grid, RangeLines, Image or Echoes
         What to write; `load` returns it bit for bit.
 
@@ -63,6 +66,8 @@ def save(path: str | os.PathLike, obj: Saved) -> None:
     ------
     TypeError
         If `obj` is of another type.
+    ValueError
+        If the file's name ends as one of another format, such as .tif.
     OSError
         If the folder does not exist or the file cannot be written, as on a full disk.
 
@@ -72,6 +77,7 @@ def save(path: str | os.PathLike, obj: Saved) -> None:
     recover from a disk that turns out to be full.
     """
     path = validate.path("path", path)
+    validate.suffix("path", path, *SUFFIXES)
     validate.instance("obj", obj, *_SAVED)
     with replacing(path) as temporary:
         memory = BytesIO()
@@ -80,10 +86,7 @@ def save(path: str | os.PathLike, obj: Saved) -> None:
             _set(content, "format", FORMAT)
             content.attrs["version"] = VERSION
             _write(content, obj)
-        with temporary.open("xb") as file:
-            file.write(memory.getbuffer())
-            file.flush()
-            os.fsync(file.fileno())
+        temporary.write_bytes(memory.getbuffer())
 
 
 def load(path: str | os.PathLike) -> Saved:
@@ -163,33 +166,6 @@ def _opened(path: str | os.PathLike) -> Iterator[h5py.File]:
     # HDF5 reports damage by any of these, depending on what it met first.
     except (OSError, RuntimeError, LookupError, ValueError, TypeError) as error:
         raise FileFormatError(f"{path} is damaged: {error}") from error
-
-
-@contextmanager
-def replacing(path: str | os.PathLike) -> Iterator[Path]:
-    """Give a temporary path beside `path`; rename it to `path` on success, else remove it.
-
-    Raises
-    ------
-    OSError
-        If the folder of `path` does not exist, or `path` is a folder.
-    """
-    path = Path(path)
-    if not path.parent.is_dir():
-        raise FileNotFoundError(f"cannot write {path}: there is no folder {path.parent}")
-    if path.is_dir():
-        raise IsADirectoryError(f"cannot write {path}: it is a folder")
-    temporary = path.with_name(f".{uuid.uuid4().hex}.part")
-    try:
-        yield temporary
-        os.replace(temporary, path)
-    except OSError as error:
-        # A full disk names no file, and the temporary one says nothing.
-        if error.errno is not None and error.filename in (None, str(temporary), temporary):
-            raise type(error)(error.errno, error.strerror, str(path)) from error
-        raise
-    finally:  # also on Ctrl-C
-        temporary.unlink(missing_ok=True)
 
 
 def cache_folder() -> Path:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -66,6 +67,20 @@ class RangeLines:
     carrier_hz: float
     sound_speed_m_s: float
     rx_velocity_m_s: NDArray[np.float64] | None = None
+
+    if TYPE_CHECKING:  # arrays are converted: the constructor takes what holds numbers
+
+        def __init__(
+            self,
+            samples: ArrayLike,
+            first_range_m: ArrayLike,
+            range_step_m: float,
+            tx_m: ArrayLike,
+            rx_m: ArrayLike,
+            carrier_hz: float,
+            sound_speed_m_s: float,
+            rx_velocity_m_s: ArrayLike | None = None,
+        ) -> None: ...
 
     def __post_init__(self) -> None:
         """Check every field and convert it."""

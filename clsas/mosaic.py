@@ -16,7 +16,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, ThreadPoolExecutor, wait
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import chain
 from pathlib import Path
@@ -40,9 +40,11 @@ from clsas.geometry import bistatic_range_m
 from clsas.grid import Grid
 from clsas.image import Image, holds_any
 from clsas.lines import RangeLines
-from clsas.plan import Plan, grid_digest
+from clsas.plan import Plan
 from clsas.planner import TOLERANCE_DB, checked_pairs, plan, tolerance_in_db
-from clsas.store import Record, Store
+from clsas.provenance import WISHES, beam_json, inputs_of
+from clsas.record import Record, describe_damage
+from clsas.store import Store
 from clsas.survey import Survey, files_of, has_ended, largest_gap_m, open_files, open_survey
 from clsas.window import MOST_TRACK_PINGS, BeamWindow, touches_boxes
 
@@ -51,9 +53,6 @@ if TYPE_CHECKING:
 
 MEMORY_BYTES = 1 << 30
 """What one patch may take unless told otherwise."""
-
-WISHES = ("tolerance_db", "tolerance_wavelengths", "stages", "accuracy_db")
-"""How a mosaic may be wished for: at most one of these."""
 
 _LARGEST_SIDE = 4096  # pixels of a patch, where memory allows more: seconds of work
 _SMALLEST_SIDE = 128
@@ -95,7 +94,7 @@ class Patch:
         """The pixels; read from the store where another process formed them."""
         if self._formed is not None:
             return self._formed
-        return Image(self._store.pixels[self.rows, self.columns], self.grid)
+        return Image(self._store.read(self.rows, self.columns), self.grid)
 
 
 @dataclass(frozen=True, eq=False)
@@ -433,7 +432,7 @@ def mosaic(
         beam = replace(beam, track_pings=MOST_TRACK_PINGS)
     sight = _Sight.of(survey, beam)
     opened = None if store is None else Store.at(store)
-    inputs = {} if opened is None else _inputs(survey, grid, wish, beam)
+    inputs = {} if opened is None else inputs_of(survey, grid, wish, beam)
     if patches is None:
         stored = None if opened is None else opened.patch_shape
         patch_shape = stored or _choose_shape(sight, grid, memory_bytes)
@@ -448,7 +447,7 @@ def mosaic(
     finished: dict[tuple[int, int], Record] = {}
     if opened is not None:
         opened.begin(inputs, grid, patch_shape)
-        finished = opened.records()
+        finished = _undamaged(opened)
     found = Mosaic(
         grid, patch_shape, finished, job, inputs, sight, source, devices, client, follow_s
     )
@@ -457,6 +456,16 @@ def mosaic(
         if sight.sees_later(found._window(*place)[0], record.survey_channels):
             del finished[place]
     return found
+
+
+def _undamaged(store: Store) -> dict[tuple[int, int], Record]:
+    """Return the records of a store's finished patches; warn of damaged ones."""
+    damage = store.damage()
+    if damage:
+        validate.warn(
+            f"{store.path} is damaged and these patches are formed again: {describe_damage(damage)}"
+        )
+    return {place: record for place, record in store.records().items() if place not in damage}
 
 
 @dataclass(frozen=True, eq=False)
@@ -486,7 +495,7 @@ class _Job:
         if self.sight_here is not None:
             return self.sight_here
         with _OPENING:
-            found = _opened(self.files, _beam_json(self.beam))
+            found = _opened(self.files, beam_json(self.beam))
         if found.survey.stamps != tuple(stamp for _, stamp in self.files):
             raise ValueError("source must not change while a mosaic is formed: a file of it did")
         return found
@@ -705,24 +714,6 @@ def _box(grid: Grid) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     low, high = grid.height_m.min(), grid.height_m.max()
     up = np.array([0.0, 0.0, 1.0])
     return centre_m + up * (low + high) / 2, np.concatenate([half_m, [up * (high - low) / 2]])
-
-
-def _inputs(
-    survey: Survey, grid: Grid, wish: dict[str, Any], beam: BeamWindow | None
-) -> dict[str, Any]:
-    """Return what a store must have been made with, as JSON has it."""
-    inputs = {
-        "parts": survey.digests(),
-        "grid": grid_digest(grid),
-        "pixels": list(grid.shape),
-        "beam": None if beam is None else json.loads(_beam_json(beam)),
-        **{name: wish.get(name) for name in WISHES},
-    }
-    return json.loads(json.dumps(inputs))
-
-
-def _beam_json(beam: BeamWindow | None) -> str | None:
-    return None if beam is None else json.dumps(asdict(beam), default=lambda value: value.tolist())
 
 
 def _without_directions(chosen: Plan) -> Plan:

@@ -126,6 +126,9 @@ class Plan:
     band : (centre, half width) or None
         Frequencies, cycles per sample, that filters are made for where the aperture is
         interpolated.
+    calibrated : bool
+        Whether times follow from costs that were measured on this device or given, and not from
+        defaults.
     """
 
     tolerance_db: float | None
@@ -158,6 +161,7 @@ class Plan:
     beam_cycles: float = 0.0
     most_channels: tuple[int, ...] = ()
     band: tuple[float, float] | None = None
+    calibrated: bool = True
 
     def __post_init__(self) -> None:
         """Check what sizes buffers and indices."""
@@ -289,9 +293,17 @@ class Plan:
             f"{_seconds(self.predicted_seconds)} on {self.device} "
             f"(exact: {_seconds(self.exact_seconds)}), {self.memory_bytes / 2**20:.0f} MiB"
         ]
+        usual = (
+            []
+            if self.calibrated
+            else [
+                "Times follow from default costs, not from any measured on this device: "
+                "`clsas calibrate` measures them."
+            ]
+        )
         if self.is_exact:
             reason = "" if self.tolerance_db is None else ": no factorization is faster within it"
-            return f"{lines[0]}\nPlain backprojection{reason}."
+            return "\n".join([*lines, f"Plain backprojection{reason}.", *usual])
         lines[0] += f", {'half' if self.half_precision else 'single'} precision"
         taps = f"{self.align.taps} taps in range at {self.resampling.ratio:.2f} x the lines' rate"
         if self.nearest:
@@ -330,15 +342,26 @@ class Plan:
         widths = [max(map(len, column)) for column in zip(*table, strict=True)]
         for row in table:
             lines.append("  ".join(f"{cell:>{w}}" for cell, w in zip(row, widths, strict=True)))
-        return "\n".join(lines)
+        return "\n".join([*lines, *usual])
 
-    def to_json(self) -> str:
-        """Return this plan as text that `from_json` reads."""
+    def to_json(self, *, filters: bool = True) -> str:
+        """Return this plan as text that `from_json` reads.
+
+        Parameters
+        ----------
+        filters : bool
+            False leaves out the hundreds of coefficients of the filters. The text is then short,
+            for people and logs, but no plan that `from_json` reads.
+        """
 
         def plain(value: object) -> object:
             return value.tolist() if isinstance(value, (np.ndarray, np.generic)) else value
 
-        return json.dumps(asdict(self), default=plain, indent=1)
+        values = asdict(self)
+        for part in values.values():
+            if not filters and isinstance(part, dict):
+                part.pop("coefficients", None)
+        return json.dumps(values, default=plain, indent=1)
 
     @classmethod
     def from_json(cls, text: str) -> Plan:

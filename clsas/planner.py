@@ -13,7 +13,8 @@ import numpy as np
 from clsas import forecast, interpolation, phases, validate
 from clsas.backproject import ACCURACY_DB
 from clsas.costs import Costs
-from clsas.costs import load as load_costs
+from clsas.costs import defaults as default_costs
+from clsas.costs import measured as measured_costs
 from clsas.decibels import in_db, power
 from clsas.device import Device, open_device
 from clsas.errors import excess_error, nearest_errors, other_errors, root_error
@@ -24,6 +25,7 @@ from clsas.grid import Grid
 from clsas.interpolation import Interpolator
 from clsas.lines import RangeLines
 from clsas.plan import Plan
+from clsas.reach import warn_unreached
 from clsas.search import MOST_STAGES, Allowed, Tree, root_limits, search
 from clsas.view import View
 from clsas.window import BeamWindow
@@ -114,7 +116,8 @@ def plan(
     -----
     ClsasWarning
         If the tolerance may be missed because the grid reaches ends of lines that do not fade, or
-        because the lines' band fills all that is sampled.
+        because the lines' band fills all that is sampled; or if no pixel lies within any line's
+        range, or the beam, so that the image will be zero.
     """
     validate.instance("lines", lines, RangeLines)
     validate.instance("grid", grid, Grid)
@@ -136,7 +139,8 @@ def plan(
     if costs is not None:
         validate.instance("costs", costs, Costs)
     device = open_device(device)
-    costs = costs or load_costs(device)
+    costs = costs or measured_costs(device)
+    calibrated, costs = costs is not None, costs or default_costs(device)
     if memory_bytes is not None:
         memory_bytes = validate.count("memory_bytes", memory_bytes)
     view = View(lines, grid, beam, OUTSIDE * power(tolerance_db or 0.0))
@@ -146,8 +150,12 @@ def plan(
         rest_db = view.ambiguity.rest_db(tolerance_db)
     found = _chosen(view, rest_db, stages, device, costs, memory_bytes, allowed)
     error_db = in_db(power(found.predicted_error_db) + view.ambiguity.error_power)
-    found = replace(found, tolerance_db=tolerance_db, predicted_error_db=error_db)
+    found = replace(
+        found, tolerance_db=tolerance_db, predicted_error_db=error_db, calibrated=calibrated
+    )
     found.kept["lines"] = weakref.ref(lines)
+    # Who forms the image next need not warn again.
+    found.kept["warned"] = warn_unreached(lines, grid, beam, view.channels_along)
     return found
 
 

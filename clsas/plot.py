@@ -13,10 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsas import validate
+from clsas.atomic import replacing
 from clsas.echoes import Echoes
+from clsas.extras import install_command
 from clsas.grid import Grid
 from clsas.image import Image
-from clsas.io import replacing
 from clsas.lines import RangeLines
 from clsas.quality import Cut, PointResponse
 from clsas.tradeoff import Row, Tradeoff
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+_LONG_NAMES = {"x": "x (along track)", "y": "y (across track)", "z": "z (up)"}
 _MOST_PIXELS = 1500  # along an axis: more than a picture shows
 
 
@@ -40,8 +42,10 @@ def image_db(
     Parameters
     ----------
     image : Image
-        On a plane or height map. Where its columns run along x and its rows along y the axes are
-        x and y, else the distances along columns and rows.
+        On a plane of any direction or a height map. The axes are the coordinates that columns and
+        rows run along (x and y, or x and z of a plane in depth), else distances along them; in
+        millimetres where all of them are less than 0.5 m, else in metres. Columns and rows are
+        drawn at right angles also where they are not.
     dynamic_range_db : float
         What is so far below the reference, or more, is black.
     reference : float, optional
@@ -57,20 +61,24 @@ def image_db(
         If an argument is of a wrong kind or not positive, or the image is one of arbitrary points.
     """
     validate.instance("image", image, Image)
-    across, upward, names = _plane_axes(image.grid)
+    if image.grid.points_m is not None:
+        raise ValueError("image must be on a plane or height map to be drawn, got points")
+    sides = image.grid.sides
+    scale, unit = _scale(max(float(np.abs(side.places_m).max()) for side in sides))
+    across, upward = (scale * side.places_m for side in sides)
     figure, axes = _draw_levels(
         np.abs(image.pixels),
         (*_edges(across, upward), *_edges(upward, across)),
         dynamic_range_db,
         reference,
     )
-    axes.set(xlabel=names[0], ylabel=names[1], title=title)
+    axes.set(xlabel=f"{sides[0].name} ({unit})", ylabel=f"{sides[1].name} ({unit})", title=title)
     axes.set_aspect("equal" if min(image.grid.shape) > 1 else "auto")
     return figure
 
 
 def cuts(response: PointResponse, *, floor_db: float = -60.0, resolutions: float = 12.0) -> Figure:
-    """Draw the cuts through a point along x and y, with the measured figures.
+    """Draw the cuts through a point along columns and rows, with the measured figures.
 
     Parameters
     ----------
@@ -93,25 +101,28 @@ def cuts(response: PointResponse, *, floor_db: float = -60.0, resolutions: float
     validate.positive("resolutions", resolutions)
     figure = _figure(7.0, 7.0)
     axes_of_both = figure.subplots(2)
-    panels = (("x (along track)", response.azimuth), ("y (across track)", response.range))
-    for axes, (name, cut) in zip(axes_of_both, panels, strict=True):
+    for axes, cut in zip(axes_of_both, (response.azimuth, response.range), strict=True):
         scale, unit = _scale(cut.resolution_m * resolutions)
         axes.plot(scale * cut.offset_m, cut.level_db, linewidth=1.0, label=_figures_of(cut))
         reach = scale * resolutions * cut.resolution_m
         axes.set(
             xlim=(max(-reach, scale * cut.offset_m[0]), min(reach, scale * cut.offset_m[-1])),
             ylim=(floor_db, 3),
-            xlabel=f"{name} from the peak ({unit})",
+            xlabel=f"{_LONG_NAMES.get(cut.axis, cut.axis)} from the peak ({unit})",
             ylabel="level (dB)",
         )
         axes.grid(alpha=0.3)
         axes.legend(loc="upper right", fontsize="small", handlelength=0)
-    axes_of_both[0].set_title(f"point at x = {response.x_m:.4f} m, y = {response.y_m:.4f} m")
+    axes_of_both[0].set_title(
+        f"point at x = {response.x_m:.4f} m, y = {response.y_m:.4f} m, z = {response.z_m:.4f} m"
+    )
     return figure
 
 
 def geometry(lines: RangeLines | Echoes, grid: Grid | None = None) -> Figure:
-    """Draw a plan view of where transmitters and receivers were, and of the grid's outline.
+    """Draw where transmitters and receivers were, and the grid's outline.
+
+    A view from above, x and y; of a grid in depth along x or y, a view from its side.
 
     Parameters
     ----------
@@ -128,25 +139,31 @@ def geometry(lines: RangeLines | Echoes, grid: Grid | None = None) -> Figure:
         If `lines` or `grid` is of another type.
     """
     validate.instance("lines", lines, RangeLines, Echoes)
+    if grid is not None:
+        validate.instance("grid", grid, Grid)
+    shown = _coordinates(grid)
+    # Metres, but for what is small altogether.
+    ends_m = [lines.rx_m, lines.tx_m] + ([] if grid is None else [_outline(grid)[0]])
+    scale, unit = _scale(max(float(np.abs(each[:, shown]).max()) for each in ends_m))
     figure = _figure(7.0, 6.0)
     axes = figure.subplots()
     for name, position_m, marker in (
         ("receiver", lines.rx_m, "."),
         ("transmitter", lines.tx_m, "x"),
     ):
-        places = np.unique(position_m[:, :2].round(6), axis=0)  # micrometres
-        axes.plot(*places.T, marker, markersize=5, label=f"{name} ({len(places)} places)")
+        places = np.unique(position_m[:, shown].round(6), axis=0)  # micrometres
+        axes.plot(*(scale * places.T), marker, markersize=5, label=f"{name} ({len(places)} places)")
     if grid is not None:
-        validate.instance("grid", grid, Grid)
-        outline, style = _outline(grid)
+        outline_m, style = _outline(grid)
         axes.plot(
-            *outline.T,
+            *(scale * outline_m[:, shown].T),
             style,
             linewidth=1.5,
             markersize=2,
             label="grid " + " × ".join(map(str, grid.shape)),
         )
-    axes.set(xlabel="x (m)", ylabel="y (m)", aspect="equal")
+    across, upward = ("xyz"[coordinate] for coordinate in shown)
+    axes.set(xlabel=f"{across} ({unit})", ylabel=f"{upward} ({unit})", aspect="equal")
     axes.set_adjustable("datalim")
     axes.grid(alpha=0.3)
     axes.legend(loc="best", fontsize="small")
@@ -244,17 +261,21 @@ def tradeoff(measured: Tradeoff, *, title: str = "") -> Figure:
 def save_png(figure: Figure, path: str | os.PathLike, *, dpi: float = 150.0) -> None:
     """Write a figure as PNG, replacing a file of that name at once or not at all.
 
+    Other formats are the figure's own: `figure.savefig("image.pdf")`.
+
     Raises
     ------
     ImportError
         If matplotlib is not installed.
     TypeError, ValueError
-        If `figure` is not a Figure, or `dpi` (pixels per inch) is not a positive number.
+        If `figure` is not a Figure, `path` ends in another suffix than .png, or `dpi` (pixels per
+        inch) is not a positive number.
     OSError
         If the folder does not exist or the file cannot be written.
     """
     validate.instance("figure", figure, _figure_class())
     validate.positive("dpi", dpi, "pixels per inch")
+    validate.suffix("path", validate.path("path", path), ".png")
     with replacing(path) as temporary:
         # What the layout leaves outside, as labels beside square axes, is drawn too.
         figure.savefig(temporary, format="png", dpi=dpi, bbox_inches="tight")
@@ -280,7 +301,7 @@ def _figure_class() -> type[Figure]:
     try:
         from matplotlib.figure import Figure
     except ImportError:
-        raise ImportError("pictures need matplotlib: pip install clsas[plot]") from None
+        raise ImportError(f"pictures need matplotlib: {install_command('plot')}") from None
     return Figure
 
 
@@ -328,33 +349,28 @@ def _plain_ticks(axes: Axes) -> None:
     axes.locator_params(nbins=6)
 
 
-def _plane_axes(grid: Grid) -> tuple[NDArray, NDArray, tuple[str, str]]:
-    """Return what to put across and upward, metres, and their names."""
-    if grid.has_axes:
-        return *grid.axes_m, ("x (m)", "y (m)")
-    if grid.points_m is not None:
-        raise ValueError("image must be on a plane or height map to be drawn, got points")
-    rows, columns = grid.shape
-    return (
-        np.arange(columns) * np.linalg.norm(grid.column_step_m),
-        np.arange(rows) * np.linalg.norm(grid.row_step_m),
-        ("along columns (m)", "along rows (m)"),
-    )
-
-
 def _edges(axis: NDArray, other: NDArray) -> tuple[float, float]:
     """Return the outer edges of the pixels of an axis; a single one is as wide as the other's."""
     step = next((a[1] - a[0] for a in (axis, other) if len(a) > 1), 1.0)
     return axis[0] - step / 2, axis[-1] + step / 2
 
 
+def _coordinates(grid: Grid | None) -> list[int]:
+    """Return which two coordinates a view of the geometry shows, across and upward."""
+    if grid is not None and grid.points_m is None and min(grid.shape) > 1:
+        names = "".join(sorted(side.name for side in grid.sides))
+        if names in ("xz", "yz"):
+            return ["xyz".index(name) for name in names]
+    return [0, 1]
+
+
 def _outline(grid: Grid) -> tuple[NDArray, str]:
-    """Return x and y of what to draw for a grid, and how."""
+    """Return the places to draw for a grid, [n, 3], and how."""
     if grid.points_m is not None:
-        return grid.points_m[..., :2].reshape(-1, 2), "."
+        return grid.points_m.reshape(-1, 3), "."
     down, right = (count - 1 for count in grid.shape)
     corners = np.array([[0, 0], [0, right], [down, right], [down, 0], [0, 0]])
-    return (grid.origin_m + corners @ [grid.row_step_m, grid.column_step_m])[:, :2], "-"
+    return grid.origin_m + corners @ [grid.row_step_m, grid.column_step_m], "-"
 
 
 def _aligned(lines: RangeLines) -> tuple[NDArray, float, float]:

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import signal
 
 from clsas import validate
-from clsas.grid import Grid
+from clsas.grid import Axis, Grid
 from clsas.image import Image
 from clsas.shadows import darkest_pixels
 
@@ -30,6 +30,9 @@ class Cut:
 
     Attributes
     ----------
+    axis : str
+        What the cut runs along: "x", "y" or "z", or "along columns" or "along rows" of a plane
+        that is not parallel to that coordinate.
     offset_m : ndarray of float64, shape [points]
         Distance from the peak, metres.
     level_db : ndarray of float64, shape [points]
@@ -46,6 +49,7 @@ class Cut:
         How many whole side lobes the ISLR counts: 10, or less where the cut ends.
     """
 
+    axis: str
     offset_m: NDArray[np.float64]
     level_db: NDArray[np.float64]
     resolution_m: float
@@ -61,17 +65,19 @@ class PointResponse:
 
     Attributes
     ----------
-    x_m, y_m : float
+    x_m, y_m, z_m : float
         Where its peak is, metres.
     amplitude : float
         Amplitude of the peak. (There is no phase here: that of the range carrier, which the
         pixels hold as an alias, is not known between them.)
     azimuth, range : Cut
-        The cuts through the peak along x and along y.
+        The cuts through the peak along the image's columns and rows: x and y of a horizontal
+        plane, x and z of one in depth.
     """
 
     x_m: float
     y_m: float
+    z_m: float
     amplitude: float
     azimuth: Cut
     range: Cut
@@ -79,7 +85,7 @@ class PointResponse:
 
 def measure_point(
     image: Image,
-    near: tuple[float, float],
+    near: Sequence[float],
     *,
     search_m: float | None = None,
     extent_m: float | None = None,
@@ -89,12 +95,14 @@ def measure_point(
     Parameters
     ----------
     image : Image
-        An image whose columns run along x and rows along y, with pixels no larger than its
+        An image on a plane of any direction or a height map, with pixels no larger than its
         bandwidth asks for (1 / bandwidth: the carrier need not be sampled).
-    near : (float, float)
-        About where the point is: x, y, metres.
+    near : (float, float) or (float, float, float)
+        About where the point is, metres. Two numbers are places on the axes of the image
+        (`Grid.sides`), as pictures show them: x, y of a horizontal plane, x, z of one in depth.
+        Three are a position x, y, z; the nearest one on the plane counts.
     search_m : float, optional
-        How far from there, along x and along y, the greatest pixel is taken for the point;
+        How far from there, along columns and along rows, the greatest pixel is taken for the point;
         10 pixels unless given.
     extent_m : float, optional
         How far from the peak side lobes are looked for, metres, to keep other targets out; as
@@ -107,9 +115,9 @@ def measure_point(
     Raises
     ------
     ValueError
-        If the image has no such axes, `near` is outside it, it is zero there or has no peak, its
-        peak is at the border, `extent_m` is less than a pixel, or the main lobe and a side lobe
-        on each side do not fit in.
+        If the image is one of arbitrary points, `near` is outside it, it is zero there or has no
+        peak, its peak is at the border, `extent_m` is less than a pixel, or the main lobe and a
+        side lobe on each side do not fit in.
     TypeError
         If an argument is of a wrong kind.
 
@@ -126,16 +134,17 @@ def measure_point(
     of that spectrum modulo the sampling; with it removed, sinc interpolation is exact.
     """
     validate.instance("image", image, Image)
-    x_m, y_m = image.grid.axes_m
-    steps = []
-    for name, axis in (("x", x_m), ("y", y_m)):
-        if len(axis) < 3:
-            raise ValueError(f"image must have 3 or more pixels along {name}, got {len(axis)}")
-        steps.append((axis[-1] - axis[0]) / (len(axis) - 1))
-    dx, dy = steps
+    across, upward = axes = image.grid.sides
+    for axis in axes:
+        if len(axis.places_m) < 3:
+            raise ValueError(
+                f"image must have 3 or more pixels along {_word(axis)}, got {len(axis.places_m)}"
+            )
+    dx, dy = across.step_m, upward.step_m
     if extent_m is not None:
         validate.number("extent_m", extent_m, "m", least=max(abs(dx), abs(dy)))
-    row, column = _find_peak(image.pixels, (x_m, y_m), (dx, dy), near, search_m)
+    place = _on_axes(image.grid, axes, near)
+    row, column = _find_peak(image.pixels, axes, place, search_m)
 
     top, left = max(row - _REACH, 0), max(column - _REACH, 0)
     pixels = image.pixels[top : row + _REACH + 1, left : column + _REACH + 1].astype(np.complex128)
@@ -145,17 +154,19 @@ def measure_point(
 
     along_x = _sinc([row], pixels.shape[0])[0] @ pixels
     along_y = pixels @ _sinc([column], pixels.shape[1])[0]
+    x_m, y_m, z_m = _position_m(image.grid, top + row, left + column)
     response = PointResponse(
-        x_m=float(x_m[0] + (left + column) * dx),
-        y_m=float(y_m[0] + (top + row) * dy),
+        x_m=x_m,
+        y_m=y_m,
+        z_m=z_m,
         amplitude=amplitude,
-        azimuth=_measure_cut("x", along_x, column, dx, amplitude, extent_m),
-        range=_measure_cut("y", along_y, row, dy, amplitude, extent_m),
+        azimuth=_measure_cut(across, along_x, column, amplitude, extent_m),
+        range=_measure_cut(upward, along_y, row, amplitude, extent_m),
     )
     highest_db = max(*response.azimuth.pslr_db, *response.range.pslr_db)
     if highest_db > 0:
         validate.warn(
-            f"the peak near ({near[0]:.9g}, {near[1]:.9g}) m is {highest_db:.1f} dB lower than a "
+            f"the peak near ({place[0]:.9g}, {place[1]:.9g}) m is {highest_db:.1f} dB lower than a "
             "side lobe of it: give a nearer place or a larger search_m, or keep other targets out "
             "by extent_m"
         )
@@ -272,26 +283,24 @@ def _intensity(image: Image | ArrayLike) -> NDArray[np.float64]:
 
 def _find_peak(
     pixels: NDArray,
-    axes_m: tuple[NDArray, NDArray],
-    steps_m: tuple[float, float],
-    near: tuple[float, float],
+    axes: tuple[Axis, Axis],
+    place: NDArray[np.float64],
     search_m: float | None,
 ) -> tuple[int, int]:
-    """Return row and column of the greatest pixel near a place."""
-    place = validate.array("near", near, np.float64, (2,))
+    """Return row and column of the greatest pixel near a place on the axes."""
     if search_m is not None:
         validate.positive("search_m", search_m, "m")
     windows = []
-    for name, axis, step, at in zip("xy", axes_m, steps_m, place, strict=True):
-        index = (at - axis[0]) / step
-        if not -0.5 <= index <= len(axis) - 0.5:
-            ends = sorted((axis[0], axis[-1]))
+    for axis, at in zip(axes, place, strict=True):
+        count, index = len(axis.places_m), (at - axis.places_m[0]) / axis.step_m
+        if not -0.5 <= index <= count - 0.5:
+            ends = sorted((axis.places_m[0], axis.places_m[-1]))
             raise ValueError(
-                f"near must be inside the image: {name} from {ends[0]:g} to {ends[1]:g} m, "
+                f"near must be inside the image: {axis.name} from {ends[0]:g} to {ends[1]:g} m, "
                 f"got {at:g} m"
             )
-        search = _SEARCH if search_m is None else search_m / abs(step)
-        nearest = int(np.clip(round(index), 0, len(axis) - 1))
+        search = _SEARCH if search_m is None else search_m / abs(axis.step_m)
+        nearest = int(np.clip(round(index), 0, count - 1))
         first = max(math.ceil(index - search), 0)
         windows.append(slice(min(first, nearest), max(math.floor(index + search), nearest) + 1))
     columns, rows = windows
@@ -300,11 +309,11 @@ def _find_peak(
     if amplitude[row, column] == 0:
         raise ValueError(f"image is zero around near = ({place[0]:g}, {place[1]:g}) m")
     row, column = int(row) + rows.start, int(column) + columns.start
-    for name, index, axis in (("x", column, axes_m[0]), ("y", row, axes_m[1])):
-        if not 0 < index < len(axis) - 1:
+    for axis, index in zip(axes, (column, row), strict=True):
+        if not 0 < index < len(axis.places_m) - 1:
             raise ValueError(
                 f"the peak near ({place[0]:g}, {place[1]:g}) m lies at the image's border "
-                f"({name} = {axis[index]:g} m): a larger image is needed"
+                f"({axis.name} = {axis.places_m[index]:g} m): a larger image is needed"
             )
     if np.abs(pixels[row - 1 : row + 2, column - 1 : column + 2]).max() > np.abs(
         pixels[row, column]
@@ -314,6 +323,28 @@ def _find_peak(
             "outside the search: give a nearer place or a larger search_m"
         )
     return row, column
+
+
+def _on_axes(grid: Grid, axes: tuple[Axis, Axis], near: Sequence[float]) -> NDArray[np.float64]:
+    """Return where a place, given by two numbers or as a position, is on the axes, metres."""
+    if np.shape(near) != (3,):
+        return validate.array("near", near, np.float64, (2,))
+    position_m = validate.array("near", near, np.float64, (3,))
+    steps = np.stack([grid.column_step_m, grid.row_step_m], axis=1)
+    index = np.linalg.lstsq(steps, position_m - grid.origin_m, rcond=None)[0]
+    return np.array([a.places_m[0] + i * a.step_m for a, i in zip(axes, index, strict=True)])
+
+
+def _position_m(grid: Grid, row: float, column: float) -> tuple[float, float, float]:
+    """Return the position at a row and column between pixels, at the height of the nearest one."""
+    position_m = grid.origin_m + row * grid.row_step_m + column * grid.column_step_m
+    height_m = 0.0 if grid.height_m is None else grid.height_m[round(row), round(column)]
+    x_m, y_m, z_m = position_m + [0, 0, height_m]
+    return float(x_m), float(y_m), float(z_m)
+
+
+def _word(axis: Axis) -> str:
+    return axis.name.removeprefix("along ")
 
 
 def _without_carrier(pixels: NDArray, row: int, column: int) -> NDArray:
@@ -343,14 +374,16 @@ def _refine_peak(pixels: NDArray, row: float, column: float) -> tuple[float, flo
 
 
 def _measure_cut(
-    name: str,
+    axis: Axis,
     samples: NDArray,
     peak: float,
-    step_m: float,
     amplitude: float,
     extent_m: float | None,
 ) -> Cut:
     """Measure a line of pixels through the peak, which lies at index `peak` in it."""
+    from scipy import signal  # slow to import
+
+    step_m = axis.step_m
     fine = signal.resample(samples, _UPSAMPLING * len(samples))
     offset = (np.arange(len(fine)) / _UPSAMPLING - peak) * step_m
     # Behind the last sample the periodic interpolation only leads back to the first one.
@@ -369,8 +402,8 @@ def _measure_cut(
         ends = signal.argrelmin(side)[0]
         if len(ends) < 2 or side[: ends[0] + 1].min() > 0.5:
             raise ValueError(
-                f"no whole side lobe at {word} {name} within the image (or extent_m): the point "
-                "is too near the border, or what is around it is not a point response"
+                f"no whole side lobe at {word} {axis.name} within the image (or extent_m): the "
+                "point is too near the border, or what is around it is not a point response"
             )
         below = int(np.argmax(side < 0.5))
         half += below - (0.5 - side[below]) / (side[below - 1] - side[below])
@@ -381,6 +414,7 @@ def _measure_cut(
         highest.append(float(_decibels(side[ends[0] :].max())))
         counts.append(len(lobes) - 1)
     return Cut(
+        axis=axis.name,
         offset_m=offset,
         level_db=_decibels(power),
         resolution_m=float(half * abs(step_m)) / _UPSAMPLING,

@@ -13,9 +13,9 @@ from clsas import validate
 from clsas.backproject import Preparation, normalising, wavelength_m
 from clsas.geometry import pairwise_range_m
 from clsas.image import Image
-from clsas.interpolation import measure_spectrum
 from clsas.lines import RangeLines
 from clsas.quality import relative_error_db
+from clsas.spectrum import measure_spectrum
 from clsas.window import BeamWindow, sines
 
 Progress = Callable[[int, int], None] | None

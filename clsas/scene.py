@@ -11,7 +11,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -65,6 +65,14 @@ class PointTargets:
 
     positions_m: NDArray[np.float64]
     amplitudes: NDArray[np.complex128] = 1.0  # type: ignore[assignment]
+
+    if TYPE_CHECKING:  # arrays are converted: the constructor takes what holds numbers
+
+        def __init__(
+            self,
+            positions_m: ArrayLike,
+            amplitudes: ArrayLike = 1.0,
+        ) -> None: ...
 
     def __post_init__(self) -> None:
         """Check every field and convert it."""
@@ -162,6 +170,19 @@ class Seabed:
     density_m2: float = 600.0
     seed: int = 0
     floor_db: float = -50.0
+
+    if TYPE_CHECKING:  # arrays are converted: the constructor takes what holds numbers
+
+        def __init__(
+            self,
+            x_m: tuple[float, float],
+            y_m: tuple[float, float],
+            heights_m: ArrayLike,
+            texture: ArrayLike = 1.0,
+            density_m2: float = 600.0,
+            seed: int = 0,
+            floor_db: float = -50.0,
+        ) -> None: ...
 
     def __post_init__(self) -> None:
         """Check every field and convert it."""

@@ -15,8 +15,9 @@ from clsas.decibels import in_db, power
 from clsas.device import Device
 from clsas.errors import leaf_error, root_error
 from clsas.filters import ALIGN_TAPS, APERTURE_TAPS, UPSAMPLING_SHARE, Choice, choose
-from clsas.interpolation import PHASES, Spectrum, upsampler
+from clsas.interpolation import PHASES, upsampler
 from clsas.plan import LEAST_BATCH
+from clsas.spectrum import Spectrum
 from clsas.view import View
 
 _ROWS = (16, 32, 64, 128, 256, 512, 1024, 2048)  # of subimages

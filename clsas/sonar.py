@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -160,6 +161,21 @@ class Sonar:
     rx_length_m: float | None = None
     tx_height_m: float | None = None
     rx_height_m: float | None = None
+
+    if TYPE_CHECKING:  # arrays are converted: the constructor takes what holds numbers
+
+        def __init__(
+            self,
+            pulse: Pulse,
+            rx_m: ArrayLike,
+            tx_m: ArrayLike = (0.0, 0.0, 0.0),
+            sample_rate_hz: float | None = None,
+            sound_speed_m_s: float = 1500.0,
+            tx_length_m: float | None = None,
+            rx_length_m: float | None = None,
+            tx_height_m: float | None = None,
+            rx_height_m: float | None = None,
+        ) -> None: ...
 
     def __post_init__(self) -> None:  # noqa: D105
         if not isinstance(self.pulse, Pulse):

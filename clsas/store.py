@@ -1,20 +1,18 @@
 """The Zarr store of a mosaic: its pixels in one array, one chunk and one record per patch.
 
 docs/mosaic.md describes the layout. A patch is finished once its record is there, which is written
-after its pixels; both are renamed into place, so that neither is ever half there.
+after its pixels. Both carry checksums, and both are on the disk before `Store.write` returns.
 """
 
 from __future__ import annotations
 
-import errno
-import json
+import itertools
 import math
 import os
 import re
-import shutil
 import tempfile
-import uuid
-from dataclasses import asdict, dataclass, fields
+from collections.abc import Callable
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -23,92 +21,31 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsas import validate
+from clsas.atomic import creating, sync_folder
+from clsas.extras import install_command
 from clsas.grid import Grid
 from clsas.image import Image
+from clsas.overview import reduced
+from clsas.plan import grid_digest
+from clsas.provenance import differences
+from clsas.record import (
+    DamageError,
+    Place,
+    Record,
+    describe_damage,
+    is_intact,
+    read_attributes,
+    with_checksum,
+    write_attributes,
+)
 
 if TYPE_CHECKING:
     import zarr
 
 FORMAT = "clsas mosaic"
-VERSION = 1
+VERSION = 2  # 1 had no checksums
 
 _OVERVIEW = 1024  # pixels along the longer side, at most
-
-
-@dataclass(frozen=True)
-class Record:
-    """What is known about a finished patch.
-
-    Attributes
-    ----------
-    channels : int
-        Channels that may see it; with 0 the patch is empty: all zero.
-    survey_channels : int
-        Channels that the survey had when it was formed.
-    missing_channels : int
-        Those of `channels` without samples.
-    gap_m : float
-        Longest way between pings that see it where that is a gap (three usual steps), else 0.
-    predicted_error_db : float or None
-        Relative rms error expected against the exact image; None for an empty patch.
-    predicted_seconds, plan_seconds, read_seconds, seconds : float
-        Expected for imaging; taken by planning and by reading; and by all of it.
-    memory_bytes : int
-        What it was planned to take.
-    device, driver : str
-        Where it was formed.
-    plan : dict or None
-        The plan, as `clsas.Plan.from_json` reads it, its beam without directions; None for an exact
-        image or an empty patch.
-    has_pixels : bool
-        Whether any pixel is not 0.
-    """
-
-    channels: int
-    survey_channels: int
-    missing_channels: int = 0
-    gap_m: float = 0.0
-    predicted_error_db: float | None = None
-    predicted_seconds: float = 0.0
-    plan_seconds: float = 0.0
-    read_seconds: float = 0.0
-    seconds: float = 0.0
-    memory_bytes: int = 0
-    device: str = ""
-    driver: str = ""
-    plan: dict[str, Any] | None = None
-    has_pixels: bool = False
-
-    @property
-    def is_empty(self) -> bool:
-        """Whether no channel contributes, so that all pixels are zero."""
-        return self.channels == self.missing_channels
-
-    @property
-    def is_whole(self) -> bool:
-        """Whether every number is one, as a record from a file may not have them."""
-        allowed = {"int": (int,), "float": (int, float), "float | None": (int, float, type(None))}
-        numbers = [
-            (getattr(self, field.name), allowed[str(field.type)])
-            for field in fields(self)
-            if field.type in allowed
-        ]
-        return all(
-            type(value) in kinds and (value is None or math.isfinite(value))
-            for value, kinds in numbers
-        )
-
-    @property
-    def flags(self) -> tuple[str, ...]:
-        """What a user should know, in words; nothing if all is well."""
-        found = []
-        if not self.channels:
-            found.append("empty: in no channel's beam and range")
-        elif self.missing_channels:
-            found.append(f"{self.missing_channels} of {self.channels} channels have no samples")
-        if self.gap_m:
-            found.append(f"a gap of {self.gap_m:.3g} m between pings")
-        return tuple(found)
 
 
 @dataclass(frozen=True)
@@ -161,8 +98,13 @@ class Store:
 
     @cached_property
     def pixels(self) -> zarr.Array:
-        """The pixels, complex64 [rows, columns], on disk."""
-        return self._array("pixels", "r")
+        """The pixels, complex64 [rows, columns], on disk; Zarr verifies their checksums."""
+        pixels, attributes = self._array("pixels"), self._attributes()
+        described = list(pixels.shape), list(pixels.chunks), pixels.dtype, pixels.fill_value
+        expected = attributes["inputs"].get("pixels"), attributes["patch_shape"], np.complex64, 0
+        if described != expected:
+            raise ValueError(f"{self.path} is damaged: its pixels are not those of its grid")
+        return pixels
 
     @property
     def grid(self) -> Grid:
@@ -171,17 +113,18 @@ class Store:
         Raises
         ------
         ValueError
-            If the mosaic is not of a plane or height map, whose grid alone is stored.
+            If the mosaic is of points, whose grid is not stored, or the grid is damaged.
         """
-        stored = self._attributes()["grid"]
+        attributes = self._attributes()
+        stored = attributes["grid"]
         if stored is None:
             raise ValueError(f"{self.path} is a mosaic of points, whose grid it does not hold")
-        shape = tuple(self.pixels.shape)
-        grid = Grid.oriented(**stored, shape=shape)
-        height = self.path / "height"
-        if not height.exists():
-            return grid
-        return grid.with_height(_zarr().open_array(height, mode="r")[:])
+        grid = Grid.oriented(**stored, shape=tuple(self.pixels.shape))
+        if (self.path / "height").exists():
+            grid = grid.with_height(self._values("height"))
+        if grid_digest(grid) != attributes["inputs"].get("grid"):
+            raise ValueError(f"{self.path} is damaged: its grid is not the one that was written")
+        return grid
 
     def begin(self, inputs: dict[str, Any], grid: Grid, patch_shape: tuple[int, int]) -> None:
         """Create the store, or check that it was made with these inputs.
@@ -195,103 +138,92 @@ class Store:
         """
         if not self._is_there():
             self._create(inputs, grid, patch_shape)
-        if differences := self._differences(inputs, patch_shape):
+        stored = self._attributes()
+        found = differences(stored["inputs"], inputs)
+        if stored["patch_shape"] != list(patch_shape):
+            mine, theirs = ("{} x {}".format(*s) for s in (stored["patch_shape"], patch_shape))
+            found.insert(0, f"patches of {mine} pixels there, of {theirs} given")
+        if found:
             ways = "give it another path or the same inputs"
             if not self.records():
                 ways += ", or delete it: no patch of it was finished"
-            raise ValueError(
-                f"{self.path} was made with other inputs: {'; '.join(differences)}; {ways}"
-            )
+            raise ValueError(f"{self.path} was made with other inputs: {'; '.join(found)}; {ways}")
         with tempfile.TemporaryFile(dir=self.path):
             pass  # raises where it cannot be written
-        pixels = self.pixels
-        if (pixels.shape, pixels.chunks) != (grid.shape, patch_shape):
-            raise ValueError(f"{self.path} is damaged: its pixels are not those of its grid")
+        _ = self.pixels  # raises where they are damaged
         self.grow(inputs)
 
     def grow(self, inputs: dict[str, Any]) -> None:
         """Keep the inputs of a survey that has grown."""
-        if self._attributes()["inputs"] != inputs:
-            _zarr().open_group(self.path, mode="r+").attrs["inputs"] = inputs
+        attributes = self._attributes()
+        if attributes["inputs"] != inputs:
+            write_attributes(self.path, with_checksum(attributes | {"inputs": inputs}))
 
     def _create(self, inputs: dict[str, Any], grid: Grid, patch_shape: tuple[int, int]) -> None:
         """Create the store, whole or not at all."""
         if not self.path.parent.is_dir():
             raise FileNotFoundError(2, "there is no such folder", str(self.path.parent))
-        temporary = self.path.with_name(f".{uuid.uuid4().hex}.part")
-        try:
-            self._fill(temporary, inputs, grid, patch_shape)
-            try:
-                os.rename(temporary, self.path)
-            except OSError as error:
-                # Another process was first: what it made is checked.
-                if error.errno not in (errno.ENOTEMPTY, errno.EEXIST):
-                    raise
-        finally:
-            shutil.rmtree(temporary, ignore_errors=True)
+        from clsas.durable import create_arrays
 
-    @staticmethod
-    def _fill(path: Path, inputs: dict[str, Any], grid: Grid, patch_shape: tuple[int, int]) -> None:
-        root = _zarr().create_group(path)
-        names = ("y", "x") if grid.has_axes else ("row", "column")
-        root.create_array(
-            "pixels",
-            shape=grid.shape,
-            dtype=np.complex64,
-            chunks=patch_shape,
-            compressors=None,  # noise does not compress
-            fill_value=0,
-            dimension_names=names,
-        )
         plane = None
         if grid.points_m is None:
             steps = ("origin_m", "row_step_m", "column_step_m")
             plane = {name: getattr(grid, name).tolist() for name in steps}
-        if grid.has_axes:
-            for name, axis in zip(("x", "y"), grid.axes_m, strict=True):
-                root.create_array(
-                    name, data=axis, dimension_names=(name,), attributes={"units": "m"}
-                )
-        if grid.height_m is not None:
-            root.create_array("height", data=grid.height_m, dimension_names=names)
-        root.create_group("patches")
-        root.attrs.update(
-            format=FORMAT,
-            version=VERSION,
-            patch_shape=list(patch_shape),
-            grid=plane,
-            inputs=inputs,
-        )
+        attributes = {
+            "format": FORMAT,
+            "version": VERSION,
+            "patch_shape": list(patch_shape),
+            "grid": plane,
+            "inputs": inputs,
+        }
+        with creating(self.path) as temporary:
+            create_arrays(temporary, grid, patch_shape)
+            write_attributes(temporary / "patches", {})
+            write_attributes(temporary, with_checksum(attributes))
 
-    def records(self) -> dict[tuple[int, int], Record]:
+    def records(self) -> dict[Place, Record]:
         """Return the records of all finished patches, by row and column.
 
-        A record whose pixels are not there, or not all, does not count.
+        Damaged patches are left out as far as their records and the sizes of their pixels tell;
+        `damage` also reads the pixels.
         """
         found = {}
-        known = {field.name for field in fields(Record)}
-        pixels = self.pixels
-        shape = [math.ceil(n / m) for n, m in zip(pixels.shape, pixels.chunks, strict=True)]
-        folders = self.path / "patches"
-        for folder in folders.iterdir() if folders.is_dir() else ():
-            if not (name := re.fullmatch(r"(\d+)\.(\d+)", folder.name)):
-                continue
-            place = int(name[1]), int(name[2])
-            if place[0] >= shape[0] or place[1] >= shape[1]:
-                continue
+        for place in self._places():
             try:
-                stored = json.loads((folder / "zarr.json").read_text())["attributes"]
-                record = Record(**{k: v for k, v in stored.items() if k in known})
-            except (OSError, ValueError, KeyError, TypeError):
-                continue  # cut off while it was written
-            if not record.is_whole:
+                record = self._record(place)
+            except DamageError:
                 continue
-            chunk = self.path / "pixels" / "c" / name[1] / name[2]
-            # Zarr leaves out a chunk that is all zero.
-            size = chunk.stat().st_size if chunk.exists() else 0
-            if size == 8 * math.prod(pixels.chunks) or not (size or record.has_pixels):
+            if record is not None:
                 found[place] = record
-        return dict(sorted(found.items()))
+        return found
+
+    def damage(self, tell: Callable[[int, int], object] | None = None) -> dict[Place, str]:
+        """Read every finished patch; return what is wrong with each that is damaged.
+
+        Parameters
+        ----------
+        tell : callable, optional
+            Called with the number of patches that were read and of all.
+
+        Returns
+        -------
+        dict of (row, column) to str
+            Reasons, such as "its pixels do not match their checksum".
+
+        Raises
+        ------
+        OSError
+            If a file cannot be read.
+        """
+        found, places = {}, self._places()
+        for done, place in enumerate(places, 1):
+            try:
+                self._verify(place)
+            except DamageError as error:
+                found[place] = str(error)
+            if tell is not None:
+                tell(done, len(places))
+        return found
 
     def write(
         self,
@@ -302,76 +234,192 @@ class Store:
         pixels: NDArray[np.complex64],
         record: Record,
     ) -> None:
-        """Write a patch and then its record.
+        """Write a patch and then its record; both are on the disk when this returns.
 
         Raises
         ------
         OSError
             If the disk is full or the store not writable.
         """
-        self._array("pixels", "r+")[rows, columns] = pixels
-        _zarr().create_group(
-            self.path / "patches" / f"{row}.{column}", attributes=asdict(record), overwrite=True
-        )
+        from clsas.durable import write_pixels
+
+        folder = self._folder((row, column))
+        # A record is of the pixels it was written for: it goes before they are replaced.
+        if (folder / "zarr.json").exists():
+            (folder / "zarr.json").unlink()
+            sync_folder(folder)
+        write_pixels(self.path, rows, columns, pixels)
+        write_attributes(folder, record.attributes(self._checksum((row, column))))
+
+    def read(
+        self, rows: slice = slice(None), columns: slice = slice(None)
+    ) -> NDArray[np.complex64]:
+        """Return some of the pixels, all by default, complex64 [rows, columns].
+
+        Raises
+        ------
+        ValueError
+            If a finished patch among them is damaged; the message names it.
+        OSError
+            If a file cannot be read.
+        """
+        places = self._touched(rows, columns)
+        try:
+            for place in places:
+                self._record(place)
+            return self.pixels[rows, columns]
+        except ValueError as error:
+            found = {}
+            for place in places:
+                try:
+                    self._verify(place)
+                except DamageError as damage:
+                    found[place] = str(damage)
+            told = describe_damage(found) if found else str(error)
+            raise ValueError(
+                f"{self.path} is damaged: {told}; clsas mosaic with the same inputs mends it"
+            ) from error
 
     def image(self, rows: slice = slice(None), columns: slice = slice(None)) -> Image:
-        """Return some of the pixels, all unless told otherwise, as an image."""
+        """Return some of the pixels, all by default, as an image.
+
+        Raises
+        ------
+        ValueError
+            If a finished patch among them is damaged, or the image does not fit into memory.
+        OSError
+            If a file cannot be read.
+        """
         window = self.grid.window(rows, columns)
         validate.memory("the mosaic", 8 * window.size)
-        return Image(self.pixels[rows, columns], window)
+        return Image(self.read(rows, columns), window)
 
     def overview(self, most: int = _OVERVIEW) -> Image:
-        """Return the mosaic at fewer pixels, each the root of the mean power of those it covers."""
-        validate.count("most", most)
-        grid, (height, width) = self.grid, self.pixels.chunks
-        step = math.ceil(max(grid.shape) / most)
-        shape = tuple(n // step or 1 for n in grid.shape)
-        step = [min(step, n) for n in grid.shape]
-        power = np.zeros(shape)
-        # Bands of whole patches and whole pixels of the overview.
-        band = max(height // step[0], 1)
-        for first in range(0, shape[0], band):
-            last = min(first + band, shape[0])
-            for start in range(0, shape[1], max(width // step[1], 1)):
-                stop = min(start + max(width // step[1], 1), shape[1])
-                part = self.pixels[
-                    first * step[0] : last * step[0], start * step[1] : stop * step[1]
-                ]
-                blocks = (np.abs(part) ** 2).reshape(last - first, step[0], stop - start, step[1])
-                power[first:last, start:stop] = blocks.mean(axis=(1, 3))
-        middle = sum(
-            (n - 1) / 2 * each
-            for n, each in zip(step, (grid.row_step_m, grid.column_step_m), strict=True)
-        )
-        coarse = Grid.oriented(
-            grid.origin_m + middle, grid.row_step_m * step[0], grid.column_step_m * step[1], shape
-        )
-        return Image(np.sqrt(power).astype(np.complex64), coarse)
+        """Return the mosaic at fewer pixels, each the root of the mean power of those it covers.
 
-    def _array(self, name: str, mode: str) -> zarr.Array:
+        Raises
+        ------
+        ValueError
+            If a finished patch is damaged.
+        """
+        validate.count("most", most)
+        return reduced(self.grid, self.pixels.chunks, self.read, most)
+
+    def _array(self, name: str) -> zarr.Array:
         try:
-            return _zarr().open_array(self.path / name, mode=mode)
+            return _zarr().open_array(self.path / name, mode="r")
         except (LookupError, OSError, ValueError, TypeError) as error:
             raise ValueError(f"{self.path} is damaged: {name} cannot be read: {error}") from error
+
+    def _values(self, name: str) -> NDArray:
+        """Return a whole array."""
+        array = self._array(name)
+        try:
+            return array[:]
+        except ValueError as error:
+            raise ValueError(f"{self.path} is damaged: {name} cannot be read: {error}") from error
+
+    def _places(self) -> list[Place]:
+        """Return the patches that have a folder for their record, in order."""
+        shape = self._shape
+        folders = self.path / "patches"
+        found = []
+        for folder in folders.iterdir() if folders.is_dir() else ():
+            if name := re.fullmatch(r"(\d+)\.(\d+)", folder.name):
+                place = int(name[1]), int(name[2])
+                if place[0] < shape[0] and place[1] < shape[1]:
+                    found.append(place)
+        return sorted(found)
+
+    @property
+    def _shape(self) -> tuple[int, int]:
+        """Number of patches along rows and columns."""
+        pixels = self.pixels
+        rows, columns = (math.ceil(n / m) for n, m in zip(pixels.shape, pixels.chunks, strict=True))
+        return rows, columns
+
+    def _touched(self, rows: slice, columns: slice) -> list[Place]:
+        """Return the patches that some pixels belong to."""
+        indices = []
+        for part, count, side in zip(
+            (rows, columns), self.pixels.shape, self.pixels.chunks, strict=True
+        ):
+            pixels = range(count)[part]
+            if not pixels:
+                return []
+            ends = sorted((pixels[0], pixels[-1]))
+            indices.append(range(ends[0] // side, ends[1] // side + 1))
+        return list(itertools.product(*indices))
+
+    def _folder(self, place: Place) -> Path:
+        return self.path / "patches" / "{}.{}".format(*place)
+
+    def _chunk(self, place: Place) -> Path:
+        return self.path.joinpath("pixels", "c", *map(str, place))
+
+    def _checksum(self, place: Place) -> str | None:
+        """Return the checksum that a patch's pixels end with, or None where they are all zero."""
+        try:
+            with self._chunk(place).open("rb") as file:
+                file.seek(8 * math.prod(self.pixels.chunks))
+                return file.read().hex()
+        except FileNotFoundError:
+            return None  # Zarr leaves out a chunk that is all zero
+
+    def _record(self, place: Place) -> Record | None:
+        """Return the record of a patch, or None if it is not finished.
+
+        Raises
+        ------
+        DamageError
+            If the record is damaged, or the pixels on disk end with another checksum.
+        """
+        found = Record.read(self._folder(place))
+        if found is None:
+            return None
+        record, expected = found
+        if self._checksum(place) != expected:
+            gone = not self._chunk(place).exists()
+            raise DamageError("its pixels are " + ("gone" if gone else "not those of its record"))
+        return record
+
+    def _verify(self, place: Place) -> None:
+        """Read a patch; raise DamageError if it is finished and not what was written."""
+        if self._record(place) is None:
+            return
+        row, column = (
+            slice(i * n, (i + 1) * n) for i, n in zip(place, self.pixels.chunks, strict=True)
+        )
+        try:
+            _ = self.pixels[row, column]
+        except ValueError as error:  # Zarr's, of a checksum
+            raise DamageError("its pixels do not match their checksum") from error
 
     def _is_there(self) -> bool:
         """Return whether the path holds anything."""
         return self.path.exists() and not (self.path.is_dir() and not any(self.path.iterdir()))
 
     def _attributes(self) -> dict[str, Any]:
-        """Return what is known about the mosaic as a whole; raises ValueError if it is none."""
+        """Return what is known about the mosaic as a whole.
+
+        Raises
+        ------
+        ValueError
+            If the path holds something else, a mosaic of another version, or a damaged one.
+        """
         try:
-            attributes = json.loads((self.path / "zarr.json").read_text())["attributes"]
-            ours = attributes["format"] == FORMAT
-        except (OSError, ValueError, LookupError, TypeError) as error:
+            attributes = read_attributes(self.path)
+        except (OSError, DamageError) as error:
             raise ValueError(f"{self.path} exists and is not a mosaic of clsas") from error
-        if not ours:
+        if attributes.get("format") != FORMAT:
             raise ValueError(f"{self.path} exists and is not a mosaic of clsas")
         if attributes.get("version") != VERSION:
             raise ValueError(
                 f"{self.path} is a mosaic of version {attributes.get('version')}, this clsas works "
                 f"with version {VERSION}: give it another path"
             )
+        if not is_intact(attributes):
+            raise ValueError(f"{self.path} is damaged: its attributes do not match their checksum")
         shape, inputs = attributes.get("patch_shape"), attributes.get("inputs")
         whole = isinstance(inputs, dict) and isinstance(inputs.get("parts"), list)
         whole = whole and isinstance(shape, list) and [type(n) for n in shape] == [int, int]
@@ -379,35 +427,10 @@ class Store:
             raise ValueError(f"{self.path} is damaged: its attributes are not those of a mosaic")
         return attributes
 
-    def _differences(self, given: dict[str, Any], patch_shape: tuple[int, int]) -> list[str]:
-        """Return in what the inputs that the store was made with differ from those given."""
-        attributes, differences = self._attributes(), []
-        stored = attributes["inputs"]
-        if attributes["patch_shape"] != list(patch_shape):
-            mine, theirs = ("{} x {}".format(*s) for s in (attributes["patch_shape"], patch_shape))
-            differences.append(f"patches of {mine} pixels there, of {theirs} given")
-        for name in given:
-            mine, theirs = stored.get(name), given[name]
-            if name == "parts":
-                if theirs[: len(mine)] != mine:
-                    differences.append("the range lines are others")
-            elif name == "grid" and mine != theirs:
-                if stored.get("pixels") == given["pixels"]:
-                    differences.append("the grid lies elsewhere")
-            elif isinstance(mine, dict) and isinstance(theirs, dict):
-                differences += [
-                    f"{name}'s {key} is {mine.get(key)} there, {theirs[key]} given"
-                    for key in theirs
-                    if mine.get(key) != theirs[key]
-                ]
-            elif mine != theirs:
-                differences.append(f"{name} is {mine} there, {theirs} given")
-        return differences
-
 
 def _zarr() -> Any:
     try:
         import zarr
     except ImportError:
-        raise ImportError("stores of mosaics need Zarr: pip install 'clsas[mosaic]'") from None
+        raise ImportError(f"stores of mosaics need Zarr: {install_command('mosaic')}") from None
     return zarr

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -49,6 +49,18 @@ class Track:
     yaw_rad: NDArray[np.float64] = 0.0  # type: ignore[assignment]
     pitch_rad: NDArray[np.float64] = 0.0  # type: ignore[assignment]
     roll_rad: NDArray[np.float64] = 0.0  # type: ignore[assignment]
+
+    if TYPE_CHECKING:  # arrays are converted: the constructor takes what holds numbers
+
+        def __init__(
+            self,
+            positions_m: ArrayLike,
+            time_s: ArrayLike,
+            velocity_m_s: ArrayLike = (0.0, 0.0, 0.0),
+            yaw_rad: ArrayLike = 0.0,
+            pitch_rad: ArrayLike = 0.0,
+            roll_rad: ArrayLike = 0.0,
+        ) -> None: ...
 
     def __post_init__(self) -> None:
         """Check every field and convert it."""

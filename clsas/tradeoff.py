@@ -16,13 +16,13 @@ from itertools import product
 import numpy as np
 
 from clsas import validate
+from clsas.atomic import replacing
 from clsas.backproject import ACCURACY_DB, form_exactly
 from clsas.device import Device, open_device
 from clsas.factorize import factorize
 from clsas.filters import ALIGN_TAPS, APERTURE_TAPS
 from clsas.grid import Grid
 from clsas.image import Image
-from clsas.io import replacing
 from clsas.lines import RangeLines
 from clsas.plan import Plan
 from clsas.planner import plan
@@ -189,9 +189,12 @@ class Tradeoff:
 
         Raises
         ------
+        ValueError
+            If the file's name ends in another suffix than .csv.
         OSError
             If the folder does not exist or the file cannot be written.
         """
+        validate.suffix("path", validate.path("path", path), ".csv")
         with replacing(path) as temporary, open(temporary, "w", newline="") as file:
             writer = csv.writer(file)
             writer.writerow(_HEADER)
@@ -416,14 +419,14 @@ def _measured(row: Row, image: Image, reference: Image) -> Row:
 
 def _responses(image: Image, reference: Image) -> tuple[Response | None, Response | None]:
     """Return the responses at the reference's strongest point, where they can be measured."""
-    if not image.grid.has_axes:
+    if image.grid.points_m is not None:
         return None, None
-    x_m, y_m = image.grid.axes_m
+    across, upward = image.grid.sides
     row, column = np.unravel_index(np.abs(reference.pixels).argmax(), reference.grid.shape)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", validate.ClsasWarning)  # of other targets around
-            point = measure_point(image, (x_m[column], y_m[row]))
+            point = measure_point(image, (across.places_m[column], upward.places_m[row]))
     except ValueError:  # no point response, or too near the border
         return None, None
     return _response(point.azimuth), _response(point.range)

@@ -121,6 +121,15 @@ def path(name: str, value: object) -> Path:
     return Path(os.fspath(value))
 
 
+def suffix(name: str, value: Path, *allowed: str) -> None:
+    """Raise ValueError if a file's name ends as one of another format.
+
+    A name without a suffix, such as `image`, goes with any format.
+    """
+    if value.suffix and value.suffix.lower() not in allowed:
+        raise ValueError(f"{name} must end in {' or '.join(allowed)}, got {_shown(str(value))}")
+
+
 def progress(given: object) -> None:
     """Raise TypeError unless `given`, a progress argument, can be called or is None."""
     if not (given is None or callable(given)):

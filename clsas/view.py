@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import KDTree
 
-from clsas import interpolation
 from clsas.ambiguity import Ambiguity, ambiguity
 from clsas.aperture import cycles_per_extent, mean_track, own_drift
 from clsas.backproject import wavelength_m
@@ -20,6 +19,7 @@ from clsas.grid import Grid
 from clsas.interpolation import Interpolator, Resampling
 from clsas.layout import STACK
 from clsas.lines import RangeLines, some_channels
+from clsas.spectrum import cycles_per_m_at, measure_spectrum
 from clsas.surface import LEAST_SIDE, surface_of, within_roots
 from clsas.tree import beam_directions, beam_rate
 from clsas.window import BeamWindow, Sight, sines
@@ -71,11 +71,11 @@ class View:
     ) -> None:
         self.lines, self.grid, self.beam = lines, grid, beam
         self.kept: dict[Hashable, Any] = {}
-        self.spectrum = interpolation.measure_spectrum(lines, grid)
+        self.spectrum = measure_spectrum(lines, grid)
         outside = min(outside, _MOST_OUTSIDE)
         occupied = self.spectrum.frequency[np.cumsum(self.spectrum.share) < 1 - outside]
         half_band = (occupied[-1] if len(occupied) else 0.5) / lines.range_step_m
-        centre = interpolation.cycles_per_m(lines, self.spectrum.centre)
+        centre = cycles_per_m_at(lines, self.spectrum.centre)
         self.highest_cycles_per_m = float(abs(centre) + half_band)
         mean_square = self.spectrum.share @ self.spectrum.frequency**2
         self.rms_cycles_per_m = float(np.sqrt(mean_square)) / lines.range_step_m  # of the band
@@ -115,7 +115,7 @@ class View:
         """
         found, power = self.spectrum.frequency, self.spectrum.share
         found = self.spectrum.centre + np.concatenate([-found[::-1], found])
-        cycles_per_m = np.abs(interpolation.cycles_per_m(self.lines, found))
+        cycles_per_m = np.abs(cycles_per_m_at(self.lines, found))
         share = np.concatenate([power[::-1], power]) / 2
         return np.maximum(cycles_per_m, 1e-3 * self.highest_cycles_per_m), share
 

@@ -13,13 +13,14 @@ import scipy.fft
 from numpy.typing import NDArray
 
 from clsas import validate
-from clsas.backproject import check_numbers, warn_unseen, wavelength_m
+from clsas.backproject import check_numbers, wavelength_m
 from clsas.geometry import bistatic_range_m, pairwise_range_m
 from clsas.grid import Grid
 from clsas.image import Image
-from clsas.interpolation import measure_spectrum
 from clsas.lines import RangeLines
+from clsas.reach import warn_unseen
 from clsas.spectral import smooth_edge
+from clsas.spectrum import measure_spectrum
 from clsas.window import BeamWindow
 
 _SUM_ERROR = 1e-7  # of the non-uniform FFTs: what complex64 holds

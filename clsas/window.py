@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.signal import savgol_filter
 from scipy.spatial.distance import cdist
 
 from clsas import validate
@@ -89,6 +89,20 @@ class BeamWindow:
     along: NDArray[np.float64] | None = None
     normalise: bool = False
     track_pings: int | None = None
+
+    if TYPE_CHECKING:  # arrays are converted: the constructor takes what holds numbers
+
+        def __init__(
+            self,
+            width_deg: float,
+            shape: str = "rectangular",
+            squint_deg: float = 0.0,
+            taper: float = 0.5,
+            element_length_m: float | None = None,
+            along: ArrayLike | None = None,
+            normalise: bool = False,
+            track_pings: int | None = None,
+        ) -> None: ...
 
     def __post_init__(self) -> None:  # noqa: D105
         width = validate.number(
@@ -596,6 +610,8 @@ def _tangents(centres_m: NDArray[np.float64], pings: int) -> NDArray[np.float64]
     window = min(2 * (pings // 2) + 1, count - 1 + count % 2)
     if window < 2:
         return np.diff(centres_m, axis=0).repeat(2, axis=0)
+    from scipy.signal import savgol_filter  # slow to import
+
     return savgol_filter(centres_m, window, min(3, window - 1), deriv=1, axis=0, mode="interp")
 
 

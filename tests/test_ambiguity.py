@@ -1,7 +1,9 @@
 """Ends of lines that do not fade, in images of both imagers."""
 
+import dataclasses
 import math
 
+import numpy as np
 import pytest
 from cases import TAPER, along_x, noise
 
@@ -9,9 +11,9 @@ import clsas
 from clsas.ambiguity import ends_error
 from clsas.backproject import execute, prepare
 from clsas.grid import Grid
-from clsas.interpolation import measure_spectrum
 from clsas.lines import RangeLines
 from clsas.quality import relative_error_db
+from clsas.spectrum import measure_spectrum
 from clsas.validate import ClsasWarning
 
 
@@ -87,3 +89,48 @@ def test_the_rest_makes_up_for_ends_that_take_some_of_what_is_allowed(cut_off, s
     assert chosen.predicted_error_db <= tolerance_db
     assert prepare(lines, grid, accuracy_db=tolerance_db).predicted_error_db <= tolerance_db
     assert relative_error_db(clsas.factorize(lines, grid, chosen), exact) <= tolerance_db
+
+
+@pytest.fixture(scope="module")
+def four_points():
+    """Echoes of four points by two pings of the thesis's sonar, a grid, and its exact image."""
+    sonar = clsas.Sonar.thesis_wide_beam()
+    track = clsas.Track.straight((-0.264, 0, 0), (2, 0, 0), pings=2, ping_interval_s=0.264)
+    points = [(0.0, 42.5, 0), (0.08, 42.505, 0), (-0.07, 42.49, 0), (0.03, 42.512, 0)]
+    # The interval keeps the ends of the lines, where echoes still ring, off the grid.
+    echoes = clsas.simulate(sonar, track, clsas.PointTargets(points), range_m=(40.0, 45.0))
+    grid = Grid.plane((-0.1, 0.1, 128), (42.4, 42.6, 128))
+    lines = clsas.compress(echoes, oversampling=4.0)
+    return echoes, grid, execute(prepare(lines, grid, accuracy_db=-85))
+
+
+@pytest.mark.parametrize("oversampling", [2.0, 1.4, 1.25, 1.1, 1.06])
+def test_thin_guard_bands_keep_what_is_asked(four_points, oversampling):
+    echoes, grid, exact = four_points
+    lines = clsas.compress(echoes, oversampling=oversampling)
+    assert relative_error_db(clsas.backproject(lines, grid, accuracy_db=-80), exact) <= -80
+    chosen = clsas.plan(lines, grid, tolerance_db=-50)
+    found_db = relative_error_db(clsas.factorize(lines, grid, chosen), exact)
+    assert found_db <= chosen.predicted_error_db <= -50
+
+
+def test_a_band_that_fills_all_that_is_sampled_is_told_with_the_numbers(four_points):
+    echoes, grid, exact = four_points
+    lines = clsas.compress(echoes, oversampling=1.0)
+    message = r"oversampling is 1\.0\d*, at least 1.05 is needed; the error may be -\d\d dB"
+    with pytest.warns(ClsasWarning, match=message):
+        image = clsas.backproject(lines, grid, accuracy_db=-80)
+    predicted_db = prepare(lines, grid, accuracy_db=-80).predicted_error_db
+    assert -80 < relative_error_db(image, exact) <= predicted_db < -20
+    with pytest.warns(ClsasWarning, match=message):
+        assert -50 < clsas.plan(lines, grid, tolerance_db=-50).predicted_error_db < -20
+
+
+def test_noise_all_over_the_sampled_band_is_no_aliasing(four_points):
+    lines = clsas.compress(four_points[0], oversampling=1.5)
+    rng = np.random.default_rng(0)
+    level = 0.3 * np.sqrt(np.mean(np.abs(lines.samples) ** 2))
+    samples = lines.samples + level * (rng.normal(size=(*lines.samples.shape, 2)) @ [1, 1j])
+    spectrum = measure_spectrum(dataclasses.replace(lines, samples=samples))
+    assert spectrum.aliasing == 0
+    assert spectrum.oversampling == pytest.approx(1.5, rel=0.03)

@@ -224,11 +224,16 @@ def test_plan(made):
     # The scene asks for an exact image.
     assert run("plan", lines, "--scene", scene)[0].startswith("Plan: tolerance -50 dB; predicted")
     args = "plan", lines, "--scene", scene, "--stages", "2x2"
-    text, stderr = run(*args, "--json")
+    text, stderr = run(*args, "--json", "--filters")
     assert stderr == ""
     plan = clsas.Plan.from_json(text)
     assert plan.describe() + "\n" == run(*args)[0]
     assert plan.nearest == (2,)
+    short = run_json(*args)
+    assert "coefficients" not in json.dumps(short)
+    assert short["align"]["taps"] == 2
+    assert short["predicted_error_db"] == plan.predicted_error_db
+    assert "--filters goes with --json" in run(*args, "--filters", code=2)[1]
     assert not (made[0] / "plan.json").exists()
 
 
@@ -333,7 +338,9 @@ def test_a_broken_sampling_limit_is_a_warning(made, tmp_path):
         r"Warning: phase centres are up to 0\.02\d* m apart .* grating lobes .*\n", stderr
     )
     lines = made[0] / "lines.h5"
-    _, stderr = run("image", lines, "--scene", sparse, "-o", tmp_path / "image.h5")
+    image = "image", lines, "--scene", sparse, "-o", tmp_path / "image.h5"
+    assert run(*image)[1] == ""  # that of the scene's own grid was told when it was simulated
+    _, stderr = run(*image, *GRID)
     assert stderr.startswith("Warning: phase centres are up to 0.02")
 
 
@@ -342,7 +349,27 @@ def test_a_grid_that_no_line_reaches_is_a_warning(made, tmp_path):
     _, stderr = run("image", made[0] / "lines.h5", *grid, "-o", tmp_path / "image.h5")
     assert stderr.startswith("Warning: ")
     assert stderr.count("\n") == 1
+    assert run("plan", made[0] / "lines.h5", *grid)[1] == stderr
+    exact = "image", made[0] / "lines.h5", *grid, "--exact", "-o", tmp_path / "exact.h5"
+    assert run(*exact)[1].count("so the image is zero") == 1
     assert not clsas.load(tmp_path / "image.h5").pixels.any()
+
+
+@pytest.mark.parametrize(
+    ("option", "name", "words"),
+    [
+        ("--png", "x.pdf", "must end in .png, got 'x.pdf'"),
+        ("-o", "x.tif", "must end in .h5 or .hdf5 or .he5, got 'x.tif'"),
+    ],
+)
+def test_a_file_is_written_as_its_name_says_or_not_at_all(
+    made, tmp_path, monkeypatch, option, name, words
+):
+    monkeypatch.chdir(tmp_path)
+    options = {"-o": "new.h5", option: name}
+    given = [part for pair in options.items() for part in pair]
+    assert words in run("image", made[0] / "lines.h5", *GRID, *given, code=2)[1]
+    assert os.listdir() == []
 
 
 GRID = ["--x", "0:1:4", "--y", "19:20:4"]
@@ -541,13 +568,15 @@ def test_pictures_without_matplotlib_are_refused_before_any_work(made, tmp_path,
     scene = made[0] / "scene.toml"
     png = ("--png", tmp_path / "x.png")
     _, stderr = run("simulate", scene, "-o", tmp_path / "echoes.h5", *png, code=1)
-    assert "pip install 'clsas[plot]'" in stderr
+    assert "pip install 'matplotlib>=3.8'" in stderr
     run("demo", "--out", tmp_path / "out", code=1)
     assert not any(tmp_path.iterdir())
 
 
 def test_help_shows_an_example_that_parses(monkeypatch):
-    for name, command in cli.main.commands.items():
+    context = cli.main.make_context("clsas", ["devices"])
+    for name in cli.main.list_commands(context):
+        command = cli.main.get_command(context, name)
         text, _ = run(name, "--help")
         ((variable, value, example),) = re.findall(r"Example:  (?:(\w+)=(\w+) )?clsas (.*)", text)
         given, *args = shlex.split(example)

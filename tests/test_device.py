@@ -104,6 +104,39 @@ def test_chosen_by_a_part_of_its_name():
             assert choose(wish)[0].index == first.index
 
 
+def several_devices():
+    """An Intel CPU that two platforms drive, and a GPU beside them."""
+    info = list_devices()[0]
+    told = (
+        ("Portable Computing Language", "pthread-Intel(R) Xeon(R)", "cpu", 16),
+        ("Intel(R) OpenCL", "Intel(R) Xeon(R)", "cpu", 1),
+        ("NVIDIA CUDA", "NVIDIA H200", "gpu", 1),
+        ("NVIDIA CUDA", "NVIDIA H200", "gpu", 1),
+    )
+    return [
+        dataclasses.replace(info, index=i, platform=platform, name=name, kind=kind, width=width)
+        for i, (platform, name, kind, width) in enumerate(told)
+    ]
+
+
+@pytest.mark.parametrize(
+    ("wish", "index"),
+    [("pocl", 0), ("PoCL", 0), ("intel", 1), ("nvidia", 2), ("cpu", 0), ("gpu", 2), ("h200", 2)],
+)
+def test_chosen_by_kind_and_platform(wish, index, monkeypatch):
+    monkeypatch.setattr(module, "list_devices", several_devices)
+    assert choose(wish) == (several_devices()[index], f"asked for as {wish!r}")
+    monkeypatch.setenv(ENVIRONMENT_VARIABLE, wish)
+    assert choose()[0].index == index
+
+
+def test_a_kind_that_is_not_there_is_told(monkeypatch):
+    monkeypatch.setattr(module, "list_devices", lambda: several_devices()[:2])
+    words = "No device matches 'gpu', asked for. Available: 0: Portable Computing Language: "
+    with pytest.raises(DeviceError, match=re.escape(words)):
+        choose("gpu")
+
+
 def test_chosen_by_the_environment(monkeypatch):
     info = list_devices()[-1]
     monkeypatch.setenv(ENVIRONMENT_VARIABLE, str(info.index))
@@ -164,7 +197,7 @@ def test_an_unknown_device_names_those_there_are(wish):
         choose(wish)
     assert repr(wish).strip("'") in str(error.value)
     for info in list_devices():
-        assert f"{info.index} = {info.label}" in str(error.value)
+        assert f"{info.index}: {info.label}" in str(error.value)
 
 
 @pytest.mark.parametrize("wish", [1.0, True, ["0"], b"0"])
@@ -182,7 +215,7 @@ def test_no_device_at_all_says_how_to_get_one(nothing, wish):
     assert list_devices() == []
     with pytest.raises(DeviceError) as error:
         open_device(wish)
-    for part in ("No OpenCL device", 'pip install "clsas[pocl]"', "/etc/OpenCL/vendors", ".libs"):
+    for part in ("No OpenCL device", "pip install 'pyopencl[pocl]", "/etc/OpenCL/vendors", ".libs"):
         assert part in str(error.value)
 
 

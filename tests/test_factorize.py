@@ -1146,3 +1146,30 @@ def test_a_beam_that_swings_with_the_track_is_not_factorized():
     beam = BeamWindow(8.0, "hann", track_pings=21)
     assert plan(lines, grid, tolerance_db=-30, beam=beam, costs=EXACT_IS_SLOW).is_exact
     assert not plan(lines, grid, tolerance_db=-30, costs=EXACT_IS_SLOW).is_exact
+
+
+@pytest.mark.parametrize("costs", [EXACT_IS_SLOW, Costs(call_ns=1e12)], ids=["stages", "exact"])
+def test_data_may_arrive_in_pieces(costs, platform):
+    """Images of parts of the lines add up, also where one is backprojected."""
+    lines, grid = made(straight)
+    whole = backproject(lines, grid, device=platform)
+    image = None
+    for part in (slice(0, 250), slice(250, 600)):
+        some = lines.select(part)
+        chosen = plan(some, grid, tolerance_db=-45, costs=costs, device=platform)
+        assert chosen.is_exact == (costs is not EXACT_IS_SLOW)
+        image = factorize(some, grid, chosen, device=platform, accumulate=image)
+    assert relative_error_db(image, whole) < -42
+
+
+def test_what_cannot_be_added_to_is_refused(platform):
+    lines, grid = made(straight)
+    other = Image(np.zeros((4, 4), complex), Grid.plane((0, 1, 4), (0, 1, 4)))
+    with pytest.raises(ValueError, match="accumulate must be an image on the same grid"):
+        factorize(lines, grid, -40, accumulate=other, device=platform)
+    with pytest.raises(TypeError, match="accumulate must be of type Image"):
+        factorize(lines, grid, -40, accumulate=np.zeros(grid.shape, complex), device=platform)
+    zero = Image(np.zeros(grid.shape, complex), grid)
+    beam = BeamWindow(60, "hann", normalise=True)
+    with pytest.raises(ValueError, match="accumulate must be None with a beam that normalises"):
+        factorize(lines, grid, -40, accumulate=zero, beam=beam, device=platform)

@@ -3,7 +3,7 @@ import pytest
 
 from clsas import filters
 from clsas.filters import choose, steering_spectrum
-from clsas.interpolation import Spectrum
+from clsas.spectrum import Spectrum
 
 LINES = Spectrum(0.0, (np.arange(128) + 0.5) / 256, np.repeat([1 / 96, 0.0], [96, 32]))
 

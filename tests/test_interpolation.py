@@ -7,14 +7,12 @@ from cases import noise
 from clsas.interpolation import (
     TAPS,
     UPSAMPLINGS,
-    Spectrum,
     choose,
     design,
-    measure_spectrum,
     resampling,
 )
-from clsas.lines import RangeLines
 from clsas.quality import relative_error_db
+from clsas.spectrum import Spectrum
 
 
 def flat(occupied, centre=0.0):
@@ -22,10 +20,6 @@ def flat(occupied, centre=0.0):
     frequency = (np.arange(200) + 0.5) / 400
     power = (frequency < occupied / 2).astype(float)
     return Spectrum(centre, frequency, power / power.sum())
-
-
-def lines_of(samples):
-    return RangeLines(samples, 10.0, 0.01, [0, 0, 0], [0, 0, 0], 1e5, 1500.0)
 
 
 NU = np.linspace(-0.5, 0.5, 101)
@@ -141,46 +135,6 @@ def test_upsampling_stays_within_what_is_preferred():
     of_taps = choose(spectrum, -70, most_upsampling={free.taps: limit})
     assert of_taps.taps != free.taps
     assert of_taps.error_db <= -70
-
-
-# Spectra
-
-
-@pytest.mark.parametrize("centre", [-0.45, -0.2, 0.0, 0.3, 0.49])
-@pytest.mark.parametrize("occupied", [0.1, 0.6])
-def test_the_spectrum_is_measured_about_its_centre(centre, occupied):
-    lines = lines_of(noise(40, 500, occupied=occupied, centre=centre))
-    spectrum = measure_spectrum(lines)
-    assert spectrum.centre == pytest.approx(centre, abs=0.01)
-    assert spectrum.power.sum() == pytest.approx(1, abs=1e-12)
-    inside = spectrum.frequency < occupied / 2
-    level = spectrum.power[inside]
-    assert level.sum() > 0.97
-    assert level[1:-2].std() < 0.2 * level.mean()
-
-
-def test_lines_of_zeros_have_a_spectrum():
-    spectrum = measure_spectrum(lines_of(np.zeros((2, 50), complex)))
-    assert -0.5 <= spectrum.centre <= 0.5
-    np.testing.assert_allclose(spectrum.power.reshape(8, -1).sum(axis=1), 1 / 8, rtol=0.3)
-
-
-@pytest.mark.parametrize("scale", [1e-35, 1e-20, 1e18, 1e30])
-def test_the_spectrum_does_not_depend_on_the_unit(scale):
-    samples = noise(3, 300, centre=0.2)
-    spectrum, scaled = (measure_spectrum(lines_of(a * samples)) for a in (1.0, scale))
-    assert scaled.centre == pytest.approx(spectrum.centre, abs=1e-4)
-    np.testing.assert_allclose(scaled.power, spectrum.power, atol=1e-5)
-
-
-@pytest.mark.parametrize(
-    "filled", [slice(None, 500, 10), slice(1, None, 4), slice(3, None, 8), slice(777, 778)]
-)
-def test_the_spectrum_is_that_of_the_channels_which_hold_anything(filled):
-    """Elements of an array may be dead, in regular steps."""
-    samples = np.zeros((1000, 100), complex)
-    samples[filled] = noise(len(samples[filled]), 200, occupied=0.4, centre=0.25)[:, 50:150]
-    assert measure_spectrum(lines_of(samples)).centre == pytest.approx(0.25, abs=0.02)
 
 
 # Resampling

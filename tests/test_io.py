@@ -1,5 +1,4 @@
 import dataclasses
-import errno
 import hashlib
 import os
 import subprocess
@@ -345,21 +344,3 @@ def test_xarray_names_bad_input(monkeypatch):
     monkeypatch.setitem(sys.modules, "xarray", None)
     with pytest.raises(ImportError, match="pip install xarray"):
         to_xarray(PLANE)
-
-
-@pytest.mark.parametrize("names", [None, "the temporary one"])
-def test_a_full_disk_names_the_file_that_was_to_be_written(tmp_path, names):
-    """Not the temporary one, nor nothing as the system does; what was there stays."""
-    path = tmp_path / "image.h5"
-    path.write_text("before")
-
-    def write():
-        with io.replacing(path) as part:
-            part.write_text("half")
-            raise OSError(errno.ENOSPC, "No space left on device", names and str(part))
-
-    with pytest.raises(OSError, match="No space left") as caught:
-        write()
-    assert caught.value.filename == str(path)
-    assert [each.name for each in tmp_path.iterdir()] == ["image.h5"]
-    assert path.read_text() == "before"

@@ -23,6 +23,7 @@ from clsas.grid import Grid
 from clsas.quality import relative_error_db
 from clsas.store import Store
 from clsas.survey import END
+from clsas.validate import ClsasWarning
 from clsas.window import BeamWindow
 
 GRID = Grid.plane((-4, 4, 80), (30, 40, 60))
@@ -357,7 +358,9 @@ class TestResuming:
         chunk = path / "pixels" / "c" / "1" / "2"
         chunk.write_bytes(chunk.read_bytes()[:100])
         patches = []
-        again = clsas.mosaic(LINES, GRID, path, **WISH).image(patches.append)
+        with pytest.warns(ClsasWarning, match="patch 1,2: its pixels are not those"):
+            mosaic = clsas.mosaic(LINES, GRID, path, **WISH)
+        again = mosaic.image(patches.append)
         np.testing.assert_array_equal(again.pixels, before.pixels)
         told = [(patch.row, patch.column) for patch in patches]
         assert told[-1] == (1, 2)  # after those that were there
@@ -445,7 +448,8 @@ class TestResuming:
         stored = json.loads(record.read_text())
         stored["attributes"][name] = value
         record.write_text(json.dumps(stored))
-        again = list(clsas.mosaic(LINES, GRID, path, **WISH))
+        with pytest.warns(ClsasWarning, match="patch 1,2: its record does not match its checksum"):
+            again = list(clsas.mosaic(LINES, GRID, path, **WISH))
         assert [(patch.row, patch.column) for patch in again] == [(1, 2)]
 
     def test_a_store_of_an_older_schema_is_refused(self, tmp_path):
@@ -474,7 +478,8 @@ class TestResuming:
             chunk.write_bytes(chunk.read_bytes()[:100])
         else:
             chunk.unlink()
-        again = list(clsas.mosaic(LINES, GRID, tmp_path / "a.zarr", **WISH))
+        with pytest.warns(ClsasWarning, match="patch 1,2: its pixels are"):
+            again = list(clsas.mosaic(LINES, GRID, tmp_path / "a.zarr", **WISH))
         assert [(patch.row, patch.column) for patch in again] == [(1, 2)]
         np.testing.assert_array_equal(Store.opened(tmp_path / "a.zarr").image().pixels, before)
 
@@ -504,7 +509,8 @@ class TestResuming:
         list(clsas.mosaic(LINES, GRID, tmp_path / "a.zarr", **WISH))
         record = tmp_path / "a.zarr" / "patches" / "1.2" / "zarr.json"
         record.write_text(record.read_text()[:50])
-        again = list(clsas.mosaic(LINES, GRID, tmp_path / "a.zarr", **WISH))
+        with pytest.warns(ClsasWarning, match="patch 1,2: its record cannot be read"):
+            again = list(clsas.mosaic(LINES, GRID, tmp_path / "a.zarr", **WISH))
         assert [(patch.row, patch.column) for patch in again] == [(1, 2)]
 
 

@@ -16,7 +16,9 @@ from test_factorize import (
     swaying,
 )
 
+from clsas import costs
 from clsas.backproject import backproject
+from clsas.device import open_device
 from clsas.grid import Grid
 from clsas.plan import Plan, grid_digest, lines_digest
 from clsas.planner import plan
@@ -265,3 +267,31 @@ def test_a_plan_knows_its_lines_and_grid(chosen):
         chosen.check(other_lines, grid)
     with pytest.raises(ValueError, match="another grid geometry"):
         chosen.check(lines, around(0, 41))
+
+
+def test_it_says_whether_times_are_of_this_device(chosen, monkeypatch, tmp_path):
+    lines, grid = made(straight)
+    monkeypatch.setenv("CLSAS_CACHE", str(tmp_path))
+    usual = plan(lines, grid, tolerance_db=-50)
+    assert not usual.calibrated
+    words = "Times follow from default costs, not from any measured on this device: `clsas calib"
+    assert words in usual.describe()
+    assert words in plan(lines, grid, stages=[]).describe()
+    device = open_device()
+    costs.save(device, costs.defaults(device))
+    measured = plan(lines, grid, tolerance_db=-50)
+    assert measured.calibrated
+    assert "default costs" not in measured.describe()
+    assert Plan.from_json(usual.to_json()).calibrated is False
+
+
+def test_json_may_leave_out_filters(chosen):
+    short, whole = chosen.to_json(filters=False), chosen.to_json()
+    assert len(short) < 0.5 * len(whole)
+    left_out = {"coefficients"}
+    for name, value in json.loads(whole).items():
+        if isinstance(value, dict):
+            value = {key: part for key, part in value.items() if key not in left_out}
+        assert json.loads(short)[name] == value
+    with pytest.raises(ValueError, match=r"a plan as of Plan\.to_json: it lacks 'coef"):
+        Plan.from_json(short)

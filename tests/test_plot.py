@@ -84,8 +84,37 @@ def test_large_images_keep_their_points():
 def test_oriented_planes_show_distances():
     grid = Grid.oriented([1, 2, 3], [0, 0, 0.5], [0.3, 0.4, 0], (3, 5))
     figure = plot.image_db(Image(np.ones(grid.shape, complex), grid))
-    np.testing.assert_allclose(shown(figure)[1], [-0.25, 2.25, -0.25, 1.25])
-    assert figure.axes[0].get_xlabel() == "along columns (m)"
+    # Rows run along z, columns along neither x nor y.
+    np.testing.assert_allclose(shown(figure)[1], [-0.25, 2.25, 2.75, 4.25])
+    labels = figure.axes[0].get_xlabel(), figure.axes[0].get_ylabel()
+    assert labels == ("along columns (m)", "z (m)")
+
+
+DEPTH = Grid.oriented([-0.01, 0, -0.02], [0, 0, -1e-4], [1e-4, 0, 0], (150, 200))
+
+
+def test_small_planes_in_depth_are_in_millimetres():
+    figure = plot.image_db(Image(np.ones(DEPTH.shape, complex), DEPTH))
+    np.testing.assert_allclose(shown(figure)[1], [-10.05, 9.95, -19.95, -34.95])
+    axes = figure.axes[0]
+    assert (axes.get_xlabel(), axes.get_ylabel()) == ("x (mm)", "z (mm)")
+    assert axes.get_ylim() == pytest.approx((-34.95, -19.95))  # up is up
+
+
+def test_cuts_in_depth_name_their_axes():
+    response = measure_point(Image(PIXELS, DEPTH), (-0.002, -0.026))
+    figure = plot.cuts(response)
+    assert figure.axes[1].get_xlabel() == "z (up) from the peak (mm)"
+    assert "z = -0.0260 m" in figure.axes[0].get_title()
+
+
+def test_geometry_of_a_plane_in_depth_is_seen_from_its_side():
+    rx_m = np.stack([np.linspace(-0.01, 0.01, 10), np.zeros(10), np.zeros(10)], -1)
+    data = RangeLines(np.ones((10, 4), complex), 0.0, 1e-4, rx_m, rx_m, 0, 1500)
+    figure = plot.geometry(data, DEPTH)
+    axes = figure.axes[0]
+    assert (axes.get_xlabel(), axes.get_ylabel()) == ("x (mm)", "z (mm)")
+    np.testing.assert_allclose(axes.get_lines()[2].get_ydata().min(), -34.9)
 
 
 def test_cuts_show_the_figures():
@@ -196,6 +225,8 @@ def test_bad_input_is_named():
 
 
 def test_only_figures_are_saved(tmp_path):
+    with pytest.raises(ValueError, match=r"path must end in .png, got '.*a.pdf'"):
+        plot.save_png(plot.image_db(IMAGE), tmp_path / "a.pdf")
     with pytest.raises(TypeError, match="figure must be of type Figure, got int"):
         plot.save_png(5, tmp_path / "a.png")
     with pytest.raises(TypeError, match="response must be of type PointResponse, got Image"):
@@ -205,5 +236,5 @@ def test_only_figures_are_saved(tmp_path):
 
 def test_missing_matplotlib_says_how_to_get_it(monkeypatch):
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
-    with pytest.raises(ImportError, match=r"pip install clsas\[plot\]"):
+    with pytest.raises(ImportError, match=r"pip install 'matplotlib>=3\.8'"):
         plot.image_db(IMAGE)

@@ -131,6 +131,47 @@ def test_axes_may_run_backwards():
     assert back.range.resolution_m == pytest.approx(forth.range.resolution_m, rel=1e-6)
 
 
+def on_plane(row_step_m, column_step_m, origin_m=(3.0, -2.0, 5.0)):
+    """The image of the point on a plane of some directions, and where on it the point is."""
+    grid = Grid.oriented(
+        origin_m, DY * np.array(row_step_m), DX * np.array(column_step_m), GRID.shape
+    )
+    column, row = (AT[0] - X[0]) / DX, (AT[1] - Y[0]) / DY
+    at_m = grid.origin_m + row * grid.row_step_m + column * grid.column_step_m
+    return Image(point(), grid), at_m
+
+
+def test_a_plane_in_depth_is_measured():
+    image, at_m = on_plane((0, 0, -1), (1, 0, 0))
+    flat = measure_point(Image(point(), GRID), near())
+    for place in (at_m[[0, 2]], at_m):
+        got = measure_point(image, place)
+        assert (got.azimuth.axis, got.range.axis) == ("x", "z")
+        np.testing.assert_allclose((got.x_m, got.y_m, got.z_m), at_m, atol=1e-3 * DX)
+        assert got.azimuth.resolution_m == pytest.approx(flat.azimuth.resolution_m, rel=1e-6)
+        assert got.range.resolution_m == pytest.approx(flat.range.resolution_m, rel=1e-6)
+    with pytest.raises(ValueError, match="near must be inside the image: z from"):
+        measure_point(image, (at_m[0], 50.0))
+
+
+def test_a_plane_of_any_direction_is_measured():
+    c, s = np.cos(0.5), np.sin(0.5)
+    image, at_m = on_plane((-s * 0.8, c * 0.8, -0.6), (c, s, 0), origin_m=(1e6, -1e6, 0))
+    got = measure_point(image, at_m)
+    assert (got.azimuth.axis, got.range.axis) == ("along columns", "along rows")
+    np.testing.assert_allclose((got.x_m, got.y_m, got.z_m), at_m, rtol=0, atol=1e-3 * DX)
+    flat = measure_point(Image(point(), GRID), near())
+    assert got.range.resolution_m == pytest.approx(flat.range.resolution_m, rel=1e-6)
+    by_axes = measure_point(image, ((AT[0] - X[0]), (AT[1] - Y[0])))
+    assert by_axes.z_m == pytest.approx(got.z_m)
+
+
+def test_heights_are_part_of_the_position():
+    heights_m = np.full(GRID.shape, 2.5)
+    got = measure_point(Image(point(), GRID.with_height(heights_m)), near())
+    assert got.z_m == 2.5
+
+
 def test_a_far_ghost_is_the_highest_but_not_the_nearest_lobe():
     ghost = point(at=(AT[0] + 40 * 1.5 * DX, AT[1]), amplitude=1.5)
     image = Image(point() + ghost, GRID)
@@ -201,7 +242,7 @@ def test_needs_an_image_with_axes():
     with pytest.raises(TypeError, match="image must be of type Image, got ndarray"):
         measure_point(point(), near())
     points = Grid.points(GRID.positions_m())
-    with pytest.raises(ValueError, match="columns must run along x"):
+    with pytest.raises(ValueError, match="must be a plane or height map to have axes"):
         measure_point(Image(point(), points), near())
     line = GRID.window(slice(0, 1))
     with pytest.raises(ValueError, match="3 or more pixels along y, got 1"):

@@ -43,8 +43,8 @@ def test_geometry_is_that_of_the_lines(folder):
 
 @pytest.mark.parametrize("how", ["memory", "file", "folder"])
 def test_what_is_read_is_what_was_recorded(how, folder, tmp_path):
-    save(tmp_path / "whole.other", LINES)
-    survey = open_survey({"memory": LINES, "file": tmp_path / "whole.other", "folder": folder}[how])
+    save(tmp_path / "whole.hdf5", LINES)
+    survey = open_survey({"memory": LINES, "file": tmp_path / "whole.hdf5", "folder": folder}[how])
     seen = np.zeros(120, bool)
     seen[[3, 4, 48, 50, 52, 119]] = True
     near_m, far_m = ranges_of(PATCH)

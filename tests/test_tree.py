@@ -10,9 +10,9 @@ from clsas.aperture import cycles_per_extent, mean_track
 from clsas.backproject import backproject
 from clsas.factorize import factorize
 from clsas.grid import Grid
-from clsas.interpolation import Spectrum
 from clsas.planner import plan
 from clsas.quality import relative_error_db
+from clsas.spectrum import Spectrum
 from clsas.surface import surface_of
 from clsas.tree import Division, interpolated_nodes, nearest_nodes
 from clsas.window import BeamWindow, touches_boxes

@@ -6,31 +6,79 @@ Results go to standard output, progress and warnings to standard error. Exit cod
 
 from __future__ import annotations
 
+import importlib
 import warnings
 from typing import Any
 
 import click
-import pyopencl
 
 import clsas
-from clsas.cli import images, lines, machine, measures, mosaics, selftest
 
-# What users cause, and what machines lack.
-_ERRORS = (
-    ValueError,
-    TypeError,
-    clsas.DeviceError,
-    pyopencl.Error,
-    OSError,
-    ImportError,
-    MemoryError,
-)
+# A command's module imports the library, which takes a second: --help and --version do without.
+# By command: its module, and the first sentence of its help.
+_COMMANDS = {
+    "devices": ("machine", "List OpenCL devices, and say which one is used and why."),
+    "simulate": ("lines", "Simulate the echoes of a scene file."),
+    "compress": ("lines", "Compress echoes into range lines."),
+    "image": ("images", "Form the image of range lines, fast to a tolerance or exactly."),
+    "plan": (
+        "images",
+        "Show how an image would be formed, how long it takes and how much it errs.",
+    ),
+    "mosaic": ("mosaics", "Form an image of any size patch by patch, into a Zarr store."),
+    "quality": (
+        "measures",
+        "Measure an image: contrast, a point's response, the error to another image.",
+    ),
+    "tradeoff": (
+        "measures",
+        "Measure speed against accuracy: one image in many ways, timed and compared.",
+    ),
+    "bench": (
+        "measures",
+        "Time a benchmark case and measure its error; without CASE, all of them run for minutes.",
+    ),
+    "demo": (
+        "machine",
+        "Run the thesis's wide-beam case, from simulation to picture and measured figures.",
+    ),
+    "calibrate": (
+        "machine",
+        "Measure what the parts of imaging cost on a device, and store it for planning.",
+    ),
+    "selftest": ("selftest", "Test this device's accuracy at the extremes, within a minute."),
+}
 
 
 class _Commands(click.Group):
-    """Turns what the library raises and warns of into messages and exit codes."""
+    """Imports a command when it is run; turns exceptions and warnings into messages."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        return list(_COMMANDS)
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        if cmd_name not in _COMMANDS:
+            return None
+        module, _ = _COMMANDS[cmd_name]
+        return getattr(importlib.import_module(f"clsas.cli.{module}"), cmd_name)
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        with formatter.section("Commands"):
+            formatter.write_dl([(name, what) for name, (_, what) in _COMMANDS.items()])
 
     def invoke(self, ctx: click.Context) -> Any:
+        import pyopencl
+
+        # What users cause, and what machines lack.
+        errors = (
+            ValueError,
+            TypeError,
+            clsas.DeviceError,
+            pyopencl.Error,
+            OSError,
+            ImportError,
+            MemoryError,
+        )
         with warnings.catch_warnings():
             warnings.simplefilter("always", clsas.ClsasWarning)
             warnings.simplefilter("ignore", pyopencl.CompilerWarning)
@@ -42,7 +90,7 @@ class _Commands(click.Group):
             except KeyboardInterrupt:
                 click.echo("Interrupted", err=True)
                 ctx.exit(130)
-            except _ERRORS as error:
+            except errors as error:
                 if ctx.params.get("traceback"):
                     raise
                 raise click.ClickException(_message(error)) from error
@@ -50,20 +98,6 @@ class _Commands(click.Group):
 
 @click.group(
     cls=_Commands,
-    commands=[
-        machine.devices,
-        lines.simulate,
-        lines.compress,
-        images.image,
-        images.plan,
-        mosaics.mosaic,
-        measures.quality,
-        measures.tradeoff,
-        measures.bench,
-        machine.demo,
-        machine.calibrate,
-        selftest.selftest,
-    ],
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 @click.version_option(clsas.__version__, prog_name="clsas")

@@ -80,16 +80,19 @@ def image(
     described, grid = read_grid(scene, given)
     wish = read_wish(described, given, exact)
     beam = read_beam(described, given)
-    warn_of_sampling(described, grid)
+    # A scene that is simulated has been warned of when that was done, with its own grid.
+    if described.targets is None or grid is not described.grid:
+        warn_of_sampling(described, grid)
     lines = load(lines_file, clsas.RangeLines)
     opened = open_device(device)
     results: dict[str, Any] = {"method": "exact"}
-    chosen, why = None, ""
+    chosen, why, warned = None, "", False
     if wish.keys() & set(DIAL):
         start = time.perf_counter()
         chosen = clsas.plan(lines, grid, **wish, beam=beam, device=opened)
         results["plan_seconds"] = time.perf_counter() - start
         _warn_of_error(chosen)
+        warned = chosen.kept["warned"]
         if chosen.is_exact:
             wish = {"accuracy_db": chosen.accuracy_db}
             why, chosen = f"exact: nothing faster within {chosen.tolerance_db:.4g} dB; ", None
@@ -110,7 +113,7 @@ def image(
             preparation = prepare(lines, grid, device=opened, beam=beam, **wish)
             if not why:  # else the plan has warned
                 preparation.warn_of_ambiguity()
-            formed = execute(preparation, progress=progress)
+            formed = execute(preparation, progress=progress, warned=warned)
             interpolator, ratio = preparation.interpolator, preparation.resampling.ratio
             how = (
                 f"{why}{interpolator.taps} taps on lines upsampled {ratio:.3g} times, "
@@ -151,17 +154,29 @@ def image(
 @options.beam
 @options.device
 @options.as_json
+@click.option(
+    "--filters", is_flag=True,
+    help="With --json, print the filters' coefficients too, for clsas.Plan.from_json.",
+)  # fmt: skip
 def plan(
-    lines_file: Path, scene: Path | None, device: str | None, as_json: bool, **given: Any
+    lines_file: Path,
+    scene: Path | None,
+    device: str | None,
+    as_json: bool,
+    filters: bool,
+    **given: Any,
 ) -> None:
     """Show how an image would be formed, how long it takes and how much it errs.
 
     Grid, dial and beam as for `clsas image`; where the scene asks for an exact image, a
-    tolerance of -50 dB counts. With --json the plan is printed whole, as Plan.to_json has it.
+    tolerance of -50 dB counts. With --json and --filters the plan is printed whole, as
+    clsas.Plan.from_json reads it.
 
     \b
     Example:  clsas plan lines.h5 --x -2.5:2.5:1024 --y 40:45:1024 --tolerance-db -40
     """
+    if filters and not as_json:
+        raise click.UsageError("--filters goes with --json")
     described, grid = read_grid(scene, given)
     wish = read_wish(described, given)
     beam = read_beam(described, given)
@@ -170,7 +185,7 @@ def plan(
         wish = DEFAULT_WISH
     chosen = clsas.plan(lines, grid, **wish, beam=beam, device=device)
     _warn_of_error(chosen)
-    click.echo(chosen.to_json() if as_json else chosen.describe())
+    click.echo(chosen.to_json(filters=filters) if as_json else chosen.describe())
 
 
 def _warn_of_error(chosen: clsas.Plan) -> None:

@@ -23,7 +23,11 @@ from clsas.tradeoff import TOLERANCES_DB
 
 @click.command()
 @click.argument("image_file", metavar="IMAGE.H5", type=INPUT)
-@click.option("--near", type=PLACE, help="Measure the point near x, y (m).")
+@click.option(
+    "--near",
+    type=PLACE,
+    help="Measure the point near a place on the image's axes, or near x, y, z (m).",
+)
 @click.option(
     "--search-m", type=float, help="How far from there its peak may be.",
     callback=options.checked(partial(validate.positive, "search_m", unit="m")),
@@ -37,7 +41,7 @@ from clsas.tradeoff import TOLERANCES_DB
 @options.as_json
 def quality(
     image_file: Path,
-    near: tuple[float, float] | None,
+    near: tuple[float, ...] | None,
     search_m: float | None,
     extent_m: float | None,
     reference: Path | None,
@@ -101,7 +105,7 @@ def quality(
 @options.beam
 @options.device
 @click.option("--repeats", type=click.IntRange(1), default=3, show_default=True, help="Timed runs.")
-@click.option("--csv", type=Output(), help="Also write the table.")
+@click.option("--csv", type=Output(".csv"), help="Also write the table.")
 @options.png("time over error")
 @options.as_json
 def tradeoff(
@@ -230,9 +234,10 @@ def _one_of(name: str, cases: Collection[str]) -> None:
 
 
 def _describe(response: PointResponse) -> str:
-    def cut(name: str, cut: Cut) -> str:
+    def cut(cut: Cut) -> str:
+        name = {"x": "azimuth", "y": "range"}.get(cut.axis, cut.axis)
         return (
-            f"  {name:<8} resolution {1e3 * cut.resolution_m:.2f} mm (-3 dB), PSLR nearest "
+            f"  {name:<13} resolution {1e3 * cut.resolution_m:.2f} mm (-3 dB), PSLR nearest "
             f"{cut.pslr_nearest_db[0]:.1f}, {cut.pslr_nearest_db[1]:.1f} dB, highest "
             f"{cut.pslr_db[0]:.1f}, {cut.pslr_db[1]:.1f} dB, ISLR {cut.islr_db:.1f} dB"
         )
@@ -240,9 +245,9 @@ def _describe(response: PointResponse) -> str:
     return "\n".join(
         [
             f"point at x = {response.x_m:.5f} m, y = {response.y_m:.5f} m, "
-            f"amplitude {response.amplitude:.6g}",
-            cut("azimuth", response.azimuth),
-            cut("range", response.range),
+            f"z = {response.z_m:.5f} m, amplitude {response.amplitude:.6g}",
+            cut(response.azimuth),
+            cut(response.range),
         ]
     )
 

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import logging
 import os
-import signal
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
@@ -17,11 +15,12 @@ from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, T
 
 import clsas
 from clsas.cli import options
-from clsas.cli.inputs import read_beam, read_grid, read_wish, warn_of_sampling
+from clsas.cli.inputs import read_beam, read_grid, read_scene, read_wish, warn_of_sampling
 from clsas.cli.outputs import progress_bar, report
 from clsas.cli.parameters import COUNTS, INPUT, File, Store, keep_apart
 from clsas.config import DIAL, SceneFile, simulation_digest
 from clsas.device import open_device
+from clsas.extras import install_command
 from clsas.mosaic import patch_shape_of
 
 _SCHEDULER_S = 10  # to answer
@@ -49,12 +48,18 @@ _LISTED = 3  # patches of one kind, at most
 @click.option("--patches", type=COUNTS, help="Patches along y and x, such as 8x8.")
 @click.option("--memory-mib", type=click.IntRange(1), help="What a patch may take. [default: 1024]")
 @click.option("--device", multiple=True, help="Once for every device that is to work.")
-@click.option("--workers", type=click.IntRange(1), help="Work in so many processes (Dask).")
-@click.option("--scheduler", metavar="ADDRESS", help="Work on a Dask cluster: tcp://host:8786.")
+@click.option("--workers", type=click.IntRange(1), help="Work in this many processes.")
+@click.option(
+    "--scheduler", metavar="ADDRESS", help="Work on a Dask cluster, such as tls://host:8786."
+)
 @click.option("--follow", is_flag=True, help="Go on while files are added to the folder --lines.")
 @click.option(
     "--idle-s", type=float, callback=options.check_idle_s,
     help="With --follow: until nothing came for so long, or a file `end` did. [default: 60]",
+)  # fmt: skip
+@click.option(
+    "--verify", is_flag=True,
+    help="Form nothing; read the store and compare all patches with their checksums.",
 )  # fmt: skip
 @options.png("an overview in dB")
 @options.dynamic_range
@@ -70,6 +75,7 @@ def mosaic(
     scheduler: str | None,
     follow: bool,
     idle_s: float | None,
+    verify: bool,
     png: Path | None,
     dynamic_range_db: float,
     as_json: bool,
@@ -78,8 +84,9 @@ def mosaic(
     """Form an image of any size patch by patch, into a Zarr store.
 
     Grid, dial and beam as for `clsas image`, but an exact image is asked for by --accuracy-db. The
-    same command goes on where it was interrupted, by Ctrl-C or by anything else. A scene without
-    --lines is simulated first.
+    same command goes on where it was interrupted, by Ctrl-C or by anything else, and forms damaged
+    patches again. With --verify it only says which are damaged, and exits with 1 if any is. A scene
+    without --lines is simulated first.
 
     \b
     Example:  clsas mosaic scene.toml --lines lines.h5 -o image.zarr --png image.png
@@ -88,6 +95,9 @@ def mosaic(
         raise click.UsageError("--workers and --scheduler exclude each other")
     if device and (workers or scheduler):
         raise click.UsageError("--device plays no part with --workers and --scheduler")
+    if verify:
+        _verify(output or read_scene(scene).mosaic.get("store") or _default_store(scene), as_json)
+        return
     described, grid = read_grid(scene, given, memory=False)
     wish = read_wish(described, given)
     if set(wish) - {*DIAL, "accuracy_db"}:
@@ -96,7 +106,7 @@ def mosaic(
     warn_of_sampling(described, grid)
     devices = [open_device(name) for name in device] or None
     in_scene = described.mosaic
-    output = output or in_scene.get("store") or scene.with_suffix(".zarr")
+    output = output or in_scene.get("store") or _default_store(scene)
     lines_path = lines_path or in_scene.get("lines")
     keep_apart("--png", png, "the store", output)
     if png is not None and Path(os.path.realpath(png)).is_relative_to(os.path.realpath(output)):
@@ -167,6 +177,30 @@ def mosaic(
     )  # fmt: skip
 
 
+def _default_store(scene: Path) -> Path:
+    return scene.with_suffix(".zarr")
+
+
+def _verify(path: Path, as_json: bool) -> None:
+    """Report which patches of a store are damaged; exit with 1 if any is."""
+    store = clsas.Store.opened(path)
+    with progress_bar("verifying") as progress:
+        damage = store.damage(progress)
+    finished = sum(place not in damage for place in store.records())
+    damaged = {f"{row},{column}": reason for (row, column), reason in damage.items()}
+    summary = f"{len(damage)} damaged" if damage else "none damaged"
+    report(
+        as_json,
+        "\n".join(
+            [f"{path}: {finished} patches match their checksums, {summary}"]
+            + [f"  patch {place}: {reason}" for place, reason in damaged.items()]
+        ),
+        file=path, finished=finished, damaged=damaged,
+    )  # fmt: skip
+    if damage:
+        click.get_current_context().exit(1)
+
+
 def _beside(output: Path, scene: Path) -> Path:
     """Return the file for a scene's simulated range lines, beside the store."""
     digest = simulation_digest(scene.read_bytes(), scene.parent)
@@ -197,11 +231,13 @@ def _cluster(workers: int | None, scheduler: str | None) -> Iterator[Any]:
         yield None
         return
     try:
-        from distributed import Client, LocalCluster
+        from distributed import Client
         from distributed.scheduler import KilledWorker
+
+        from clsas.workers import local_client
     except ImportError:
         raise ImportError(
-            "--workers and --scheduler need Dask: pip install 'clsas[mosaic]'"
+            f"--workers and --scheduler need Dask: {install_command('mosaic')}"
         ) from None
     with ExitStack() as opened:
         if scheduler is not None:
@@ -212,19 +248,7 @@ def _cluster(workers: int | None, scheduler: str | None) -> Iterator[Any]:
                     f"--scheduler {scheduler} cannot be reached: {error}"
                 ) from None
         else:
-            # Ctrl-C at a terminal is for this process, which then ends the others.
-            heeded = signal.signal(signal.SIGINT, signal.SIG_IGN)
-            try:
-                cluster = LocalCluster(
-                    n_workers=workers,
-                    threads_per_worker=1,
-                    dashboard_address=None,
-                    silence_logs=logging.CRITICAL,
-                )
-            finally:
-                signal.signal(signal.SIGINT, heeded)
-            opened.enter_context(cluster)
-            client = opened.enter_context(Client(cluster))
+            client = opened.enter_context(local_client(workers))
         try:
             yield client
         except KilledWorker as error:

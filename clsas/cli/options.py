@@ -11,6 +11,7 @@ import click
 from clsas import validate
 from clsas.backproject import BEST_ACCURACY_DB
 from clsas.cli.parameters import AXIS, INPUT, RATIO, STAGES, Output
+from clsas.io import SUFFIXES
 from clsas.planner import BEST_TOLERANCE_DB, WORST_TOLERANCE_DB, wavelengths
 from clsas.window import SHAPES
 
@@ -32,12 +33,14 @@ def checked(check: Callable[[Any], object]) -> Callable:
 
 def output(kind: str) -> Callable:
     """Return the option for the file that is the result."""
-    return click.option("-o", "--output", type=Output(), required=True, help=f"{kind} to write.")
+    return click.option(
+        "-o", "--output", type=Output(*SUFFIXES), required=True, help=f"{kind} to write."
+    )
 
 
 def png(what: str) -> Callable:
     """Return the option for a picture of the result."""
-    return click.option("--png", type=Output(), help=f"Also draw {what}.")
+    return click.option("--png", type=Output(".png"), help=f"Also draw {what}.")
 
 
 def _together(*options: Callable) -> Callable:
@@ -57,7 +60,11 @@ dynamic_range = click.option(
     callback=checked(partial(validate.positive, "dynamic_range_db", unit="dB")),
 )  # fmt: skip
 scene = click.option("--scene", type=INPUT, help="Scene file for what the options leave out.")
-device = click.option("--device", help="Index or part of the name, as `clsas devices` shows.")
+device = click.option(
+    "--device",
+    help="Index, kind (cpu, gpu), platform (pocl, intel, nvidia) or part of the name, as "
+    "`clsas devices` shows them.",
+)
 axes = _together(
     click.option("--x", type=AXIS, help="First and last pixel centre along x (m), how many."),
     click.option("--y", type=AXIS, help="The same along y."),

@@ -13,6 +13,9 @@ from typing import Any
 
 import click
 
+from clsas import validate
+from clsas.extras import install_command
+
 
 class Parsed(click.ParamType):
     """What a function reads from a text.
@@ -50,11 +53,11 @@ def _axis(text: str) -> tuple[float, float, int]:
     return axis
 
 
-def _place(text: str) -> tuple[float, float]:
-    x, y = text.split(",")
-    if not (math.isfinite(float(x)) and math.isfinite(float(y))):
+def _place(text: str) -> tuple[float, ...]:
+    place = tuple(map(float, text.split(",")))
+    if len(place) not in (2, 3) or not all(map(math.isfinite, place)):
         raise ValueError
-    return float(x), float(y)
+    return place
 
 
 def _ratio(text: str) -> float:
@@ -77,7 +80,7 @@ def _counts(text: str) -> tuple[int, int]:
 
 
 AXIS = Parsed("START:STOP:N", _axis, "START:STOP:N, two places in metres and a number of pixels")
-PLACE = Parsed("X,Y", _place, "X,Y in metres, without a space, such as 0,42.5")
+PLACE = Parsed("X,Y", _place, "X,Y or X,Y,Z in metres, without a space, such as 0,42.5")
 RATIO = Parsed("NUMBER", _ratio, "a number or a fraction such as 1/30")
 STAGES = Parsed("stages", _stages, "QRxQI for every stage, such as 2x2,2x2")
 COUNTS = Parsed("ROWSxCOLUMNS", _counts, "ROWSxCOLUMNS, at least 1x1, such as 8x8")
@@ -106,16 +109,21 @@ class File(click.Path):
 
 
 class Output(File):
-    """A file to write: what would keep it from being written is said before any work."""
+    """A file of some format to write: what would keep it from being written is said at once."""
 
     written = True
 
-    def __init__(self) -> None:
+    def __init__(self, *suffixes: str) -> None:
         super().__init__(dir_okay=False, writable=True)
+        self._suffixes = suffixes
 
     def convert(self, value: Any, param: Any, ctx: Any) -> Path:
         """Return the path; what keeps it from being written is a usage error."""
         path = super().convert(value, param, ctx)
+        try:
+            validate.suffix("the file's name", path, *self._suffixes)
+        except ValueError as error:
+            self.fail(str(error), param, ctx)
         if not path.parent.is_dir():
             self.fail(f"there is no folder {str(path.parent)!r}", param, ctx)
         try:
@@ -170,4 +178,4 @@ def _exists(path: Path) -> bool:
 def need_matplotlib() -> None:
     """End the command where pictures cannot be drawn."""
     if importlib.util.find_spec("matplotlib") is None:
-        raise click.ClickException("pictures need matplotlib: pip install 'clsas[plot]'")
+        raise click.ClickException(f"pictures need matplotlib: {install_command('plot')}")

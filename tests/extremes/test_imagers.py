@@ -101,7 +101,7 @@ def test_exact(name, asked_db, platform, recwarn):
     assert known.error_db(execute(prepared).pixels) <= bound_db
 
 
-@pytest.mark.parametrize("asked_db", [-65, -35])
+@pytest.mark.parametrize("asked_db", [-65, -50, -35])
 @pytest.mark.parametrize("name", CASES)
 @pytest.mark.filterwarnings("always::clsas.validate.ClsasWarning")
 def test_factorized(name, asked_db, platform, recwarn):

@@ -1,0 +1,19 @@
+"""Packages that only some of the work needs, and the commands that install them."""
+
+from __future__ import annotations
+
+PACKAGES = {
+    "pocl": ("pyopencl[pocl]>=2024.1",),
+    "plot": ("matplotlib>=3.8",),
+    "mosaic": ("zarr>=3.1.3", "distributed>=2024.1", "xarray>=2024.1"),
+}
+"""Requirements of every extra, as `pyproject.toml` has them."""
+
+
+def install_command(extra: str) -> str:
+    """Return the command that installs the packages of an extra.
+
+    It names the packages themselves: `clsas[extra]` would be looked for on a package index, where
+    a checkout is not.
+    """
+    return "pip install " + " ".join(f"'{package}'" for package in PACKAGES[extra])

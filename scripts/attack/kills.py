@@ -1,0 +1,171 @@
+"""Kill mosaics with SIGKILL, over and over; what is left must be whole, and the end bit-identical.
+
+    python scripts/attack/kills.py --kills 200 --workers 0 2
+
+Every run is killed at a random moment: while it starts, or after some patches. Either all of its
+processes are killed, or the main one alone, or one worker. After every kill the patches that count
+as finished must be those of a mosaic that was never killed. After 10 kills the run is left to
+finish: the store must then equal the other, and hold no temporary file. Exits with 1 otherwise.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import random
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import psutil
+from case import PATCHES, command, write_scene
+
+from clsas import Store
+
+KILLS_PER_STORE = 10
+ORPHANS_S = 60  # by when workers whose main process was killed must have ended
+DEADLINE_S = 600  # for one run
+
+
+class Miss(Exception):
+    """Something that a kill must not leave."""
+
+
+def run_and_kill(arguments: list[str], chance: random.Random, start_s: float, log: Path) -> str:
+    """Start a run and kill it; return what was killed, or "nothing" if it finished before."""
+    after = chance.randrange(12) if chance.random() < 0.7 else None
+    wait_s = chance.uniform(0, 0.3) if after is not None else chance.uniform(0, start_s)
+    with log.open("w") as output:
+        process = subprocess.Popen(
+            arguments, stderr=output, stdout=subprocess.DEVNULL, start_new_session=True
+        )
+    deadline = time.monotonic() + DEADLINE_S
+    while after and process.poll() is None and log.read_text().count("\npatch ") < after:
+        if time.monotonic() > deadline:
+            raise Miss(f"a run takes more than {DEADLINE_S} s")
+        time.sleep(0.01)
+    time.sleep(wait_s)
+    workers = [p for p in family(process.pid) if "--multiprocessing-fork" in " ".join(p.cmdline())]
+    kinds = ["all"] + (["main", "worker"] if workers else [])
+    kind = chance.choice(kinds)
+    if process.poll() is not None:
+        kind = "nothing"
+    elif kind == "worker":
+        chance.choice(workers).kill()
+        # The others do its work, unless it had not started yet: then the run ends with one error.
+        if process.wait(DEADLINE_S) and "while it started" not in log.read_text().split("\n")[-2]:
+            raise Miss(f"a run did not survive the loss of a worker:\n{log.read_text()[-2000:]}")
+    elif kind == "main":
+        process.kill()
+    else:
+        os.killpg(process.pid, signal.SIGKILL)
+    process.wait()
+    until = time.monotonic() + ORPHANS_S
+    while orphans := in_session(process.pid):
+        if time.monotonic() > until:
+            raise Miss(f"{len(orphans)} processes outlive their run by {ORPHANS_S} s")
+        time.sleep(0.05)
+    if kind == "nothing" and process.returncode:
+        raise Miss(f"a run failed with {process.returncode}:\n{log.read_text()[-2000:]}")
+    return kind
+
+
+def family(pid: int) -> list[psutil.Process]:
+    """Return the processes that a process started."""
+    try:
+        return psutil.Process(pid).children(recursive=True)
+    except psutil.NoSuchProcess:
+        return []
+
+
+def in_session(leader: int) -> list[int]:
+    """Return the live processes of a session."""
+    found = []
+    for pid in psutil.pids():
+        try:
+            if os.getsid(pid) == leader and psutil.Process(pid).status() != psutil.STATUS_ZOMBIE:
+                found.append(pid)
+        except (ProcessLookupError, psutil.NoSuchProcess):
+            pass
+    return found
+
+
+def check_finished(path: Path, reference: Store) -> int:
+    """Compare the patches that count as finished; return how many there are."""
+    if not path.exists():
+        return 0
+    store = Store.opened(path)
+    if damage := store.damage():
+        raise Miss(f"damaged: {damage}")
+    records = store.records()
+    for row, column in records:
+        check_chunk(path, reference, row, column)
+    return len(records)
+
+
+def check_chunk(path: Path, reference: Store, row: int, column: int) -> None:
+    """Compare a patch's pixels, bit by bit."""
+    ours, theirs = (each / "pixels" / "c" / f"{row}/{column}" for each in (path, reference.path))
+    if ours.read_bytes() != theirs.read_bytes():
+        raise Miss(f"patch {row},{column} has other pixels")
+
+
+def main() -> None:
+    """Kill, check, tell."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--kills", type=int, default=200, help="for each number of workers")
+    parser.add_argument("--workers", type=int, nargs="+", default=[0, 2], help="0: no workers")
+    parser.add_argument("--seed", type=int, default=0)
+    options = parser.parse_args()
+    chance = random.Random(options.seed)
+    try:
+        with tempfile.TemporaryDirectory(prefix="kills-") as folder:
+            for workers in options.workers:
+                attack(Path(folder), workers, options.kills, chance)
+    except Miss as miss:
+        sys.exit(f"MISS: {miss}")
+    print("no miss")
+
+
+def attack(folder: Path, workers: int, kills: int, chance: random.Random) -> None:
+    """Kill so many runs with so many workers."""
+    scene, log = write_scene(folder), folder / "log"
+    reference = folder / "reference.zarr"
+    # The first run also simulates the lines; the one alone is the reference of all.
+    subprocess.run(command(scene, reference), check=True, capture_output=True)
+    first = Store.opened(reference)
+    start = time.monotonic()
+    subprocess.run(
+        command(scene, folder / f"timed-{workers}.zarr", workers), check=True, capture_output=True
+    )
+    usual_s = time.monotonic() - start
+    done, stores, tally = 0, 0, {}
+    while done < kills:
+        path = folder / f"{workers}-{stores}.zarr"
+        finished = 0
+        for _ in range(min(KILLS_PER_STORE, kills - done)):
+            kind = run_and_kill(command(scene, path, workers), chance, usual_s, log)
+            tally[kind] = tally.get(kind, 0) + 1
+            done += kind != "nothing"
+            finished = check_finished(path, first)
+            if finished == PATCHES:
+                break
+        subprocess.run(command(scene, path, workers), check=True, capture_output=True)
+        if check_finished(path, first) != PATCHES:
+            raise Miss(f"{path.name} is not finished")
+        if left := [str(each) for each in folder.rglob("*.part")]:
+            raise Miss(f"temporary files are left: {left}")
+        stores += 1
+    told = ", ".join(f"{kind} {count}" for kind, count in sorted(tally.items()))
+    print(
+        f"{workers or 'no'} workers: {done} kills ({told}), {stores} stores of {PATCHES} patches, "
+        "all bit-identical, no temporary file left",
+        flush=True,
+    )
+
+
+if __name__ == "__main__":
+    main()
