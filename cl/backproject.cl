@@ -134,7 +134,7 @@ INLINE void interpolate(const Source *from, vfloat t, __global const float *weig
     const vfloat nu = t - (shifted - ROUNDER);
     const vfloat nu2 = nu * nu;
 #ifndef WINDOW
-    const vint index = min(max(ROUNDED_VINT(shifted) + from->offset, 0), from->pitch - TAPS);
+    const vint index = min(max(ROUNDED_VINT(shifted) + from->offset, (vint)0), (vint)(from->pitch - TAPS));
 #if WIDTH == 1
     float2 samples[TAPS];
 #pragma unroll

@@ -105,7 +105,7 @@ INLINE vfloat filtered(const float *weight, vfloat low, vfloat high)
 #endif
 
 /* Lines of different channels lie apart: a CPU fetches those of the channel after the next meanwhile. */
-#if defined(__clang__) && WIDTH > 1
+#if defined(__clang__) && WIDTH > 1 && !defined(NO_PREFETCH) /* which simulators do not know */
 #define PREFETCH(p) __builtin_prefetch((const void *)(size_t)(p))
 #define AHEAD 4
 #endif

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -43,19 +44,19 @@ class Known:
     beam: BeamWindow | None = None
 
     def error_db(self, pixels: ArrayLike) -> float:
-        """Relative rms error of an image of this scene, dB."""
+        """Return the relative rms error of an image of this scene, dB."""
         return oracle.error_db(pixels, self.wanted)
 
 
 def along_x(channels: int, spacing_m: float, sway_m: float = 0.0) -> NDArray[np.float64]:
-    """Positions along x about the origin, with random deviations across, [channels, 3]."""
+    """Return positions along x about the origin, with random deviations across, [channels, 3]."""
     x_m = (np.arange(channels) - (channels - 1) / 2) * spacing_m
     across_m = sway_m * np.random.default_rng(1).normal(size=(channels, 2))
     return np.column_stack([x_m, across_m])
 
 
 def circle(channels: int, radius_m: float, height_m: float = 0.0) -> NDArray[np.float64]:
-    """Positions all around the origin, [channels, 3]."""
+    """Return positions all around the origin, [channels, 3]."""
     angle = 2 * np.pi * np.arange(channels) / channels
     return np.column_stack(
         [radius_m * np.cos(angle), radius_m * np.sin(angle), np.full(channels, height_m)]
@@ -84,6 +85,7 @@ def scene(
     noise: float = 0.0,
     origin_m: Sequence[float] = (0.0, 0.0, 0.0),
     own_starts: bool = False,
+    relief_m: float = 0.0,
     seed: int = 0,
 ) -> Known:
     """Return points at random in a horizontal grid, as one sonar receives them.
@@ -120,6 +122,8 @@ def scene(
         What is added to all coordinates.
     own_starts : bool
         Whether every line begins at another range.
+    relief_m : float
+        Standard deviation of the pixels' heights over the grid's plane, each another.
     seed : int
 
     Returns
@@ -138,6 +142,8 @@ def scene(
     pixels = corner + np.stack(
         np.broadcast_arrays(x_m - x_m[0], (y_m - y_m[0])[:, None], 0.0), axis=-1
     )
+    height_m = relief_m * np.random.default_rng(seed).normal(size=shape)
+    pixels[..., 2] += height_m
     # Points keep off the border, so that the image holds their main lobes.
     points = corner + rng.uniform(0.1, 0.9, (targets, 3)) * [np.ptp(x_m), np.ptp(y_m), 0]
     amplitude = rng.normal(size=(targets, 2)) @ [1, 1j]
@@ -176,6 +182,9 @@ def scene(
 
     weights = 1.0 if beam is None else _weights(beam, pixels, (tx + rx) / 2)
     origin = np.asarray(origin_m, np.float64)
+    grid = Grid.oriented(corner + origin, [0, pixel_m[1], 0], [pixel_m[0], 0, 0], shape)
+    if relief_m:
+        grid = grid.with_height(height_m)
     return Known(
         RangeLines(
             values,
@@ -187,10 +196,76 @@ def scene(
             speed_m_s,
             rx_velocity_m_s,
         ),
-        Grid.oriented(corner + origin, [0, pixel_m[1], 0], [pixel_m[0], 0, 0], shape),
+        grid,
         oracle.image(echoes, of_pixels_m, weights).reshape(shape),
         beam,
     )
+
+
+def ultrasonic(channels: int = 160, track: NDArray | None = None, **options: Any) -> Known:
+    """1 MHz, 100 kHz, 42.5 m away: 28 000 wavelengths."""
+    defaults = {
+        "carrier_hz": 1e6, "bandwidth_hz": 1e5, "pixel_m": (4e-3, 4e-3), "shape": (48, 48),
+    }  # fmt: skip
+    track = along_x(channels, 8.25e-3) if track is None else track
+    return scene(track, (0.3, 42.5, 0), **(defaults | options))
+
+
+def array(*, moving: bool, channels: int = 160, **options: Any) -> Known:
+    """Eight receivers beside one transmitter per ping, that stand still or move at up to 17 m/s."""
+    rx = along_x(channels, 8.25e-3)
+    tx = np.repeat(rx[::8], 8, axis=0) + [0.3, 0.1, -0.2]
+    velocity = np.random.default_rng(3).uniform(-10, 10, rx.shape) if moving else None
+    return ultrasonic(track=tx, rx_m=rx, rx_velocity_m_s=velocity, **options)
+
+
+def raw(channels: int = 96, targets: int = 60, oversampling: float = 8.0, **options: Any) -> Known:
+    """30 kHz, 8 kHz on the carrier, sampled at 64 kHz and made analytic."""
+    return scene(
+        along_x(channels, 0.025), (0.2, 12, 0), carrier_hz=3e4, bandwidth_hz=8e3,
+        pixel_m=(0.03, 0.03), on_carrier=True, targets=targets, oversampling=oversampling,
+        **options,
+    )  # fmt: skip
+
+
+def at_1_khz(**options: Any) -> Known:
+    """1 kHz, 200 Hz, 1.5 km away."""
+    return scene(
+        along_x(80, 0.7), (0, 1500, -200), carrier_hz=1e3, bandwidth_hz=200, pixel_m=(6.0, 1.5),
+        **options,
+    )  # fmt: skip
+
+
+def radar(**options: Any) -> Known:
+    """10 GHz, 600 MHz, from an aircraft 8 km away."""
+    return scene(
+        along_x(128, 2.0, sway_m=0.3), (20, 7000, -4000), carrier_hz=1e10, bandwidth_hz=6e8,
+        pixel_m=(0.15, 0.1), speed_m_s=LIGHT_M_S, **options,
+    )  # fmt: skip
+
+
+def closed(**options: Any) -> Known:
+    """100 kHz, 20 kHz, from a circle of 8 m all around the grid."""
+    return scene(
+        circle(300, 8.0, 3.0), (0.1, 0.05, 0), carrier_hz=1e5, bandwidth_hz=2e4,
+        pixel_m=(3e-3, 3e-3), **options,
+    )  # fmt: skip
+
+
+def steps(centre: float, width: float) -> list[Band]:
+    """Return three bands at 0, -15 and -30 dB."""
+    return [
+        Band(centre + shift * width, 0.28 * width, 0.01 * width, 10 ** (level_db / 20))
+        for shift, level_db in ((-0.3, 0), (0, -15), (0.3, -30))
+    ]
+
+
+def line_in_the_spectrum(centre: float, width: float) -> list[Band]:
+    """Return a weak flat band and, near its edge, a tone of 20 dB more."""
+    return [
+        Band(centre, 0.9 * width, 0.01 * width, 0.1),
+        Band(centre + 0.42 * width, 0.0, 0.01 * width, 1.0),
+    ]
 
 
 def _quantised(positions_m: ArrayLike) -> NDArray[np.float64]:
@@ -241,7 +316,7 @@ def _other(
 def _weights(
     beam: BeamWindow, pixels_m: NDArray[np.float64], centres_m: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Weights of a beam by its definition, [channels, pixels]."""
+    """Return the weights of a beam by its definition, [channels, pixels]."""
     towards = pixels_m.reshape(1, -1, 3) - centres_m[:, None]
     sine = towards @ beam.along / np.linalg.norm(towards, axis=-1)
     u = (np.degrees(np.arcsin(sine)) - beam.squint_deg) / beam.width_deg

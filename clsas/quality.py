@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from clsas import validate
 from clsas.grid import Axis, Grid
 from clsas.image import Image
+from clsas.shadows import darkest_pixels
 
 _LOBES = 10  # side lobes on each side that the ISLR counts
 _SEARCH = 10  # pixels around the given place where the peak is looked for, unless told
@@ -172,13 +173,19 @@ def measure_point(
     return response
 
 
-def relative_error_db(image: Image | ArrayLike, reference: Image | ArrayLike) -> float:
+def relative_error_db(
+    image: Image | ArrayLike, reference: Image | ArrayLike, *, darkest: float | None = None
+) -> float:
     """Return the relative rms error of an image, 20 log10(||I - R|| / ||R||), dB.
 
     Parameters
     ----------
     image, reference : Image or array_like
         Complex images of one shape and, where both are Images, of the same pixel positions.
+    darkest : float, optional
+        Take both norms over the darkest pixels of the reference only, this share of them (0.1 is
+        a tenth): the error in shadows, against their own level. `clsas.shadows` says which pixels
+        are the darkest, and how dark they are.
 
     Returns
     -------
@@ -188,7 +195,8 @@ def relative_error_db(image: Image | ArrayLike, reference: Image | ArrayLike) ->
     Raises
     ------
     ValueError
-        If the shapes or grids differ, a value is not finite, or the reference is zero.
+        If the shapes or grids differ, a value is not finite, the reference is zero, or `darkest`
+        is not above 0 and at most 1.
     """
     given, wanted = _values("image", image), _values("reference", reference)
     if given.shape != wanted.shape:
@@ -199,6 +207,9 @@ def relative_error_db(image: Image | ArrayLike, reference: Image | ArrayLike) ->
         _check_one_grid(image.grid, reference.grid)
     if not wanted.any():
         raise ValueError("reference must not be zero everywhere")
+    if darkest is not None:
+        chosen = darkest_pixels(wanted, darkest)
+        given, wanted = given[chosen], wanted[chosen]
     # Scaled by the greatest part, so that no square overflows or vanishes.
     given, wanted = given.view(np.float64), wanted.view(np.float64)
     scale = max(np.abs(given).max(), np.abs(wanted).max())

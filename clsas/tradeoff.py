@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import math
 import os
 import statistics
 import time
@@ -26,6 +27,7 @@ from clsas.lines import RangeLines
 from clsas.plan import Plan
 from clsas.planner import plan
 from clsas.quality import Cut, measure_point, relative_error_db
+from clsas.shadows import DARKEST, dark_level_db
 from clsas.window import BeamWindow
 
 TOLERANCES_DB = (-20.0, -30.0, -40.0, -50.0, -60.0, -70.0)
@@ -40,7 +42,7 @@ REFERENCE_DB = -85.0
 """Accuracy of the exact image that errors are against."""
 
 _HEADER = ("label", "method", "plan", "plan_s", "time_s", "predicted_time_s", "error_db")
-_HEADER += ("predicted_error_db",)
+_HEADER += ("predicted_error_db", "dark_error_db")
 _HEADER += tuple(
     f"{axis}_{figure}"
     for axis in ("azimuth", "range")
@@ -89,6 +91,9 @@ class Row:
         Relative rms error against the exact image.
     azimuth, range : Response or None
         Of the strongest point of the exact image; None where there is none to be measured.
+    dark_error_db : float
+        Error in the darkest tenth of the exact image, against the level there: see
+        `clsas.shadows`.
     """
 
     label: str
@@ -101,6 +106,7 @@ class Row:
     predicted_error_db: float
     azimuth: Response | None = None
     range: Response | None = None
+    dark_error_db: float = -math.inf
 
 
 @dataclass(frozen=True)
@@ -119,6 +125,8 @@ class Tradeoff:
         Runs of which `seconds` are medians.
     rows : tuple of Row
         By tolerance, of a study, by stages, and the exact image last.
+    dark_level_db : float
+        Level of the darkest tenth of the exact image, over that of the whole image.
     """
 
     device: str
@@ -127,6 +135,7 @@ class Tradeoff:
     pixels: tuple[int, ...]
     repeats: int
     rows: tuple[Row, ...]
+    dark_level_db: float = 0.0
 
     @property
     def exact(self) -> Row:
@@ -144,8 +153,12 @@ class Tradeoff:
         return tuple(front)
 
     def describe(self) -> str:
-        """Return a table of all rows; resolutions are shown over those of the exact image."""
+        """Return a table of all rows; resolutions are shown over those of the exact image.
+
+        "In the dark" is the error in the darkest tenth of the image against the level there.
+        """
         names = ("", "time (s)", "predicted (s)", "speedup", "error (dB)", "predicted (dB)")
+        names += ("in the dark (dB)",)
         names += ("azimuth", "range", "azimuth PSLR", "range PSLR")
         table = [names]
         for row in self.rows:
@@ -156,6 +169,7 @@ class Tradeoff:
                 f"{self.exact.seconds / row.seconds:.2g}",
                 f"{row.error_db:.1f}",
                 f"{row.predicted_error_db:.1f}",
+                f"{row.dark_error_db:.1f}",
             )
             pairs = ((row.azimuth, self.exact.azimuth), (row.range, self.exact.range))
             cells += tuple(
@@ -189,6 +203,7 @@ class Tradeoff:
                     [
                         *(row.label, row.method, row.plan, row.plan_seconds, row.seconds),
                         *(row.predicted_seconds, row.error_db, row.predicted_error_db),
+                        row.dark_error_db,
                         *_figures(row.azimuth),
                         *_figures(row.range),
                     ]
@@ -334,6 +349,7 @@ def tradeoff(
             replace(row, seconds=statistics.median(taken))
             for row, taken in zip(rows, seconds, strict=True)
         ),
+        dark_level_db=dark_level_db(reference),
     )
 
 
@@ -392,8 +408,13 @@ def _row(label: str, method: str, chosen: Plan, plan_seconds: float) -> Row:
 def _measured(row: Row, image: Image, reference: Image) -> Row:
     """Return a row with the error of its image, and the response of the strongest point."""
     azimuth, range_ = _responses(image, reference)
-    error_db = relative_error_db(image, reference)
-    return replace(row, error_db=error_db, azimuth=azimuth, range=range_)
+    return replace(
+        row,
+        error_db=relative_error_db(image, reference),
+        azimuth=azimuth,
+        range=range_,
+        dark_error_db=relative_error_db(image, reference, darkest=DARKEST),
+    )
 
 
 def _responses(image: Image, reference: Image) -> tuple[Response | None, Response | None]:

@@ -1,15 +1,11 @@
 """Every OpenCL platform here, and every way in which a CPU's kernels can be built."""
 
-import dataclasses
 from functools import cache
 
 import pytest
 
 from clsas.device import Device, list_devices, open_device
-
-# What other devices have: float lanes (one is what runs on GPUs), and whether kernels may permute.
-# No more lanes are asked for than a compiler has that is driven with several: it may break.
-FORCED = ((1, False), (4, False), (8, False), (8, True), (16, False))
+from clsas.selftest import driven, forced_ways
 
 
 def _named(ways, infos):
@@ -31,12 +27,7 @@ def _variants():
     # Of the CPUs' compilers PoCL's is the fastest.
     cpus = sorted((info for info in first if info.kind == "cpu"), key=lambda i: i.platform)[-1:]
     forced = _named(
-        [
-            (info.index, *way)
-            for info in cpus
-            for way in FORCED
-            if way[0] <= info.width or info.width == 1
-        ],
+        [(info.index, *way) for info in cpus for way in forced_ways(info)],
         infos,
     )
     # Without any device the tests fail, with the message that says how to get one.
@@ -46,11 +37,7 @@ def _variants():
 @cache
 def variant(index, width, permute):
     """A device that is driven in a given way; its kernels are built once."""
-    device = open_device(index)
-    info = dataclasses.replace(device.info, width=width, permute=permute)
-    if info == device.info:
-        return device
-    return dataclasses.replace(device, info=info, _kernels={})
+    return driven(open_device(index), width, permute)
 
 
 OWN, OTHERS = _variants()

@@ -28,7 +28,7 @@ MADE = Tradeoff(
     (96, 128),
     3,
     (
-        row("-20 dB", 0.1, -25.0, azimuth=WIDER, range=POINT),
+        row("-20 dB", 0.1, -25.0, azimuth=WIDER, range=POINT, dark_error_db=-3.0),
         row("-30 dB", 0.3, -35.0),
         row("-50 dB", 0.2, -52.0),
         row("2 of 2x2", 0.4, -5.0, method="stages"),
@@ -57,6 +57,9 @@ def test_every_way_is_measured_against_the_exact_image(lines):
     assert seen == [(done, 13) for done in range(1, 14)]  # a reference, and 3 runs of 4 ways
     loose, tight, summed, exact = measured.rows
     assert measured.exact is exact
+    # Two points in the dark: what errors are spread over is far above the darkest tenth.
+    assert measured.dark_level_db < -30
+    assert all(row.dark_error_db > row.error_db for row in measured.rows)
     assert tight.error_db < -48
     assert loose.error_db < -28
     assert exact.error_db < -60
@@ -144,7 +147,7 @@ def test_table():
     table = [line.split("  ") for line in MADE.describe().splitlines()]
     first = [cell.strip() for cell in table[1] if cell.strip()]
     assert first == [
-        *("-20 dB", "0.1", "0.2", "10", "-25.0", "-26.0"),
+        *("-20 dB", "0.1", "0.2", "10", "-25.0", "-26.0", "-3.0"),
         *("1.100", "1.000", "-12.0", "-13.2"),
     ]
     assert len(table) == 1 + len(MADE.rows)
@@ -160,6 +163,7 @@ def test_csv(tmp_path):
     assert [row["label"] for row in rows] == [row.label for row in MADE.rows]
     assert float(rows[0]["time_s"]) == 0.1
     assert float(rows[0]["predicted_time_s"]) == 0.2
+    assert float(rows[0]["dark_error_db"]) == -3.0
     assert float(rows[0]["azimuth_resolution_m"]) == 0.011
     assert rows[1]["azimuth_resolution_m"] == ""
     assert rows[-1]["method"] == "exact"

@@ -17,6 +17,7 @@ from clsas.cli.outputs import json_able, print_json, progress_bar, report
 from clsas.cli.parameters import INPUT, PLACE, STAGES, Output
 from clsas.config import SceneFile
 from clsas.quality import Cut, PointResponse
+from clsas.shadows import DARKEST, dark_level_db
 from clsas.tradeoff import TOLERANCES_DB
 
 
@@ -61,9 +62,16 @@ def quality(
     }
     text = [f"entropy {results['entropy']:.3f} nats, contrast {results['contrast']:.3f}"]
     if reference is not None:
-        error = clsas.relative_error_db(pixels, load(reference, clsas.Image))
+        wanted = load(reference, clsas.Image)
+        error = clsas.relative_error_db(pixels, wanted)
+        dark_error = clsas.relative_error_db(pixels, wanted, darkest=DARKEST)
+        level = dark_level_db(wanted)
         results["relative_error_db"] = error
-        text.append(f"error relative to {reference}: {error:.1f} dB")
+        results["dark_error_db"], results["dark_level_db"] = dark_error, level
+        text.append(
+            f"error relative to {reference}: {error:.1f} dB; in its darkest tenth, at "
+            f"{level:.1f} dB, {dark_error:.1f} dB of the level there"
+        )
     if near is not None:
         response = clsas.measure_point(pixels, near, search_m=search_m, extent_m=extent_m)
         results["point"] = response
@@ -151,7 +159,7 @@ def tradeoff(
         as_json,
         f"{measured.channels} lines, {' x '.join(map(str, measured.pixels))} pixels on "
         f"{measured.device}, median of {repeats} runs; resolutions over those of the exact "
-        f"image\n{measured.describe()}",
+        f"image; its darkest tenth at {measured.dark_level_db:.1f} dB\n{measured.describe()}",
         **json_able(measured),
     )  # fmt: skip
 

@@ -1,0 +1,61 @@
+"""The command that tests accuracy on the user's own device: selftest."""
+
+from __future__ import annotations
+
+import time
+
+import click
+
+from clsas.cli import options
+from clsas.cli.outputs import print_json, progress_bar
+from clsas.device import open_device
+
+
+@click.command()
+@options.device
+@options.as_json
+@click.pass_context
+def selftest(ctx: click.Context, device: str | None, as_json: bool) -> None:
+    """Test this device's accuracy at the extremes, within a minute.
+
+    Images of scenes whose ideal is known analytically are formed by every imager and compared.
+    The exit code is 1 if any errs by more than it may.
+
+    \b
+    Example:  clsas selftest --device 0
+    """
+    from clsas import selftest as test
+
+    opened, begun = open_device(device), time.perf_counter()
+    with progress_bar("testing") as progress:
+        results = test.run(opened, progress=progress)
+    seconds = time.perf_counter() - begun
+    missed = sum(not result.passed for result in results)
+    if as_json:
+        print_json(
+            {
+                "device": opened.info.label,
+                "driver": opened.info.driver,
+                "seconds": seconds,
+                "passed": not missed,
+                "results": [
+                    {**vars(result), "verdict": _verdict(result.passed)} for result in results
+                ],
+            }
+        )
+    else:
+        click.echo(f"{opened.info.label}, driver {opened.info.driver}; errors in dB")
+        click.echo(f"{'asked':>6} {'measured':>9} {'bound':>6}  verdict  case")
+        for result in results:
+            asked = "-" if result.asked_db is None else f"{result.asked_db:.0f}"
+            click.echo(
+                f"{asked:>6} {result.measured_db:9.1f} {result.bound_db:6.0f}  "
+                f"{_verdict(result.passed):7}  {result.case}"
+            )
+        click.echo(f"{len(results) - missed} of {len(results)} within bounds, {seconds:.0f} s")
+    if missed:
+        ctx.exit(1)
+
+
+def _verdict(passed: bool) -> str:
+    return "ok" if passed else "MISSED"
