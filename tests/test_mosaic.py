@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -538,6 +539,7 @@ def test_a_full_disk_keeps_what_is_finished(file, tmp_path):
         capture_output=True, check=True,
     )  # fmt: skip
     assert "too large" in done.stdout
+    assert re.search(r"a\.zarr/pixels/c/\d/\d'$", done.stdout.strip())  # not a temporary file
     kept = Store.opened(tmp_path / "a.zarr").records()
     assert 3 <= len(kept) < 8
     assert len(list(clsas.mosaic(file, GRID, tmp_path / "a.zarr", **WISH))) == 8 - len(kept)
