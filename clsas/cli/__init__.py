@@ -50,7 +50,7 @@ _COMMANDS = {
         "machine",
         "Measure what the parts of imaging cost on a device, and store it for planning.",
     ),
-    "selftest": ("selftest", "Test this device's accuracy at the extremes, within a minute."),
+    "selftest": ("selftest", "Test this device's accuracy at the extremes, in about a minute."),
 }
 
 

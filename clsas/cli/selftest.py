@@ -16,7 +16,7 @@ from clsas.device import open_device
 @options.as_json
 @click.pass_context
 def selftest(ctx: click.Context, device: str | None, as_json: bool) -> None:
-    """Test this device's accuracy at the extremes, within a minute.
+    """Test this device's accuracy at the extremes, in about a minute.
 
     Images of scenes whose ideal is known analytically are formed by every imager and compared.
     The exit code is 1 if any errs by more than it may.
