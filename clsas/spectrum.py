@@ -21,7 +21,7 @@ _FLOOR_WIDTH = 1 / 64  # cycles per sample: the quietest stretch, which is taken
 _FLOOR_MARGIN = 2.0  # the mean of few periodograms scatters by as much
 _NOISE_LEFT = 0.1  # of the noise's power: peaks above that margin
 _OUTSIDE_BAND = (1e-8, 1e-6, 1e-4)  # of the signal's power: tails of windows and finite lines
-_CLOSING = 1 / 1024  # cycles per sample to either side of where the circle closes
+_CLOSING = 1 / 300  # cycles per sample to either side of where the circle closes, that may alias
 _COHERENT_CYCLES = 2.0  # of phase over the aperture, up to which common parts add up
 _COHERENT_CHANNELS, _COHERENT_PLACES, _COHERENT_FREQUENCIES = 128, 3, 256  # sampled
 _LINES_TOGETHER = 8  # transformed at once: they stay in the processor's caches
@@ -43,7 +43,9 @@ class Spectrum:
     oversampling : float
         Sample rate over the width of the occupied band.
     aliasing : float
-        Share of the power that may have aliased, since the band fills all that is sampled.
+        Relative error power from aliasing, where the band fills all that is sampled.
+    line_power : float64 [n] or None
+        Share of the power of the lines, where `power` has some of the image.
     """
 
     centre: float
@@ -51,11 +53,12 @@ class Spectrum:
     power: NDArray[np.float64]
     oversampling: float = np.inf
     aliasing: float = 0.0
+    line_power: NDArray[np.float64] | None = None
 
     @property
     def share(self) -> NDArray[np.float64]:
-        """Power that sums to 1."""
-        return self.power / self.power.sum()
+        """Share of the power of the lines at every distance, float64 [n]; sums to 1."""
+        return self.power if self.line_power is None else self.line_power
 
 
 def measure_spectrum(lines: RangeLines, grid: Grid | None = None) -> Spectrum:
@@ -67,6 +70,7 @@ def measure_spectrum(lines: RangeLines, grid: Grid | None = None) -> Spectrum:
     frequency, power, faded = _mean_power(samples, lines.length)
     centre, width = _occupied_band(frequency, faded)
     distance = _distance(frequency, centre)
+    share = _histogram(distance, power)
     if grid is not None:
         power = np.maximum(power, _image_power(lines, grid, frequency, power))
     return Spectrum(
@@ -75,6 +79,7 @@ def measure_spectrum(lines: RangeLines, grid: Grid | None = None) -> Spectrum:
         _histogram(distance, power),
         oversampling=1 / width,
         aliasing=_aliasing(distance, faded, width),
+        line_power=share,
     )
 
 
@@ -120,14 +125,15 @@ def _histogram(distance: NDArray[np.float64], power: NDArray[np.float64]) -> NDA
 
 
 def _aliasing(distance: NDArray[np.float64], power: NDArray[np.float64], width: float) -> float:
-    """Share of the power that may have aliased: what lies where the circle closes, if it is full.
+    """Error power if what lies where the circle closes has aliased, as it may if the band is full.
 
-    With a guard band it is noise, on either side alike.
+    It then misses on one side and is wrong on the other, so it counts twice. With a guard band it
+    is noise, on either side alike.
     """
     if width <= 1 / NEEDED_OVERSAMPLING:
         return 0.0
     closing = max(_CLOSING, 1.5 / len(power))
-    return float(power[distance > 0.5 - closing].sum())
+    return 2 * float(power[distance > 0.5 - closing].sum())
 
 
 def power_outside(lines: RangeLines, centre: float, half_width: float, most_channels: int) -> float:
