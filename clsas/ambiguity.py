@@ -64,21 +64,24 @@ class Ambiguity:
     def warn(self, name: str, wanted_db: float) -> None:
         """Warn where the error asked for by the argument `name` may be missed."""
         wanted = power(wanted_db)
-        outcome = (
-            f"the error may be {in_db(wanted + self.error_power):.0f} dB in place of {name} "
-            f"{wanted_db:.3g} dB"
-        )
+
+        def outcome(error_power: float) -> str:
+            found_db = in_db(wanted + error_power)
+            return f"the error may be {found_db:.0f} dB in place of {name} {wanted_db:.3g} dB"
+
         if self.ends > _MOST * wanted:
             validate.warn(
-                "the grid reaches ends of lines that do not fade: what pixels near an end get "
-                f"depends on how lines are interpolated, so that {outcome}; let the grid end "
-                "before the lines, let the lines fade, or sample them more finely"
+                "lines do not fade towards ends that the grid reaches, or their guard band is thin "
+                f"(oversampling {self.oversampling:.4g}) and the cut is felt farther inside: what "
+                f"pixels get depends on how lines are interpolated, so that {outcome(self.ends)}; "
+                "let the grid end before the lines, let the lines fade, or sample them more finely"
             )
         if self.aliasing > _MOST * wanted:
             validate.warn(
-                "the lines' band fills all that is sampled, so that its edges alias: "
-                f"oversampling is {self.oversampling:.3g}, at least {NEEDED_OVERSAMPLING:.3g} is "
-                f"needed; {outcome}; sample more finely (compress(oversampling=...))"
+                "the lines' band fills all that is sampled, so that its edges may alias: "
+                f"oversampling is {self.oversampling:.4g}, more than {NEEDED_OVERSAMPLING:.4g} is "
+                f"needed; {outcome(self.aliasing)}; sample more finely "
+                "(compress(oversampling=...))"
             )
 
 
@@ -137,20 +140,20 @@ def ends_error(
     at_ends, total = 0.0, 0.0
     for samples, near, far in zip(part.samples, nearest, farthest, strict=True):
         line = samples.astype(np.complex128)
-        within = line[max(int(np.clip(near, 0, last)), 0) : int(np.clip(far, -1, last)) + 1]
+        within = line[int(np.clip(near, 0, last)) : int(np.clip(far, -1, last)) + 1]
         if not within.size:
             continue
-        total += _power(within) * len(within)
+        total += _mean_square(within) * len(within)
         # From either end: its samples, and how far off the nearest and the farthest pixel are.
         for end, first, beyond in ((line, near, far), (line[::-1], last - far, last - near)):
             share = _AT_END if first < _BESIDE and beyond > -_BESIDE else 0.0
-            if _power(end[:1]) > _CUT * _power(end[:_FADING]):
+            if _mean_square(end[:1]) > _CUT * _mean_square(end[:_FADING]):
                 first = max(first, _BESIDE)
                 share += inside * max(1 / first - 1 / max(beyond, first), 0.0)
-            at_ends += share * _power(end[:_END])
+            at_ends += share * _mean_square(end[:_END])
     return at_ends / total if total else 0.0
 
 
-def _power(samples: NDArray[np.complex128]) -> float:
-    """Mean power of samples."""
+def _mean_square(samples: NDArray[np.complex128]) -> float:
+    """Mean square of samples."""
     return float(np.vdot(samples, samples).real) / len(samples)

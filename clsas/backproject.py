@@ -156,7 +156,7 @@ def backproject(
     -----
     ClsasWarning
         If no pixel lies within any line's range, or the beam, so that the lines add nothing; or if
-        `accuracy_db` may be missed because the grid reaches ends of lines that do not fade, or
+        `accuracy_db` may be missed because lines do not fade towards ends that the grid reaches, or
         because the lines' band fills all that is sampled.
 
     Notes

@@ -47,14 +47,15 @@ _ROOTS_PREPARED = 16  # enough for few and large arrays
 
 
 def margin_db(view: View) -> float:
-    """Return what lies between an error as expected and as predicted, for what it scatters.
+    """Margin between the expected and the predicted error, dB, for the scatter of measured ones.
 
-    Where few channels see a pixel it depends on how these happen to lie between nodes, and whether
-    any lies at a step of the window.
+    It is larger where few channels see a pixel: then the error depends on how these happen to lie
+    between virtual channels, and on whether one lies at a step of the window. It is larger, too,
+    where the power of the lines lies at few frequencies.
     """
     channels = view.lines.channels * view.share_seen((16, 16))
     few = _FEW_CHANNELS[view.beam is not None and view.beam.jumps]
-    return MARGIN_DB + in_db(1 + few / max(channels, 1.0))
+    return MARGIN_DB + in_db(view.spectrum.scatter * (1 + few / max(channels, 1.0)))
 
 
 @dataclass(frozen=True)

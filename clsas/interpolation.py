@@ -27,7 +27,6 @@ Gain = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 """A factor of spectra, by the distance from their centre in cycles per sample."""
 _POSITIONS = 17
 _SCATTER_DB = 0.5
-_FEW_FREQUENCIES = 4.0  # power at one frequency of a spectrum may err by 5 times as predicted
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,8 +179,7 @@ def choose(
     if taps is not None and upsampling is not None:
         return design(taps, upsampling, spectrum)
     power_left = 10 ** (accuracy_db / 10) - other_error**2
-    few = _FEW_FREQUENCIES * float(np.sum(spectrum.share**2))
-    target_db = 10 * np.log10(max(power_left, 1e-30) / (1 + few)) - _SCATTER_DB
+    target_db = 10 * np.log10(max(power_left, 1e-30) / spectrum.scatter) - _SCATTER_DB
     rates: Sequence[float] = UPSAMPLINGS if upsampling is None else (upsampling,)
     candidates = []
     for each_taps in TAPS if taps is None else (taps,):

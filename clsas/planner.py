@@ -119,9 +119,9 @@ def plan(
     Warns
     -----
     ClsasWarning
-        If the tolerance may be missed because the grid reaches ends of lines that do not fade, or
-        because the lines' band fills all that is sampled; or if no pixel lies within any line's
-        range, or the beam, so that the image will be zero.
+        If the tolerance may be missed because lines do not fade towards ends that the grid
+        reaches, or because the lines' band fills all that is sampled; or if no pixel lies within
+        any line's range, or the beam, so that the image will be zero.
     """
     validate.instance("lines", lines, RangeLines)
     validate.instance("grid", grid, Grid)

@@ -24,6 +24,8 @@ _OUTSIDE_BAND = (1e-8, 1e-6, 1e-4)  # of the signal's power: tails of windows an
 _CLOSING = 1 / 300  # cycles per sample to either side of where the circle closes, that may alias
 _COHERENT_CYCLES = 2.0  # of phase over the aperture, up to which common parts add up
 _COHERENT_CHANNELS, _COHERENT_PLACES, _COHERENT_FREQUENCIES = 128, 3, 256  # sampled
+_FEW_FREQUENCIES = 4.0  # power at one frequency may err by 5 times as predicted
+_LOUDEST = 16  # channels sampled besides those spread evenly
 _LINES_TOGETHER = 8  # transformed at once: they stay in the processor's caches
 
 
@@ -56,6 +58,14 @@ class Spectrum:
     line_power: NDArray[np.float64] | None = None
 
     @property
+    def scatter(self) -> float:
+        """Factor by which measured error power may exceed its mean, >= 1.
+
+        At few frequencies errors do not average out.
+        """
+        return 1 + _FEW_FREQUENCIES * float(np.sum(self.share**2))
+
+    @property
     def share(self) -> NDArray[np.float64]:
         """Share of the power of the lines at every distance, float64 [n]; sums to 1."""
         return self.power if self.line_power is None else self.line_power
@@ -66,9 +76,8 @@ def measure_spectrum(lines: RangeLines, grid: Grid | None = None) -> Spectrum:
 
     With a grid, frequencies that add up coherently in its image weigh as much as they do there.
     """
-    samples = _sampled_lines(lines, MEASURED_CHANNELS)
-    frequency, power, faded = _mean_power(samples, lines.length)
-    centre, width = _occupied_band(frequency, faded)
+    frequency, power, faded = _mean_power(*_sampled_lines(lines, MEASURED_CHANNELS))
+    centre, width, left_out = _occupied_band(frequency, faded)
     distance = _distance(frequency, centre)
     share = _histogram(distance, power)
     if grid is not None:
@@ -78,15 +87,15 @@ def measure_spectrum(lines: RangeLines, grid: Grid | None = None) -> Spectrum:
         (np.arange(_FREQUENCIES) + 0.5) / (2 * _FREQUENCIES),
         _histogram(distance, power),
         oversampling=1 / width,
-        aliasing=_aliasing(distance, faded, width),
+        aliasing=left_out + _aliasing(distance, faded, width),
         line_power=share,
     )
 
 
 def _occupied_band(
     frequency: NDArray[np.float64], power: NDArray[np.float64]
-) -> tuple[float, float]:
-    """Middle and width of the occupied band, cycles per sample.
+) -> tuple[float, float, float]:
+    """Middle and width of the occupied band, cycles per sample, and the share it has to leave out.
 
     Frequencies farther than half a cycle per sample from the middle alias. The band is therefore
     the narrowest arc of the frequency circle that holds nearly all power above the noise floor: the
@@ -97,7 +106,7 @@ def _occupied_band(
     smoothed = uniform_filter1d(power, max(round(_FLOOR_WIDTH * count), 1), mode="wrap")
     signal = np.maximum(power - _FLOOR_MARGIN * smoothed.min(), 0.0)
     if not signal.any():  # white: no arc is better than another
-        return float(np.angle(power @ np.exp(2j * np.pi * frequency)) / (2 * np.pi)), 0.5
+        return float(np.angle(power @ np.exp(2j * np.pi * frequency)) / (2 * np.pi)), 0.5, 0.0
     held = np.append(0.0, np.cumsum(np.tile(signal, 2)))
     least, *_, most = _OUTSIDE_BAND
     noise = np.clip(_NOISE_LEFT * count * smoothed.min(), least, most)
@@ -108,7 +117,8 @@ def _occupied_band(
         if bins[first] * NEEDED_OVERSAMPLING <= count:
             break
     middle = (first + (bins[first] - 1) / 2) / count
-    return float((middle + 0.5) % 1.0 - 0.5), float(bins[first] / count)
+    left_out = 1 - (held[ends[first]] - held[first]) / held[count] if outside > noise else 0.0
+    return float((middle + 0.5) % 1.0 - 0.5), float(bins[first] / count), max(left_out, 0.0)
 
 
 def _histogram(distance: NDArray[np.float64], power: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -138,7 +148,7 @@ def _aliasing(distance: NDArray[np.float64], power: NDArray[np.float64], width: 
 
 def power_outside(lines: RangeLines, centre: float, half_width: float, most_channels: int) -> float:
     """Share of the lines' power outside a band, in cycles per sample; of some lines."""
-    frequency, power, _ = _mean_power(_sampled_lines(lines, most_channels), lines.length)
+    frequency, power, _ = _mean_power(*_sampled_lines(lines, most_channels))
     return float(power[_distance(frequency, centre) > half_width].sum())
 
 
@@ -147,29 +157,46 @@ def _distance(frequency: NDArray[np.float64], centre: float) -> NDArray[np.float
     return np.abs((frequency - centre + 0.5) % 1.0 - 0.5)
 
 
-def _sampled_lines(lines: RangeLines, most_channels: int) -> NDArray[np.complex64]:
-    """Take the samples of some channels that hold anything."""
-    samples = lines.samples[some_channels(lines.channels, most_channels)]
-    if _largest_part(samples) == 0 and (filled := np.flatnonzero(lines.samples.any(axis=1))).size:
-        samples = lines.samples[filled[some_channels(len(filled), most_channels)]]
-    return samples
+def _sampled_lines(
+    lines: RangeLines, most_channels: int
+) -> tuple[NDArray[np.complex64], NDArray[np.float32]]:
+    """Sample some channels, spread evenly, and the loudest; return a factor for each too.
+
+    With these factors the sampled channels have the power of all of them.
+    """
+    some = some_channels(lines.channels, most_channels)
+    if len(some) == lines.channels:
+        return lines.samples, np.ones(lines.channels, np.float32)
+    # Relative to the largest part, since squares might overflow; row by row, in the caches.
+    scale = _largest_part(lines.samples) or 1.0
+    scaled = (row / scale for row in lines.samples.view(np.float32))
+    energy = np.array([np.vdot(row, row) for row in scaled], np.float64)
+    loudest = np.argpartition(energy, -_LOUDEST)[-_LOUDEST:]
+    even = np.setdiff1d(some, loudest)
+    rest, held = energy.sum() - energy[loudest].sum(), energy[even].sum()
+    weight = np.sqrt(max(rest, 0.0) / held) if held > 0 else 0.0
+    factor = np.append(np.full(len(even), weight), np.ones(len(loudest))).astype(np.float32)
+    return lines.samples[np.append(even, loudest)], factor
 
 
 def _mean_power(
-    samples: NDArray[np.complex64], line_length: int
+    samples: NDArray[np.complex64], factor: NDArray[np.float32]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Frequencies, cycles per sample, and the share of the power at each, of lines as they are.
 
     The last is the share of lines that fade to both ends: it shows the band without the leakage of
-    lines that are cut.
+    lines that are cut. `factor` multiplies every line.
     """
     largest = _largest_part(samples) or samples.real.dtype.type(1)
-    length = scipy.fft.next_fast_len(2 * line_length)
+    length = scipy.fft.next_fast_len(2 * samples.shape[1])
     power, faded = np.zeros(length), np.zeros(length)
     parts = samples.view(samples.real.dtype)
-    # So few together that they stay in the processor's caches.
-    for block in np.array_split(parts, -(-len(parts) // _LINES_TOGETHER)):
-        amplitude = scipy.fft.fft((block / largest).view(samples.dtype), length)
+    blocks = -(-len(parts) // _LINES_TOGETHER)
+    for block, scale in zip(
+        np.array_split(parts, blocks), np.array_split(factor, blocks), strict=True
+    ):
+        scaled = block * (scale / largest)[:, None]
+        amplitude = scipy.fft.fft(scaled.view(samples.dtype), length)
         power += _column_power(amplitude)
         # A Hann window over half of the FFT's length, where the lines lie.
         faded += _column_power(
