@@ -157,9 +157,8 @@ class RangeLines:
             if index.size == 0:
                 raise ValueError("channels must select at least one line, got none")
             if index.dtype.kind not in "iub":
-                raise TypeError(
-                    f"channels must be a slice, whole numbers or bools, got {channels!r}"
-                )
+                got = validate.shown(channels)
+                raise TypeError(f"channels must be a slice, whole numbers or bools, got {got}")
         velocity = self.rx_velocity_m_s
         return replace(
             self,

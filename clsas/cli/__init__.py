@@ -7,12 +7,14 @@ Results go to standard output, progress and warnings to standard error. Exit cod
 from __future__ import annotations
 
 import warnings
+from collections.abc import Callable
 from typing import Any
 
 import click
 import pyopencl
 
 import clsas
+from clsas import validate
 from clsas.cli import images, lines, machine, measures, mosaics
 
 # What users cause, and what machines lack.
@@ -34,9 +36,12 @@ class _Commands(click.Group):
         with warnings.catch_warnings():
             warnings.simplefilter("always", clsas.ClsasWarning)
             warnings.simplefilter("ignore", pyopencl.CompilerWarning)
-            warnings.showwarning = _show_warning
+            warnings.showwarning = _showing(warnings.showwarning)
             try:
                 return super().invoke(ctx)
+            except click.ClickException as error:
+                error.message = validate.printable(error.message)
+                raise
             except BrokenPipeError:
                 raise  # click's: whoever reads our output has left
             except KeyboardInterrupt:
@@ -79,11 +84,23 @@ def main(traceback: bool) -> None:
     """
 
 
-def _show_warning(message: Warning | str, *_: Any, **__: Any) -> None:
-    click.echo(f"Warning: {message}", err=True)
+def _showing(others: Callable[..., None]) -> Callable[..., None]:
+    """Return what shows a warning: one of clsas as a message, others as Python does."""
+
+    def show(message: Warning | str, category: type[Warning], *where: Any, **options: Any) -> None:
+        if issubclass(category, clsas.ClsasWarning):
+            click.echo(f"Warning: {validate.printable(str(message))}", err=True)
+        else:
+            others(message, category, *where, **options)
+
+    return show
 
 
 def _message(error: BaseException) -> str:
+    return validate.printable(_text(error))
+
+
+def _text(error: BaseException) -> str:
     if isinstance(error, OSError) and error.strerror:
         return f"{error.strerror}: {error.filename}" if error.filename else error.strerror
     if isinstance(error, MemoryError):
