@@ -170,7 +170,7 @@ def memory(name: str, size_bytes: float) -> None:
     Where the system does not tell nothing is refused.
     """
     available = _memory_bytes()
-    if size_bytes > available:
+    if not size_bytes <= available:  # nor NaN
         try:
             asked = f"{size_bytes / 2**30:.3g} GiB"
         except OverflowError:  # a whole number beyond float64
