@@ -49,7 +49,8 @@ class RangeLines:
         If an argument is of a wrong kind; real samples, which hold no phase, among them.
     ValueError
         If shapes disagree, an array is empty, a value is NaN or infinite, a step or speed is not
-        positive, the carrier is negative, or a receiver is not slower than the waves.
+        positive, the carrier is negative, or a receiver is not slower than the waves. Also if
+        wider samples are all so small or large that complex64 loses their digits.
 
     Notes
     -----

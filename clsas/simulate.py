@@ -121,7 +121,8 @@ def simulate(
     TypeError, ValueError
         If an argument is of another type or outside its limits, `pointing` has nothing to act on,
         a point lies on an element while spreading or patterns are asked for, no echo is received
-        to set the noise by, or the echoes do not fit into memory.
+        to set the noise by, or the echoes, or the patterns of very long elements, do not fit
+        into memory.
 
     Warns
     -----

@@ -40,7 +40,7 @@ class _Commands(click.Group):
             try:
                 return super().invoke(ctx)
             except click.ClickException as error:
-                error.message = validate.printable(error.message)
+                error.message = validate.printable(error.message)  # type: ignore[misc]
                 raise
             except BrokenPipeError:
                 raise  # click's: whoever reads our output has left
