@@ -278,11 +278,11 @@ def array(
 def _check_narrowing(name: str, given: NDArray, dtype: np.dtype) -> None:
     """Raise ValueError unless a narrower float type holds values to its precision.
 
-    What is small beside the largest value may become 0. The largest one must have all its digits,
-    down to the last one's share of it.
+    What is small beside the largest value may become 0. From the least normal number on, the
+    largest one keeps all its digits, and the others what these leave.
     """
     kind = np.finfo(dtype)
-    least, most = float(kind.tiny / kind.eps), float(kind.max)
+    least, most = float(kind.tiny), float(kind.max)
     parts = (given.real, given.imag) if given.dtype.kind == "c" else (given,)
     ends = [f.reduce(part, axis=None) for part in parts for f in (np.fmin, np.fmax)]
     largest = float(np.max(np.abs(ends)))

@@ -99,7 +99,7 @@ class File(click.Path):
         if not os.fspath(value):
             self.fail("must be a path, got an empty one", param, ctx)
         path: Any = super().convert(value, param, ctx)
-        if not self.written:
+        if not self.written and path.exists():
             try:
                 check_ordinary(path)
             except ValueError as error:
