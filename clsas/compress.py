@@ -166,7 +166,7 @@ def band_window(
     except (ValueError, TypeError, IndexError) as error:
         raise ValueError(
             f"window must be 'none' or a window of scipy.signal.get_window, "
-            f"got {window!r} ({error})"
+            f"got {validate.shown(window)} ({error})"
         ) from None
     values = validate.array("window", values, np.float64, (count,))
     half = bandwidth_hz / 2

@@ -10,9 +10,10 @@ import csv
 import difflib
 import hashlib
 import inspect
+import io
 import json
 import os
-import tomllib
+import re
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
@@ -24,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from clsas import validate
+from clsas import reading, validate
 from clsas.backproject import BEST_ACCURACY_DB
 from clsas.compress import check_options as check_compression
 from clsas.grid import Grid
@@ -40,6 +41,7 @@ from clsas.window import BeamWindow
 PRESETS = ("thesis_wide_beam", "edgetech", "sensotek")
 SEABEDS: dict[str, Callable[..., Seabed]] = {"wreck": wreck, "pipeline": pipeline, "rocks": rocks}
 
+_MOST_MISTAKES = 20  # in one message
 _IMAGING = ("grid", "image", "mosaic")  # tables that range lines do not depend on
 
 DIAL = ("tolerance_db", "tolerance_wavelengths", "stages")
@@ -101,26 +103,32 @@ def read_scene(path: str | os.PathLike) -> SceneFile:
     ------
     ValueError
         If it is not TOML, a key is unknown, missing, of a wrong type or outside its limits (one
-        line per mistake, each with the key's path, what was given and what is allowed), or a file
-        that it names cannot be read.
+        line per mistake, each with the key's path, what was given and what is allowed, for the
+        first 20), or a file that it names cannot be read.
     OSError
         If it cannot be read.
     """
     path = Path(path)
-    return parse_scene(path.read_bytes(), name=str(path), folder=path.parent)
+    return parse_scene(reading.read_bytes(path), name=str(path), folder=path.parent)
 
 
 def parse_scene(text: bytes, *, name: str, folder: Path) -> SceneFile:
     """Return what the TOML `text` describes; `read_scene` for text that is in no file."""
     try:
-        tables = tomllib.loads(text.decode())
+        tables = reading.parse_toml(text)
     except ValueError as error:  # TOML's and UTF-8's
         kind = "an HDF5 file, not a scene" if text.startswith(b"\x89HDF") else f"not TOML: {error}"
         raise ValueError(f"{name}: is {kind}") from None
     try:
         return _Scene.model_validate(tables).build(name, folder)
     except ValidationError as error:
-        raise ValueError("\n".join(f"{name}: {line}" for line in _explain(error, tables))) from None
+        mistakes = _explain(error, tables)
+        lines = [f"{name}: {line}" for line in mistakes[:_MOST_MISTAKES]]
+        if len(mistakes) > _MOST_MISTAKES:
+            lines.append(f"{name}: and {len(mistakes) - _MOST_MISTAKES} more mistakes")
+        raise ValueError("\n".join(lines)) from None
+    except RecursionError:
+        raise ValueError(f"{name}: nested too deep") from None
     except (TypeError, ValueError) as error:
         raise ValueError(f"{name}: {error}") from None
 
@@ -129,11 +137,11 @@ def simulation_digest(text: bytes, folder: Path) -> str:
     """Return a digest of all that the range lines of a scene file depend on, clsas included."""
     from clsas import __version__  # which imports this module
 
-    tables = tomllib.loads(text.decode())
+    tables = reading.parse_toml(text)
     told = {name: table for name, table in tables.items() if name not in _IMAGING}
     digest = hashlib.sha256(json.dumps([__version__, told], sort_keys=True, default=str).encode())
     if isinstance(file := tables.get("track", {}).get("file"), str):
-        digest.update((folder / file).read_bytes())
+        digest.update(reading.read_bytes(folder / file))
     return digest.hexdigest()[:12]
 
 
@@ -320,7 +328,9 @@ class _Seabed(_Table):
             known = inspect.signature(make).parameters
             for name in options:
                 if name not in known:
-                    raise ValueError(f"{name} must be left out with the scene {self.scene!r}")
+                    raise ValueError(
+                        f"{name} must be left out with the scene {validate.shown(self.scene)}"
+                    )
             return make(**options)
 
 
@@ -523,14 +533,17 @@ def read_track(path: str | os.PathLike) -> Track:
     OSError
         If the file cannot be read.
     """
-    with open(path, newline="", encoding="utf-8-sig") as file:
-        reader = csv.reader(file, skipinitialspace=True)
+    text = reading.read_bytes(path).decode("utf-8-sig")
+    reader = csv.reader(io.StringIO(text, newline=""), skipinitialspace=True)
+    try:
         names = [name.strip() for name in next(reader, [])]
         rows = [(reader.line_num, row) for row in reader if row]
+    except csv.Error as error:
+        raise ValueError(f"{path}: line {reader.line_num} is not CSV: {error}") from None
     known = (*_POSITION, *_ATTITUDE, *_VELOCITY)
     for name in names:
         if name not in known:
-            raise ValueError(f"{path}: unknown column {name!r}{_near(name, known)}")
+            raise ValueError(f"{path}: unknown column {validate.shown(name)}{_near(name, known)}")
     velocity = _VELOCITY if set(names) & set(_VELOCITY) else ()
     for name in (*_POSITION, *velocity, *names):
         if names.count(name) != 1:
@@ -540,8 +553,9 @@ def read_track(path: str | os.PathLike) -> Track:
         try:
             values[index] = [float(value) for value in row]
         except ValueError:
+            got = validate.shown(",".join(row))
             raise ValueError(
-                f"{path}: line {line} must be {len(names)} numbers, got {','.join(row)!r}"
+                f"{path}: line {line} must be {len(names)} numbers, got {got}"
             ) from None
     column = dict(zip(names, values.T, strict=True))
     with _in(f"{path}:"):
@@ -570,6 +584,8 @@ def _in(place: str) -> Iterator[None]:
         raise ValueError(f"{place} {error}") from None
 
 
+_BARE_KEY = re.compile(r"[\w-]{1,100}", re.ASCII)
+
 # What a value must be, by pydantic's name for the mistake; its own words for any other.
 _MUST_BE = {
     "bool_type": "true or false",
@@ -595,12 +611,15 @@ def _explain(error: ValidationError, tables: dict[str, Any]) -> list[str]:
             *place, name = *path[:-1], str(path[-1])
             allowed = list(_model_at(place).model_fields)
             mistyped |= {(*place, guess) for guess in _close(name, allowed)}
-            unknown = f"key {name!r} in {_table(place)}" if place else f"table [{name}]"
+            table = name if _BARE_KEY.fullmatch(name) else validate.shown(name)
+            unknown = (
+                f"key {validate.shown(name)} in {_table(place)}" if place else f"table [{table}]"
+            )
             lines[path] = f"unknown {unknown}{_near(name, allowed)}"
         else:  # each member of a union of types reports its own
             musts.setdefault(path, {})[_must_be(problem, path)] = None
             expected = " or ".join(musts[path])
-            lines[path] = f"{_key(path)} must be {expected}, got {problem['input']!r}"
+            lines[path] = f"{_key(path)} must be {expected}, got {validate.shown(problem['input'])}"
     return [line for path, line in lines.items() if path not in mistyped]
 
 

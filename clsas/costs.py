@@ -8,7 +8,7 @@ from pathlib import Path
 
 from numpy.typing import ArrayLike
 
-from clsas import validate
+from clsas import reading, validate
 from clsas.atomic import replacing
 from clsas.device import Device
 from clsas.interpolation import COST
@@ -132,7 +132,7 @@ def measured(device: Device) -> Costs | None:
     """Return what was measured for a device and its driver, if anything was."""
     names = {field.name for field in fields(Costs)}
     try:
-        stored = json.loads(path().read_text())[_key(device)]
+        stored = reading.parse_json(reading.read_bytes(path()))[_key(device)]
         return Costs(**{name: float(stored[name]) for name in names})
     except (OSError, ValueError, KeyError, TypeError):
         return None
@@ -142,7 +142,7 @@ def save(device: Device, costs: Costs) -> Path:
     """Store what was measured for a device; return where."""
     file = path()
     try:
-        stored = dict(json.loads(file.read_text()))
+        stored = dict(reading.parse_json(reading.read_bytes(file)))
     except (OSError, ValueError, TypeError):
         stored = {}  # none yet, or not ours
     stored[_key(device)] = asdict(costs)

@@ -45,7 +45,8 @@ class Echoes:
     ------
     TypeError, ValueError
         If an array has the wrong kind or shape, is empty or not finite, a number is outside its
-        limits, or the pulse's carrier differs.
+        limits, the pulse's carrier differs, or wider samples are all so small or large that
+        float32 loses their digits.
     """
 
     samples: NDArray[np.complex64] | NDArray[np.float32]

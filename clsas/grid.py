@@ -91,7 +91,7 @@ class Grid:
             shape = tuple(validate.count("every entry of shape", n) for n in self.shape)
         except TypeError:
             raise TypeError(
-                f"shape must be whole numbers of pixels per axis, got {self.shape!r}"
+                f"shape must be whole numbers of pixels per axis, got {validate.shown(self.shape)}"
             ) from None
         object.__setattr__(self, "shape", shape)
 
@@ -333,7 +333,9 @@ def _axis(name: str, axis: tuple[float, float, int]) -> tuple[float, float, int]
     try:
         start, stop, count = axis
     except (TypeError, ValueError):
-        raise TypeError(f"{name} must be (start m, stop m, count), got {axis!r}") from None
+        raise TypeError(
+            f"{name} must be (start m, stop m, count), got {validate.shown(axis)}"
+        ) from None
     start = validate.number(f"{name} start", start, "m")
     stop = validate.number(f"{name} stop", stop, "m")
     count = validate.count(f"{name} count", count)

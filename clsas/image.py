@@ -31,7 +31,8 @@ class Image:
     TypeError
         If the pixels are not complex or `grid` is not a Grid.
     ValueError
-        If the pixels do not have the grid's shape, or a pixel is NaN or infinite.
+        If the pixels do not have the grid's shape, or a pixel is NaN or infinite. Also if
+        wider pixels are all so small or large that complex64 loses their digits.
 
     Notes
     -----

@@ -173,7 +173,7 @@ def choose(
         `accuracy_db`.
     """
     if taps is not None and not (isinstance(taps, (int, np.integer)) and taps in TAPS):
-        raise ValueError(f"taps must be one of {TAPS}, got {taps!r}")
+        raise ValueError(f"taps must be one of {TAPS}, got {validate.shown(taps)}")
     if upsampling is not None:
         upsampling = validate.number("upsampling", upsampling, least=1.0, most=MOST_UPSAMPLING)
     if taps is not None and upsampling is not None:

@@ -20,7 +20,7 @@ import h5py
 import numpy as np
 from platformdirs import user_cache_path
 
-from clsas import validate
+from clsas import reading, validate
 from clsas.atomic import replacing
 from clsas.echoes import Echoes
 from clsas.grid import Grid
@@ -105,7 +105,8 @@ def load(path: str | os.PathLike) -> Saved:
     Raises
     ------
     FileFormatError
-        If the file is not HDF5, not of clsas, of a newer version, incomplete or damaged.
+        If the file is not HDF5, not of clsas, of a newer version, incomplete, damaged, larger
+        than memory when unpacked, or refers to other files or places.
     OSError
         If it does not exist (FileNotFoundError) or cannot be read.
     """
@@ -146,13 +147,22 @@ def read_samples(path: str | os.PathLike, rows: slice, columns: slice) -> np.nda
         As `read_geometry` does.
     """
     with _opened(path) as file:
-        return _samples_of(file)[rows, columns]
+        samples = _samples_of(file)
+        counts = [
+            len(range(n)[part]) for n, part in zip(samples.shape, (rows, columns), strict=True)
+        ]
+        _check_memory(samples, samples.dtype.itemsize * math.prod(counts))
+        return samples[rows, columns]
 
 
 @contextmanager
 def _opened(path: str | os.PathLike) -> Iterator[h5py.File]:
     """Open a file of clsas to read; whatever is wrong with it is said by one exception."""
     path = Path(path)
+    try:
+        reading.check_ordinary(path)
+    except ValueError as error:
+        raise FileFormatError(str(error)) from None
     with path.open("rb"):
         pass  # Whatever keeps it from being opened is said by Python, better than by HDF5.
     if not h5py.is_hdf5(path):
@@ -223,8 +233,8 @@ def _write(group: h5py.Group, obj: Any) -> None:
 def _samples_of(file: h5py.File) -> h5py.Dataset:
     kind = _attribute(file, "kind")
     if kind != "range_lines":
-        raise FileFormatError(f"must hold range lines, got {kind}")
-    samples = file.get("samples")
+        raise FileFormatError(f"must hold range lines, got {validate.shown(kind)}")
+    samples = _item(file, "samples")
     if not isinstance(samples, h5py.Dataset):
         raise FileFormatError("lacks samples of the range_lines at /")
     if samples.dtype.kind != "c" or len(samples.shape or ()) != 2 or not samples.size:
@@ -238,8 +248,9 @@ def _samples_of(file: h5py.File) -> h5py.Dataset:
 def _read(group: h5py.Group, **instead: Any) -> Any:
     """Return the object in a group, some of whose fields may be given `instead` of being read."""
     name = _attribute(group, "kind")
-    if name not in _KINDS:
-        raise FileFormatError(f"holds an object of unknown kind {name!r} at {group.name}")
+    if not isinstance(name, str) or name not in _KINDS:
+        where = f"{validate.shown(name)} at {validate.shown(group.name)}"
+        raise FileFormatError(f"holds an object of unknown kind {where}")
     kind = _KINDS[name]
     values = {}
     for field in fields(kind):
@@ -247,14 +258,44 @@ def _read(group: h5py.Group, **instead: Any) -> Any:
             values[field.name] = instead[field.name]
         elif field.name in group.attrs:
             values[field.name] = _attribute(group, field.name)
-        elif field.name in group:
-            item = group[field.name]
-            values[field.name] = _read(item) if isinstance(item, h5py.Group) else _values(item)
+        elif (item := _item(group, field.name)) is not None:
+            is_group = isinstance(item, h5py.Group)
+            # A group may be linked as a part of itself.
+            if is_group and _kind_of_field(field.type) != _attribute(item, "kind"):
+                raise FileFormatError(f"holds another object as {field.name} of the {name}")
+            values[field.name] = _read(item) if is_group else _values(item)
         elif "None" in str(field.type):
             values[field.name] = None
         else:
             raise FileFormatError(f"lacks {field.name} of the {name} at {group.name}")
     return kind(**values)
+
+
+def _kind_of_field(annotation: object) -> str | None:
+    """Return the kind of object that a field such as `pulse: Pulse | None` holds, if of any."""
+    classes = str(annotation).split(" | ")
+    return next((name for name, kind in _KINDS.items() if kind.__name__ in classes), None)
+
+
+def _item(group: h5py.Group, name: str) -> h5py.Group | h5py.Dataset | None:
+    """Return a group or dataset that lies in this file itself, or None where there is none.
+
+    A file from elsewhere must not decide which other files are read.
+    """
+    link = group.get(name, getlink=True)
+    if link is None:
+        return None
+    if not isinstance(link, h5py.HardLink):
+        raise FileFormatError(f"must hold {name} itself, got a link to another place")
+    item = group[name]
+    if isinstance(item, h5py.Dataset):
+        if item.is_virtual or item.external:
+            raise FileFormatError(f"must hold {name} itself, got a dataset kept in other files")
+        if item.dtype.kind not in "iufc":
+            raise FileFormatError(f"must hold {name} as numbers, got {item.dtype}")
+    elif not isinstance(item, h5py.Group):
+        raise FileFormatError(f"must hold {name} as a dataset, got a type")
+    return item
 
 
 def _values(dataset: h5py.Dataset) -> np.ndarray:
@@ -266,7 +307,18 @@ def _values(dataset: h5py.Dataset) -> np.ndarray:
         whole = dataset.id.get_num_chunks() == math.prod(counts)
     if not whole:
         raise FileFormatError(f"lacks a part of {dataset.name}, of shape {dataset.shape}")
+    _check_memory(dataset, dataset.nbytes)
     return dataset[()]
+
+
+def _check_memory(dataset: h5py.Dataset, size_bytes: int) -> None:
+    """Raise FileFormatError unless so much of a dataset fits into memory when it is read."""
+    # HDF5 unpacks chunks whole, from one buffer into another.
+    chunk = math.prod(dataset.chunks or (0,)) * dataset.dtype.itemsize
+    try:
+        validate.memory(f"reading {dataset.name}", size_bytes + 2 * chunk)
+    except ValueError as error:
+        raise FileFormatError(f"is too large: {error}") from None
 
 
 def _set(group: h5py.Group, name: str, value: Any) -> None:

@@ -50,7 +50,8 @@ class RangeLines:
         If an argument is of a wrong kind; real samples, which hold no phase, among them.
     ValueError
         If shapes disagree, an array is empty, a value is NaN or infinite, a step or speed is not
-        positive, the carrier is negative, or a receiver is not slower than the waves.
+        positive, the carrier is negative, or a receiver is not slower than the waves. Also if
+        wider samples are all so small or large that complex64 loses their digits.
 
     Notes
     -----
@@ -172,9 +173,8 @@ class RangeLines:
             if index.size == 0:
                 raise ValueError("channels must select at least one line, got none")
             if index.dtype.kind not in "iub":
-                raise TypeError(
-                    f"channels must be a slice, whole numbers or bools, got {channels!r}"
-                )
+                got = validate.shown(channels)
+                raise TypeError(f"channels must be a slice, whole numbers or bools, got {got}")
         velocity = self.rx_velocity_m_s
         return replace(
             self,

@@ -13,10 +13,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clsas import phases
+from clsas import phases, validate
 from clsas.grid import Grid
 from clsas.interpolation import PHASES, UPSAMPLING_TAPS, Interpolator, Resampling, Upsampler
 from clsas.lines import RangeLines
+from clsas.reading import parse_json
 from clsas.simplify import EFFECTS, Model, leave_out
 from clsas.window import BeamWindow
 
@@ -174,7 +175,9 @@ class Plan:
 
         def check(good: bool, name: str, wanted: str) -> None:
             if not good:
-                raise ValueError(f"{name} must be {wanted}, got {getattr(self, name)!r}")
+                raise ValueError(
+                    f"{name} must be {wanted}, got {validate.shown(getattr(self, name))}"
+                )
 
         def whole(value: object, least: int) -> bool:
             return type(value) is int and least <= value < 2**31
@@ -368,11 +371,12 @@ class Plan:
         def plain(value: object) -> object:
             return value.tolist() if isinstance(value, (np.ndarray, np.generic)) else value
 
-        values = asdict(self)
-        for part in values.values():
-            if not filters and isinstance(part, dict):
-                part.pop("coefficients", None)
-        return json.dumps(values, default=plain, indent=1)
+        values = json.loads(json.dumps(asdict(self), default=plain))
+        if not filters:
+            for part in values.values():
+                if isinstance(part, dict):
+                    part.pop("coefficients", None)
+        return json.dumps(values | {"digest": _json_digest(values)}, indent=1)
 
     @classmethod
     def from_json(cls, text: str) -> Plan:
@@ -381,10 +385,15 @@ class Plan:
         Raises
         ------
         ValueError
-            If the text is not such a plan.
+            If the text is not such a plan, or its digest is not that of what it says.
         """
         try:
-            values = json.loads(text)
+            values = parse_json(text)
+            if not isinstance(values, dict):
+                raise TypeError(f"it must be an object, got {validate.shown(values)}")
+            digest = values.pop("digest", None)
+            if digest is not None and digest != _json_digest(values):
+                raise TypeError("its digest differs: it was changed or damaged")
             for name in ("align", "aperture", "final"):
                 if values[name] is not None:
                     half = values[name]["taps"] // 2
@@ -410,7 +419,7 @@ class Plan:
             values["left_out"] = tuple(values.get("left_out", ()))
             values["stages"] = tuple(Stage(**stage) for stage in values["stages"])
             return cls(**values)
-        except (TypeError, KeyError, AttributeError, json.JSONDecodeError) as error:
+        except (TypeError, ValueError, KeyError, AttributeError, OverflowError) as error:
             what = f"it lacks {error}" if isinstance(error, KeyError) else error
             raise ValueError(f"text must be a plan as of Plan.to_json: {what}") from error
 
@@ -487,6 +496,10 @@ def grid_digest(grid: Grid) -> str:
     """Return a digest of where a grid's pixels lie."""
     parts = (grid.origin_m, grid.row_step_m, grid.column_step_m, grid.height_m, grid.points_m)
     return _digest(np.array(grid.shape), *(part for part in parts if part is not None))
+
+
+def _json_digest(values: dict[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()[:16]
 
 
 def _digest(*arrays: NDArray) -> str:

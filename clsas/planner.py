@@ -233,7 +233,9 @@ def _allowed(taps: tuple[int, int] | None, depth: int | None) -> Allowed | None:
     fields = {}
     if taps is not None:
         if not isinstance(taps, (tuple, list)) or len(taps) != 2:
-            raise TypeError(f"taps must be two, in range and along the aperture, got {taps!r}")
+            raise TypeError(
+                f"taps must be two, in range and along the aperture, got {validate.shown(taps)}"
+            )
         for each in taps:
             validate.one_of("taps", validate.count("every entry of taps", each), ALIGN_TAPS)
         fields = {"align_taps": (taps[0],), "aperture_taps": (taps[1],)}
@@ -405,7 +407,7 @@ def checked_pairs(stages: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
     except TypeError:
         whole = False
     if not whole:
-        raise TypeError(f"stages must be a sequence of (QR, QI), got {stages!r}")
+        raise TypeError(f"stages must be a sequence of (QR, QI), got {validate.shown(stages)}")
     return [
         (validate.count("QR of stages", beams), validate.count("QI of stages", divisions))
         for beams, divisions in pairs

@@ -520,7 +520,7 @@ def rocks(
     position_m : array_like, [2]
         Middle of the field of boulders, which thins out over some 12 m around it.
     count : int
-        Number of boulders, at least 1.
+        Number of boulders, 1 to 100 000.
     x_m, y_m, cell_m, density_m2, seed, floor_db
         As for `wreck`; the seed also draws the boulders.
 
@@ -529,7 +529,7 @@ def rocks(
     TypeError, ValueError
         As `wreck` does.
     """
-    count = validate.count("count", count)
+    count = validate.count("count", count, most=_MOST_BOULDERS)
     sand = _Sand.draw(x_m, y_m, cell_m, seed)
     east, north = sand.around(position_m, 0.0)
     random = np.random.default_rng([seed, 1])
@@ -549,6 +549,8 @@ def rocks(
     return sand.seabed(top, 3.0, density_m2, floor_db)
 
 
+# Of about 1 m2 each in a field of some 3000 m2: far more than lie side by side.
+_MOST_BOULDERS = 100_000
 _LARGEST_CELL_M, _HIGHEST_MAST_M = 1.0, 100.0  # what shows a wreck at all
 
 

@@ -129,7 +129,8 @@ def simulate(
     TypeError, ValueError
         If an argument is of another type or outside its limits, `pointing` has nothing to act on,
         a point lies on an element while spreading or patterns are asked for, no echo is received
-        to set the noise by, or the echoes do not fit into memory.
+        to set the noise by, or the echoes, or the patterns of very long elements, do not fit
+        into memory.
 
     Warns
     -----
@@ -150,6 +151,7 @@ def simulate(
         element_pattern=element_pattern, phase_centres=phase_centres,
         range_m=range_m, snr_db=snr_db, seed=seed,
     )  # fmt: skip
+    check_size(sonar, track, range_m)
     parts = _parts(scene)
     beams = None
     if not sonar.is_omnidirectional and element_pattern:
@@ -223,6 +225,19 @@ def check_options(
     if snr_db is not None:
         validate.number("snr_db", snr_db, "dB", least=-200.0, most=300.0)
     validate.count("seed", seed, least=0)
+
+
+def check_size(sonar: Sonar, track: Track, range_m: ArrayLike | None = None) -> None:
+    """Raise ValueError where even the shortest echoes of a survey do not fit into memory.
+
+    This needs neither the channels' positions nor a scene, so it is quick for any survey.
+    """
+    name, samples = "sonar and track", 2.0 * _RINGING
+    if range_m is not None:
+        near, far = map(float, np.asarray(range_m))
+        name, samples = "range_m", 2 * (far - near) / sonar.sound_speed_m_s * sonar.sample_rate_hz
+    samples += sonar.pulse.duration_s * sonar.sample_rate_hz
+    validate.memory(name, 8 * track.pings * sonar.receivers * samples)
 
 
 def simulate_lines(
@@ -389,7 +404,7 @@ class _Beams:
         ]
 
     def gains(
-        self, sines: list[NDArray], error: float, dtype: type[np.floating]
+        self, sines: list[NDArray], error: float, dtype: type[np.floating], modes: int
     ) -> NDArray[np.float32]:
         """Return the two-way pattern [terms, points] at `_nodes(terms)` of the sampled band.
 
@@ -401,6 +416,12 @@ class _Beams:
             (sum_i a_i)^Q min(1/(Q + 1), prod_i min(1, 2/(a_i f_least))),
 
         so that over a band of +-h hertz Q nodes leave at most 2 (h/2)^Q/Q! times that.
+
+        Raises
+        ------
+        ValueError
+            If elements are so long that the pattern, and its sum's spectrum at `modes`
+            frequencies, do not fit into memory.
         """
         sonar = self.sonar
         half_band = sonar.sample_rate_hz / 2
@@ -413,6 +434,9 @@ class _Beams:
         level: NDArray | float = 2.0
         for slope in slopes:
             level = level / np.maximum(slope * (lowest / 2), 1.0)
+        # Stirling: with this many terms (reach e/Q)^Q has fallen below the error.
+        most = math.e * float(np.max(reach)) - math.log(error / 4)
+        validate.memory("the sonar's element lengths", 8 * most * (most + len(reach) + 2 * modes))
         terms = _terms(reach, level, error / 2)
         frequency = (sonar.pulse.carrier_hz + _nodes(terms) * half_band)[:, None].astype(dtype)
         patterns = (
@@ -424,10 +448,13 @@ class _Beams:
 
 def _terms(reach: NDArray, level: NDArray | float, error: float) -> int:
     """Return the least Q with reach^Q/Q! min(2/(Q + 1), level) <= `error` everywhere."""
-    terms, power = 1, reach
-    while np.max(power * np.minimum(level, 2 / (terms + 1))) > error:
+    with np.errstate(divide="ignore"):
+        slope, cap = np.log(reach), np.log(level)
+    # Logarithms: the powers of a long element overflow before Q! catches up.
+    terms, power = 1, slope
+    while np.max(power + np.minimum(cap, math.log(2 / (terms + 1)))) > math.log(error):
         terms += 1
-        power = power * (reach / terms)
+        power = power + (slope - math.log(terms))
     return terms
 
 
@@ -634,7 +661,7 @@ def _record(
             total += _sum(angles, strengths, modes, accuracy)
             return
         sines = [sine.astype(real) for sine in sines]
-        gains = paths.beams.gains(sines, max(_PATTERN_ERROR, look.error), real)
+        gains = paths.beams.gains(sines, max(_PATTERN_ERROR, look.error), real, modes)
         sums = _sum(angles, strengths * gains, modes, accuracy).reshape(len(gains), modes)
         total += np.sum(_interpolation(len(gains), modes) * sums, axis=0)
 

@@ -61,7 +61,9 @@ class Pulse:
             return
         given = np.ravel(self.code).tolist()
         if not given or any(chip not in (1, -1) for chip in given):
-            raise ValueError(f"code must be 'up', 'down' or chips of +1 and -1, got {self.code!r}")
+            raise ValueError(
+                f"code must be 'up', 'down' or chips of +1 and -1, got {validate.shown(self.code)}"
+            )
         chips = tuple(int(chip) for chip in given)
         if not np.isclose(self.bandwidth_hz * self.duration_s, len(chips)):
             raise ValueError(

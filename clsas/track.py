@@ -189,8 +189,8 @@ def channels(sonar: Sonar, track: Track, *, motion_in_flight: bool = False) -> C
     validate.instance("sonar", sonar, Sonar)
     validate.instance("track", track, Track)
     validate.instance("motion_in_flight", motion_in_flight, bool)
-    # Positions of transmitter and receiver, and the latter's velocity.
-    validate.memory("sonar and track", 72 * track.pings * sonar.receivers)
+    # Nine numbers a channel, and ranges to four points, which every use of them takes.
+    validate.memory("sonar and track", 300 * track.pings * sonar.receivers)
     turn = track.rotations.as_matrix()
     tx = track.positions_m + turn @ sonar.tx_m
     rx = track.positions_m[:, None] + sonar.rx_m @ turn.transpose(0, 2, 1)

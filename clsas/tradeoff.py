@@ -289,7 +289,9 @@ def tradeoff(
         tolerances_db = validate.array("tolerances_db", tolerances_db, np.float64, (None,))
     tolerances_db = tolerances_db.tolist()
     if not (stages is None or isinstance(stages, Sequence)):
-        raise TypeError(f"stages must be a sequence of plans' (QR, QI), got {stages!r}")
+        raise TypeError(
+            f"stages must be a sequence of plans' (QR, QI), got {validate.shown(stages)}"
+        )
     device = open_device(device)
     wishes: list[dict] = [{"tolerance_db": tolerance_db} for tolerance_db in tolerances_db]
     if study:

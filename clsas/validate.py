@@ -5,8 +5,10 @@ Every check raises one exception that names the argument, what was given and wha
 
 from __future__ import annotations
 
+import contextlib
 import math
 import os
+import reprlib
 import sys
 import warnings
 from collections.abc import Sequence
@@ -17,6 +19,14 @@ import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 _LONGEST = 100  # characters of what was given, in a message
+_LONGEST_LINE = 1000  # characters of a message's line
+# Largest parts of a value that a message shows; lists within lists end in "...".
+_REPR = reprlib.Repr()
+_REPR.maxlevel = 4
+_REPR.maxlist = _REPR.maxtuple = _REPR.maxdict = _REPR.maxset = _REPR.maxfrozenset = 20
+_REPR.maxstring = _REPR.maxother = _REPR.maxlong = 2 * _LONGEST
+# Files that hold the most memory of a process's control group, version 2 and 1.
+_GROUP_LIMITS = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes")
 
 
 class ClsasWarning(UserWarning):
@@ -55,7 +65,7 @@ def number(
     scalar = value[()] if getattr(value, "ndim", None) == 0 else value
     if isinstance(scalar, bool) or not isinstance(scalar, Real) or np.ma.is_masked(value):
         kind = f"number in {unit}" if unit else "number"
-        raise TypeError(f"{name} must be one real {kind}, got {_shown(value)}")
+        raise TypeError(f"{name} must be one real {kind}, got {shown(value)}")
     try:
         result = float(scalar)
     except OverflowError:  # a whole number or fraction beyond float64
@@ -87,12 +97,14 @@ def positive(name: str, value: float, unit: str = "") -> float:
     return number(name, value, unit, above=0.0)
 
 
-def count(name: str, value: int, *, least: int = 1) -> int:
-    """Return `value` as an int of at least `least`; raises TypeError or ValueError."""
+def count(name: str, value: int, *, least: int = 1, most: int | None = None) -> int:
+    """Return `value` as an int from `least` to `most`; raises TypeError or ValueError."""
     if isinstance(value, bool) or not isinstance(value, (int, np.integer)):
-        raise TypeError(f"{name} must be a whole number, got {_shown(value)}")
+        raise TypeError(f"{name} must be a whole number, got {shown(value)}")
     if value < least:
-        raise ValueError(f"{name} must be at least {least}, got {value}")
+        raise ValueError(f"{name} must be at least {least}, got {shown(value)}")
+    if most is not None and value > most:
+        raise ValueError(f"{name} must be at most {most}, got {shown(value)}")
     return int(value)
 
 
@@ -100,7 +112,7 @@ def one_of(name: str, value: str, allowed: Sequence[str]) -> str:
     """Return `value` if it is one of `allowed`; raises ValueError naming them all."""
     if value not in allowed:
         raise ValueError(
-            f"{name} must be one of {', '.join(map(repr, allowed))}, got {_shown(value)}"
+            f"{name} must be one of {', '.join(map(repr, allowed))}, got {shown(value)}"
         )
     return value
 
@@ -115,7 +127,7 @@ def instance(name: str, value: object, *kinds: type) -> None:
 def path(name: str, value: object) -> Path:
     """Return `value` as a path; raises TypeError unless it is one, ValueError if it is empty."""
     if not isinstance(value, (str, os.PathLike)):
-        raise TypeError(f"{name} must be a path, got {_shown(value)}")
+        raise TypeError(f"{name} must be a path, got {shown(value)}")
     if not os.fspath(value):
         raise ValueError(f"{name} must be a path, got an empty one")
     return Path(os.fspath(value))
@@ -133,22 +145,65 @@ def suffix(name: str, value: Path, *allowed: str) -> None:
 def progress(given: object) -> None:
     """Raise TypeError unless `given`, a progress argument, can be called or is None."""
     if not (given is None or callable(given)):
-        raise TypeError(f"progress must be a function or None, got {given!r}")
+        raise TypeError(f"progress must be a function or None, got {shown(given)}")
+
+
+def shown(value: object) -> str:
+    """Return a value as a message shows it: shortened, and without control characters."""
+    try:
+        text = _REPR.repr(value)
+    except Exception:  # what a stranger's __repr__ raises must not hide the message
+        text = f"<{type(value).__name__}>"
+    text = text if len(text) <= _LONGEST else f"{text[: _LONGEST - 3]}..."
+    return printable(text)
+
+
+def printable(text: str) -> str:
+    """Return a text whose control characters but for line feeds are escaped, its lines shortened.
+
+    A terminal obeys control characters, and names of files may hold any.
+    """
+    escaped = "".join(
+        c if c.isprintable() or c == "\n" else c.encode("unicode_escape").decode() for c in text
+    )
+    return "\n".join(
+        line if len(line) <= _LONGEST_LINE else f"{line[: _LONGEST_LINE - 3]}..."
+        for line in escaped.split("\n")
+    )
 
 
 def memory(name: str, size_bytes: float) -> None:
-    """Raise ValueError if what argument `name` asks for is larger than this machine's memory.
+    """Raise ValueError if what `name` asks for is larger than the memory of this process.
 
-    Where the system does not tell its memory nothing is refused.
+    That is the machine's, or less where the process's control group or address space is limited.
+    Where the system does not tell nothing is refused.
     """
-    if "SC_PHYS_PAGES" not in getattr(os, "sysconf_names", ()):
-        return
-    available = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    if size_bytes > available:
+    available = _memory_bytes()
+    if not size_bytes <= available:  # nor NaN
+        try:
+            asked = f"{size_bytes / 2**30:.3g} GiB"
+        except OverflowError:  # a whole number beyond float64
+            asked = "more than 1e300 GiB"
         raise ValueError(
             f"{name} must ask for at most {available / 2**30:.3g} GiB, this machine's memory, "
-            f"got {size_bytes / 2**30:.3g} GiB"
+            f"got {asked}"
         )
+
+
+def _memory_bytes() -> float:
+    """Return the most memory that this process may have, infinite where that is not told."""
+    limits = [math.inf]
+    if "SC_PHYS_PAGES" in getattr(os, "sysconf_names", ()):
+        limits.append(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
+    for file in _GROUP_LIMITS:
+        with contextlib.suppress(OSError, ValueError):  # no such group, or "max"
+            limits.append(int(Path(file).read_text()))
+    with contextlib.suppress(ImportError):  # of Unix
+        import resource
+
+        soft, _ = resource.getrlimit(resource.RLIMIT_AS)
+        limits.append(math.inf if soft == resource.RLIM_INFINITY else soft)
+    return min(limits)
 
 
 def array(
@@ -180,7 +235,8 @@ def array(
     TypeError
         If the values are not numbers of a kind that fits `dtype`.
     ValueError
-        If the shape differs, an axis is empty, or a value is NaN, infinite or masked.
+        If the shape differs, an axis is empty, a value is NaN, infinite or masked, or `dtype`
+        cannot hold the values: they overflow, or all are too small to be told apart.
 
     Notes
     -----
@@ -212,7 +268,9 @@ def array(
     if not fits:
         wanted = ", ".join("any" if axis is None else str(axis) for axis in shape)
         raise ValueError(f"{name} must have shape ({wanted}) and no empty axis, got {given.shape}")
-    with np.errstate(over="ignore"):
+    if given.dtype.kind in "fc" and np.can_cast(dtype, given.dtype) and dtype != given.dtype:
+        _check_narrowing(name, given, dtype)
+    with np.errstate(over="ignore", under="ignore"):
         result = np.ascontiguousarray(given, dtype=dtype)
     with np.errstate(over="ignore", invalid="ignore"):
         finite = np.isfinite(np.add.reduce(result, axis=None))  # else sums may merely be too large
@@ -226,11 +284,23 @@ def array(
     return result
 
 
+def _check_narrowing(name: str, given: NDArray, dtype: np.dtype) -> None:
+    """Raise ValueError unless a narrower float type holds values to its precision.
+
+    What is small beside the largest value may become 0. From the least normal number on, the
+    largest one keeps all its digits, and the others what these leave.
+    """
+    kind = np.finfo(dtype)
+    least, most = float(kind.tiny), float(kind.max)
+    parts = (given.real, given.imag) if given.dtype.kind == "c" else (given,)
+    ends = [f.reduce(part, axis=None) for part in parts for f in (np.fmin, np.fmax)]
+    largest = float(np.max(np.abs(ends)))
+    if 0 < largest < least or most < largest < math.inf:
+        raise ValueError(
+            f"{name} must have a largest value from {least:.2g} to {most:.2g}, as {kind.dtype} "
+            f"holds it, got {largest:.3g}: scale them"
+        )
+
+
 def _in(unit: str) -> str:
     return f" {unit}" if unit else ""
-
-
-def _shown(value: object) -> str:
-    """Return what was given as a message shows it: not all of a long text."""
-    text = repr(value)
-    return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 3]}..."

@@ -133,7 +133,9 @@ class BeamWindow:
         if self.track_pings is not None:
             fields["track_pings"] = validate.count("track_pings", self.track_pings, least=5)
         if not isinstance(self.normalise, (bool, np.bool_)):
-            raise TypeError(f"normalise must be True or False, got {self.normalise!r}")
+            raise TypeError(
+                f"normalise must be True or False, got {validate.shown(self.normalise)}"
+            )
         for name, value in fields.items():
             object.__setattr__(self, name, value)
 

@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+import warnings
 from pathlib import Path
 
 import click
@@ -17,7 +18,7 @@ import pytest
 from click.testing import CliRunner
 
 import clsas
-from clsas import bench, cli, costs, demo
+from clsas import bench, cli, costs, demo, validate
 from clsas.config import built_in_scene, read_scene
 
 pytest.importorskip("matplotlib")
@@ -751,3 +752,33 @@ def test_documentation_pages_are_listed_and_links_lead_somewhere():
             assert (page.parent / link).exists(), (page, link)
     for page in (ROOT / "docs").glob("*.md"):
         assert f"(docs/{page.name})" in README
+
+
+def test_pipes_and_devices_are_refused_as_inputs(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    for path, kind in ((tmp_path / "pipe", "a pipe"), ("/dev/zero", "a device")):
+        for command in ("simulate", "compress"):
+            _, stderr = run(command, path, "-o", tmp_path / "out.h5", code=2)
+            assert f"must be an ordinary file, got {kind}" in stderr
+
+
+def test_messages_hold_no_control_characters(tmp_path):
+    path = tmp_path / "\x1b[31mname\x07"
+    path.write_text("[sonar")
+    for given, code in ((path, 1), (tmp_path / "\x1b]0;x", 2)):
+        _, stderr = run("simulate", given, "-o", tmp_path / "out.h5", code=code)
+        assert "\x1b" not in stderr
+        assert stderr.count("Error: ") == 1
+
+
+def test_warnings_of_others_are_not_shown_as_clsas_own(monkeypatch, tmp_path):
+    def warn(*_, **__):
+        warnings.warn("of another library", DeprecationWarning, stacklevel=1)
+        validate.warn("of clsas\x1b")
+        raise ValueError("end")
+
+    monkeypatch.setattr("clsas.cli.lines.read_scene", warn)
+    (tmp_path / "scene.toml").touch()
+    _, stderr = run("simulate", tmp_path / "scene.toml", "-o", tmp_path / "out.h5", code=1)
+    assert "Warning: of clsas\\x1b\n" in stderr
+    assert "\nWarning: of another" not in f"\n{stderr}"

@@ -425,3 +425,51 @@ def test_files_that_cannot_be_read(tmp_path):
         ValueError, match=r"scene\.toml: \[track\] file must be readable: No such file .*none\.csv"
     ):
         config.read_scene(tmp_path / "scene.toml")
+
+
+@pytest.mark.parametrize("depth", [100, 300, 500, 100_000])
+@pytest.mark.parametrize("start", ["a=", "[[targets]]\nposition_m="])
+def test_nested_tables_are_one_error(depth, start):
+    text = start + "[" * depth + "]" * depth
+    with pytest.raises(
+        ValueError, match=r"scene.toml: .*(nested too deep|must be|unknown)"
+    ) as error:
+        config.parse_scene(text.encode(), name="scene.toml", folder=Path())
+    assert len(str(error.value)) < 1000
+
+
+def test_a_thousand_mistakes_are_one_short_message():
+    text = "\n".join(f"key{i} = 1" for i in range(1000))
+    with pytest.raises(ValueError, match="unknown table") as error:
+        config.parse_scene(text.encode(), name="scene.toml", folder=Path())
+    lines = str(error.value).splitlines()
+    assert len(lines) == 21
+    assert lines[-1] == "scene.toml: and 980 more mistakes"
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        '[sonar]\npreset = "{}"',
+        '[sonar]\n"{}" = 1',
+        '"{}" = 1',
+        '[track]\npings = "{}"',
+        '[seabed]\nscene = "rocks"\n"{}" = 1',
+        '[simulate]\nsnr_db = ["{}"]',
+    ],
+)
+def test_messages_shorten_and_escape_what_was_given(text):
+    text = text.format("\\u001b[31m" + "x" * 100_000)
+    with pytest.raises(ValueError, match=r"\\x1b\[31mxxx") as error:
+        config.parse_scene(text.encode(), name="scene.toml", folder=Path())
+    assert len(str(error.value)) < 500
+    assert "\x1b" not in str(error.value)
+
+
+def test_a_damaged_track_is_one_short_message(tmp_path):
+    path = tmp_path / "track.csv"
+    for text in ("x" * 10**6, "time_s,x_m,y_m,z_m\n" + "1" * 200_000, 'time_s,"x_m\n\0'):
+        path.write_text(text)
+        with pytest.raises(ValueError, match=r"track\.csv") as error:
+            config.read_track(path)
+        assert len(str(error.value)) < 500

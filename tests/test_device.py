@@ -262,6 +262,28 @@ def test_a_program_is_built_once_for_all_its_kernels(platform, monkeypatch):
     assert platform.kernel("backproject", "backproject_points", **options)
 
 
+def test_only_the_programs_used_last_are_kept(platform, monkeypatch):
+    monkeypatch.setattr(module, "_MOST_PROGRAMS", 3)
+    device = dataclasses.replace(platform, _kernels={})
+    first = device.kernel("peak", "peak", WIDTH=1)
+    for unused in range(5):
+        assert device.kernel("peak", "peak", WIDTH=1) is first  # used again and again
+        device.kernel("peak", "peak", WIDTH=1, UNUSED=unused)
+    assert len(device._kernels) == 3
+    for unused in range(3):
+        device.kernel("peak", "peak", WIDTH=1, UNUSED=unused)
+    assert len(device._kernels) == 3
+    again = device.kernel("peak", "peak", WIDTH=1)
+    assert again is not first
+    assert first.function_name == again.function_name  # what a run holds goes on living
+
+
+def test_kernels_are_released_with_the_last_that_holds_them(platform):
+    """Those of Program.all_kernels have a reference too many, and never are."""
+    kernel = platform.kernel("backproject", "backproject_tiles", **OPTIONS)
+    assert kernel.reference_count == 1
+
+
 def test_a_failed_build_shows_the_compilers_log(platform, monkeypatch):
     broken = "__kernel void broken(__global float *x) { x[0] = no_such_variable; }"
     monkeypatch.setattr(module, "kernel_source", lambda name: broken * name.endswith(".cl"))

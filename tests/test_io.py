@@ -8,11 +8,11 @@ import h5py
 import numpy as np
 import pytest
 
-from clsas import io
+from clsas import io, validate
 from clsas.echoes import Echoes
 from clsas.grid import Grid
 from clsas.image import Image
-from clsas.io import FileFormatError, load, save, to_xarray
+from clsas.io import FileFormatError, load, read_geometry, read_samples, save, to_xarray
 from clsas.lines import RangeLines
 from clsas.sonar import Pulse
 
@@ -255,6 +255,89 @@ def test_samples_never_written_are_refused(shape, chunks, tmp_path):
             samples[:2, :6] = samples[2:4, :4] = 1  # all but one of the chunks of the small one
     with pytest.raises(FileFormatError, match=r"file\.h5 lacks a part of /samples, of shape"):
         load(path)
+
+
+def elsewhere(file, name, folder):
+    """Put something in the place of a dataset whose values lie in another file or place."""
+    del file[name]
+    match folder.name:
+        case "external link":
+            file[name] = h5py.ExternalLink(folder / "other.h5", name)
+        case "soft link":
+            file[name] = h5py.SoftLink("/first_range_m")
+        case "external storage":
+            file.create_dataset(name, (4, 3), "f8", external=[(folder / "other.h5", 0, 96)])
+        case "virtual dataset":
+            layout = h5py.VirtualLayout((4, 3), "f8")
+            layout[...] = h5py.VirtualSource(folder / "other.h5", name, (4, 3))
+            file.create_virtual_dataset(name, layout)
+
+
+@pytest.mark.parametrize("name", ["samples", "tx_m"])
+@pytest.mark.parametrize(
+    "way", ["external link", "soft link", "external storage", "virtual dataset"]
+)
+def test_only_the_file_itself_is_read(way, name, tmp_path):
+    folder = tmp_path / way
+    folder.mkdir()
+    path = folder / "file.h5"
+    for each in (path, folder / "other.h5"):
+        save(each, OBJECTS["lines"])
+    with h5py.File(path, "r+") as file:
+        elsewhere(file, name, folder)
+    with pytest.raises(FileFormatError, match=rf"file\.h5 must hold {name} itself, got a "):
+        load(path)
+    with pytest.raises(FileFormatError, match=rf"file\.h5 must hold {name} itself, got a "):
+        read_geometry(path)
+    if name == "samples":
+        with pytest.raises(FileFormatError, match=r"file\.h5 must hold samples itself"):
+            read_samples(path, slice(1), slice(1))
+
+
+def test_an_object_is_no_part_of_itself(tmp_path):
+    path = tmp_path / "file.h5"
+    save(path, OBJECTS["echoes"])
+    with h5py.File(path, "r+") as file:
+        del file["pulse"]
+        file["pulse"] = file["/"]
+    with pytest.raises(FileFormatError, match="holds another object as pulse of the echoes"):
+        load(path)
+
+
+def test_what_does_not_fit_into_memory_is_refused_before_it_is_read(tmp_path, monkeypatch):
+    path = tmp_path / "file.h5"
+    save(path, OBJECTS["lines"])
+    with h5py.File(path, "r+") as file:
+        del file["samples"]
+        shape = 4, 1 << 20
+        file.create_dataset("samples", data=np.zeros(shape, np.complex64), compression="gzip")
+    assert path.stat().st_size < 1 << 20
+    assert load(path).samples.shape == shape
+    monkeypatch.setattr(validate, "_memory_bytes", lambda: 10 << 20)
+    monkeypatch.setattr(h5py.Dataset, "__getitem__", None)
+    words = r"file\.h5 is too large: reading /samples must ask for at most 0.00977 GiB"
+    with pytest.raises(FileFormatError, match=words):
+        load(path)
+    with pytest.raises(FileFormatError, match=words):
+        read_samples(path, slice(0, 4), slice(0, 1 << 20))
+
+
+@pytest.mark.parametrize("values", [np.array([b"x"] * 4), np.ones(4, "?")], ids=["text", "bool"])
+def test_other_than_numbers_are_refused(values, tmp_path):
+    path = tmp_path / "file.h5"
+    save(path, OBJECTS["lines"])
+    with h5py.File(path, "r+") as file:
+        del file["first_range_m"]
+        file["first_range_m"] = values
+    with pytest.raises(FileFormatError, match="must hold first_range_m as numbers, got"):
+        load(path)
+
+
+def test_a_pipe_or_device_is_refused_unopened(tmp_path):
+    os.mkfifo(tmp_path / "pipe.h5")
+    for path, kind in ((tmp_path / "pipe.h5", "a pipe"), ("/dev/zero", "a device")):
+        with pytest.raises(FileFormatError, match=f"must be an ordinary file, got {kind}"):
+            load(path)
 
 
 def test_a_pulse_alone_is_no_file(tmp_path):

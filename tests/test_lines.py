@@ -3,6 +3,9 @@ import dataclasses
 import numpy as np
 import pytest
 
+from clsas.echoes import Echoes
+from clsas.grid import Grid
+from clsas.image import Image
 from clsas.lines import RangeLines
 
 
@@ -132,3 +135,16 @@ def test_it_is_shown_in_one_line():
     text = repr(make())
     assert text.startswith("RangeLines(4 channels of ")
     assert len(text) < 200
+
+
+def test_samples_that_float32_does_not_hold_are_refused():
+    for scale in (1e-50, 1e50):
+        samples = scale * np.ones((2, 3), np.complex128)
+        with pytest.raises(ValueError, match=r"samples must have .* got 1e[+-]50: scale them"):
+            RangeLines(samples, 1.0, 0.1, (0, 0, 0), (0, 0, 0), 1e5, 1500.0)
+        with pytest.raises(ValueError, match="scale them"):
+            Echoes(samples, 0.0, 1e5, 1e5, (0, 0, 0), (0, 0, 0), 1500.0)
+        with pytest.raises(ValueError, match="scale them"):
+            Echoes(samples.real, 0.0, 1e5, 1e5, (0, 0, 0), (0, 0, 0), 1500.0)
+        with pytest.raises(ValueError, match="scale them"):
+            Image(samples, Grid.plane((0, 1, 3), (0, 1, 2)))

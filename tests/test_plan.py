@@ -48,6 +48,13 @@ def any_plan(request):
 # Text
 
 
+def changeable(plan):
+    """A plan's JSON as a dict that may be changed: without its digest."""
+    values = json.loads(plan.to_json())
+    del values["digest"]
+    return values
+
+
 def test_text_gives_the_same_plan(any_plan):
     again = Plan.from_json(any_plan.to_json())
     assert again.to_json() == any_plan.to_json()
@@ -118,7 +125,7 @@ def test_text_that_is_no_plan_is_refused(text):
 )
 def test_a_plan_with_a_wrong_value_is_refused(chosen, field, value):
     """Before a device reads what is not there."""
-    values = json.loads(chosen.to_json())
+    values = changeable(chosen)
     with pytest.raises((ValueError, TypeError)):
         Plan.from_json(json.dumps(values | {field: value}))
 
@@ -126,14 +133,14 @@ def test_a_plan_with_a_wrong_value_is_refused(chosen, field, value):
 @pytest.mark.parametrize("coefficients", ["none", [[1.0]], [[[None]]], []])
 @pytest.mark.parametrize("name", ["align", "aperture", "final"])
 def test_a_filter_that_is_none_is_refused(chosen, name, coefficients):
-    values = json.loads(chosen.to_json())
+    values = changeable(chosen)
     values[name]["coefficients"] = coefficients
     with pytest.raises((ValueError, TypeError)):
         Plan.from_json(json.dumps(values))
 
 
 def test_a_plan_with_a_field_too_many_or_too_few_is_refused(chosen):
-    values = json.loads(chosen.to_json())
+    values = changeable(chosen)
     with pytest.raises(ValueError, match="unknown"):
         Plan.from_json(json.dumps(values | {"unknown": 1}))
     del values["sides"]
@@ -150,6 +157,22 @@ def test_it_is_immutable(any_plan):
     for each in (any_plan, Plan.from_json(any_plan.to_json())):
         for name in ("sides", "tile", "nearest", "half_lengths", "stages"):
             assert isinstance(getattr(each, name), tuple), name
+
+
+def test_a_changed_number_is_found(chosen):
+    text = chosen.to_json()
+    Plan.from_json(json.dumps(json.loads(text), indent=None, sort_keys=True))  # says the same
+    position = text.index('"coefficients"') + 60
+    position += next(i for i, c in enumerate(text[position:]) if c in "12345678")
+    changed = text[:position] + str(int(text[position]) + 1) + text[position + 1 :]
+    with pytest.raises(ValueError, match="its digest differs"):
+        Plan.from_json(changed)
+
+
+@pytest.mark.parametrize("text", ["[" * 100_000, '{"a":' * 100_000, "[]", "5", "", "{", '{"a": 1}'])
+def test_other_text_is_no_plan(text):
+    with pytest.raises(ValueError, match=r"text must be a plan as of Plan\.to_json"):
+        Plan.from_json(text)
 
 
 @pytest.mark.parametrize("name", ["align", "aperture", "final"])

@@ -315,3 +315,8 @@ def test_bad_built_ins(make, arguments, error, message):
 def test_bad_details(make, arguments, message):
     with pytest.raises(ValueError, match=message):
         make(**arguments)
+
+
+def test_boulders_are_as_many_as_a_field_holds():
+    with pytest.raises(ValueError, match="count must be at most 100000, got 1000000000"):
+        scene.rocks(count=10**9)

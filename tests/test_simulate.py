@@ -1,4 +1,5 @@
 import importlib
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -8,7 +9,7 @@ from scipy.special import erfc, fresnel
 from clsas.echoes import Echoes
 from clsas.geometry import bistatic_range_m
 from clsas.scene import PointTargets, Seabed, View
-from clsas.simulate import simulate, simulate_lines
+from clsas.simulate import _terms, simulate, simulate_lines
 from clsas.sonar import Pulse, Sonar, line_array
 from clsas.track import Pointing, Track, channels
 from clsas.validate import ClsasWarning
@@ -675,3 +676,29 @@ def test_line_arguments_of_another_type(arguments):
 def test_bad_points(arguments, error, message):
     with pytest.raises(error, match=message):
         PointTargets(**{"positions_m": [[1, 2, 3]], **arguments})
+
+
+@pytest.mark.parametrize("length_m", [1e6, 1e12, 1e300, 1e308])
+@pytest.mark.parametrize("name", ["rx_length_m", "tx_height_m"])
+def test_elements_too_long_for_memory_are_an_error_at_once(name, length_m):
+    with pytest.raises(ValueError, match="the sonar's element lengths must ask for at most"):
+        simulate(replace(SMOOTH, **{name: length_m}), TRACK, PointTargets([[3, 40, 4]]))
+
+
+def test_the_terms_of_long_elements_pass_what_floats_hold():
+    """Powers overflow from about 700 on, before Q! catches up."""
+    reach = np.array([5000.0])
+    terms = _terms(reach, 2.0, 1e-6)
+    assert terms == pytest.approx(np.e * 5000, rel=0.01)
+    assert terms * np.log(reach[0]) - math.lgamma(terms + 1) + np.log(2 / (terms + 1)) < -13.8
+
+
+def test_a_survey_too_large_for_memory_is_an_error_before_its_channels_are_laid_out(monkeypatch):
+    module = importlib.import_module("clsas.simulate")  # hidden by the function
+    monkeypatch.setattr(module, "channels", None)
+    track = Track.straight((0, 0, 0), (1, 0, 0), pings=10**6, ping_interval_s=0.1)
+    sonar = replace(SMOOTH, rx_m=np.zeros((1000, 3)))
+    with pytest.raises(ValueError, match=r"sonar and track must ask for at most .* GiB"):
+        simulate(sonar, track, SCENE)
+    with pytest.raises(ValueError, match=r"range_m must ask for at most .* GiB"):
+        simulate(sonar, track, SCENE, range_m=(30, 40))

@@ -1,3 +1,5 @@
+import subprocess
+import sys
 from fractions import Fraction
 
 import numpy as np
@@ -156,12 +158,33 @@ def test_array_refuses_ragged_lists():
         validate.array("x", [[1, 2], [3]], np.float64, (None, None))
 
 
-@pytest.mark.parametrize("bad", [np.nan, np.inf, complex(0, np.nan), 1e300 + 0j])
+@pytest.mark.parametrize("bad", [np.nan, np.inf, complex(0, np.nan)])
 def test_array_counts_what_is_not_finite(bad):
     given = np.ones((2, 3), np.complex128)
     given[1, 2] = bad
     with pytest.raises(ValueError, match="samples must be finite, got 1 NaN or infinite of 6"):
         validate.array("samples", given, np.complex64, (None, None))
+
+
+@pytest.mark.parametrize("scale", [1e-300, 1e-50, 1e-40, 1e-38, 1e39, 1e300])
+@pytest.mark.parametrize("part", [1, 1j])
+def test_array_refuses_values_that_a_narrower_type_does_not_hold(scale, part):
+    given = np.zeros((2, 3), np.complex128)
+    given[1, 2] = -scale * part
+    with pytest.raises(ValueError, match=r"samples must have .* from 1.2e-38 to 3.4e\+38.*scale"):
+        validate.array("samples", given, np.complex64, (None, None))
+
+
+@pytest.mark.parametrize("scale", [1.2e-38, 1e38])
+def test_array_keeps_float32s_digits_to_the_ends_of_its_range(scale):
+    given = scale * np.random.default_rng(1).uniform(-1, 1, (50, 3))
+    given[0] = scale, 1e-60, 0  # what is lost beside the largest value
+    held = validate.array("x", given, np.float32, (None, None))
+    np.testing.assert_allclose(held, given, rtol=0, atol=6e-8 * scale)
+
+
+def test_array_holds_zeros():
+    assert not validate.array("x", np.zeros(3), np.float32, (3,)).any()
 
 
 def test_array_stretches_one_entry_over_the_first_axis():
@@ -175,3 +198,44 @@ def test_array_stretches_one_entry_over_the_first_axis():
 def test_array_does_not_stretch_anything_else(given):
     with pytest.raises(ValueError, match=r"tx_m must have shape \(4, 3\)"):
         validate.array("tx_m", given, np.float64, (4, 3), broadcast=True)
+
+
+def test_shown_is_short_and_escapes_what_a_terminal_obeys():
+    assert validate.shown(1.5) == "1.5"
+    assert validate.shown("a\x1b[31m\nb") == r"'a\x1b[31m\nb'"
+    nested = []
+    for _ in range(100_000):
+        nested = [nested]
+    for long in ("x" * 10**6, list(range(10**6)), nested, 10**10_000, {"x": "y" * 10**6}):
+        assert len(validate.shown(long)) <= 100
+
+
+def test_shown_survives_a_repr_that_raises():
+    class Bad:
+        def __repr__(self):
+            raise RuntimeError
+
+    assert "Bad" in validate.shown(Bad())
+
+
+def test_printable_keeps_lines_and_text():
+    assert validate.printable("größer als 5 µs\nnext") == "größer als 5 µs\nnext"
+    assert validate.printable("a\x1b]0;title\x07\r\u202e\udcff") == (
+        r"a\x1b]0;title\x07\r\u202e\udcff"
+    )
+    assert [len(line) for line in validate.printable("x" * 5000 + "\nb").split("\n")] == [1000, 1]
+
+
+def test_memory_heeds_the_limit_of_the_address_space():
+    script = (
+        "import resource; from clsas import validate; validate.memory('x', 3 << 30);"
+        "resource.setrlimit(resource.RLIMIT_AS, (2 << 30,) * 2); validate.memory('x', 3 << 30)"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    assert "ValueError: x must ask for at most 2 GiB" in done.stderr
+
+
+@pytest.mark.parametrize("size", [1e30, float("inf"), 10**400])
+def test_memory_refuses_any_size(size):
+    with pytest.raises(ValueError, match=r"x must ask for at most .* GiB"):
+        validate.memory("x", size)

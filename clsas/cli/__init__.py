@@ -8,11 +8,13 @@ from __future__ import annotations
 
 import importlib
 import warnings
+from collections.abc import Callable
 from typing import Any
 
 import click
 
 import clsas
+from clsas import validate
 
 # A command's module imports the library, which takes a second: --help and --version do without.
 # By command: its module, and the first sentence of its help.
@@ -86,9 +88,12 @@ class _Commands(click.Group):
         with warnings.catch_warnings():
             warnings.simplefilter("always", clsas.ClsasWarning)
             warnings.simplefilter("ignore", pyopencl.CompilerWarning)
-            warnings.showwarning = _show_warning
+            warnings.showwarning = _showing(warnings.showwarning)
             try:
                 return super().invoke(ctx)
+            except click.ClickException as error:
+                error.message = validate.printable(error.message)  # type: ignore[misc]
+                raise
             except BrokenPipeError:
                 raise  # click's: whoever reads our output has left
             except KeyboardInterrupt:
@@ -118,11 +123,23 @@ def main(traceback: bool) -> None:
     """
 
 
-def _show_warning(message: Warning | str, *_: Any, **__: Any) -> None:
-    click.echo(f"Warning: {message}", err=True)
+def _showing(others: Callable[..., None]) -> Callable[..., None]:
+    """Return what shows a warning: one of clsas as a message, others as Python does."""
+
+    def show(message: Warning | str, category: type[Warning], *where: Any, **options: Any) -> None:
+        if issubclass(category, clsas.ClsasWarning):
+            click.echo(f"Warning: {validate.printable(str(message))}", err=True)
+        else:
+            others(message, category, *where, **options)
+
+    return show
 
 
 def _message(error: BaseException) -> str:
+    return validate.printable(_text(error))
+
+
+def _text(error: BaseException) -> str:
     if isinstance(error, OSError) and error.strerror:
         return f"{error.strerror}: {error.filename}" if error.filename else error.strerror
     if isinstance(error, MemoryError):

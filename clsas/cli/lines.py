@@ -14,6 +14,7 @@ from clsas.cli.inputs import load, read_scene, warn_of_sampling
 from clsas.cli.outputs import progress_bar, report
 from clsas.cli.parameters import INPUT
 from clsas.compress import check_options
+from clsas.simulate import check_size
 
 
 @click.command()
@@ -29,6 +30,7 @@ def simulate(scene_file: Path, output: Path, png: Path | None, as_json: bool) ->
     """
     scene = read_scene(scene_file)
     sonar, track, targets = scene.need("sonar", "track", "targets")
+    check_size(sonar, track, scene.simulate.get("range_m"))
     warn_of_sampling(scene)
     with progress_bar("simulating") as progress:
         start = time.perf_counter()

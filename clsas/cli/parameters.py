@@ -15,6 +15,7 @@ import click
 
 from clsas import validate
 from clsas.extras import install_command
+from clsas.reading import check_ordinary
 
 
 class Parsed(click.ParamType):
@@ -40,7 +41,7 @@ class Parsed(click.ParamType):
         try:
             return self._parse(value)
         except (ValueError, ArithmeticError):
-            self.fail(f"{value!r} must be {self._wanted}", param, ctx)
+            self.fail(f"{validate.shown(value)} must be {self._wanted}", param, ctx)
 
 
 def _axis(text: str) -> tuple[float, float, int]:
@@ -99,6 +100,11 @@ class File(click.Path):
         if not os.fspath(value):
             self.fail("must be a path, got an empty one", param, ctx)
         path: Any = super().convert(value, param, ctx)
+        if not self.written and path.exists():
+            try:
+                check_ordinary(path)
+            except ValueError as error:
+                self.fail(str(error), param, ctx)
         for other in ctx.command.params:
             # Whichever comes second on the command line finds the first one here.
             if other is not param and isinstance(other.type, File):
