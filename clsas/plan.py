@@ -372,11 +372,13 @@ class Plan:
             return value.tolist() if isinstance(value, (np.ndarray, np.generic)) else value
 
         values = json.loads(json.dumps(asdict(self), default=plain))
-        if not filters:
+        if filters:
+            values["digest"] = _json_digest(values)
+        else:
             for part in values.values():
                 if isinstance(part, dict):
                     part.pop("coefficients", None)
-        return json.dumps(values | {"digest": _json_digest(values)}, indent=1)
+        return json.dumps(values, indent=1)
 
     @classmethod
     def from_json(cls, text: str) -> Plan:

@@ -139,7 +139,7 @@ def suffix(name: str, value: Path, *allowed: str) -> None:
     A name without a suffix, such as `image`, goes with any format.
     """
     if value.suffix and value.suffix.lower() not in allowed:
-        raise ValueError(f"{name} must end in {' or '.join(allowed)}, got {_shown(str(value))}")
+        raise ValueError(f"{name} must end in {' or '.join(allowed)}, got {shown(str(value))}")
 
 
 def progress(given: object) -> None:

@@ -731,7 +731,7 @@ def test_readme_tour(tmp_path, monkeypatch):
     )
     assert re.search(r"range +6\.86 mm wide at -3 dB \(theory 6\.86 mm", shown["demo"])
     assert "point at x = " in shown["quality"]
-    error_db = float(re.search(r"error relative to exact.h5: (.*) dB", shown["quality"])[1])
+    error_db = float(re.search(r"error relative to exact.h5: (\S*) dB;", shown["quality"])[1])
     assert error_db < -38
     assert shown["plan"].startswith("Plan: tolerance -40 dB")
     pictures = {path.name for path in Path().glob("*.png")}

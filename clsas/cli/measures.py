@@ -69,8 +69,8 @@ def quality(
         results["relative_error_db"] = error
         results["dark_error_db"], results["dark_level_db"] = dark_error, level
         text.append(
-            f"error relative to {reference}: {error:.1f} dB; in its darkest tenth, at "
-            f"{level:.1f} dB, {dark_error:.1f} dB of the level there"
+            f"error relative to {reference}: {error:.1f} dB; its darkest tenth lies at "
+            f"{level:.1f} dB and errs by {dark_error:.1f} dB of that level"
         )
     if near is not None:
         response = clsas.measure_point(pixels, near, search_m=search_m, extent_m=extent_m)

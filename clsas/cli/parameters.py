@@ -110,7 +110,7 @@ class File(click.Path):
             if other is not param and isinstance(other.type, File):
                 taken = ctx.params.get(other.name)
                 if self.written or other.type.written:
-                    keep_apart(_shown(other), taken, _shown(param), path)
+                    keep_apart(_option_name(other), taken, _option_name(param), path)
         return path
 
 
@@ -163,11 +163,11 @@ def keep_apart(one: str, path: Path | None, other: str, path_of_other: Path | No
 def written_to(ctx: click.Context) -> dict[str, Path]:
     """Return the files that the running command is to write, by the names of their options."""
     outputs = [p for p in ctx.command.params if isinstance(p.type, File) and p.type.written]
-    paths = {_shown(param): ctx.params.get(param.name) for param in outputs}
+    paths = {_option_name(param): ctx.params.get(param.name) for param in outputs}
     return {shown: path for shown, path in paths.items() if path is not None}
 
 
-def _shown(param: click.Parameter) -> str:
+def _option_name(param: click.Parameter) -> str:
     """Return how a parameter is called on the command line."""
     return param.opts[0] if isinstance(param, click.Option) else (param.metavar or "").strip("[]")
 
