@@ -15,6 +15,7 @@ from clsas.decibels import in_db, power
 from clsas.device import Device, open_device
 from clsas.effects import (
     BEAM,
+    ENDS,
     KEYS,
     SINGLE,
     SWAY,
@@ -122,7 +123,9 @@ class Assessment:
     @property
     def spare(self) -> tuple[str, ...]:
         """Effects that are modelled and not needed."""
-        return tuple(e.name for e in self.effects if e.modelled and e.needed is False)
+        return tuple(
+            e.name for e in self.effects if e.modelled and e.needed is False and e.name != ENDS
+        )
 
     @property
     def missing(self) -> tuple[str, ...]:

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from clsas.atomic import make_folders, replacing
+from clsas.reading import parse_json, read_bytes
 
 CHECKSUM = "crc32"
 """Attribute that holds the checksum of the other attributes."""
@@ -131,8 +132,8 @@ def read_attributes(folder: Path) -> dict[str, Any]:
         If it cannot be read.
     """
     try:
-        attributes = json.loads((folder / "zarr.json").read_text())["attributes"]
-    except (ValueError, LookupError, TypeError, RecursionError) as error:
+        attributes = parse_json(read_bytes(folder / "zarr.json"))["attributes"]
+    except (ValueError, LookupError, TypeError) as error:
         raise DamageError("its record cannot be read") from error
     if not isinstance(attributes, dict):
         raise DamageError("its record cannot be read")
