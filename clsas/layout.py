@@ -29,7 +29,8 @@ GEOMETRY_ERROR = 3.2e-5
 ROUNDING = 2.2e-7
 """Rms error of a phase, radians, per cycle over a part's radius: measured, of many channels."""
 
-_FEW_CHANNELS = 5.0  # the error of one channel is up to 2.4 times as large, by how it lies
+_ONE_CHANNEL = 5.0  # relative excess of the error power of a single channel, at worst
+_FEW_CHANNELS = 32  # of more, errors average to within a decibel of the mean
 
 _SIDES = (64, 32, 16)
 _AT_ONCE = 1024  # groups: what stays in a cache
@@ -338,7 +339,8 @@ def rounding_error(channels: int) -> float:
     Coefficients are rounded once per part and channel, so that the error of one channel depends on
     how it lies to the part; that of many averages out.
     """
-    return ROUNDING * math.sqrt(1 + _FEW_CHANNELS / channels)
+    excess = _ONE_CHANNEL / channels if channels <= _FEW_CHANNELS else 0.0
+    return ROUNDING * math.sqrt(1 + excess)
 
 
 def largest_radius_m(cycles_per_m: float, channels: int) -> float:
