@@ -14,7 +14,6 @@ from typing import Any
 import click
 
 import clsas
-from clsas import validate
 
 # A command's module imports the library, which takes a second: --help and --version do without.
 # By command: its module, and the first sentence of its help.
@@ -92,7 +91,7 @@ class _Commands(click.Group):
             try:
                 return super().invoke(ctx)
             except click.ClickException as error:
-                error.message = validate.printable(error.message)  # type: ignore[misc]
+                error.message = _printable(error.message)  # type: ignore[misc]
                 raise
             except BrokenPipeError:
                 raise  # click's: whoever reads our output has left
@@ -128,15 +127,22 @@ def _showing(others: Callable[..., None]) -> Callable[..., None]:
 
     def show(message: Warning | str, category: type[Warning], *where: Any, **options: Any) -> None:
         if issubclass(category, clsas.ClsasWarning):
-            click.echo(f"Warning: {validate.printable(str(message))}", err=True)
+            click.echo(f"Warning: {_printable(str(message))}", err=True)
         else:
             others(message, category, *where, **options)
 
     return show
 
 
+def _printable(text: str) -> str:
+    """Return a message without control characters; NumPy, which this imports, is slow to load."""
+    from clsas import validate
+
+    return validate.printable(text)
+
+
 def _message(error: BaseException) -> str:
-    return validate.printable(_text(error))
+    return _printable(_text(error))
 
 
 def _text(error: BaseException) -> str:
