@@ -195,7 +195,7 @@ def _mean_power(
     for block, scale in zip(
         np.array_split(parts, blocks), np.array_split(factor, blocks), strict=True
     ):
-        scaled = block * (scale / largest)[:, None]
+        scaled = block / largest * scale[:, None]
         amplitude = scipy.fft.fft(scaled.view(samples.dtype), length)
         power += _column_power(amplitude)
         # A Hann window over half of the FFT's length, where the lines lie.
@@ -246,7 +246,8 @@ def _image_power(
     # Samples about a range near all of them keep phases small.
     scale = _largest_part(part.samples) or 1.0
     turns = np.exp(-2j * np.pi * np.outer(np.arange(lines.length), frequency[coherent]))
-    spectra = (part.samples / scale) @ turns
+    scaled = (part.samples.view(np.float32) / scale).view(np.complex64)
+    spectra = scaled @ turns
     spectra *= np.exp(-2j * np.pi * np.outer(part.first_range_m, phase_per_m[coherent]))
     spectra *= np.exp(2j * np.pi * part.carrier_cycles_per_m * part.first_range_m)[:, None]
     steering = np.exp(2j * np.pi * range_m[..., None] * phase_per_m[coherent])

@@ -1,5 +1,6 @@
 """Effects that an image does without: only where no pixel can tell, and then they cost nothing."""
 
+import json
 from dataclasses import replace
 from functools import cache
 
@@ -190,10 +191,10 @@ def test_plans_without_the_key_leave_out_nothing():
     lines, grid, *_ = made(apart)
     chosen = plan(lines, grid, tolerance_db=-40, full_model=True)
     assert chosen.left_out == ()
-    assert '"left_out": []' in chosen.to_json()
-    text = chosen.to_json().replace(',\n "left_out": []', "")
-    assert "left_out" not in text
-    assert Plan.from_json(text).left_out == ()
+    values = json.loads(chosen.to_json())
+    assert values.pop("left_out") == []
+    del values["digest"]  # which is of all the rest
+    assert Plan.from_json(json.dumps(values)).left_out == ()
     with pytest.raises(ValueError, match="left_out must be some of"):
         replace(chosen, left_out=("gravity",))
 
