@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-import os
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -28,6 +26,7 @@ from clsas.lines import RangeLines, some_channels
 from clsas.reach import warn_unseen
 from clsas.simplify import Model, simplify
 from clsas.spectrum import Spectrum, cycles_per_m_at, measure_spectrum
+from clsas.threads import in_threads
 from clsas.window import HARDLY_SEEN, INTERVALS, BeamWindow, channel_ranges, sines
 
 BEST_ACCURACY_DB = -85.0
@@ -759,8 +758,8 @@ def upsampled_lines(
             else:
                 padded[some, part, inside] = values
 
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
-        list(pool.map(fill, _slices(slice(0, len(samples)), _LINES_AT_ONCE)))
+    for _ in in_threads(fill, _slices(slice(0, len(samples)), _LINES_AT_ONCE)):
+        pass
     return padded
 
 

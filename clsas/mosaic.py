@@ -15,7 +15,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Executor, Future, ThreadPoolExecutor, wait
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import chain
@@ -46,6 +46,7 @@ from clsas.provenance import WISHES, beam_json, inputs_of
 from clsas.record import Record, describe_damage
 from clsas.store import Store
 from clsas.survey import Survey, files_of, has_ended, largest_gap_m, open_files, open_survey
+from clsas.threads import uninterrupted, wait
 from clsas.window import MOST_TRACK_PINGS, BeamWindow, touches_boxes
 
 if TYPE_CHECKING:
@@ -165,19 +166,16 @@ class Mosaic:
                 for place in ready[: max(most - len(running), 0)]:
                     ready.remove(place)
                     todo.remove(place)
-                    future = executor.submit(_form, self._job_on(sight), *self._window(*place))
-                    running[future] = place
+                    with uninterrupted():
+                        job, window = self._job_on(sight), self._window(*place)
+                        running[executor.submit(_form, job, *window)] = place
                     known[place] = survey.channels
                 if not running and not todo and ended:
                     return
-                done, _ = wait(
-                    running or [Future()],
-                    timeout=None if ended and running else _POLL_S,
-                    return_when=FIRST_COMPLETED,
-                )
-                for future in done:
-                    place = running.pop(future)
-                    record, formed = future.result()
+                for future in wait(running or [Future()], None if ended and running else _POLL_S):
+                    with uninterrupted():
+                        place = running.pop(future)
+                        record, formed = future.result()
                     if self._job.store is not None:
                         self.finished[place] = record
                     yield self._patch(place, record, formed)
@@ -201,14 +199,18 @@ class Mosaic:
                 if news:
                     ready = self._ready(todo, sight, ended)
         finally:
-            for future in running:
-                future.cancel()
+            with uninterrupted():
+                begun = {future for future in running if not future.cancel()}
             # Patches begun are finished here; workers may have been lost.
-            executor.shutdown(wait=self._client is None)
-            if self._client is None and self._job.store is not None:
-                for future, place in running.items():
-                    if not future.cancelled() and future.exception() is None:
-                        self.finished[place] = future.result()[0]
+            left = begun if self._client is None else set()
+            while left:
+                left = left - wait(left)
+            with uninterrupted():
+                executor.shutdown(wait=self._client is None)
+                if self._client is None and self._job.store is not None:
+                    for future in begun:
+                        if future.exception() is None:
+                            self.finished[running[future]] = future.result()[0]
 
     def image(self, tell: Callable[[Patch], object] | None = None) -> Image:
         """Form what is not finished and return the whole image.

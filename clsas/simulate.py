@@ -22,9 +22,7 @@ echoes an error is summed only as exactly as that, in single precision where it 
 from __future__ import annotations
 
 import math
-import os
-from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import lru_cache, reduce
 from typing import Any, NamedTuple
@@ -44,6 +42,7 @@ from clsas.lines import RangeLines
 from clsas.scene import PointTargets, Seabed, View
 from clsas.sonar import PASSBAND, Sonar, element_pattern
 from clsas.spectral import EDGE_PRODUCT, smooth_edge
+from clsas.threads import in_threads
 from clsas.track import Channels, Pointing, Track, channels
 
 Scene = PointTargets | Seabed | tuple[PointTargets | Seabed, ...]
@@ -573,7 +572,7 @@ class _Paths:
             return [(min(nearest), max(farthest)) for nearest, farthest in both]
 
         found = np.array(
-            [ends for some in _in_threads(limits, self.together, workers) for ends in some]
+            [ends for some in in_threads(limits, self.together, workers) for ends in some]
         )
         return np.maximum(found.T, 0.0) / self.sound_speed_m_s
 
@@ -675,7 +674,7 @@ def _record(
 
     samples = np.empty((paths.channels, length), np.complex64)
     together = paths.together
-    for some, lines in zip(together, _in_threads(echoes, together, workers), strict=True):
+    for some, lines in zip(together, in_threads(echoes, together, workers), strict=True):
         for channel, line in zip(some, lines, strict=True):
             samples[channel] = line
             if progress is not None:
@@ -691,17 +690,6 @@ def _sum(angles: NDArray, strengths: NDArray, modes: int, error: float) -> NDArr
     return finufft.nufft1d1(
         angles, strengths, modes, eps=error, isign=-1, modeord=1, nthreads=1, spread_sort=0
     )
-
-
-def _in_threads(function: Callable, items: Iterable, workers: int | None) -> Iterator:
-    """Yield the function of every item, computed by threads; stop early if closed."""
-    if workers is not None:
-        workers = validate.count("workers", workers)
-    pool = ThreadPoolExecutor(workers or os.cpu_count())
-    try:
-        yield from pool.map(function, items)
-    finally:
-        pool.shutdown(cancel_futures=True)
 
 
 def _channels(tx_m: ArrayLike, rx_m: ArrayLike, rx_velocity_m_s: ArrayLike | None) -> Channels:

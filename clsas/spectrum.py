@@ -26,6 +26,7 @@ _COHERENT_CYCLES = 2.0  # of phase over the aperture, up to which common parts a
 _COHERENT_CHANNELS, _COHERENT_PLACES, _COHERENT_FREQUENCIES = 128, 3, 256  # sampled
 _FEW_FREQUENCIES = 4.0  # power at one frequency may err by 5 times as predicted
 _LOUDEST = 16  # channels sampled besides those spread evenly
+_SUMMABLE = 1e-20, 1e38  # energies that float32 squares and sums without loss
 _LINES_TOGETHER = 8  # transformed at once: they stay in the processor's caches
 
 
@@ -167,16 +168,24 @@ def _sampled_lines(
     some = some_channels(lines.channels, most_channels)
     if len(some) == lines.channels:
         return lines.samples, np.ones(lines.channels, np.float32)
-    # Relative to the largest part, since squares might overflow; row by row, in the caches.
-    scale = _largest_part(lines.samples) or 1.0
-    scaled = (row / scale for row in lines.samples.view(np.float32))
-    energy = np.array([np.vdot(row, row) for row in scaled], np.float64)
+    energy = _energy(lines.samples)
     loudest = np.argpartition(energy, -_LOUDEST)[-_LOUDEST:]
     even = np.setdiff1d(some, loudest)
     rest, held = energy.sum() - energy[loudest].sum(), energy[even].sum()
     weight = np.sqrt(max(rest, 0.0) / held) if held > 0 else 0.0
     factor = np.append(np.full(len(even), weight), np.ones(len(loudest))).astype(np.float32)
     return lines.samples[np.append(even, loudest)], factor
+
+
+def _energy(samples: NDArray[np.complex64]) -> NDArray[np.float64]:
+    """Energy of every line, in a unit of its own where squares would leave float32."""
+    parts = samples.view(np.float32)
+    with np.errstate(over="ignore"):
+        energy = np.einsum("ij,ij->i", parts, parts)
+    if not _SUMMABLE[0] < energy.max() < _SUMMABLE[1]:
+        parts = parts / (_largest_part(samples) or 1.0)
+        energy = np.einsum("ij,ij->i", parts, parts)
+    return energy.astype(np.float64)
 
 
 def _mean_power(
@@ -188,7 +197,7 @@ def _mean_power(
     lines that are cut. `factor` multiplies every line.
     """
     largest = _largest_part(samples) or samples.real.dtype.type(1)
-    length = scipy.fft.next_fast_len(2 * samples.shape[1])
+    length = scipy.fft.next_fast_len(max(2 * samples.shape[1], 4))
     power, faded = np.zeros(length), np.zeros(length)
     parts = samples.view(samples.real.dtype)
     blocks = -(-len(parts) // _LINES_TOGETHER)
@@ -199,9 +208,12 @@ def _mean_power(
         amplitude = scipy.fft.fft(scaled.view(samples.dtype), length)
         power += _column_power(amplitude)
         # A Hann window over half of the FFT's length, where the lines lie.
-        faded += _column_power(
-            amplitude - (np.roll(amplitude, 2, axis=1) + np.roll(amplitude, -2, axis=1)) / 2
-        )
+        around = np.empty_like(amplitude)
+        np.add(amplitude[:, :-4], amplitude[:, 4:], out=around[:, 2:-2])
+        around[:, :2] = amplitude[:, -2:] + amplitude[:, 2:4]
+        around[:, -2:] = amplitude[:, -4:-2] + amplitude[:, :2]
+        around *= 0.5
+        faded += _column_power(np.subtract(amplitude, around, out=around))
     frequency = scipy.fft.fftfreq(length)
     if not power.any():
         power[:] = 1.0

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import os
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import finufft
@@ -21,6 +20,7 @@ from clsas.lines import RangeLines
 from clsas.reach import warn_unseen
 from clsas.spectral import smooth_edge
 from clsas.spectrum import measure_spectrum
+from clsas.threads import in_threads
 from clsas.window import BeamWindow
 
 _SUM_ERROR = 1e-7  # of the non-uniform FFTs: what complex64 holds
@@ -367,8 +367,7 @@ def _form(
         ).reshape(-1, rows)
         return sum(part * track.row_range_m ** (0.5 - i) for i, part in enumerate(focused))
 
-    with ThreadPoolExecutor(workers) as pool:
-        focused = np.stack(list(pool.map(focus, range(len(modes)))), axis=1)
+    focused = np.stack(list(in_threads(focus, range(len(modes)), workers)), axis=1)
     start_m = track.pixel_along_m[:, 0] - track.pixel_along_m[0, 0]
     if start_m.any():  # every row begins at its own place along the track
         focused *= np.exp(1j * per_m * np.multiply.outer(start_m, modes))

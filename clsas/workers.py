@@ -17,6 +17,7 @@ from distributed import Client, Nanny, Scheduler, Security, SpecCluster, Worker
 from distributed.system import MEMORY_LIMIT
 
 from clsas.io import cache_folder
+from clsas.threads import uninterrupted
 
 
 class _NoPages:
@@ -64,24 +65,30 @@ def local_client(workers: int) -> Iterator[Client]:
         "local_directory": str(folder),
         "silence_logs": logging.CRITICAL,
     }
-    with ExitStack() as opened:
-        # Ctrl-C at a terminal is for this process, which then ends the others.
-        heeded = signal.signal(signal.SIGINT, signal.SIG_IGN)
-        try:
-            cluster = SpecCluster(
-                scheduler={"cls": _Scheduler, "options": {**shared, "port": 0}},
-                workers={index: {"cls": Nanny, "options": worker} for index in range(workers)},
-                security=security,
-                silence_logs=logging.CRITICAL,
-            )
-        except RuntimeError as error:
-            raise ChildProcessError(
-                f"a worker process ended while it started: {_cause(error)}"
-            ) from error
-        finally:
-            signal.signal(signal.SIGINT, heeded)
-        opened.enter_context(cluster)
-        yield opened.enter_context(Client(cluster))
+    # Ctrl-C at a terminal is for this process, which then ends the others.
+    heeded = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        cluster = SpecCluster(
+            scheduler={"cls": _Scheduler, "options": {**shared, "port": 0}},
+            workers={index: {"cls": Nanny, "options": worker} for index in range(workers)},
+            security=security,
+            silence_logs=logging.CRITICAL,
+        )
+    except RuntimeError as error:
+        raise ChildProcessError(
+            f"a worker process ended while it started: {_cause(error)}"
+        ) from error
+    finally:
+        signal.signal(signal.SIGINT, heeded)
+    opened = ExitStack()
+    try:
+        with uninterrupted():
+            opened.enter_context(cluster)
+            client = opened.enter_context(Client(cluster))
+        yield client
+    finally:
+        with uninterrupted():
+            opened.close()
 
 
 def _certificate() -> Security:

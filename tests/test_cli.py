@@ -5,10 +5,8 @@ import pty
 import re
 import shlex
 import shutil
-import signal
 import subprocess
 import sys
-import time
 import warnings
 from pathlib import Path
 
@@ -16,6 +14,7 @@ import click
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from interrupt import interrupted
 
 import clsas
 from clsas import bench, cli, costs, demo, validate
@@ -672,20 +671,9 @@ def test_ctrl_c_ends_with_130_and_leaves_no_file(tmp_path):
         "spacing_m = 0.02", "spacing_m = 1"
     )
     (tmp_path / "scene.toml").write_text(points + text.replace("snr_db = 20", ""))
-    command = [sys.executable, "-m", "clsas", "simulate", "scene.toml", "-o", "echoes.h5"]
-
-    def heed() -> None:
-        """A shell's background jobs, and so what they start, ignore Ctrl-C."""
-        signal.signal(signal.SIGINT, signal.SIG_DFL)
-
-    with subprocess.Popen(
-        command, cwd=tmp_path, stderr=subprocess.PIPE, text=True, preexec_fn=heed
-    ) as process:
-        assert process.stderr.readline().startswith("Warning: phase centres")
-        time.sleep(0.5)
-        process.send_signal(signal.SIGINT)
-        _, stderr = process.communicate(timeout=60)
-    assert process.returncode == 130
+    command = ["simulate", "scene.toml", "-o", "echoes.h5"]
+    code, stderr = interrupted(command, "Warning: phase centres", tmp_path, after_s=0.5)
+    assert code == 130
     assert stderr.splitlines()[-1] == "Interrupted"
     assert "Traceback" not in stderr
     assert [path.name for path in tmp_path.iterdir()] == ["scene.toml"]

@@ -4,13 +4,11 @@ import json
 import os
 import re
 import shutil
-import signal
-import subprocess
-import sys
 
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from interrupt import interrupted
 
 import clsas
 from clsas.cli import main
@@ -106,23 +104,8 @@ def test_ctrl_c_keeps_what_is_finished(made, tmp_path, workers):
     """It ends with 130, and the same command goes on."""
     command = ["mosaic", made[0] / "scene.toml", "--lines", lines_of(made)]
     command += ["-o", tmp_path / "a.zarr", "--patches", "10x8", *workers]
-
-    def heed() -> None:
-        """A shell's background jobs, and so what they start, ignore Ctrl-C."""
-        signal.signal(signal.SIGINT, signal.SIG_DFL)
-
-    with subprocess.Popen(
-        [sys.executable, "-m", "clsas", *map(str, command)],
-        stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True, preexec_fn=heed,
-        start_new_session=True,
-    ) as process:  # fmt: skip
-        lines = []
-        while not any(line.startswith("patch ") for line in lines):
-            lines.append(process.stderr.readline())
-            assert lines[-1], lines
-        os.killpg(process.pid, signal.SIGINT)  # as a terminal does, the workers too
-        _, stderr = process.communicate(timeout=60)
-    assert process.returncode == 130
+    code, stderr = interrupted(command, "patch ")
+    assert code == 130
     assert stderr.splitlines()[-1] == "Interrupted"
     assert "Traceback" not in stderr
     stdout, _ = run(*command[:-2] if workers else command)

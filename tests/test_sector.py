@@ -32,10 +32,12 @@ def any_track(request, wide):
     """The same, and with pings missing over more than a root and its beam."""
     if request.param == "whole":
         return wide
-    lines = wide.lines.select(np.flatnonzero(np.abs(wide.lines.tx_m[:, 0] - 2) > 8))
+    case = bench.scaled(512)
+    lines = case.lines()
+    lines = lines.select(np.flatnonzero(np.abs(lines.tx_m[:, 0] - 2) > 8))
     beam = BeamWindow(3.0, "hann")
-    chosen = plan(lines, wide.surface.grid, tolerance_db=-40, beam=beam, costs=EXACT_IS_SLOW)
-    return Geometry(lines, surface_of(wide.surface.grid), chosen)
+    chosen = plan(lines, case.grid, tolerance_db=-40, beam=beam, costs=EXACT_IS_SLOW)
+    return Geometry(lines, surface_of(case.grid), chosen)
 
 
 # What is formed

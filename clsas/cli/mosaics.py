@@ -22,6 +22,7 @@ from clsas.config import DIAL, SceneFile, simulation_digest
 from clsas.device import open_device
 from clsas.extras import install_command
 from clsas.mosaic import patch_shape_of
+from clsas.threads import uninterrupted
 
 _SCHEDULER_S = 10  # to answer
 _IDLE_S = 60.0  # after which nothing more is expected to come
@@ -242,7 +243,8 @@ def _cluster(workers: int | None, scheduler: str | None) -> Iterator[Any]:
     with ExitStack() as opened:
         if scheduler is not None:
             try:
-                client = opened.enter_context(Client(scheduler, timeout=_SCHEDULER_S))
+                with uninterrupted():
+                    client = opened.enter_context(Client(scheduler, timeout=_SCHEDULER_S))
             except (OSError, ValueError) as error:
                 raise click.ClickException(
                     f"--scheduler {scheduler} cannot be reached: {error}"
