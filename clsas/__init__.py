@@ -3,38 +3,37 @@
 from __future__ import annotations
 
 import importlib
-import sys
-from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from clsas import plot
-    from clsas.assess import Assessment, Effect, assess, survey_lines
-    from clsas.backproject import backproject
-    from clsas.compress import compress
-    from clsas.device import DeviceError, list_devices
-    from clsas.echoes import Echoes
-    from clsas.factorize import factorize
-    from clsas.grid import Grid
-    from clsas.image import Image
-    from clsas.io import FileFormatError, load, save, to_xarray
-    from clsas.lines import RangeLines
-    from clsas.mosaic import Mosaic, Patch, mosaic
-    from clsas.plan import Plan
-    from clsas.planner import plan
-    from clsas.quality import contrast, entropy, measure_point, relative_error_db
-    from clsas.sampling import check_sampling
-    from clsas.scene import PointTargets, Seabed
-    from clsas.simulate import simulate, simulate_lines
-    from clsas.sonar import Pulse, Sonar
-    from clsas.store import Store
-    from clsas.track import Pointing, Track, channels
-    from clsas.tradeoff import Tradeoff, tradeoff
-    from clsas.validate import ClsasWarning
-    from clsas.wavenumber import wavenumber
-    from clsas.window import BeamWindow
+    from clsas.core.grid import Grid
+    from clsas.core.image import Image
+    from clsas.core.image_error import relative_error_db
+    from clsas.core.lines import RangeLines
+    from clsas.core.validate import ClsasWarning
+    from clsas.exact.backprojection import backproject
+    from clsas.exact.wavenumber import wavenumber
+    from clsas.factorized.plan import Plan
+    from clsas.files.hdf5 import FileFormatError, load, save, to_xarray
+    from clsas.mosaics.mosaic import Mosaic, Patch, mosaic
+    from clsas.mosaics.store import Store
+    from clsas.opencl.device import DeviceError, list_devices
+    from clsas.planning.factorize import factorize
+    from clsas.planning.planner import plan
+    from clsas.products import plot
+    from clsas.products.assessment import Assessment, Effect, assess, survey_lines
+    from clsas.products.quality import contrast, entropy, measure_point
+    from clsas.products.tradeoff import Tradeoff, tradeoff
+    from clsas.signal.compression import compress
+    from clsas.signal.echoes import Echoes
+    from clsas.simulation.scenes import PointTargets, Seabed
+    from clsas.simulation.simulator import simulate, simulate_lines
+    from clsas.sonar.beam import BeamWindow
+    from clsas.sonar.sampling import check_sampling
+    from clsas.sonar.system import Pulse, Sonar
+    from clsas.sonar.track import Pointing, Track, channels
 
-__version__ = "0.1.0"
+from clsas.core.version import __version__ as __version__
 
 __all__ = [
     "Assessment",
@@ -83,52 +82,40 @@ __all__ = [
 ]
 
 _MODULES = {
-    "assess": "Assessment Effect assess survey_lines",
-    "backproject": "backproject",
-    "compress": "compress",
-    "device": "DeviceError list_devices",
-    "echoes": "Echoes",
-    "factorize": "factorize",
-    "grid": "Grid",
-    "image": "Image",
-    "io": "FileFormatError load save to_xarray",
-    "lines": "RangeLines",
-    "mosaic": "Mosaic Patch mosaic",
-    "plan": "Plan",
-    "planner": "plan",
-    "quality": "contrast entropy measure_point relative_error_db",
-    "sampling": "check_sampling",
-    "scene": "PointTargets Seabed",
-    "simulate": "simulate simulate_lines",
-    "sonar": "Pulse Sonar",
-    "store": "Store",
-    "track": "Pointing Track channels",
-    "tradeoff": "Tradeoff tradeoff",
-    "validate": "ClsasWarning",
-    "wavenumber": "wavenumber",
-    "window": "BeamWindow",
+    "core.grid": "Grid",
+    "core.image": "Image",
+    "core.image_error": "relative_error_db",
+    "core.lines": "RangeLines",
+    "core.validate": "ClsasWarning",
+    "exact.backprojection": "backproject",
+    "exact.wavenumber": "wavenumber",
+    "factorized.plan": "Plan",
+    "files.hdf5": "FileFormatError load save to_xarray",
+    "mosaics.mosaic": "Mosaic Patch mosaic",
+    "mosaics.store": "Store",
+    "opencl.device": "DeviceError list_devices",
+    "planning.factorize": "factorize",
+    "planning.planner": "plan",
+    "products.assessment": "Assessment Effect assess survey_lines",
+    "products.quality": "contrast entropy measure_point",
+    "products.tradeoff": "Tradeoff tradeoff",
+    "signal.compression": "compress",
+    "signal.echoes": "Echoes",
+    "simulation.scenes": "PointTargets Seabed",
+    "simulation.simulator": "simulate simulate_lines",
+    "sonar.beam": "BeamWindow",
+    "sonar.sampling": "check_sampling",
+    "sonar.system": "Pulse Sonar",
+    "sonar.track": "Pointing Track channels",
 }
 """Public names of each module. A module is imported when one of its names is first used."""
 
 _MODULE_OF = {name: module for module, names in _MODULES.items() for name in names.split()}
 
 
-class _Package(ModuleType):
-    """A package whose functions stay visible when modules of their names are imported."""
-
-    def __setattr__(self, name: str, value: Any) -> None:
-        # The import system binds every imported submodule to the package: clsas.plan, a module,
-        # would hide clsas.plan, the function.
-        if not (name in _MODULE_OF and isinstance(value, ModuleType)):
-            super().__setattr__(name, value)
-
-
-sys.modules[__name__].__class__ = _Package
-
-
 def __getattr__(name: str) -> Any:
     if name == "plot":
-        return importlib.import_module("clsas.plot")
+        return importlib.import_module("clsas.products.plot")
     if name not in _MODULE_OF:
         raise AttributeError(f"module 'clsas' has no attribute {name!r}")
     value = getattr(importlib.import_module(f"clsas.{_MODULE_OF[name]}"), name)

@@ -4,12 +4,14 @@ from functools import cache, partial
 
 import numpy as np
 
-from clsas.backproject import execute, prepare
-from clsas.geometry import pairwise_range_m
-from clsas.grid import Grid
-from clsas.lines import RangeLines
-from clsas.quality import relative_error_db
-from clsas.reference import ideal, same_interpolator
+from clsas.core.geometry import pairwise_range_m
+from clsas.core.grid import Grid
+from clsas.core.image_error import relative_error_db
+from clsas.core.lines import RangeLines
+from clsas.exact.backprojection import prepare
+from clsas.exact.reference import ideal, same_interpolator
+from clsas.exact.run import execute
+from clsas.signal.spectrum import Spectrum
 
 SPARE = 160  # samples of a line beyond what a grid needs, at each end
 TAPER = 100  # of them, over how many a line fades
@@ -190,3 +192,15 @@ def rounding_error_db(case, device, *, taps=6, upsampling=3.0):
 def true_error_db(case, image):
     """Error of those pixels against the ideal sum."""
     return relative_error_db(image.pixels.ravel()[pixels_of(case)[0]], ideal_of(case))
+
+
+def flat(occupied, centre=0.0):
+    """Spectrum of a flat band of a given width, cycles per sample."""
+    frequency = (np.arange(200) + 0.5) / 400
+    power = (frequency < occupied / 2).astype(float)
+    return Spectrum(centre, frequency, power / power.sum())
+
+
+def burst(index, centre):
+    """A Gaussian burst of 8 samples about sample 60, its energy about a frequency."""
+    return np.exp(-(((index - 60) / 8) ** 2) + 2j * np.pi * centre * (index - 60))

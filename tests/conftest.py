@@ -4,8 +4,8 @@ from functools import cache
 
 import pytest
 
-from clsas.device import Device, list_devices, open_device
-from clsas.selftest import driven, forced_ways
+from clsas.opencl.device import Device, list_devices, open_device
+from clsas.trials.selftest import driven, forced_ways
 
 
 def _named(ways, infos):

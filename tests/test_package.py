@@ -11,7 +11,8 @@ from pathlib import Path
 import pytest
 
 import clsas
-from clsas import cli, extras
+from clsas import cli
+from clsas.core import extras
 
 ROOT = Path(__file__).parents[1]
 SLOW = ("matplotlib", "h5py", "pyopencl", "scipy", "pydantic", "rich", "numpy", "finufft")
@@ -47,7 +48,7 @@ def test_every_public_name_is_there_and_known_to_type_checkers():
     seen = {name.name: node.module for node in checked.body for name in node.names}
     assert seen.keys() == set(clsas.__all__) == set(dir(clsas)) - {"__version__"}
     for name, module in seen.items():
-        there = importlib.import_module("clsas.plot" if name == "plot" else module)
+        there = importlib.import_module("clsas.products.plot" if name == "plot" else module)
         assert getattr(clsas, name) is (there if name == "plot" else getattr(there, name))
     with pytest.raises(AttributeError, match="'clsas' has no attribute 'imag'"):
         _ = clsas.imag
@@ -57,7 +58,7 @@ def test_functions_keep_their_names_when_modules_of_these_are_imported():
     program = """
 import clsas
 import clsas.plan, clsas.mosaic, clsas.tradeoff, clsas.compress
-from clsas.simulate import simulate_lines
+from clsas.simulation.simulator import simulate_lines
 assert all(callable(getattr(clsas, name)) for name in clsas.__all__ if name != "plot")
 from clsas import plan, simulate
 assert callable(plan) and callable(simulate)

@@ -8,14 +8,14 @@ from pathlib import Path
 
 import pytest
 
-from clsas.echoes import Echoes
-from clsas.grid import Grid
-from clsas.image import Image
-from clsas.lines import RangeLines
-from clsas.scene import PointTargets, Seabed
-from clsas.sonar import Sonar
-from clsas.track import Track
-from clsas.window import BeamWindow
+from clsas.core.grid import Grid
+from clsas.core.image import Image
+from clsas.core.lines import RangeLines
+from clsas.signal.echoes import Echoes
+from clsas.simulation.scenes import PointTargets, Seabed
+from clsas.sonar.beam import BeamWindow
+from clsas.sonar.system import Sonar
+from clsas.sonar.track import Track
 
 ROOT = Path(__file__).parents[1]
 

@@ -136,7 +136,7 @@ def _showing(others: Callable[..., None]) -> Callable[..., None]:
 
 def _printable(text: str) -> str:
     """Return a message without control characters; NumPy, which this imports, is slow to load."""
-    from clsas import validate
+    from clsas.core import validate
 
     return validate.printable(text)
 

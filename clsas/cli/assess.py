@@ -12,7 +12,12 @@ from clsas.cli import options
 from clsas.cli.inputs import load, read_beam, read_grid, read_wish
 from clsas.cli.outputs import json_able, report
 from clsas.cli.parameters import INPUT
-from clsas.planner import BEST_TOLERANCE_DB, TOLERANCE_DB, WORST_TOLERANCE_DB, tolerance_in_db
+from clsas.planning.planner import (
+    BEST_TOLERANCE_DB,
+    TOLERANCE_DB,
+    WORST_TOLERANCE_DB,
+    tolerance_in_db,
+)
 
 _HDF5 = b"\x89HDF"
 

@@ -11,17 +11,18 @@ from typing import Any
 import click
 
 import clsas
-from clsas import validate
-from clsas.backproject import execute, prepare
 from clsas.cli import options
 from clsas.cli.inputs import DEFAULT_WISH, load, read_beam, read_grid, read_wish, warn_of_sampling
 from clsas.cli.outputs import progress_bar, report
 from clsas.cli.parameters import INPUT
-from clsas.config import DIAL
-from clsas.device import open_device
-from clsas.interpolation import MOST_UPSAMPLING, TAPS
-from clsas.planner import WORST_TOLERANCE_DB
-from clsas.tradeoff import summary
+from clsas.core import validate
+from clsas.exact.backprojection import prepare
+from clsas.exact.run import execute
+from clsas.files.scene_files import DIAL
+from clsas.opencl.device import open_device
+from clsas.planning.planner import WORST_TOLERANCE_DB
+from clsas.products.tradeoff import summary
+from clsas.signal.interpolation import MOST_UPSAMPLING, TAPS
 
 
 @click.command()
@@ -132,7 +133,7 @@ def image(
     how += f"; without {', '.join(left_out)}, far below the error allowed" if left_out else ""
     clsas.save(output, formed)
     if png is not None:
-        from clsas import plot
+        from clsas.products import plot
 
         plot.save_png(plot.image_db(formed, dynamic_range_db=dynamic_range_db), png)
     planned = f", planned in {results['plan_seconds']:.2f} s" if "plan_seconds" in results else ""

@@ -9,10 +9,11 @@ from typing import Any
 import click
 
 import clsas
-from clsas import config, validate
 from clsas.cli.parameters import keep_apart, written_to
-from clsas.config import DIAL, EXACT, SceneFile
-from clsas.planner import TOLERANCE_DB
+from clsas.core import validate
+from clsas.files import scene_files as config
+from clsas.files.scene_files import DIAL, EXACT, SceneFile
+from clsas.planning.planner import TOLERANCE_DB
 
 DEFAULT_WISH = {"tolerance_db": TOLERANCE_DB}
 

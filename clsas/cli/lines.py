@@ -13,8 +13,8 @@ from clsas.cli import options
 from clsas.cli.inputs import load, read_scene, warn_of_sampling
 from clsas.cli.outputs import progress_bar, report
 from clsas.cli.parameters import INPUT
-from clsas.compress import check_options
-from clsas.simulate import check_size
+from clsas.signal.compression import check_options
+from clsas.simulation.simulator import check_size
 
 
 @click.command()
@@ -38,7 +38,7 @@ def simulate(scene_file: Path, output: Path, png: Path | None, as_json: bool) ->
         seconds = time.perf_counter() - start
     clsas.save(output, echoes)
     if png is not None:
-        from clsas import plot
+        from clsas.products import plot
 
         plot.save_png(plot.geometry(echoes, scene.grid), png)
     report(
@@ -86,7 +86,7 @@ def compress(
         seconds = time.perf_counter() - start
     clsas.save(output, lines)
     if png is not None:
-        from clsas import plot
+        from clsas.products import plot
 
         plot.save_png(plot.range_lines(lines), png)
     report(

@@ -8,11 +8,11 @@ from pathlib import Path
 import click
 
 import clsas
-from clsas import demo as demonstration
 from clsas.cli import options
 from clsas.cli.outputs import print_json, progress_bar, report
 from clsas.cli.parameters import File, need_matplotlib
-from clsas.device import choose, open_device
+from clsas.opencl.device import choose, open_device
+from clsas.trials import demo as demonstration
 
 
 @click.command()
@@ -48,8 +48,8 @@ def calibrate(device: str | None, as_json: bool) -> None:
     \b
     Example:  clsas calibrate --device 0
     """
-    from clsas import costs
-    from clsas.calibrate import calibrate as measure
+    from clsas.planning import costs
+    from clsas.planning.calibration import calibrate as measure
 
     opened = open_device(device)
     with progress_bar("calibrating") as progress:

@@ -10,15 +10,15 @@ from typing import Any
 import click
 
 import clsas
-from clsas import validate
 from clsas.cli import options
 from clsas.cli.inputs import load, read_beam, read_grid
 from clsas.cli.outputs import json_able, print_json, progress_bar, report
 from clsas.cli.parameters import INPUT, PLACE, STAGES, Output
-from clsas.config import SceneFile
-from clsas.quality import Cut, PointResponse
-from clsas.shadows import DARKEST, dark_level_db
-from clsas.tradeoff import TOLERANCES_DB
+from clsas.core import validate
+from clsas.files.scene_files import SceneFile
+from clsas.products.quality import Cut, PointResponse
+from clsas.products.shadows import DARKEST, dark_level_db
+from clsas.products.tradeoff import TOLERANCES_DB
 
 
 @click.command()
@@ -77,7 +77,7 @@ def quality(
         results["point"] = response
         text.append(_describe(response))
         if png is not None:
-            from clsas import plot
+            from clsas.products import plot
 
             plot.save_png(plot.cuts(response), png)
     report(as_json, "\n".join(text), **results)
@@ -196,7 +196,7 @@ def bench(
     \b
     Example:  clsas bench ffbp-2k --tolerance-db -40 --json
     """
-    from clsas import bench as benchmark
+    from clsas.trials import bench as benchmark
 
     measures = dict.fromkeys(benchmark.CASES, benchmark.run)
     measures |= dict.fromkeys(benchmark.FACTORIZED, benchmark.run_factorized)
@@ -221,7 +221,7 @@ def bench(
 
 
 def _case(name: str) -> Any:
-    from clsas import bench
+    from clsas.trials import bench
 
     cases = bench.CASES | bench.FACTORIZED
     _one_of(name, cases)

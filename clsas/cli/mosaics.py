@@ -18,11 +18,11 @@ from clsas.cli import options
 from clsas.cli.inputs import read_beam, read_grid, read_scene, read_wish, warn_of_sampling
 from clsas.cli.outputs import progress_bar, report
 from clsas.cli.parameters import COUNTS, INPUT, File, Store, keep_apart
-from clsas.config import DIAL, SceneFile, simulation_digest
-from clsas.device import open_device
-from clsas.extras import install_command
-from clsas.mosaic import patch_shape_of
-from clsas.threads import uninterrupted
+from clsas.core.extras import install_command
+from clsas.core.threads import uninterrupted
+from clsas.files.scene_files import DIAL, SceneFile, simulation_digest
+from clsas.mosaics.mosaic import patch_shape_of
+from clsas.opencl.device import open_device
 
 _SCHEDULER_S = 10  # to answer
 _IDLE_S = 60.0  # after which nothing more is expected to come
@@ -142,7 +142,7 @@ def mosaic(
     store = clsas.Store.opened(output)
     records = store.records()
     if png is not None:
-        from clsas import plot
+        from clsas.products import plot
 
         plot.save_png(plot.image_db(store.overview(), dynamic_range_db=dynamic_range_db), png)
     errors = [r.predicted_error_db for r in records.values() if r.predicted_error_db is not None]
@@ -235,7 +235,7 @@ def _cluster(workers: int | None, scheduler: str | None) -> Iterator[Any]:
         from distributed import Client
         from distributed.scheduler import KilledWorker
 
-        from clsas.workers import local_client
+        from clsas.mosaics.workers import local_client
     except ImportError:
         raise ImportError(
             f"--workers and --scheduler need Dask: {install_command('mosaic')}"

@@ -8,12 +8,12 @@ from typing import Any
 
 import click
 
-from clsas import validate
-from clsas.backproject import BEST_ACCURACY_DB
 from clsas.cli.parameters import AXIS, INPUT, RATIO, STAGES, Output
-from clsas.io import SUFFIXES
-from clsas.planner import BEST_TOLERANCE_DB, WORST_TOLERANCE_DB, wavelengths
-from clsas.window import SHAPES
+from clsas.core import validate
+from clsas.exact.backprojection import BEST_ACCURACY_DB
+from clsas.files.hdf5 import SUFFIXES
+from clsas.planning.planner import BEST_TOLERANCE_DB, WORST_TOLERANCE_DB, wavelengths
+from clsas.sonar.beam import SHAPES
 
 
 def checked(check: Callable[[Any], object]) -> Callable:

@@ -13,9 +13,9 @@ from typing import Any
 
 import click
 
-from clsas import validate
-from clsas.extras import install_command
-from clsas.reading import check_ordinary
+from clsas.core import validate
+from clsas.core.extras import install_command
+from clsas.core.reading import check_ordinary
 
 
 class Parsed(click.ParamType):

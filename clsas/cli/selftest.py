@@ -8,7 +8,7 @@ import click
 
 from clsas.cli import options
 from clsas.cli.outputs import print_json, progress_bar
-from clsas.device import open_device
+from clsas.opencl.device import open_device
 
 
 @click.command()
@@ -24,7 +24,7 @@ def selftest(ctx: click.Context, device: str | None, as_json: bool) -> None:
     \b
     Example:  clsas selftest --device 0
     """
-    from clsas import selftest as test
+    from clsas.trials import selftest as test
 
     opened, begun = open_device(device), time.perf_counter()
     with progress_bar("testing") as progress:

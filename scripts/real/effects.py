@@ -22,10 +22,11 @@ import recordings
 import ultrasound
 
 import clsas
-from clsas import config
-from clsas.assess import Assessment
-from clsas.backproject import execute, prepare
-from clsas.device import open_device
+from clsas.exact.backprojection import prepare
+from clsas.exact.run import execute
+from clsas.files import scene_files as config
+from clsas.opencl.device import open_device
+from clsas.products.assessment import Assessment
 
 AIRCRAFT_M_S = 100.0
 """About what the aircraft flew: its positions are known, their times are not."""

@@ -14,7 +14,7 @@ from scipy.io import loadmat
 
 import clsas
 from clsas import plot
-from clsas.quality import PointResponse
+from clsas.products.quality import PointResponse
 
 RECORDING = "fmc_aluminium/contact_notch_aluminium.mat"
 SOUND_SPEED_M_S = 6320.0  # longitudinal waves in aluminium

@@ -21,9 +21,10 @@ from pathlib import Path
 import numpy as np
 
 import clsas
-from clsas import nearest, plot
-from clsas.device import Device, open_device
-from clsas.sonar import Sonar, line_array
+from clsas import plot
+from clsas.factorized import thesis as nearest
+from clsas.opencl.device import Device, open_device
+from clsas.sonar.system import Sonar, line_array
 
 Stages = Sequence[tuple[int, int]]  # (QR, QI)
 

@@ -18,9 +18,11 @@ import numpy as np
 from scipy.spatial.distance import cdist
 
 import clsas
-from clsas import nearest, scene, wreck
-from clsas.device import Device, open_device
-from clsas.window import sines, touches_boxes
+from clsas.factorized import thesis as nearest
+from clsas.opencl.device import Device, open_device
+from clsas.simulation import scenes as scene
+from clsas.sonar.beam import sines, touches_boxes
+from clsas.trials import wreck
 
 PIXELS = 1024
 NEAR_M = 53.0  # where the part round the wreck begins, across the track

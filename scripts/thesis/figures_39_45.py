@@ -14,7 +14,7 @@ import chapter6
 import numpy as np
 
 import clsas
-from clsas import wreck
+from clsas.trials import wreck
 
 THESIS = {"42": (8, "λ/13"), "43": (4, "λ/6"), "44": (1, "λ/1")}  # patches a side, worst error
 TOLERANCES_DB = (-20, -30, -40, -50)

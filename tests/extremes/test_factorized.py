@@ -5,13 +5,13 @@ import dataclasses
 import numpy as np
 import pytest
 from cases import along_x
-from test_factorize import EXACT_IS_SLOW, around, exact, made, over, planned, swaying
+from factorizing import EXACT_IS_SLOW, around, exact, made, over, planned, swaying
 
-from clsas.backproject import backproject
-from clsas.factorize import factorize
-from clsas.grid import Grid
-from clsas.planner import plan
-from clsas.quality import relative_error_db
+from clsas.core.grid import Grid
+from clsas.core.image_error import relative_error_db
+from clsas.exact.backprojection import backproject
+from clsas.planning.factorize import factorize
+from clsas.planning.planner import plan
 
 FAR = np.array([1e7, -1e7, 1e7])
 

@@ -5,9 +5,14 @@ from functools import cache
 import pytest
 
 from clsas import wavenumber as form_wavenumber
-from clsas.backproject import execute, prepare
-from clsas.costs import Costs
-from clsas.extremes import (
+from clsas.exact.backprojection import prepare
+from clsas.exact.run import execute
+from clsas.mosaics.mosaic import mosaic
+from clsas.planning.costs import Costs
+from clsas.planning.factorize import factorize
+from clsas.planning.planner import plan
+from clsas.sonar.beam import BeamWindow
+from clsas.trials.extremes import (
     along_x,
     array,
     at_1_khz,
@@ -18,10 +23,6 @@ from clsas.extremes import (
     steps,
     ultrasonic,
 )
-from clsas.factorize import factorize
-from clsas.mosaic import mosaic
-from clsas.planner import plan
-from clsas.window import BeamWindow
 
 SLOW = Costs(pixel_ns=1e3, point_ns=1e3)  # plans for small images divide them
 FAR = (1e7, -1e7, 1e7)

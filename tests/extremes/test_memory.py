@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from cases import APERTURE, CARRIER, STEP, along_x, noise, patch, thesis_lines
 
-from clsas.backproject import backproject
-from clsas.grid import Grid
-from clsas.lines import RangeLines
-from clsas.quality import relative_error_db
-from clsas.reference import ideal
+from clsas.core.grid import Grid
+from clsas.core.image_error import relative_error_db
+from clsas.core.lines import RangeLines
+from clsas.exact.backprojection import backproject
+from clsas.exact.reference import ideal
 
 
 @pytest.fixture

@@ -21,12 +21,13 @@ from cases import (
     thesis_lines,
 )
 
-from clsas.backproject import backproject, execute, prepare
-from clsas.grid import Grid
-from clsas.lines import RangeLines
-from clsas.quality import relative_error_db
-from clsas.reference import same_interpolator, sampled_error_db
-from clsas.validate import ClsasWarning
+from clsas.core.grid import Grid
+from clsas.core.image_error import relative_error_db
+from clsas.core.lines import RangeLines
+from clsas.core.validate import ClsasWarning
+from clsas.exact.backprojection import backproject, prepare
+from clsas.exact.reference import same_interpolator, sampled_error_db
+from clsas.exact.run import execute
 
 FAR = np.array([1e7, -1e7, 1e7])
 

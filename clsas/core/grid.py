@@ -1,0 +1,369 @@
+"""Where to image: a plane of pixels, a plane with heights, or arbitrary points."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple, Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from clsas.core import validate
+
+_ALL = slice(None)
+_PARALLEL = 1e-12  # sine of the angle between steps: float64 leaves 1e-16
+
+
+class Axis(NamedTuple):
+    """One side of a plane: along which coordinate it runs, and where its pixels lie.
+
+    Attributes
+    ----------
+    name : str
+        "x", "y" or "z" where the side is parallel to that coordinate, else "along columns" or
+        "along rows".
+    places_m : ndarray of float64
+        That coordinate of every column (or row); else its distance from the first one. Metres.
+    """
+
+    name: str
+    places_m: NDArray[np.float64]
+
+    @property
+    def step_m(self) -> float:
+        """Distance from one place to the next, metres: negative where the coordinate falls."""
+        return float(self.places_m[-1] - self.places_m[0]) / max(len(self.places_m) - 1, 1)
+
+
+@dataclass(frozen=True, eq=False)
+class Grid:
+    """Pixel positions of an image, in metres (x along-track, y across-track, z up).
+
+    Made by `Grid.plane`, `Grid.oriented`, `Grid.height_map` or `Grid.points`. On a plane, pixel
+    [row, column] lies at
+
+        origin_m + row row_step_m + column column_step_m (+ height_m[row, column] along z).
+
+    All coordinates are float64, so that UTM-sized ones (1e7 m) keep nanometres. Arrays that need
+    no conversion are not copied: do not write into them afterwards.
+
+    Attributes
+    ----------
+    origin_m, row_step_m, column_step_m : ndarray of float64, shape [3], or None
+        Position of pixel [0, 0] and the steps to the next row and column; None for points.
+    shape : tuple of int
+        Shape of the image: (rows, columns), or that of the points.
+    height_m : ndarray of float64, shape [rows, columns], or None
+        Height of every pixel over the plane, added to z.
+    points_m : ndarray of float64, shape [*shape, 3], or None
+        Arbitrary positions.
+    """
+
+    origin_m: NDArray[np.float64] | None
+    row_step_m: NDArray[np.float64] | None
+    column_step_m: NDArray[np.float64] | None
+    shape: tuple[int, ...]
+    height_m: NDArray[np.float64] | None = None
+    points_m: NDArray[np.float64] | None = None
+
+    if TYPE_CHECKING:  # arrays are converted: the constructor takes what holds numbers
+
+        def __init__(
+            self,
+            origin_m: ArrayLike | None,
+            row_step_m: ArrayLike | None,
+            column_step_m: ArrayLike | None,
+            shape: Sequence[int],
+            height_m: ArrayLike | None = None,
+            points_m: ArrayLike | None = None,
+        ) -> None: ...
+
+    def __post_init__(self) -> None:
+        """Check every field and convert it."""
+
+        def put(name: str, shape: tuple[int, ...]) -> None:
+            value = validate.array(name, getattr(self, name), np.float64, shape)
+            object.__setattr__(self, name, value)
+
+        try:
+            shape = tuple(validate.count("every entry of shape", n) for n in self.shape)
+        except TypeError:
+            raise TypeError(
+                f"shape must be whole numbers of pixels per axis, got {validate.shown(self.shape)}"
+            ) from None
+        object.__setattr__(self, "shape", shape)
+
+        plane = ("origin_m", "row_step_m", "column_step_m")
+        if self.points_m is not None:
+            if any(getattr(self, name) is not None for name in (*plane, "height_m")):
+                raise ValueError("points_m must stand alone: it excludes a plane and heights")
+            put("points_m", (*shape, 3))
+            return
+        if len(shape) != 2:
+            raise ValueError(f"shape of a plane must be (rows, columns), got {shape}")
+        for name in plane:
+            put(name, (3,))
+        _check_steps(self.row_step_m, self.column_step_m, shape)
+        if self.height_m is not None:
+            put("height_m", shape)
+
+    @classmethod
+    def plane(
+        cls, x: tuple[float, float, int], y: tuple[float, float, int], z: float = 0.0
+    ) -> Self:
+        """Return a horizontal plane; `x` runs along the columns, `y` along the rows.
+
+        Parameters
+        ----------
+        x, y : (start, stop, count)
+            Centres of the first and the last pixel, metres, and number of pixels, as in
+            `numpy.linspace`. With one pixel, `start` is where it lies.
+        z : float
+            Height of the plane, metres.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If an axis is not (start, stop, count) with finite ends, that differ where there is
+            more than one pixel.
+        """
+        x_start, x_step, columns = _axis("x", x)
+        y_start, y_step, rows = _axis("y", y)
+        origin = [x_start, y_start, validate.number("z", z, "m")]
+        return cls.oriented(origin, [0, y_step, 0], [x_step, 0, 0], (rows, columns))
+
+    @classmethod
+    def oriented(
+        cls,
+        origin_m: ArrayLike,
+        row_step_m: ArrayLike,
+        column_step_m: ArrayLike,
+        shape: tuple[int, int],
+    ) -> Self:
+        """Return a plane of any direction.
+
+        Parameters
+        ----------
+        origin_m : array_like, shape [3]
+            Position of pixel [0, 0], metres.
+        row_step_m, column_step_m : array_like, shape [3]
+            From one pixel to the next row, and to the next column, metres. They need not be
+            perpendicular.
+        shape : (rows, columns)
+            Number of pixels.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If an argument has a wrong kind or shape or is not finite, or the steps are zero or
+            parallel, so that pixels would coincide.
+        """
+        return cls(origin_m, row_step_m, column_step_m, shape)
+
+    @classmethod
+    def height_map(
+        cls, x: tuple[float, float, int], y: tuple[float, float, int], height_m: ArrayLike
+    ) -> Self:
+        """Return the plane z = 0 (see `plane`) raised by `height_m`, shape [rows, columns]."""
+        return cls.plane(x, y).with_height(height_m)
+
+    @classmethod
+    def points(cls, points_m: ArrayLike) -> Self:
+        """Return arbitrary pixels at `points_m`, shape [..., 3], metres.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If the points are not finite real numbers, or there is none, or the last axis is not
+            of length 3.
+        """
+        wanted = (*(None,) * max(np.ndim(points_m) - 1, 1), 3)
+        checked = validate.array("points_m", points_m, np.float64, wanted)
+        return cls(None, None, None, checked.shape[:-1], points_m=checked)
+
+    def with_height(self, height_m: ArrayLike) -> Self:
+        """Return this plane raised by `height_m`, shape [rows, columns], metres along z.
+
+        Raises
+        ------
+        ValueError
+            If the grid is not a plane, or the heights do not have its shape or are not finite.
+        """
+        if not self.is_planar:
+            raise ValueError("height_m can be put only on a plane, and once")
+        return type(self)(
+            self.origin_m, self.row_step_m, self.column_step_m, self.shape, height_m=height_m
+        )
+
+    @property
+    def is_planar(self) -> bool:
+        """Whether the pixels lie on one plane by equal steps."""
+        return self.points_m is None and self.height_m is None
+
+    @property
+    def size(self) -> int:
+        """Number of pixels."""
+        return math.prod(self.shape)
+
+    @property
+    def has_axes(self) -> bool:
+        """Whether columns run along x and rows along y, so that `axes_m` describes them."""
+        if self.points_m is not None:
+            return False
+        return not (np.any(self.column_step_m[1:]) or np.any(self.row_step_m[[0, 2]]))
+
+    @property
+    def axes_m(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """The x of every column and the y of every row, metres.
+
+        Raises
+        ------
+        ValueError
+            Unless columns run along x and rows along y (`has_axes`).
+        """
+        if not self.has_axes:
+            raise ValueError("the grid's columns must run along x and its rows along y for axes_m")
+        rows, columns = self.shape
+        return (
+            self.origin_m[0] + np.arange(columns) * self.column_step_m[0],
+            self.origin_m[1] + np.arange(rows) * self.row_step_m[1],
+        )
+
+    @property
+    def sides(self) -> tuple[Axis, Axis]:
+        """The axes of a plane or height map: what runs along its columns, and along its rows.
+
+        Raises
+        ------
+        ValueError
+            If the grid holds arbitrary points.
+        """
+        if self.points_m is not None:
+            raise ValueError("grid must be a plane or height map to have axes, got points")
+        rows, columns = self.shape
+        across = self._side("along columns", self.column_step_m, columns, free="xyz")
+        taken = across.name if len(across.name) == 1 else ""
+        free = [name for name in "yxz" if name != taken]
+        return across, self._side("along rows", self.row_step_m, rows, free="".join(free))
+
+    def _side(self, name: str, step_m: NDArray[np.float64], count: int, free: str) -> Axis:
+        """Return the axis of some steps; without any it is that of the first `free` coordinate."""
+        along = np.flatnonzero(np.abs(step_m) > _PARALLEL * np.abs(step_m).max())
+        if len(along) > 1:
+            return Axis(name, np.arange(count) * float(np.linalg.norm(step_m)))
+        index = along[0] if len(along) else "xyz".index(free[0])
+        return Axis("xyz"[index], self.origin_m[index] + np.arange(count) * step_m[index])
+
+    def positions_m(self, rows: slice = _ALL, columns: slice = _ALL) -> NDArray[np.float64]:
+        """Return pixel positions, float64 [..., 3], metres.
+
+        Parameters
+        ----------
+        rows, columns : slice
+            Which rows and columns (the first two axes of points).
+        """
+        if self.points_m is not None:
+            return self.points_m[self._index(rows, columns)].copy()
+        row = np.arange(self.shape[0])[rows, None, None]
+        column = np.arange(self.shape[1])[None, columns, None]
+        positions = self.origin_m + row * self.row_step_m + column * self.column_step_m
+        if self.height_m is not None:
+            positions[..., 2] += self.height_m[rows, columns]
+        return positions
+
+    def at(self, index: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Return the positions of some pixels, counted row by row, float64 [..., 3], metres."""
+        if self.points_m is not None:
+            return self.points_m.reshape(-1, 3)[index]
+        row, column = np.divmod(index[..., None], self.shape[1])
+        positions = self.origin_m + row * self.row_step_m + column * self.column_step_m
+        if self.height_m is not None:
+            positions[..., 2] += self.height_m.reshape(-1)[index]
+        return positions
+
+    def spread(self, most: int) -> NDArray[np.float64]:
+        """Return some pixels all over the grid, its edges too, [n, 3]: so many a side at most."""
+        places = [np.unique(np.linspace(0, n - 1, most).round().astype(int)) for n in self.shape]
+        return self.at(np.ravel_multi_index(np.ix_(*places), self.shape).ravel())
+
+    def window(self, rows: slice = _ALL, columns: slice = _ALL) -> Self:
+        """Return the sub-grid of some rows and columns (the first two axes of points).
+
+        Its pixels are this grid's `positions_m(rows, columns)`: the first bit for bit, the others
+        of a plane to the last bit of a float64 coordinate. `image.pixels[rows, columns]` is what
+        belongs to it.
+
+        Raises
+        ------
+        TypeError
+            If `rows` or `columns` is not a slice.
+        ValueError
+            If nothing is selected.
+        """
+        validate.instance("rows", rows, slice)
+        validate.instance("columns", columns, slice)
+        if self.points_m is not None:
+            return self.points(self.points_m[self._index(rows, columns)])
+        row, column = (range(n)[s] for n, s in zip(self.shape, (rows, columns), strict=True))
+        if not row or not column:
+            raise ValueError(f"window must hold a pixel, got rows {rows} and columns {columns}")
+        if (row, column) == tuple(map(range, self.shape)):
+            return self
+        return type(self)(
+            self.origin_m + row[0] * self.row_step_m + column[0] * self.column_step_m,
+            self.row_step_m * row.step,
+            self.column_step_m * column.step,
+            (len(row), len(column)),
+            height_m=None if self.height_m is None else self.height_m[rows, columns],
+        )
+
+    def _index(self, rows: slice, columns: slice) -> tuple[slice, ...]:
+        """Index of some rows and columns of points, which may have one axis only."""
+        if len(self.shape) > 1:
+            return rows, columns
+        if columns != _ALL:
+            raise ValueError(f"columns must be left out for points of shape {self.shape}")
+        return (rows,)
+
+
+def _axis(name: str, axis: tuple[float, float, int]) -> tuple[float, float, int]:
+    """Return start, step and count of a (start, stop, count) axis."""
+    try:
+        start, stop, count = axis
+    except (TypeError, ValueError):
+        raise TypeError(
+            f"{name} must be (start m, stop m, count), got {validate.shown(axis)}"
+        ) from None
+    start = validate.number(f"{name} start", start, "m")
+    stop = validate.number(f"{name} stop", stop, "m")
+    count = validate.count(f"{name} count", count)
+    validate.memory(f"{name} count", 8 * count)
+    if count == 1:
+        return start, 0.0, count
+    if start == stop:
+        raise ValueError(
+            f"{name} must end elsewhere than it starts, got {count} pixels at {start} m"
+        )
+    return start, (stop - start) / (count - 1), count
+
+
+def _check_steps(
+    row_step_m: NDArray[np.float64], column_step_m: NDArray[np.float64], shape: tuple[int, ...]
+) -> None:
+    """Refuse steps that put two pixels of a plane at one place."""
+    steps = {"row_step_m": row_step_m, "column_step_m": column_step_m}
+    for (name, step), count in zip(steps.items(), shape, strict=True):
+        if count > 1 and not step.any():
+            raise ValueError(f"{name} must not be zero m, got {step} for {count} pixels")
+    if min(shape) == 1:
+        return
+    # Of steps of any length, by the sine of the angle between them.
+    directions = (step / np.abs(step).max() for step in steps.values())
+    sine = np.linalg.norm(np.cross(*(d / np.linalg.norm(d) for d in directions)))
+    if sine < _PARALLEL:
+        raise ValueError(
+            f"row_step_m and column_step_m must not be parallel, got {row_step_m} "
+            f"and {column_step_m} m"
+        )

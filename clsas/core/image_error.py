@@ -1,0 +1,134 @@
+"""How far two images differ."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from clsas.core import validate
+from clsas.core.grid import Grid
+from clsas.core.image import Image
+
+# Pixels along either side over which levels are averaged. A single pixel of speckle is dark by
+# chance: the darkest tenth would be its nulls, 13 dB below the mean. Over 81 pixels, some 20 of
+# them independent, the mean varies by 1 dB.
+_AROUND = 9
+
+
+def relative_error_db(
+    image: Image | ArrayLike, reference: Image | ArrayLike, *, darkest: float | None = None
+) -> float:
+    """Return the relative rms error of an image, 20 log10(||I - R|| / ||R||), dB.
+
+    Parameters
+    ----------
+    image, reference : Image or array_like
+        Complex images of one shape and, where both are Images, of the same pixel positions.
+    darkest : float, optional
+        Take both norms over the darkest pixels of the reference only, this share of them (0.1 is
+        a tenth): the error in shadows, against their own level. See `darkest_pixels` for which
+        these are.
+
+    Returns
+    -------
+    float
+        -inf when they are equal.
+
+    Raises
+    ------
+    ValueError
+        If the shapes or grids differ, a value is not finite, the reference is zero, or `darkest`
+        is not above 0 and at most 1.
+    """
+    given, wanted = complex_values("image", image), complex_values("reference", reference)
+    if given.shape != wanted.shape:
+        raise ValueError(
+            f"image and reference must have one shape, got {given.shape} and {wanted.shape}"
+        )
+    if isinstance(image, Image) and isinstance(reference, Image):
+        _check_one_grid(image.grid, reference.grid)
+    if not wanted.any():
+        raise ValueError("reference must not be zero everywhere")
+    if darkest is not None:
+        chosen = darkest_pixels(wanted, darkest)
+        given, wanted = given[chosen], wanted[chosen]
+    # Scaled by the greatest part, so that no square overflows or vanishes.
+    given, wanted = given.view(np.float64), wanted.view(np.float64)
+    scale = max(np.abs(given).max(), np.abs(wanted).max())
+    error = given / scale - wanted / scale
+    if not error.any():
+        return -math.inf
+    return _norm_db(error) + 20 * math.log10(scale) - _norm_db(wanted)
+
+
+def complex_values(name: str, image: Image | ArrayLike) -> NDArray[np.complex128]:
+    """Return complex values, checked, in double precision."""
+    values = np.asanyarray(image.pixels if isinstance(image, Image) else image)
+    if values.dtype.kind in "iuf":
+        values = values.astype(np.complex128)
+    return validate.array(name, values, np.complex128, (None,) * max(values.ndim, 1))
+
+
+def _check_one_grid(image: Grid, reference: Grid) -> None:
+    """Refuse grids of one shape whose pixels lie elsewhere."""
+    part = [slice(None)] * 2
+    if image.is_planar and reference.is_planar:
+        part = [slice(None, None, max(count - 1, 1)) for count in image.shape]  # the corners
+    places = reference.positions_m(*part)
+    apart_m = np.abs(image.positions_m(*part) - places).max()
+    if apart_m > 1e-9 + 1e-14 * np.abs(places).max():
+        raise ValueError(
+            "image and reference must lie on one grid, got pixel positions that are up to "
+            f"{apart_m:g} m apart"
+        )
+
+
+def _norm_db(values: NDArray[np.float64]) -> float:
+    greatest = np.abs(values).max()
+    return 20 * (math.log10(greatest) + math.log10(np.linalg.norm(values / greatest)))
+
+
+def darkest_pixels(image: NDArray[np.complexfloating], darkest: float) -> NDArray[np.bool_]:
+    """Return which pixels are the darkest ones.
+
+    A pixel is as dark as the mean intensity of the 9 x 9 pixels around it, so that shadows count
+    and nulls of speckle do not; pixels with one axis, which may lie anywhere, count one by one.
+    Pixels of exactly zero were not imaged: they do not count.
+
+    Parameters
+    ----------
+    image : complex array
+    darkest : float
+        Share of the pixels, above 0 to 1.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If `darkest` is not allowed, or the image is zero everywhere.
+    """
+    darkest = validate.number("darkest", darkest, above=0.0, most=1.0)
+    imaged = image != 0
+    if not imaged.any():
+        raise ValueError("the image must not be zero everywhere: it has no darkest part")
+    level = levels(image)
+    count = max(round(darkest * np.count_nonzero(imaged)), 1)
+    order = np.argsort(np.where(imaged, level, np.inf), axis=None, kind="stable")
+    chosen = np.zeros(image.size, bool)
+    chosen[order[:count]] = True
+    return chosen.reshape(image.shape)
+
+
+def levels(image: NDArray[np.complexfloating]) -> NDArray[np.float64]:
+    """Return the mean intensity around every pixel, over that of the brightest pixel.
+
+    The image must not be zero everywhere.
+    """
+    from scipy import ndimage  # takes a while to import, and few need it
+
+    amplitude = np.abs(image)
+    intensity = (amplitude / amplitude.max()) ** 2
+    if intensity.ndim == 1:
+        return intensity
+    return ndimage.uniform_filter(intensity, _AROUND, mode="nearest")

@@ -1,0 +1,214 @@
+"""Range lines: compressed echoes with their geometry, the one input of every imager."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from clsas.core import validate
+
+_GOLDEN = (np.sqrt(5) - 1) / 2
+
+
+@dataclass(frozen=True, eq=False)
+class RangeLines:
+    """Pulse-compressed complex echoes of every channel, and where each was taken.
+
+    A channel is one (ping, receiver) pair, in ping-major order. Range is half the two-way path,
+    rho(x) = (|x - tx| + |x - rx|) / 2, so that monostatic range is range. A point of amplitude A
+    at rho appears in a line as
+
+        A p(r - rho) exp(-j 2 k rho),   k = 2 pi carrier_hz / sound_speed_m_s,
+
+    with sample n of channel i at r = first_range_m[i] + n range_step_m.
+
+    Parameters
+    ----------
+    samples : array_like of complex, shape [channels, length]
+        Kept as complex64.
+    first_range_m : float or array_like, shape [channels]
+        Range of each channel's first sample, metres; one number stands for every channel.
+    range_step_m : float
+        Range between samples, metres: sound_speed_m_s / (2 sample rate).
+    tx_m, rx_m : array_like of float, shape [channels, 3] or [3]
+        Transmitter and receiver positions (x, y, z) at transmission, metres, kept as float64;
+        one position stands for every channel. Monostatic is `rx_m=tx_m`.
+    carrier_hz : float
+        Frequency that was mixed out, hertz; 0 when the lines still carry their carrier.
+    sound_speed_m_s : float
+        Speed of the waves, metres per second.
+    rx_velocity_m_s : array_like of float, shape [channels, 3] or [3], optional
+        Velocity of the receivers during the echoes' flight, metres per second. None is
+        stop-and-hop.
+
+    Raises
+    ------
+    TypeError
+        If an argument is of a wrong kind; real samples, which hold no phase, among them.
+    ValueError
+        If shapes disagree, an array is empty, a value is NaN or infinite, a step or speed is not
+        positive, the carrier is negative, or a receiver is not slower than the waves. Also if
+        wider samples are all so small or large that complex64 loses their digits.
+
+    Notes
+    -----
+    Arrays that need no conversion are not copied, since samples are large: the fields are
+    read-only views of them. Do not write into your own arrays afterwards; what is written is
+    not checked again.
+    """
+
+    samples: NDArray[np.complex64]
+    first_range_m: NDArray[np.float64]
+    range_step_m: float
+    tx_m: NDArray[np.float64]
+    rx_m: NDArray[np.float64]
+    carrier_hz: float
+    sound_speed_m_s: float
+    rx_velocity_m_s: NDArray[np.float64] | None = None
+
+    if TYPE_CHECKING:  # arrays are converted: the constructor takes what holds numbers
+
+        def __init__(
+            self,
+            samples: ArrayLike,
+            first_range_m: ArrayLike,
+            range_step_m: float,
+            tx_m: ArrayLike,
+            rx_m: ArrayLike,
+            carrier_hz: float,
+            sound_speed_m_s: float,
+            rx_velocity_m_s: ArrayLike | None = None,
+        ) -> None: ...
+
+    def __post_init__(self) -> None:
+        """Check every field and convert it."""
+
+        def put(name: str, value: object) -> None:
+            object.__setattr__(self, name, value)
+
+        put("samples", validate.array("samples", self.samples, np.complex64, (None, None)))
+        per_channel = {"first_range_m": (self.channels,)}
+        per_channel |= dict.fromkeys(("tx_m", "rx_m"), (self.channels, 3))
+        if self.rx_velocity_m_s is not None:
+            per_channel["rx_velocity_m_s"] = (self.channels, 3)
+        for name, shape in per_channel.items():
+            value = getattr(self, name)
+            put(name, validate.array(name, value, np.float64, shape, broadcast=True))
+        put("range_step_m", validate.positive("range_step_m", self.range_step_m, "m"))
+        put("carrier_hz", validate.number("carrier_hz", self.carrier_hz, "Hz", least=0.0))
+        put("sound_speed_m_s", validate.positive("sound_speed_m_s", self.sound_speed_m_s, "m/s"))
+        if self.rx_velocity_m_s is not None:
+            fastest = float(np.linalg.norm(self.rx_velocity_m_s, axis=1).max())
+            validate.number(
+                "the speed of rx_velocity_m_s", fastest, "m/s", below=self.sound_speed_m_s
+            )
+
+    def __repr__(self) -> str:
+        """Return sizes and extents: the arrays are long."""
+        return (
+            f"RangeLines({self.channels} channels of {self.length} samples, "
+            f"{self.first_range_m.min():.6g} m to {self.last_range_m.max():.6g} m in steps of "
+            f"{self.range_step_m:.4g} m, carrier {self.carrier_hz:.6g} Hz)"
+        )
+
+    @property
+    def channels(self) -> int:
+        """Number of channels."""
+        return self.samples.shape[0]
+
+    @property
+    def length(self) -> int:
+        """Samples per channel."""
+        return self.samples.shape[1]
+
+    @property
+    def phase_centres_m(self) -> NDArray[np.float64]:
+        """Middles between transmitters and receivers, metres, shape [channels, 3]."""
+        return (self.tx_m + self.rx_m) / 2
+
+    @property
+    def ping_starts(self) -> NDArray[np.int64]:
+        """First channel of every ping: successive channels of one transmitter position are one."""
+        return np.flatnonzero(np.append(True, (np.diff(self.tx_m, axis=0) != 0).any(axis=1)))
+
+    @property
+    def wavenumber_rad_m(self) -> float:
+        """Wavenumber k of the carrier, radians per metre (one way)."""
+        return 2 * np.pi * self.carrier_hz / self.sound_speed_m_s
+
+    @property
+    def carrier_cycles_per_m(self) -> float:
+        """Phase of the carrier per metre of range (two ways), cycles."""
+        return 2 * self.carrier_hz / self.sound_speed_m_s
+
+    @property
+    def last_range_m(self) -> NDArray[np.float64]:
+        """Range of each channel's last sample, metres, shape [channels]."""
+        return self.first_range_m + (self.length - 1) * self.range_step_m
+
+    def select(self, channels: slice | ArrayLike) -> RangeLines:
+        """Return the lines of some channels.
+
+        Parameters
+        ----------
+        channels : slice or array_like
+            Which channels: a slice (samples are then shared, not copied), indices, or a mask of
+            bools.
+
+        Raises
+        ------
+        IndexError
+            If an index is outside the channels.
+        TypeError
+            If `channels` is neither a slice nor whole numbers nor bools.
+        ValueError
+            If nothing is selected.
+        """
+        index = channels
+        if not isinstance(channels, slice):
+            index = np.atleast_1d(channels)
+            if index.size == 0:
+                raise ValueError("channels must select at least one line, got none")
+            if index.dtype.kind not in "iub":
+                got = validate.shown(channels)
+                raise TypeError(f"channels must be a slice, whole numbers or bools, got {got}")
+        velocity = self.rx_velocity_m_s
+        return replace(
+            self,
+            samples=self.samples[index],
+            first_range_m=self.first_range_m[index],
+            tx_m=self.tx_m[index],
+            rx_m=self.rx_m[index],
+            rx_velocity_m_s=None if velocity is None else velocity[index],
+        )
+
+    def without_samples(self) -> RangeLines:
+        """Return everything about these lines but their samples: of each there is one, 0."""
+        return replace(self, samples=np.zeros((self.channels, 1), np.complex64))
+
+
+def some_channels(count: int, most: int) -> NDArray[np.int64]:
+    """Return about so many channels of a number, evenly but not regularly.
+
+    Arrays come in regular steps.
+    """
+    if count <= most:
+        return np.arange(count)
+    number = np.arange(most)
+    return ((number + number * _GOLDEN % 1) * count / most).astype(np.int64)
+
+
+def wavelength_m(lines: RangeLines) -> float:
+    """Return the wavelength of the carrier, infinite without one."""
+    return lines.sound_speed_m_s / lines.carrier_hz if lines.carrier_hz else math.inf
+
+
+def fastest(lines: RangeLines) -> float:
+    """Return the speed of the fastest receiver over that of sound."""
+    if lines.rx_velocity_m_s is None:
+        return 0.0
+    return float(np.linalg.norm(lines.rx_velocity_m_s, axis=1).max()) / lines.sound_speed_m_s

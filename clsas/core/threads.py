@@ -1,0 +1,87 @@
+"""Work in threads that Ctrl-C can end at any time.
+
+Python raises `KeyboardInterrupt` wherever the main thread happens to be, even between taking a lock
+of `threading` and the code that gives it back. Threads that need the lock then wait for ever. So
+Ctrl-C is held back while the main thread uses what it shares with other threads.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+from collections import deque
+from collections.abc import Callable, Collection, Iterable, Iterator
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor
+from concurrent.futures import wait as wait_for
+from contextlib import contextmanager
+from typing import TypeVar
+
+from clsas.core import validate
+
+_POLL_S = 0.1  # how long Ctrl-C may be held back
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+
+@contextmanager
+def uninterrupted() -> Iterator[None]:
+    """Hold Ctrl-C back until the end of the block, which must be short."""
+    handler = signal.getsignal(signal.SIGINT)
+    # Signals interrupt the main thread only, and only by a handler of Python's.
+    if threading.current_thread() is not threading.main_thread() or not callable(handler):
+        yield
+        return
+    came: list[tuple] = []
+    signal.signal(signal.SIGINT, lambda *signalled: came.append(signalled))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, handler)
+        if came:
+            handler(*came[0])
+
+
+def wait(futures: Collection[Future], timeout: float | None = None) -> set[Future]:
+    """Return the futures that are done once any is, or none after `timeout` seconds."""
+    left = timeout
+    while True:
+        with uninterrupted():
+            step = _POLL_S if left is None else min(left, _POLL_S)
+            done = wait_for(futures, step, FIRST_COMPLETED).done
+        if left is not None:
+            left -= step
+        if done or left == 0:
+            return done
+
+
+def in_threads(
+    function: Callable[[Item], Result], items: Iterable[Item], workers: int | None = None
+) -> Iterator[Result]:
+    """Yield the function of every item in order, computed by threads; stop early if closed.
+
+    Parameters
+    ----------
+    function : callable
+        Called with one item. Ctrl-C waits for the calls that have begun.
+    items : iterable
+        Taken whole before the first result.
+    workers : int, optional
+        Threads, as many as the machine has cores by default.
+    """
+    if workers is not None:
+        workers = validate.count("workers", workers)
+    futures: deque[Future[Result]] = deque()
+    pool = ThreadPoolExecutor(workers or os.cpu_count())
+    try:
+        with uninterrupted():
+            futures.extend(pool.submit(function, item) for item in items)
+        while futures:
+            wait([futures[0]])
+            with uninterrupted():
+                result = futures.popleft().result()
+            yield result
+    finally:
+        with uninterrupted():
+            pool.shutdown(cancel_futures=True)

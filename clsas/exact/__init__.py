@@ -1,0 +1,1 @@
+"""The image, whatever it takes: backprojection, float64 reference, wavenumber imager."""

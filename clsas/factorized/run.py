@@ -1,0 +1,343 @@
+"""Factorized backprojection: the aperture interpolated, stage by stage."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections import deque
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import pyopencl as cl
+from numpy.typing import NDArray
+
+from clsas.core import validate
+from clsas.core.grid import Grid
+from clsas.core.image import Image, holds_any
+from clsas.core.lines import RangeLines
+from clsas.exact.backprojection import form_exactly
+from clsas.exact.checks import check_numbers
+from clsas.factorized.filters import edges_gain
+from clsas.factorized.leaves import Finish, Level, PlaneLeaves, SurfaceLeaves
+from clsas.factorized.plan import CHUNK, Plan
+from clsas.factorized.sector import Geometry, Sector
+from clsas.factorized.surface import surface_of
+from clsas.opencl.buffers import (
+    GUARD,
+    MARGIN,
+    VECTOR_ROOM,
+    channel_pitch,
+    padded_length,
+    sample_bytes,
+    upsampled_lines,
+)
+from clsas.opencl.device import Device, Slot, aligned
+from clsas.opencl.upsampling import upsample
+from clsas.sonar.visibility import warn_unseen
+
+_GROUP = 64  # work-items that share a subimage where each has one lane
+_AHEAD_S = 0.1  # of work that is started: roots are prepared meanwhile, an interruption waits
+_PREPARED_FIRST = 4  # batches
+_LARGEST_HALF, _LEAST_HALF = 65504.0, 2.0**-13  # with a margin of 2 to what is rounded coarser
+_FILTERS_SUM = 8.0  # of the absolute values of upsampling and aligning filters, with a margin
+_MOST_EXPONENT = 100  # of a gain: float32 holds filters times it, and over it
+_GROUPS_PER_UNIT = 3  # at least, of compute units: so that they end together
+
+
+def form(
+    lines: RangeLines,
+    grid: Grid,
+    chosen: Plan,
+    device: Device,
+    progress: Callable[[int, int], None] | None,
+) -> Image:
+    """Return the image by a checked plan."""
+    warned = chosen.kept.get("warned", False)  # not where the plan comes from a file
+    if chosen.is_exact:
+        # The plan has warned of ends of lines.
+        return form_exactly(
+            lines,
+            grid,
+            device=device,
+            accuracy_db=chosen.accuracy_db,
+            beam=chosen.beam,
+            progress=progress,
+            warned=warned,
+        )
+    largest = check_numbers(lines, chosen.beam)
+    pixels, done = aligned(np.empty, grid.shape, np.complex64), 0
+    try:
+        run = _Run(lines, grid, chosen, device, pixels, largest)
+        for formed in run.parts():
+            done += formed
+            if progress is not None:
+                progress(done, grid.size)
+    finally:
+        device.finish()  # an interrupted run leaves nothing in use
+    image = Image(pixels, grid)
+    if not warned and not holds_any(pixels) and lines.samples.any():
+        corners_m = run.division.centres_m(0, run.division.roots)
+        along = None if chosen.beam is None else chosen.beam.directions(lines)
+        warn_unseen(lines, corners_m, chosen.beam, along)
+    return image
+
+
+@dataclass(frozen=True, eq=False)
+class _Tables:
+    """What a device is told of a sector's roots, all at once.
+
+    Attributes
+    ----------
+    slot : Slot
+        Its buffers.
+    pitches : list of int
+        Channels of a row, stage by stage.
+    strides : list of int
+        Lines of a subimage, stage by stage.
+    """
+
+    slot: Slot
+    pitches: list[int]
+    strides: list[int]
+
+
+class _Run:
+    """A plan at work on a device."""
+
+    def __init__(
+        self,
+        lines: RangeLines,
+        grid: Grid,
+        chosen: Plan,
+        device: Device,
+        pixels: NDArray[np.complex64],
+        largest: float,
+    ) -> None:
+        self.lines, self.grid, self.plan, self.device = lines, grid, chosen, device
+        self.width, self.pitch = device.info.width, padded_length(chosen.resampling)
+        self.half_precision = chosen.half_precision
+        self.gain = _gain(largest, lines.channels) if self.half_precision and largest > 0 else 1.0
+        self.samples = self._upload_lines()  # early: a device upsamples them beside what follows
+        self.geometry = _geometry(lines, grid, chosen)
+        self.division = self.geometry.division
+        if self.half_precision and not _holds(self.gain * self.geometry.rms(lines)):
+            device.finish()  # the buffer given up may still be written
+            self.half_precision, self.gain = False, 1.0
+            self.samples = self._upload_lines()
+            validate.warn(
+                "lines are held in single precision, not in half as planned, which takes up to "
+                "twice the memory: what can be seen of the grid is too faint beside the "
+                f"largest sample, {largest:.3g}, or that is too far from 1"
+            )
+        self.levels = [
+            Level(half, -(-(2 * half + 1) // self.width) * self.width)
+            for half in chosen.half_lengths
+        ]
+        self.filters = {
+            name: device.upload(getattr(chosen, name).coefficients.astype(np.float32))
+            for name in ("align", "aperture")
+        }
+        options = {"WIDTH": self.width, "TAPS": chosen.align.taps}
+        options |= {"APERTURE_TAPS": chosen.aperture.taps, "HALF": int(self.half_precision)}
+        options["CHUNK"] = CHUNK
+        ramp = int(self.geometry.ramps)
+        self.first_stage = device.kernel("stage", "stage", GIVEN=1, RAMP=ramp, **options)
+        self.later_stage = device.kernel("stage", "stage", GIVEN=0, RAMP=0, **options)
+        kind = PlaneLeaves if self.geometry.surface.is_plane else SurfaceLeaves
+        self.leaves = kind(
+            lines, self.geometry, self.levels[-1], device, pixels, self.half_precision, self.gain
+        )
+        later = range(1, len(self.levels))
+        self.parents = {
+            level: device.upload(self.division.parents(level).astype(np.int32)) for level in later
+        }
+        # One set of tables is filled while the device works with the other.
+        self.table_slots = itertools.cycle([Slot(device), Slot(device)])
+        self.slot = Slot(device)
+
+    def _upload_lines(self) -> cl.Buffer:
+        """Return all lines on the device, upsampled."""
+        device, chosen, count = self.device, self.plan, self.lines.channels
+        resampling = chosen.resampling
+        line_bytes = sample_bytes(self.half_precision) * self.pitch
+        if count * line_bytes > device.info.max_buffer_bytes:
+            raise ValueError(
+                f"{count} lines of {self.lines.length} samples need "
+                f"{count * line_bytes / 2**20:.0f} MiB when upsampled, more than a buffer of "
+                f"{device.info.label}, {device.info.max_buffer_bytes / 2**20:.0f} MiB: image "
+                f"a part of them, or backproject exactly"
+            )
+        if chosen.upsampler is not None:
+            return upsample(
+                self.lines.samples,
+                resampling,
+                chosen.upsampler,
+                self.pitch,
+                device,
+                half_precision=self.half_precision,
+                gain=self.gain,
+            )
+        gain = None
+        if not chosen.nearest:
+            gain = edges_gain(chosen.align, chosen.final, len(chosen.sides), resampling.ratio)
+        return device.share(
+            upsampled_lines(self.lines.samples, resampling, self.width, MARGIN, self.pitch, gain)
+        )
+
+    def parts(self) -> Iterator[int]:
+        """Form all pixels; yield how many each time that some are finished.
+
+        The geometry of a sector is prepared while the device works on the one before.
+        """
+        under_way = deque()
+        batches = -(-len(self.division.roots) // self.plan.roots_at_once)
+        most = max(math.ceil(_AHEAD_S * batches / max(self.plan.predicted_seconds, 1e-9)), 2)
+        for sector, tables in self._sectors():
+            for first in range(0, len(sector.roots), self.plan.roots_at_once):
+                under_way.append(self._start(sector, tables, first))
+                if len(under_way) > most:
+                    yield under_way.popleft()()
+            tables.slot.busy = cl.enqueue_marker(self.device.queue)
+        while under_way:
+            yield under_way.popleft()()
+        self.leaves.complete()
+
+    def _sectors(self) -> Iterator[tuple[Sector, _Tables]]:
+        """Prepare the roots, some together; few at first, for the device to begin with."""
+        first = _PREPARED_FIRST * self.plan.roots_at_once
+        for sector in self.geometry.sectors(first, self.plan.roots_prepared):
+            yield sector, self._upload_tables(sector)
+
+    def _start(self, sector: Sector, tables: _Tables, first: int) -> Finish:
+        """Start forming the pixels of some roots of a sector."""
+        batch = slice(first, min(first + self.plan.roots_at_once, len(sector.roots)))
+        if not all(tables.strides):
+            return self.leaves.blank(sector, batch)
+        for level in range(len(self.levels)):
+            self._stage(tables, level, batch)
+        lines = self.slot[f"lines{len(self.levels) - 1}"]
+        finish = self.leaves.form(tables.slot, sector, batch, lines)
+        self.slot.busy = cl.enqueue_marker(self.device.queue)
+        return finish
+
+    def _upload_tables(self, sector: Sector) -> _Tables:
+        """Start copying to the device all that it is told of a sector's roots."""
+        slot, levels = next(self.table_slots), range(len(self.levels))
+        slot.wait()
+        strides = [sector.stride(level) for level in levels]
+        for name, values in self.geometry.references(sector).items():
+            slot.fill(name, _padded(values))
+        for level, (nodes, need) in enumerate(zip(sector.nodes, sector.needs, strict=True)):
+            children = np.zeros((*need.first.shape, 5), np.int32)
+            children[..., 0], children[..., 1] = need.begin, need.end
+            if level:
+                parents = self.division.parents(level)
+                children[..., 2] = sector.needs[level - 1].first[:, parents]
+                position_m = sector.positions_m(level - 1).swapaxes(1, 2)
+                slot.fill(f"positions{level}", _padded(position_m.astype(np.float32)))
+                parent_m = sector.relative_m[level - 1][:, parents]
+                offsets_m = [parent_m, sector.relative_m[level] - parent_m]
+                offsets_m = np.concatenate(offsets_m, axis=-1).astype(np.float32)
+                slot.fill(f"offsets{level}", offsets_m)
+            children[..., 3], children[..., 4] = need.first, need.last - need.first
+            slot.fill(f"children{level}", children)
+            slot.fill(f"base{level}", _padded(nodes.base.astype(np.int32)))
+            slot.fill(f"between{level}", _padded(nodes.between.astype(np.float32)))
+        self.leaves.fill(slot, sector)
+        pitches = [_pitch(nodes.base.shape[1]) for nodes in sector.nodes]
+        return _Tables(slot, pitches, strides)
+
+    def _stage(self, tables: _Tables, level: int, batch: slice) -> None:
+        """Form the lines of a stage from those of the one before, or from the raw ones."""
+        device, table, shape, stride = (
+            self.device,
+            tables.slot,
+            self.levels[level],
+            tables.strides[level],
+        )
+        # A buffer that grows waits for all that is under way.
+        lines_each = max(stride, self.plan.most_channels[level])
+        per_root = self.division.per_root(level)
+        children = (batch.stop - batch.start) * per_root
+        if level == 0:
+            kernel, parent, parent_pitch = self.first_stage, self.samples, self.pitch
+            names = ("order", "start", "nu", "cycles", *(["ramp"] if self.geometry.ramps else []))
+            geometry = [table[name] for name in names]
+        else:
+            kernel, before = self.later_stage, self.levels[level - 1]
+            parent, parent_pitch = self.slot[f"lines{level - 1}"], before.pitch
+            geometry = [
+                self.parents[level],
+                self.division.per_root(level - 1),
+                tables.strides[level - 1],
+                table[f"positions{level}"],
+                table[f"offsets{level}"],
+                np.append(self.geometry.drift, 0).astype(np.float32),
+                self.geometry.samples_per_m,
+                self.geometry.cycles_per_m,
+                before.centre,
+            ]
+        items = _GROUP if self.width == 1 else 1
+        # Few children are divided, so that there is work for all.
+        step = _GROUP if self.width == 1 else 8 * self.width
+        parts = -(-_GROUPS_PER_UNIT * device.info.compute_units // children)
+        part_length = step * -(-shape.length // (step * parts))
+        device.run(
+            kernel,
+            (children * items, -(-shape.length // part_length)),
+            parent,
+            parent_pitch,
+            table[f"children{level}"],
+            batch.start * per_root,
+            per_root,
+            table[f"base{level}"],
+            table[f"between{level}"],
+            tables.pitches[level],
+            *geometry,
+            shape.half,
+            self.filters["align"],
+            self.filters["aperture"],
+            self.slot.zeros(
+                f"lines{level}",
+                sample_bytes(self.half_precision) * children * lines_each * shape.pitch,
+            ),
+            stride,
+            shape.pitch,
+            shape.length,
+            part_length,
+            GUARD,
+            wait_for=table.filled,
+            local=(items, 1),
+        )
+
+
+def _geometry(lines: RangeLines, grid: Grid, chosen: Plan) -> Geometry:
+    """Return how lines see the roots of a plan, as the image before has left it."""
+    if "geometry" not in chosen.kept:
+        chosen.kept["geometry"] = Geometry(lines, surface_of(grid), chosen)
+    return chosen.kept["geometry"]
+
+
+def _gain(largest: float, channels: int) -> float:
+    """Return a power of 2 that brings lines, and sums of them all, within half precision."""
+    exponent = math.floor(math.log2(_LARGEST_HALF / (_FILTERS_SUM * channels * largest)))
+    return 2.0 ** min(max(exponent, -_MOST_EXPONENT), _MOST_EXPONENT)
+
+
+def _holds(rms: float) -> bool:
+    """Return whether half precision holds lines of an rms value, or there is nothing to hold."""
+    return rms == 0 or _LEAST_HALF <= rms <= _LARGEST_HALF
+
+
+def _pitch(channels: int) -> int:
+    """Channels of a row in a table, with room for a vector that begins at the last."""
+    return channel_pitch(channels) + VECTOR_ROOM
+
+
+def _padded(values: NDArray) -> NDArray:
+    """Return [..., channels] as the stages' kernel wants it: rows of whole vectors."""
+    count = values.shape[-1]
+    padded = np.zeros((*values.shape[:-1], _pitch(count)), values.dtype)
+    padded[..., :count] = values
+    return padded

@@ -1,0 +1,154 @@
+"""Factorized backprojection with nearest beams: the formulas of THESIS chapter 4."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from clsas.core.geometry import pairwise_range_m
+from clsas.core.grid import Grid
+from clsas.core.lines import RangeLines
+from clsas.factorized.aperture import mean_track
+from clsas.factorized.plan import Plan
+from clsas.factorized.surface import surface_of
+from clsas.factorized.tree import Division
+
+Stages = Sequence[tuple[int, int]]
+"""(QR, QI) of every stage: how many lines are summed, and the division of either image side."""
+
+
+def range_error_m(
+    range_m: ArrayLike, half_length_m: ArrayLike, angle_rad: ArrayLike, away_rad: ArrayLike
+) -> NDArray[np.float64]:
+    """Return the error of one beam standing for a sector, at one place [40].
+
+    Parameters
+    ----------
+    range_m : array_like
+        Distance r of the point from the middle of the subaperture.
+    half_length_m : array_like
+        Half the subaperture's length, t.
+    angle_rad : array_like
+        Angle a between the subaperture and the beam's direction.
+    away_rad : array_like
+        Angle b from the beam's direction to the point.
+
+    Notes
+    -----
+    sqrt(r^2 + t^2 - 2 r t cos(a + b)) - sqrt(r^2 + t^2 - 2 r t cos(a)).
+    """
+    r, t, a, b = map(np.asarray, (range_m, half_length_m, angle_rad, away_rad))
+    square = r * r + t * t
+    return np.sqrt(square - 2 * r * t * np.cos(a + b)) - np.sqrt(square - 2 * r * t * np.cos(a))
+
+
+def stage_errors_m(
+    stages: Stages, aperture_m: float, image_m: float, nearest_m: float
+) -> list[float]:
+    """Return the largest range error of every stage [45]; those of a plan add up.
+
+    Parameters
+    ----------
+    stages : sequence of (QR, QI)
+    aperture_m : float
+        Distance between neighbouring channels of the raw lines.
+    image_m : float
+        Longer side of the image.
+    nearest_m : float
+        Least range, Rmin.
+
+    Notes
+    -----
+    L_A L_I/(4 Rmin) for L_A <= Rmin, else L_I/2, with the subaperture's length L_A and the
+    subimage's side L_I after the stage. This bounds [40] with t = L_A/2 over the sector L_I/(2 r)
+    to either side, as |d rho/d angle| <= min(r, t). Channels lie less far out, at most
+    (QR - 1)/QR of t; corners of square subimages that are seen obliquely, at 22.5 degrees most,
+    err by up to (1 + sqrt 2)/2 more.
+    """
+    errors, length_m, side_m = [], aperture_m, image_m
+    for beams, divisions in stages:
+        length_m *= beams
+        side_m /= divisions
+        near = length_m > nearest_m
+        errors.append(side_m / 2 if near else length_m * side_m / (4 * nearest_m))
+    return errors
+
+
+def operations(
+    stages: Stages, channels: int, samples: Sequence[int], pixels: int, gamma: float = 0.0
+) -> list[float]:
+    """Return the operations of every stage and, last, of the backprojection [44].
+
+    Parameters
+    ----------
+    stages : sequence of (QR, QI)
+    channels : int
+        Raw lines, N.
+    samples : sequence of int
+        Range samples per line, Nr, stage by stage.
+    pixels : int
+        Of the whole image, X Y.
+    gamma : float
+        What a line costs in a stage besides its samples.
+
+    Notes
+    -----
+    As the thesis's worked example has it, N lines take part in the first stage, for each of its
+    QI^2 subimages; N/QR in the second, for each of its QI^4; and so on.
+    """
+    counts, subimages = [], 1
+    for (beams, divisions), length in zip(stages, samples, strict=True):
+        subimages *= divisions**2
+        counts.append(float(channels * (subimages * length + gamma)))
+        channels = math.ceil(channels / beams)
+    counts.append(float(channels * pixels))
+    return counts
+
+
+def plan_errors_m(
+    plan: Plan, lines: RangeLines, grid: Grid, pixels: ArrayLike
+) -> NDArray[np.float64]:
+    """Return the range errors that a plan of nearest beams makes, followed stage by stage.
+
+    Parameters
+    ----------
+    plan : Plan
+        Made with `stages`, at least one.
+    lines : RangeLines
+        Without motion during flight.
+    grid : Grid
+        A plane.
+    pixels : array_like of int, [n, 2]
+        Rows and columns.
+
+    Returns
+    -------
+    ndarray of float64, shape [n, channels]
+        The range at which a pixel takes a channel's line, less the right one; channels in order
+        along the track.
+
+    Notes
+    -----
+    [42] and [43] applied to every channel: in each stage its line is shifted so that the range of
+    the subimage's centre is right for the mean of its neighbours, which then stands for it.
+    """
+    order = np.argsort(mean_track(lines).place, kind="stable")
+    ends_m = lines.tx_m[order], lines.rx_m[order]
+    division = Division(surface_of(grid), plan.sides)
+    pixels = np.asarray(pixels)
+    points_m = grid.origin_m + pixels[:, :1] * grid.row_step_m + pixels[:, 1:] * grid.column_step_m
+    errors_m = -pairwise_range_m(points_m, *ends_m)
+    position_m = lines.phase_centres_m[order]
+    beam = np.arange(lines.channels)  # of the stage before, that holds each channel
+    for level, (side, beams) in enumerate(zip(plan.sides, plan.nearest, strict=True)):
+        centres_m = division.centres_m(level, pixels // side * side)
+        errors_m += pairwise_range_m(centres_m, *ends_m)[:, beam]
+        starts = np.arange(0, len(position_m), beams)
+        counts = np.diff(np.append(starts, len(position_m)))
+        position_m = np.add.reduceat(position_m, starts) / counts[:, None]
+        beam, ends_m = beam // beams, (position_m, position_m)
+        errors_m -= pairwise_range_m(centres_m, *ends_m)[:, beam]
+    return errors_m + pairwise_range_m(points_m, *ends_m)[:, beam]

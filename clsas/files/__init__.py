@@ -1,0 +1,1 @@
+"""In and out: HDF5 and scene files."""

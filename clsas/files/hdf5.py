@@ -1,0 +1,384 @@
+"""Files: one HDF5 schema for grids, range lines, echoes and images; and xarray.
+
+The schema is in docs/format.md. It follows the dataclasses: an array is a dataset, a number or
+string is an attribute, a nested object is a group, None is left out.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import fields, is_dataclass
+from io import BytesIO
+from pathlib import Path
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
+
+import h5py
+import numpy as np
+
+from clsas.core import reading, validate
+from clsas.core.atomic import replacing
+from clsas.core.grid import Grid
+from clsas.core.image import Image
+from clsas.core.lines import RangeLines
+from clsas.signal.echoes import Echoes
+from clsas.sonar.system import Pulse
+
+if TYPE_CHECKING:
+    import xarray
+
+FORMAT = "clsas"
+VERSION = 1
+_KINDS = {
+    "grid": Grid,
+    "range_lines": RangeLines,
+    "image": Image,
+    "echoes": Echoes,
+    "pulse": Pulse,
+}
+_SAVED = (Grid, RangeLines, Image, Echoes)
+
+SUFFIXES = (".h5", ".hdf5", ".he5")
+"""What names of files may end in."""
+
+Saved = Grid | RangeLines | Image | Echoes
+
+
+class FileFormatError(ValueError):
+    """A file that is not a whole clsas file of a version this library reads."""
+
+
+def save(path: str | os.PathLike, obj: Saved) -> None:
+    """Write an object to an HDF5 file, replacing a file of that name at once or not at all.
+
+    Parameters
+    ----------
+    path : path-like
+        The file: its name ends in one of `SUFFIXES` or has none. Its folder must exist.
+    obj : Grid, RangeLines, Image or Echoes
+        What to write; `load` returns it bit for bit.
+
+    Raises
+    ------
+    TypeError
+        If `obj` is of another type.
+    ValueError
+        If the file's name ends as one of another format, such as .tif.
+    OSError
+        If the folder does not exist or the file cannot be written, as on a full disk.
+
+    Notes
+    -----
+    The file is put together in memory, which thus holds the object once more: HDF5 does not
+    recover from a disk that turns out to be full.
+    """
+    path = validate.path("path", path)
+    validate.suffix("path", path, *SUFFIXES)
+    validate.instance("obj", obj, *_SAVED)
+    with replacing(path) as temporary:
+        memory = BytesIO()
+        # The metadata of HDF5 1.10 carry checksums; those of earlier versions do not all.
+        with h5py.File(memory, "w", libver=("v110", "v110")) as content:
+            _set(content, "format", FORMAT)
+            content.attrs["version"] = VERSION
+            _write(content, obj)
+        temporary.write_bytes(memory.getbuffer())
+
+
+def load(path: str | os.PathLike) -> Saved:
+    """Read what `save` wrote.
+
+    Parameters
+    ----------
+    path : path-like
+        The file.
+
+    Returns
+    -------
+    Grid, RangeLines, Image or Echoes
+        Equal to what was saved, bit for bit.
+
+    Raises
+    ------
+    FileFormatError
+        If the file is not HDF5, not of clsas, of a newer version, incomplete, damaged, larger
+        than memory when unpacked, or refers to other files or places.
+    OSError
+        If it does not exist (FileNotFoundError) or cannot be read.
+    """
+    with _opened(validate.path("path", path)) as file:
+        obj = _read(file)
+        if not isinstance(obj, _SAVED):
+            raise FileFormatError(f"holds only a {type(obj).__name__}")
+        return obj
+
+
+def read_geometry(path: str | os.PathLike) -> tuple[RangeLines, int]:
+    """Read everything of range lines but their samples.
+
+    Returns
+    -------
+    lines : RangeLines
+        With one sample per channel, zero.
+    length : int
+        Samples per channel in the file.
+
+    Raises
+    ------
+    FileFormatError, OSError
+        As `load` does, and if the file holds something else.
+    """
+    with _opened(path) as file:
+        dataset = _samples_of(file)
+        nothing = np.zeros((dataset.shape[0], 1), np.complex64)
+        return _read(file, samples=nothing), dataset.shape[1]
+
+
+def read_samples(path: str | os.PathLike, rows: slice, columns: slice) -> np.ndarray:
+    """Read some samples of range lines, [channels, samples], and nothing else.
+
+    Raises
+    ------
+    FileFormatError, OSError
+        As `read_geometry` does.
+    """
+    with _opened(path) as file:
+        samples = _samples_of(file)
+        counts = [
+            len(range(n)[part]) for n, part in zip(samples.shape, (rows, columns), strict=True)
+        ]
+        _check_memory(samples, samples.dtype.itemsize * math.prod(counts))
+        return samples[rows, columns]
+
+
+@contextmanager
+def _opened(path: str | os.PathLike) -> Iterator[h5py.File]:
+    """Open a file of clsas to read; whatever is wrong with it is said by one exception."""
+    path = Path(path)
+    try:
+        reading.check_ordinary(path)
+    except ValueError as error:
+        raise FileFormatError(str(error)) from None
+    with path.open("rb"):
+        pass  # Whatever keeps it from being opened is said by Python, better than by HDF5.
+    if not h5py.is_hdf5(path):
+        raise FileFormatError(f"{path} is not an HDF5 file")
+    try:
+        with h5py.File(path, "r") as file:
+            _check_header(file)
+            yield file
+    except FileFormatError as error:
+        raise FileFormatError(f"{path} {error}") from None
+    # HDF5 reports damage by any of these, depending on what it met first.
+    except (OSError, RuntimeError, LookupError, ValueError, TypeError) as error:
+        raise FileFormatError(f"{path} is damaged: {error}") from error
+
+
+def to_xarray(obj: Saved) -> xarray.DataArray | xarray.Dataset:
+    """Return an object as an xarray one, with coordinates in metres.
+
+    An image is a DataArray; a grid is a Dataset of coordinates only; range lines and echoes are
+    Datasets over (channel, sample). A coordinate has its unit in `attrs["units"]`; numbers that
+    belong to no axis are attributes, with the unit in their name.
+
+    Parameters
+    ----------
+    obj : Grid, RangeLines, Image or Echoes
+        What to convert. The arrays are shared, not copied.
+
+    Raises
+    ------
+    ImportError
+        If xarray is not installed.
+    TypeError
+        If `obj` is of another type.
+    """
+    try:
+        import xarray
+    except ImportError:
+        raise ImportError("to_xarray needs xarray: pip install xarray") from None
+    validate.instance("obj", obj, *_SAVED)
+    match obj:
+        case Grid():
+            return xarray.Dataset(coords=_grid_coordinates(obj))
+        case Image(pixels=pixels, grid=grid):
+            return xarray.DataArray(pixels, _grid_coordinates(grid), _grid_dims(grid), "pixels")
+    return _channels_to_xarray(xarray, obj)
+
+
+def _write(group: h5py.Group, obj: Any) -> None:
+    _set(group, "kind", next(name for name, kind in _KINDS.items() if type(obj) is kind))
+    for field in fields(obj):
+        value = getattr(obj, field.name)
+        if value is None:
+            continue
+        if isinstance(value, np.ndarray):
+            # Checksummed, so that damage does not become data.
+            group.create_dataset(field.name, data=value, fletcher32=True)
+        elif type(value) in _KINDS.values():
+            _write(group.create_group(field.name), value)
+        else:
+            _set(group, field.name, value)
+
+
+def _samples_of(file: h5py.File) -> h5py.Dataset:
+    kind = _attribute(file, "kind")
+    if kind != "range_lines":
+        raise FileFormatError(f"must hold range lines, got {validate.shown(kind)}")
+    samples = _item(file, "samples")
+    if not isinstance(samples, h5py.Dataset):
+        raise FileFormatError("lacks samples of the range_lines at /")
+    if samples.dtype.kind != "c" or len(samples.shape or ()) != 2 or not samples.size:
+        raise FileFormatError(
+            "must hold samples that are complex numbers, [channels, samples], got "
+            f"{samples.dtype} of shape {samples.shape}"
+        )
+    return samples
+
+
+def _read(group: h5py.Group, **instead: Any) -> Any:
+    """Return the object in a group, some of whose fields may be given `instead` of being read."""
+    name = _attribute(group, "kind")
+    if not isinstance(name, str) or name not in _KINDS:
+        where = f"{validate.shown(name)} at {validate.shown(group.name)}"
+        raise FileFormatError(f"holds an object of unknown kind {where}")
+    kind = _KINDS[name]
+    values = {}
+    for field in fields(kind):
+        if field.name in instead:
+            values[field.name] = instead[field.name]
+        elif field.name in group.attrs:
+            values[field.name] = _attribute(group, field.name)
+        elif (item := _item(group, field.name)) is not None:
+            is_group = isinstance(item, h5py.Group)
+            # A group may be linked as a part of itself.
+            if is_group and _kind_of_field(field.type) != _attribute(item, "kind"):
+                raise FileFormatError(f"holds another object as {field.name} of the {name}")
+            values[field.name] = _read(item) if is_group else _values(item)
+        elif "None" in str(field.type):
+            values[field.name] = None
+        else:
+            raise FileFormatError(f"lacks {field.name} of the {name} at {group.name}")
+    return kind(**values)
+
+
+def _kind_of_field(annotation: object) -> str | None:
+    """Return the kind of object that a field such as `pulse: Pulse | None` holds, if of any."""
+    classes = str(annotation).split(" | ")
+    return next((name for name, kind in _KINDS.items() if kind.__name__ in classes), None)
+
+
+def _item(group: h5py.Group, name: str) -> h5py.Group | h5py.Dataset | None:
+    """Return a group or dataset that lies in this file itself, or None where there is none.
+
+    A file from elsewhere must not decide which other files are read.
+    """
+    link = group.get(name, getlink=True)
+    if link is None:
+        return None
+    if not isinstance(link, h5py.HardLink):
+        raise FileFormatError(f"must hold {name} itself, got a link to another place")
+    item = group[name]
+    if isinstance(item, h5py.Dataset):
+        if item.is_virtual or item.external:
+            raise FileFormatError(f"must hold {name} itself, got a dataset kept in other files")
+        if item.dtype.kind not in "iufc":
+            raise FileFormatError(f"must hold {name} as numbers, got {item.dtype}")
+    elif not isinstance(item, h5py.Group):
+        raise FileFormatError(f"must hold {name} as a dataset, got a type")
+    return item
+
+
+def _values(dataset: h5py.Dataset) -> np.ndarray:
+    # HDF5 reads what was never written as zeros, however many.
+    if dataset.chunks is None:
+        whole = dataset.id.get_storage_size() >= dataset.nbytes
+    else:
+        counts = map(math.ceil, np.divide(dataset.shape, dataset.chunks))
+        whole = dataset.id.get_num_chunks() == math.prod(counts)
+    if not whole:
+        raise FileFormatError(f"lacks a part of {dataset.name}, of shape {dataset.shape}")
+    _check_memory(dataset, dataset.nbytes)
+    return dataset[()]
+
+
+def _check_memory(dataset: h5py.Dataset, size_bytes: int) -> None:
+    """Raise FileFormatError unless so much of a dataset fits into memory when it is read."""
+    # HDF5 unpacks chunks whole, from one buffer into another.
+    chunk = math.prod(dataset.chunks or (0,)) * dataset.dtype.itemsize
+    try:
+        validate.memory(f"reading {dataset.name}", size_bytes + 2 * chunk)
+    except ValueError as error:
+        raise FileFormatError(f"is too large: {error}") from None
+
+
+def _set(group: h5py.Group, name: str, value: Any) -> None:
+    # Of fixed length, a string is inside the checksummed metadata; of variable length it is not.
+    group.attrs[name] = np.bytes_(value.encode()) if isinstance(value, str) else value
+
+
+def _attribute(group: h5py.Group, name: str) -> Any:
+    """Return an attribute as Python's own number, string or list, or None where there is none."""
+    value = group.attrs.get(name)
+    value = value.tolist() if isinstance(value, np.generic | np.ndarray) else value
+    return value.decode() if isinstance(value, bytes) else value
+
+
+def _check_header(file: h5py.File) -> None:
+    if _attribute(file, "format") != FORMAT:
+        raise FileFormatError("is an HDF5 file, but not one of clsas (attribute format)")
+    version = int(file.attrs["version"])
+    if version > VERSION:
+        raise FileFormatError(
+            f"is of format version {version}, newer than this clsas, which reads up to {VERSION}"
+        )
+    if version < 1:
+        raise FileFormatError(f"is of format version {version}, but the first one is 1")
+
+
+def _grid_dims(grid: Grid) -> tuple[str, ...]:
+    if grid.points_m is not None:
+        return tuple(f"point_{axis}" for axis in range(len(grid.shape)))
+    return ("y", "x") if grid.has_axes else ("row", "column")
+
+
+def _grid_coordinates(grid: Grid) -> dict[str, tuple]:
+    metres = {"units": "m"}
+    dims = _grid_dims(grid)
+    if not grid.has_axes:
+        positions = np.moveaxis(grid.positions_m(), -1, 0)
+        return {name: (dims, values, metres) for name, values in zip("xyz", positions, strict=True)}
+    x, y = grid.axes_m
+    if grid.height_m is None:
+        z = ((), grid.origin_m[2], metres)
+    else:
+        z = (dims, grid.origin_m[2] + grid.height_m, metres)
+    return {"x": ("x", x, metres), "y": ("y", y, metres), "z": z}
+
+
+_UNITS = {"_m_s": "m s-1", "_m": "m", "_s": "s", "_hz": "Hz"}
+
+
+def _channels_to_xarray(xarray: ModuleType, obj: RangeLines | Echoes) -> xarray.Dataset:
+    steps = np.arange(obj.samples.shape[1])
+    if isinstance(obj, RangeLines):
+        offset = {"range_offset_m": ("sample", steps * obj.range_step_m, {"units": "m"})}
+    else:
+        offset = {"time_offset_s": ("sample", steps / obj.sample_rate_hz, {"units": "s"})}
+    variables, attributes = {}, {}
+    for field in fields(obj):
+        name, value = field.name, getattr(obj, field.name)
+        if isinstance(value, np.ndarray):
+            dims = ("channel", "sample" if name == "samples" else "axis")[: value.ndim]
+            unit = next((unit for end, unit in _UNITS.items() if name.endswith(end)), None)
+            variables[name] = (dims, value, {} if unit is None else {"units": unit})
+        elif is_dataclass(value):
+            attributes |= {
+                f"{name}_{part.name}": getattr(value, part.name) for part in fields(value)
+            }
+        elif value is not None:
+            attributes[name] = value
+    return xarray.Dataset(variables, {**offset, "axis": ["x", "y", "z"]}, attributes)

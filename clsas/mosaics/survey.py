@@ -1,0 +1,298 @@
+"""Surveys: range lines in files, of which only what a part of an image needs is read.
+
+A survey is one file of range lines, or a folder of such files in the order of their names, to which
+more may be added while it is recorded. Its geometry is in memory, its samples are not.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsas.core import validate
+from clsas.core.lines import RangeLines
+from clsas.factorized.plan import lines_digest
+from clsas.files.hdf5 import FileFormatError, read_geometry, read_samples
+
+END = "end"
+"""Name of the file that says of a folder that no more files will be added."""
+
+_TAPER = 64  # samples over which a line that is cut fades
+_BEYOND = 32  # further samples, untouched: what interpolation reaches, and the fading's ringing
+_DIGESTED = 16  # lines of a part whose samples its digest sees
+_APART = 64  # unseen channels that are rather read than skipped
+_HOLE = 3.0  # steps between pings, in median ones, that make a gap
+
+
+@dataclass(frozen=True, eq=False)
+class Survey:
+    """Range lines of which only the geometry is in memory.
+
+    Attributes
+    ----------
+    geometry : RangeLines
+        Every channel's, with one sample each, zero.
+    parts : tuple of RangeLines or Path
+        Where the samples are, in the order of the channels.
+    begins : tuple of int
+        First channel of every part, and the number of channels.
+    lengths : tuple of int
+        Samples per channel of every part.
+    stamps : tuple of (int, int)
+        Size and time of change, ns, of every file when it was opened; 0, 0 for lines in memory.
+    """
+
+    geometry: RangeLines
+    parts: tuple[RangeLines | Path, ...]
+    begins: tuple[int, ...]
+    lengths: tuple[int, ...]
+    stamps: tuple[tuple[int, int], ...]
+
+    @property
+    def channels(self) -> int:
+        """Number of channels."""
+        return self.begins[-1]
+
+    @property
+    def length(self) -> NDArray[np.int64]:
+        """Samples of every channel, [channels]."""
+        return np.repeat(self.lengths, np.diff(self.begins))
+
+    def digests(self, first: int = 0) -> list[str]:
+        """Return a digest of every part from the first on.
+
+        It is of geometry and samples; of a file's samples it sees 16 lines.
+        """
+        found = []
+        for index, part in enumerate(self.parts[first:], first):
+            count = self.begins[index + 1] - self.begins[index]
+            digest = hashlib.sha256(lines_digest(self._part_geometry(index)).encode())
+            if isinstance(part, RangeLines):
+                digest.update(part.samples)
+            else:
+                for channel in np.unique(np.linspace(0, count - 1, _DIGESTED).astype(int)):
+                    rows, columns = slice(channel, channel + 1), slice(0, self.lengths[index])
+                    digest.update(np.ascontiguousarray(self._samples(index, rows, columns)))
+            found.append(digest.hexdigest()[:16])
+        return found
+
+    def within(self, near_m: NDArray[np.float64], far_m: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Return which channels recorded anything of ranges from near to far, [channels]."""
+        first_m = self.geometry.first_range_m
+        last_m = first_m + (self.length - 1) * self.geometry.range_step_m
+        return (far_m >= first_m) & (near_m <= last_m)
+
+    def extent(
+        self, seen: NDArray[np.bool_], near_m: NDArray[np.float64], far_m: NDArray[np.float64]
+    ) -> tuple[int, int]:
+        """Return how many lines, and samples of each, `read` would return."""
+        blocks = list(self._blocks(seen, near_m, far_m))
+        longest = max(columns.stop - columns.start for _, _, columns in blocks)
+        return int(np.count_nonzero(seen)), longest
+
+    def read(
+        self, seen: NDArray[np.bool_], near_m: NDArray[np.float64], far_m: NDArray[np.float64]
+    ) -> tuple[RangeLines, NDArray[np.bool_]]:
+        """Return some channels' lines between ranges, and which of them have no samples.
+
+        Parameters
+        ----------
+        seen : bool [channels]
+            Which channels; at least one.
+        near_m, far_m : float64 [channels]
+            Ranges that must be there as they were recorded. Where more was recorded, lines go on
+            for 32 samples and then fade over 64, so that they can be interpolated; beyond what was
+            recorded they are zero.
+
+        Returns
+        -------
+        lines : RangeLines
+        missing : bool [lines.channels]
+            Channels whose samples are not finite or all zero; they are zero in `lines`.
+
+        Raises
+        ------
+        FileFormatError, OSError
+            If a file cannot be read, or is not what it was when the survey was opened.
+        """
+        geometry, index = self.geometry, np.flatnonzero(seen)
+        blocks = list(self._blocks(seen, near_m, far_m))
+        longest = max(columns.stop - columns.start for _, _, columns in blocks)
+        validate.memory("lines of a patch", 8 * len(index) * longest)
+        samples = np.zeros((len(index), longest), np.complex64)
+        first_m = np.empty(len(index))
+        place = 0
+        for part, rows, columns in blocks:
+            begin = self.begins[part]
+            wanted = seen[rows]
+            block = self._samples(part, slice(rows.start - begin, rows.stop - begin), columns)
+            here = slice(place, place + np.count_nonzero(wanted))
+            lines = samples[here, : block.shape[1]]
+            lines[:] = block if wanted.all() else block[wanted]
+            fade = np.sin(np.pi / 2 * (np.arange(_TAPER) + 0.5) / _TAPER) ** 2
+            if columns.start > 0:
+                lines[:, :_TAPER] *= fade.astype(np.float32)
+            if columns.stop < self.lengths[part]:
+                lines[:, -_TAPER:] *= fade[::-1].astype(np.float32)
+            first_m[here] = geometry.first_range_m[rows][wanted]
+            first_m[here] += columns.start * geometry.range_step_m
+            place = here.stop
+        # Sums tell of most: they may also be too large, or cancel.
+        with np.errstate(over="ignore", invalid="ignore"):
+            sums = np.add.reduce(samples, axis=1)
+        missing, silent = ~np.isfinite(sums), sums == 0
+        missing[missing] = ~np.isfinite(samples[missing]).all(axis=1)
+        samples[missing] = 0
+        silent[silent] = ~samples[silent].any(axis=1)
+        missing |= silent
+        velocity = geometry.rx_velocity_m_s
+        lines = replace(
+            geometry,
+            samples=samples,
+            first_range_m=first_m,
+            tx_m=geometry.tx_m[index],
+            rx_m=geometry.rx_m[index],
+            rx_velocity_m_s=None if velocity is None else velocity[index],
+        )
+        return lines, missing
+
+    def _blocks(
+        self, seen: NDArray[np.bool_], near_m: NDArray[np.float64], far_m: NDArray[np.float64]
+    ) -> Iterator[tuple[int, slice, slice]]:
+        """Yield part, channels and samples of every run of channels that is read at once."""
+        step_m = self.geometry.range_step_m
+        reach = _TAPER + _BEYOND
+        for part, length in enumerate(self.lengths):
+            begin, end = self.begins[part : part + 2]
+            index = begin + np.flatnonzero(seen[begin:end])
+            if not index.size:
+                continue
+            for run in np.split(index, np.flatnonzero(np.diff(index) > _APART) + 1):
+                first_m = self.geometry.first_range_m[run]
+                start = int(np.floor(((near_m[run] - first_m) / step_m).min())) - reach
+                stop = int(np.ceil(((far_m[run] - first_m) / step_m).max())) + reach + 1
+                start = min(max(start, 0), length - 1)
+                stop = max(min(stop, length), start + 1)
+                # A fade needs its room: what is nearly all of a line is read whole.
+                start = 0 if start < 2 * _TAPER else start
+                stop = length if stop > length - 2 * _TAPER else stop
+                yield part, slice(int(run[0]), int(run[-1]) + 1), slice(start, stop)
+
+    def _samples(self, index: int, rows: slice, columns: slice) -> NDArray[np.complex64]:
+        part = self.parts[index]
+        if isinstance(part, RangeLines):
+            return part.samples[rows, columns]
+        if _stamp(part) != self.stamps[index]:
+            raise FileFormatError(f"{part} is not what it was when the survey was opened")
+        return read_samples(part, rows, columns)
+
+    def _part_geometry(self, index: int) -> RangeLines:
+        channels = self.geometry.select(slice(*self.begins[index : index + 2]))
+        return channels.without_samples()
+
+
+def open_survey(source: RangeLines | str | os.PathLike) -> Survey:
+    """Return the survey in a file, in a folder of files (*.h5), or of lines in memory.
+
+    Raises
+    ------
+    TypeError
+        If `source` is neither lines nor a path.
+    FileFormatError
+        If a file does not hold range lines.
+    ValueError
+        If the files of a folder differ in carrier, sound speed, range step or in having
+        velocities, or there is none.
+    OSError
+        If a file cannot be read.
+    """
+    if isinstance(source, RangeLines):
+        geometry = source.without_samples()
+        return Survey(geometry, (source,), (0, source.channels), (source.length,), ((0, 0),))
+    paths = files_of(source)
+    if not paths:
+        raise ValueError(f"source must hold range lines: the folder {source} has no file *.h5")
+    return open_files(paths)
+
+
+def files_of(source: str | os.PathLike) -> tuple[Path, ...]:
+    """Return the files that a survey is made of, by name."""
+    path = validate.path("source", source)
+    if not path.is_dir():
+        return (path,)
+    return tuple(sorted(p for p in path.glob("*.h5") if not p.name.startswith(".")))
+
+
+def has_ended(source: str | os.PathLike) -> bool:
+    """Return whether a survey will not grow: it is a file, or its folder holds a file `end`."""
+    path = Path(source)
+    return not path.is_dir() or (path / END).exists()
+
+
+def open_files(paths: tuple[Path, ...], before: Survey | None = None) -> Survey:
+    """Return the survey of these files; `before` is of the first of them, already open.
+
+    Raises ValueError also if these are not the first of them any more.
+    """
+    known = 0 if before is None else len(before.parts)
+    if before is not None and paths[:known] != before.parts:
+        changed = next(a for a, b in zip((*paths, None), before.parts, strict=False) if a != b)
+        raise ValueError(
+            f"source must grow by files whose names follow the last one, {before.parts[-1].name}, "
+            f"got {'fewer files' if changed is None else changed.name}"
+        )
+    stamps = [] if before is None else list(before.stamps)
+    found = [] if before is None else [before.geometry]
+    lengths = [] if before is None else list(before.lengths)
+    begins = [0] if before is None else list(before.begins)
+    for path in paths[known:]:
+        stamps.append(_stamp(path))
+        geometry, length = read_geometry(path)
+        lengths.append(length)
+        begins.append(begins[-1] + geometry.channels)
+        found.append(geometry)
+        for name in ("range_step_m", "carrier_hz", "sound_speed_m_s"):
+            ours, theirs = getattr(geometry, name), getattr(found[0], name)
+            if ours != theirs:
+                raise ValueError(
+                    f"{path}: {name} must be that of the survey's first file, {theirs:g}, got "
+                    f"{ours:g}"
+                )
+        if (geometry.rx_velocity_m_s is None) != (found[0].rx_velocity_m_s is None):
+            raise ValueError(
+                f"{path}: rx_velocity_m_s must be in every file of the survey or in none"
+            )
+    names = ["first_range_m", "tx_m", "rx_m"]
+    names += [] if found[0].rx_velocity_m_s is None else ["rx_velocity_m_s"]
+    joined = {name: np.concatenate([getattr(each, name) for each in found]) for name in names}
+    geometry = replace(found[0], samples=np.zeros((begins[-1], 1), np.complex64), **joined)
+    return Survey(geometry, tuple(paths), tuple(begins), tuple(lengths), tuple(stamps))
+
+
+def largest_gap_m(lines: RangeLines, missing: NDArray[np.bool_]) -> float:
+    """Return the longest way between successive pings if it is a gap, else 0, metres.
+
+    A gap is three times the median step. Channels that are `missing` make gaps too.
+    """
+    there = ~missing
+    if np.count_nonzero(there) < 2:
+        return 0.0
+    every_m, some_m = (
+        np.unique(lines.phase_centres_m[each], axis=0) for each in (np.ones_like(there), there)
+    )
+    axis = np.ptp(every_m, axis=0).argmax()
+    steps_m = np.diff(np.sort(every_m[:, axis]))
+    usual_m = float(np.median(steps_m[steps_m > 0])) if steps_m.any() else 0.0
+    longest_m = float(np.diff(np.sort(some_m[:, axis])).max(initial=0.0))
+    return longest_m if longest_m > _HOLE * usual_m else 0.0
+
+
+def _stamp(path: Path) -> tuple[int, int]:
+    status = path.stat()
+    return status.st_size, status.st_mtime_ns

@@ -1,0 +1,122 @@
+"""The buffers that kernels share: their formats and sizes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsas.core.lines import RangeLines, wavelength_m
+from clsas.core.threads import in_threads
+from clsas.opencl import phases
+from clsas.opencl.device import Device, aligned
+from clsas.signal.interpolation import (
+    Gain,
+    Resampling,
+)
+from clsas.sonar.beam import INTERVALS, BeamWindow
+
+VECTOR_ROOM = 16
+"""Channels by which rows are longer in which a vector may begin at the last."""
+_LINES_AT_ONCE = 32  # upsampled together: what stays in a core's cache
+
+
+GIVEN_BYTES = 64 << 20
+"""Of lines as they come, at most, that are on a device at once to be upsampled."""
+MARGIN = 32
+"""Zeros on either side of an upsampled line: what lies further out is moved into them."""
+GUARD = 16
+"""Zeros on either side of a virtual channel's line, which the last stage's lookup may touch."""
+
+
+def beam_arguments(
+    device: Device, beam: BeamWindow | None, lines: RangeLines
+) -> tuple[float, tuple[object, ...]]:
+    """Return table intervals per sine, and what kernels with BEAM take at their ends."""
+    if beam is None:
+        return 0.0, ()
+    low, high = (float(limit) for limit in beam.limits)
+    lowest, highest = max(low, -1.0), min(high, 1.0)
+    per_sine = INTERVALS / (highest - lowest)
+    places = (lowest * per_sine, (low - lowest) * per_sine, (high - lowest) * per_sine)
+    return per_sine, (device.upload(beam.table(wavelength_m(lines))), *places)
+
+
+def upsampled_lines(
+    samples: NDArray[np.complex64],
+    resampling: Resampling,
+    width: int,
+    margin: int,
+    pitch: int,
+    gain: Gain | None = None,
+) -> NDArray[np.float32]:
+    """Return lines upsampled as the kernels want them: `pitch` samples each, zeros around.
+
+    With one lane per work-item they are interleaved, [channels, pitch, 2]; with more, real and
+    imaginary parts are planes, [channels, 2, pitch]. `gain` multiplies their spectrum.
+    """
+    of_line = (pitch, 2) if width == 1 else (2, pitch)
+    padded = aligned(np.zeros, (len(samples), *of_line), np.float32)
+    inside = slice(margin, margin + resampling.length)
+
+    factor = None if gain is None else gain(resampling.frequency)
+
+    def fill(some: slice) -> None:
+        upsampled = resampling.apply(samples[some], factor)
+        for part, values in enumerate((upsampled.real, upsampled.imag)):
+            if width == 1:
+                padded[some, inside, part] = values
+            else:
+                padded[some, part, inside] = values
+
+    for _ in in_threads(fill, slices(slice(0, len(samples)), _LINES_AT_ONCE)):
+        pass
+    return padded
+
+
+def float_pairs(positions_m: NDArray[np.float64]) -> NDArray[np.float32]:
+    """Return float32 [n, 6]: positions [n, 3] as nearest float32 numbers, and what these leave."""
+    nearest = positions_m.astype(np.float32)
+    return np.concatenate([nearest, (positions_m - nearest).astype(np.float32)], axis=1)
+
+
+def lookup_weights(coefficients: NDArray[np.float64], terms: int) -> NDArray[np.float32]:
+    """Return what the kernels take as weights: an interpolator's, and polynomials for phases."""
+    polynomials = phases.polynomials(terms).ravel()
+    return np.concatenate([coefficients.ravel().astype(np.float32), polynomials])
+
+
+def expansion_terms(beam: BeamWindow | None) -> int:
+    """Return how many numbers `expand_tiles` finds per tile and channel."""
+    return 9 if beam is None else 19
+
+
+def channel_pitch(channels: int) -> int:
+    """Channels with padding to whole vectors of any width."""
+    return round_up(channels, 16)
+
+
+def round_up(number: int, multiple: int) -> int:
+    """Return the least multiple that is not below a number."""
+    return -(-number // multiple) * multiple
+
+
+def slices(whole: slice, most: int) -> Iterator[slice]:
+    """Cut a slice into pieces of at most `most`."""
+    for start in range(whole.start, whole.stop, most):
+        yield slice(start, min(start + most, whole.stop))
+
+
+def sample_bytes(half_precision: bool) -> int:
+    """Return the bytes of a complex sample that stages hand on."""
+    return 4 if half_precision else 8
+
+
+def padded_length(resampling: Resampling) -> int:
+    """Return the samples of an upsampled line on the device, with zeros around it.
+
+    Lines at equal places in a cache's sets would evict each other.
+    """
+    length = -(-(resampling.length + 2 * MARGIN) // 16) * 16
+    return length + 16 * (length % 256 == 0)

@@ -1,0 +1,487 @@
+"""Choosing an OpenCL device, building kernels once, and profiling them."""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import math
+import os
+import re
+import statistics
+import threading
+import warnings
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from importlib.resources import files
+from pathlib import Path
+
+import numpy as np
+import pyopencl as cl
+from numpy.typing import DTypeLike
+
+from clsas.core.extras import install_command
+
+ENVIRONMENT_VARIABLE = "CLSAS_DEVICE"
+KINDS = ("gpu", "cpu", "accelerator")
+"""Kinds of device, from the one that is chosen first."""
+_PLATFORMS = {"pocl": "portable computing language"}
+"""Names of platforms that people use and that are no part of the full one, in lower case."""
+_ALIGNMENT = 4096  # bytes: of pages
+# Programs that a device keeps built: 0.6 MiB each with PoCL, 4 MiB with Intel's runtime. An image
+# takes 1 to 4 of them.
+_MOST_PROGRAMS = 32
+_TYPED = "_clsas_typed"  # attribute of kernels whose arguments' types are known
+
+_HOW_TO_GET_A_DEVICE = """\
+No OpenCL device was found. Any one of these gives one:
+  - a CPU driver from PyPI:  {command}
+  - the vendor's driver of your GPU or CPU, which installs an .icd file in /etc/OpenCL/vendors;
+    PyOpenCL's wheel looks there and in {folder}
+    (copy or write an .icd file there when the driver lives in your Python environment:
+    it is one line, the path of the driver's shared library).
+The environment variable OCL_ICD_VENDORS, where it is set, replaces these places."""
+
+
+class DeviceError(RuntimeError):
+    """No OpenCL device fits, or it refused to build a kernel."""
+
+
+@dataclass(frozen=True)
+class DeviceInfo:
+    """One OpenCL device, and how clsas would drive it.
+
+    Attributes
+    ----------
+    index : int
+        Place in `list_devices()`.
+    platform, name, driver : str
+        As the driver reports them.
+    kind : str
+        "gpu", "cpu" or "accelerator".
+    compute_units : int
+        Cores of a CPU, multiprocessors of a GPU.
+    memory_bytes, max_buffer_bytes : int
+        Global memory and largest single buffer.
+    fp64 : bool
+        Whether the device has double precision (clsas never needs it).
+    width : int
+        Float lanes per work-item that clsas uses: 1 on GPUs, and where the driver's compiler
+        vectorises across work-items itself.
+    permute : bool
+        Whether kernels may look samples up in registers, of AVX2 or AVX-512.
+    """
+
+    index: int
+    platform: str
+    name: str
+    driver: str
+    kind: str
+    compute_units: int
+    memory_bytes: int
+    max_buffer_bytes: int
+    fp64: bool
+    width: int
+    permute: bool
+
+    @property
+    def half_precision(self) -> bool:
+        """Whether kernels take half-precision numbers in and out as fast as others.
+
+        Of CPUs those do that permute.
+        """
+        return self.kind == "gpu" or self.permute
+
+    @property
+    def label(self) -> str:
+        """Platform and name in one string; what a name is matched against."""
+        return f"{self.platform}: {self.name}"
+
+
+@dataclass(frozen=True)
+class KernelTimes:
+    """How often a kernel ran on the device, and for how long, in seconds."""
+
+    count: int
+    minimum_s: float
+    median_s: float
+    maximum_s: float
+    total_s: float
+
+
+@dataclass(eq=False)
+class _Program:
+    """A built program and those of its kernels that were asked for."""
+
+    program: cl.Program
+    kernels: dict[str, cl.Kernel] = field(default_factory=dict)
+
+    def kernel(self, name: str) -> cl.Kernel:
+        # Not Program.all_kernels: PyOpenCL never releases what that returns.
+        if name not in self.kernels:
+            self.kernels[name] = cl.Kernel(self.program, name)
+        return self.kernels[name]
+
+
+@dataclass(eq=False)
+class Device:
+    """An opened device: its context, its queues and the kernels built so far.
+
+    Kernels run in order on `queue`; uploads go through `uploads`, beside them. Threads may share
+    a device; `profile` then counts what all of them run.
+    """
+
+    info: DeviceInfo
+    context: cl.Context
+    queue: cl.CommandQueue
+    uploads: cl.CommandQueue
+    # By source and options; the program used last is the last one.
+    _kernels: dict[tuple, _Program] = field(default_factory=dict, repr=False)
+    _events: list[tuple[str, cl.Event]] | None = field(default=None, repr=False)
+    # A kernel holds its arguments from when they are set until it is enqueued.
+    _lock: threading.RLock = field(default_factory=threading.RLock, repr=False)
+
+    def kernel(self, source: str, name: str, **options: int) -> cl.Kernel:
+        """Return kernel `name` of `cl/<source>.cl`, built once per set of options.
+
+        The device keeps the 32 programs that were used last. A program used again after that is
+        built again, which is a lookup in the driver's cache on disk.
+
+        Parameters
+        ----------
+        source : str
+            File name in `cl/` without its ending; `common.h` is put before it.
+        name : str
+            Kernel in that file.
+        **options : int
+            Preprocessor definitions.
+
+        Raises
+        ------
+        DeviceError
+            If the driver's compiler refuses it; the message holds the compiler's log.
+        """
+        key = (source, *sorted(options.items()))
+        with self._lock:
+            program = self._kernels.pop(key, None) or self._build(source, options)
+            self._kernels[key] = program
+            while len(self._kernels) > _MOST_PROGRAMS:
+                # Runs hold the kernels they use, and the driver those it was given.
+                del self._kernels[next(iter(self._kernels))]
+            return program.kernel(name)
+
+    def _build(self, source: str, options: dict[str, int]) -> _Program:
+        definitions = [f"-D{option}={value}" for option, value in sorted(options.items())]
+        text = kernel_source("common.h") + kernel_source(f"{source}.cl")
+        try:
+            return _Program(_built(self.context, text, ["-cl-mad-enable", *definitions]))
+        except cl.RuntimeError as error:
+            raise DeviceError(
+                f"{self.info.label} could not build {source}.cl with "
+                f"{' '.join(definitions)}:\n{error}"
+            ) from error
+
+    def run(
+        self,
+        kernel: cl.Kernel,
+        size: tuple[int, ...],
+        *arguments: object,
+        wait_for: Sequence[cl.Event] = (),
+        local: tuple[int, ...] | None = None,
+    ) -> cl.Event:
+        """Enqueue a kernel over `size` work-items; ints and floats become 32-bit.
+
+        An argument is a number of the same kind, or not one, whenever a kernel is run.
+
+        Unless `local` says otherwise, work-items that hold vectors are work-groups of their own
+        (PoCL compiles a kernel anew for every local size), and else the driver chooses.
+        """
+        if local is None and self.info.width > 1:
+            local = (1,) * len(size)
+        with self._lock:
+            if not hasattr(kernel, _TYPED):
+                # Numbers of known types are handed over ten times as fast.
+                kernel.set_scalar_arg_dtypes([_scalar_type(each) for each in arguments])
+                setattr(kernel, _TYPED, True)
+            event = kernel(self.queue, size, local, *arguments, wait_for=wait_for)
+            if self._events is not None:
+                self._events.append((kernel.function_name, event))
+        return event
+
+    @contextlib.contextmanager
+    def profile(self) -> Iterator[dict[str, KernelTimes]]:
+        """Time every kernel run within the block; the yielded dict is filled at its end."""
+        times: dict[str, KernelTimes] = {}
+        self._events = []
+        try:
+            yield times
+            self.finish()
+            seconds = defaultdict(list)
+            for name, event in self._events:
+                seconds[name].append(1e-9 * (event.profile.end - event.profile.start))
+            for name, runs in seconds.items():
+                times[name] = KernelTimes(
+                    len(runs), min(runs), statistics.median(runs), max(runs), sum(runs)
+                )
+        finally:
+            self._events = None
+
+    def finish(self) -> None:
+        """Wait until the device has done all it was given."""
+        self.uploads.finish()
+        self.queue.finish()
+
+    def buffer(self, bytes_: int) -> cl.Buffer:
+        """Return a read-write buffer of anything, to be kept until the device is done with it."""
+        flags, bytes_ = cl.mem_flags.READ_WRITE, max(int(bytes_), 4)
+        if self.info.kind != "cpu":
+            return cl.Buffer(self.context, flags, bytes_)
+        # NumPy's memory lies in large pages where the system has them: far fewer faults and
+        # misses than in a driver's.
+        return self.share(aligned(np.empty, (bytes_,), np.uint8))
+
+    def share(self, array: np.ndarray) -> cl.Buffer:
+        """Return a buffer that holds an array: on a CPU its own memory, elsewhere a copy.
+
+        Both are to be kept, and the array left alone, until the device is done with them.
+        """
+        how = cl.mem_flags.USE_HOST_PTR if self.info.kind == "cpu" else cl.mem_flags.COPY_HOST_PTR
+        access = cl.mem_flags.READ_WRITE if array.flags.writeable else cl.mem_flags.READ_ONLY
+        return cl.Buffer(self.context, access | how, hostbuf=array)
+
+    def upload(self, array: np.ndarray) -> cl.Buffer:
+        """Return a buffer that holds a copy of `array`; one of anything where that is empty."""
+        if not array.size:
+            return self.buffer(0)
+        flags = cl.mem_flags.READ_WRITE | cl.mem_flags.COPY_HOST_PTR
+        return cl.Buffer(self.context, flags, hostbuf=np.ascontiguousarray(array))
+
+    def zeros(self, bytes_: int) -> cl.Buffer:
+        """Return a buffer of zeros."""
+        if self.info.kind == "cpu":
+            return self.share(aligned(np.zeros, (max(int(bytes_), 4),), np.uint8))
+        buffer = self.buffer(bytes_)
+        cl.enqueue_fill_buffer(self.queue, buffer, np.uint32(0), 0, buffer.size)
+        return buffer
+
+
+class Slot:
+    """Named buffers of one job, filled anew once the job that used them last is done.
+
+    With two slots in turn the host fills one while the device works on the other. `busy` is to be
+    set to the last event that uses any of them.
+    """
+
+    def __init__(self, device: Device) -> None:
+        self.device = device
+        self.busy: cl.Event | None = None
+        self.filled: list[cl.Event] = []
+        self._buffers: dict[str, cl.Buffer] = {}
+
+    def __getitem__(self, name: str) -> cl.Buffer:
+        """Return a buffer that was filled or made before."""
+        return self._buffers[name]
+
+    def wait(self) -> None:
+        """Wait until the buffers are free; to be called before they are filled."""
+        self._wait_for_job()
+        self.filled.clear()
+
+    def buffer(self, name: str, bytes_: int) -> cl.Buffer:
+        """Return a buffer of at least so many bytes."""
+        return self._at_least(name, bytes_, self.device.buffer)
+
+    def zeros(self, name: str, bytes_: int) -> cl.Buffer:
+        """Return a buffer of at least so many bytes, that held zeros when it was made."""
+        return self._at_least(name, bytes_, self.device.zeros)
+
+    def _wait_for_job(self) -> None:
+        # A job of which nothing was seen has not waited for what was filled for it.
+        for event in [*self.filled, *([] if self.busy is None else [self.busy])]:
+            event.wait()
+
+    def _at_least(self, name: str, bytes_: int, make: Callable[[int], cl.Buffer]) -> cl.Buffer:
+        if name not in self._buffers:
+            self._buffers[name] = make(bytes_)
+        elif self._buffers[name].size < bytes_:
+            self._wait_for_job()
+            del self._buffers[name]
+            self._buffers[name] = make(bytes_)
+        return self._buffers[name]
+
+    def fill(self, name: str, array: np.ndarray) -> None:
+        """Start copying an array into a buffer; `filled` gains the event to wait for."""
+        array = np.ascontiguousarray(array)
+        buffer = self.buffer(name, array.nbytes)
+        event = cl.enqueue_copy(self.device.uploads, buffer, array, is_blocking=False)
+        self.filled.append(event)
+        self.device.uploads.flush()
+
+
+def aligned(make: Callable[..., np.ndarray], shape: tuple[int, ...], kind: DTypeLike) -> np.ndarray:
+    """Return np.empty or np.zeros of a shape that begins where vectors and pages do."""
+    count = math.prod(shape) * np.dtype(kind).itemsize
+    memory = make(count + _ALIGNMENT, np.uint8)
+    start = -memory.ctypes.data % _ALIGNMENT
+    return memory[start : start + count].view(kind).reshape(shape)
+
+
+def _scalar_type(value: object) -> type | None:
+    if isinstance(value, (int, np.integer)):
+        return np.int32
+    return np.float32 if isinstance(value, (float, np.floating)) else None
+
+
+def kernel_source(name: str) -> str:
+    """Return the text of a file of `cl/`."""
+    installed = files("clsas") / "cl" / name
+    if installed.is_file():
+        return installed.read_text()
+    return (Path(__file__).parents[2] / "cl" / name).read_text()  # a source checkout
+
+
+def _built(context: cl.Context, text: str, options: Sequence[str] = ()) -> cl.Program:
+    """Return a built program."""
+    with warnings.catch_warnings():
+        # Some drivers' compilers greet; a failure brings its log anyway.
+        warnings.simplefilter("ignore", cl.CompilerWarning)
+        return cl.Program(context, text).build(list(options))
+
+
+def _describe(index: int, device: cl.Device) -> DeviceInfo:
+    is_cpu = bool(device.type & cl.device_type.CPU)
+    is_gpu = bool(device.type & cl.device_type.GPU)
+    platform = device.platform.name
+    width, permute = 1, False
+    # Intel's runtime vectorises across work-items, faster than through explicit vectors.
+    if is_cpu and not platform.startswith("Intel"):
+        width, permute = _compiled_vectors(device)
+    return DeviceInfo(
+        index=index,
+        platform=platform,
+        name=device.name.strip(),
+        driver=device.driver_version,
+        kind="gpu" if is_gpu else "cpu" if is_cpu else "accelerator",
+        compute_units=device.max_compute_units,
+        memory_bytes=device.global_mem_size,
+        max_buffer_bytes=device.max_mem_alloc_size,
+        fp64="cl_khr_fp64" in device.extensions.split(),
+        width=width,
+        permute=permute,
+    )
+
+
+@functools.cache
+def _compiled_vectors(device: cl.Device) -> tuple[int, bool]:
+    """Return the floats of a vector as a CPU's compiler has them, and whether it permutes them."""
+    try:
+        context = cl.Context([device])
+        kernel = cl.Kernel(_built(context, kernel_source("lanes.cl")), "lanes")
+        size = kernel.get_work_group_info(cl.kernel_work_group_info.COMPILE_WORK_GROUP_SIZE, device)
+    except cl.Error:  # whatever is wrong is told where there is work to do
+        return 4, False
+    lanes, permute, _ = size
+    return (lanes, permute == 2) if lanes in (8, 16) else (4, False)
+
+
+def _raw_devices() -> list[cl.Device]:
+    try:
+        platforms = cl.get_platforms()
+    except cl.LogicError:  # the loader found no driver at all
+        return []
+    devices = []
+    for platform in platforms:
+        try:
+            devices += platform.get_devices()
+        except cl.RuntimeError:  # a platform without a device
+            continue
+    return devices
+
+
+def list_devices() -> list[DeviceInfo]:
+    """Return every OpenCL device of every platform; empty when there is none."""
+    return [_describe(index, device) for index, device in enumerate(_raw_devices())]
+
+
+def choose(wish: str | int | None = None) -> tuple[DeviceInfo, str]:
+    """Return the device that `wish` names, and why it was chosen.
+
+    Parameters
+    ----------
+    wish : str or int, optional
+        An index of `list_devices()`, a kind ("gpu", "cpu" or "accelerator"), a platform or part
+        of its name ("pocl", "intel", "nvidia", "amd"), or a part of "platform: name"; in any case.
+        What comes first in this list and matches counts: "intel" is Intel's platform also where
+        other platforms drive an Intel CPU. None takes the environment variable CLSAS_DEVICE.
+        Of several devices that match, or without a wish, the first GPU is chosen, then the CPU
+        with the widest vectors.
+
+    Raises
+    ------
+    DeviceError
+        If there is no device, saying how to get one, or none that fits, naming those there are.
+    """
+    devices = list_devices()
+    if not devices:
+        folder = Path(cl.__file__).parent / ".libs"
+        raise DeviceError(
+            _HOW_TO_GET_A_DEVICE.format(folder=folder, command=install_command("pocl"))
+        )
+    source = ""
+    if wish is None and os.environ.get(ENVIRONMENT_VARIABLE):
+        wish = os.environ[ENVIRONMENT_VARIABLE]
+        source = f" by {ENVIRONMENT_VARIABLE}"
+    if wish is None:
+        chosen = _first(devices)
+        if chosen.kind == "gpu":
+            return chosen, "the first GPU"
+        widest = f" with vectors of {chosen.width}" if chosen.width > 1 else ""
+        return chosen, f"the first {chosen.kind.upper()}{widest}; there is no GPU"
+    if isinstance(wish, str) and re.fullmatch(r"\s*[0-9]+\s*", wish, re.ASCII):
+        wish = int(wish)
+    if isinstance(wish, (int, np.integer)) and not isinstance(wish, bool):
+        fitting = [info for info in devices if info.index == wish]
+    elif isinstance(wish, str):
+        fitting = _named(wish.strip().lower(), devices)
+    else:
+        raise TypeError(f"device must be a name, an index or None, got {wish!r}")
+    if not fitting:
+        have = "; ".join(f"{info.index}: {info.label}" for info in devices)
+        raise DeviceError(f"No device matches {wish!r}, asked for{source}. Available: {have}")
+    return _first(fitting), f"asked for{source} as {wish!r}"
+
+
+def _first(devices: Sequence[DeviceInfo]) -> DeviceInfo:
+    """Return the device that is chosen of several: a GPU, else the CPU of the widest vectors."""
+    return min(devices, key=lambda info: (KINDS.index(info.kind), -info.width, info.index))
+
+
+def _named(name: str, devices: Sequence[DeviceInfo]) -> list[DeviceInfo]:
+    """Return the devices of a kind, else of a platform, else those whose label holds a name."""
+    if not name:
+        return []
+    names = name, _PLATFORMS.get(name, name)
+    for fits in (
+        lambda info: info.kind == name,
+        lambda info: any(each in info.platform.lower() for each in names),
+        lambda info: any(each in info.label.lower() for each in names),
+    ):
+        if fitting := [info for info in devices if fits(info)]:
+            return fitting
+    return []
+
+
+@functools.cache
+def _open(index: int) -> Device:
+    device = _raw_devices()[index]
+    context = cl.Context([device])
+    queue = cl.CommandQueue(context, properties=cl.command_queue_properties.PROFILING_ENABLE)
+    info = _describe(index, device)
+    return Device(info, context, queue, cl.CommandQueue(context))
+
+
+def open_device(wish: Device | str | int | None = None) -> Device:
+    """Return an opened device: `wish` itself, or what `choose` finds; opened once per process."""
+    if isinstance(wish, Device):
+        return wish
+    return _open(choose(wish)[0].index)

@@ -1,0 +1,1 @@
+"""How fast, how accurate, and which way: errors, costs, search and plans."""

@@ -1,0 +1,327 @@
+"""Measuring what the parts of imaging cost on a device."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from functools import partial
+from itertools import product
+
+import numpy as np
+from scipy.optimize import nnls
+
+from clsas.core import validate
+from clsas.core.grid import Grid
+from clsas.core.image import Image
+from clsas.core.lines import RangeLines
+from clsas.exact.backprojection import backproject
+from clsas.factorized.plan import Plan
+from clsas.opencl.device import Device, open_device
+from clsas.planning import costs as stored
+from clsas.planning.costs import Costs
+from clsas.planning.exact_image import Exact, expect
+from clsas.planning.factorize import factorize
+from clsas.planning.planner import plan
+from clsas.planning.view import View
+from clsas.signal.interpolation import COST
+from clsas.simulation.scenes import PointTargets
+from clsas.simulation.simulator import simulate_lines
+from clsas.sonar.beam import BeamWindow
+
+_SIZES = ((500, 768), (1500, 512))
+"""Channels, and pixels along a side, of the images that are formed in every way."""
+_SMALL_SIZES = ((100, 128), (400, 256))
+"""Those of what is backprojected only."""
+_TOLERANCES_DB = (-25.0, -45.0, -60.0)
+# Plans differ with what they are told that things cost: these have shallow trees and deep ones.
+_TOLD = (Costs(pixel_ns=1e3, point_ns=1e3), Costs(pixel_ns=1e3, leaf_ns=10.0))
+_EXACT_DB = -50.0
+_WIDE = BeamWindow(120.0, "hann")  # every channel sees every pixel
+_PIXEL_M = 0.02
+
+_ROUNDS = 4
+_PRIOR = 0.3
+"""What a cost that is not as expected counts, by its relative size, against images' times."""
+_MOST_SCATTER = 0.2  # of times between halves of the rounds: rms of the logarithm
+_MOST_MISFIT = 0.35  # of times from those that the costs make
+
+
+@dataclass(frozen=True, eq=False)
+class _Image:
+    """One way to an image, what it should take, and what it took."""
+
+    form: Callable[[], object]
+    channels: int
+    expected: Plan | Exact
+    tiled: bool
+    seconds: list[float] = field(default_factory=list)
+    kernels: list[dict[str, float]] = field(default_factory=list)
+
+    def run(self, device: Device) -> None:
+        """Form the image once more, timed as a whole and kernel by kernel."""
+        with device.profile() as times:
+            start = time.perf_counter()
+            self.form()
+            self.seconds.append(time.perf_counter() - start)
+        self.kernels.append({name: each.total_s for name, each in times.items()})
+
+    @property
+    def in_stages(self) -> float:
+        """Least seconds that the stages' kernels took."""
+        return min(each.get("stage", 0.0) for each in self.kernels)
+
+    @property
+    def in_pixels(self) -> float:
+        """Least seconds that the backprojecting kernels took."""
+        names = ("backproject_tiles", "backproject_points")
+        return min(sum(each.get(name, 0.0) for name in names) for each in self.kernels)
+
+    @property
+    def scatter(self) -> float:
+        """By how much two halves of the runs differ: logarithm of the ratio of least times."""
+        return math.log(min(self.seconds[::2]) / min(self.seconds[1::2]))
+
+    @property
+    def host_work(self) -> list[float]:
+        """How often it takes what `_HOST` costs."""
+        e = self.expected
+        if isinstance(e, Exact):
+            grouped = 0.0 if self.tiled else e.parts * e.part_pixels
+            lines = self.channels * e.samples
+            return [1.0, lines, 0.0, 0.0, 0.0, grouped, e.parts * self.channels]
+        roots = e.stages[0].subimages
+        batches = -(-roots // e.roots_at_once)
+        lines = self.channels * e.resampling.length
+        last = e.stages[-1]
+        grouped = 0.0 if self.tiled else last.operations / last.channels
+        by_fft, filtered = (lines, 0.0) if e.upsampler is None else (0.0, lines)
+        stages = batches * len(e.sides)
+        return [1.0, by_fft, filtered, roots * self.channels, stages, grouped, 0.0]
+
+    @property
+    def stage_work(self) -> list[float]:
+        """How often it takes what `_STAGES` cost."""
+        if isinstance(self.expected, Exact):
+            return [0.0] * len(_STAGES)
+        stages = self.expected.stages[:-1]
+        operations = sum(s.operations for s in stages)
+        taps = self.expected.align.taps + self.expected.aperture.taps
+        subimages = float(sum(s.subimages for s in stages))
+        return [subimages, operations, operations * taps, stages[0].operations]
+
+    @property
+    def leaf_channels(self) -> float:
+        """Virtual channels of all subimages of the last stage."""
+        if isinstance(self.expected, Exact):
+            return 0.0
+        return float(self.expected.stages[-1].subimages * self.expected.stages[-1].channels)
+
+    @property
+    def pixel_work(self) -> float:
+        """Pixels times channels, as many as with 4 taps take as long."""
+        e = self.expected
+        if isinstance(e, Exact):
+            return self.channels * e.parts * e.part_pixels * COST[e.taps]
+        return e.stages[-1].operations * COST[e.final.taps]
+
+
+_HOST = (
+    "call_ns",
+    "upsampled_sample_ns",
+    "filtered_sample_ns",
+    "reference_ns",
+    "batch_ns",
+    "group_ns",
+    "part_ns",
+)
+_STAGES = ("subimage_ns", "sample_ns", "sample_tap_ns", "given_sample_ns")
+
+
+def calibrate(
+    device: Device | str | int | None = None,
+    *,
+    progress: Callable[[int, int], None] | None = None,
+) -> Costs:
+    """Measure what imaging costs on a device, and store it for `clsas.plan`.
+
+    Parameters
+    ----------
+    device : Device, str or int, optional
+        See `clsas.opencl.device.choose`.
+    progress : callable, optional
+        Called as progress(done, total).
+
+    Returns
+    -------
+    Costs
+        None below zero, fitted with least relative squares to the times of some images of a
+        built-in scene, the least of some runs of each, which take turns. What these times cannot
+        tell apart is divided as in `clsas.planning.costs.defaults`.
+
+    Raises
+    ------
+    DeviceError
+        If there is no such device.
+    OSError
+        If the user's cache directory cannot be written.
+
+    Warns
+    -----
+    ClsasWarning
+        If times differ much from run to run, or from what the costs make them: then the costs are
+        returned, but not stored, and those of before stay.
+    """
+    validate.progress(progress)
+    device = open_device(device)
+    images = _images(device)
+    total = len(images) * (1 + _ROUNDS)
+    for done in range(total):
+        image = images[done % len(images)]
+        if done < len(images):  # this builds the kernels
+            image.form()
+        else:
+            image.run(device)
+        if progress is not None:
+            progress(done + 1, total)
+    costs = _fitted(images, stored.defaults(device))
+    scatter = _rms([image.scatter for image in images])
+    misfit = _rms([math.log(_expected_s(image, costs) / min(image.seconds)) for image in images])
+    wrong = []
+    if not scatter <= _MOST_SCATTER:
+        wrong.append(f"times of the same image differ by {math.expm1(scatter):.0%} between runs")
+    if not misfit <= _MOST_MISFIT:
+        wrong.append(f"the costs miss the times measured by {math.expm1(misfit):.0%}")
+    if wrong:
+        validate.warn(
+            f"what was measured is not stored: {' and '.join(wrong)}; calibrate again when the "
+            f"machine has nothing else to do"
+        )
+    else:
+        stored.save(device, costs)
+    return costs
+
+
+def _images(device: Device) -> list[_Image]:
+    """Return the images that are timed."""
+    images = []
+
+    def backprojected(lines: RangeLines, grid: Grid, beam: BeamWindow | None = None) -> None:
+        expected = expect(View(lines, grid, beam), _EXACT_DB, device)
+        form = partial(backproject, lines, grid, device=device, accuracy_db=_EXACT_DB, beam=beam)
+        images.append(_Image(form, lines.channels, expected, expected.tiled))
+
+    def factorized(lines: RangeLines, grid: Grid, tolerance_db: float, told: Costs) -> None:
+        chosen = plan(lines, grid, tolerance_db=tolerance_db, device=device, costs=told)
+        if chosen.is_exact:
+            return
+
+        def form() -> Image:
+            """Form the first image of the plan: a copy has kept nothing."""
+            return factorize(lines, grid, replace(chosen), device=device)
+
+        images.append(_Image(form, lines.channels, chosen, grid.is_planar))
+
+    for channels, pixels in _SIZES:
+        lines, grid = _scene(channels, pixels)
+        backprojected(lines, grid)
+        backprojected(lines, grid, _WIDE)
+        for tolerance_db, told in product(_TOLERANCES_DB, _TOLD):
+            factorized(lines, grid, tolerance_db, told)
+            if told is _TOLD[0]:
+                factorized(lines, grid.with_height(np.zeros(grid.shape)), tolerance_db, told)
+    for channels, pixels in _SMALL_SIZES:
+        lines, grid = _scene(channels, pixels)
+        backprojected(lines, grid)
+        backprojected(lines, grid.with_height(np.zeros(grid.shape)))
+    return images
+
+
+def _scene(channels: int, pixels: int) -> tuple[RangeLines, Grid]:
+    """Return lines of random points at 120 kHz and a grid over them, from 40 m."""
+    random = np.random.default_rng(0)
+    half_m = _PIXEL_M * pixels / 2
+    grid = Grid.plane((-half_m, half_m, pixels), (40.0, 40 + 2 * half_m, pixels))
+    along = (np.arange(channels) - (channels - 1) / 2) * (20.0 / channels)
+    tx_m = np.stack([along, 0 * along, 0 * along], axis=1)
+    positions_m = random.uniform([-half_m, 40, 0], [half_m, 40 + 2 * half_m, 0], (100, 3))
+    lines = simulate_lines(
+        tx_m,
+        tx_m,
+        PointTargets(positions_m, random.standard_normal(100)),
+        carrier_hz=120e3,
+        bandwidth_hz=30e3,
+        oversampling=1.25,
+    )
+    return lines, grid
+
+
+def _fitted(images: list[_Image], usual: Costs) -> Costs:
+    """Return the costs that make the least times of some images, in `usual` proportions."""
+    plans = [image for image in images if isinstance(image.expected, Plan)]
+    exact = [image for image in images if isinstance(image.expected, Exact)]
+    tiled = [image for image in plans if image.tiled]
+
+    def per_pixel(some: list[_Image]) -> float:
+        return float(np.median([1e9 * image.in_pixels / image.pixel_work for image in some]))
+
+    of_host = [
+        max(min(image.seconds) - image.in_stages - image.in_pixels, 1e-6) for image in images
+    ]
+    least_squares = partial(_least_squares, usual)
+    leaves = least_squares(
+        ("leaf_channel_ns", "leaf_ns"),
+        [[image.leaf_channels, image.pixel_work] for image in tiled],
+        [image.in_pixels for image in tiled],
+    )
+    of_points = [
+        (1e9 * image.in_pixels - leaves["leaf_channel_ns"] * image.leaf_channels) / image.pixel_work
+        for image in plans
+        if not image.tiled
+    ]
+    pixel_ns = per_pixel([i for i in exact if i.tiled and not i.expected.weighted])
+    weighted = [i for i in exact if i.expected.weighted]
+    of_beam = [1e9 * image.in_pixels - pixel_ns * image.pixel_work for image in weighted]
+    pairs = [image.pixel_work / COST[image.expected.taps] for image in weighted]
+    return Costs(
+        **least_squares(_HOST, [image.host_work for image in images], of_host),
+        **least_squares(
+            _STAGES,
+            [image.stage_work for image in plans],
+            [image.in_stages for image in plans],
+        ),
+        **leaves,
+        leaf_point_ns=max(float(np.median(of_points)), 0.0),
+        pixel_ns=pixel_ns,
+        point_ns=per_pixel([i for i in exact if not i.tiled]),
+        beam_ns=max(float(np.median(np.divide(of_beam, pairs))), 0.0),
+    )
+
+
+def _least_squares(
+    usual: Costs, names: tuple[str, ...], work: list[list[float]], seconds: list[float]
+) -> dict[str, float]:
+    """Return the costs, ns, of least relative error: work times costs is seconds."""
+    usual_ns = np.array([getattr(usual, name) for name in names])
+    rows = 1e-9 * np.array(work) * usual_ns / np.maximum(seconds, 1e-6)[:, None]
+    # Costs over the usual ones, on average over the images; each is like it but for good reason.
+    faster = 1 / np.exp(np.mean(np.log(rows.sum(axis=1))))
+    rows = np.concatenate([rows * faster, _PRIOR * np.eye(len(names))])
+    wanted = np.concatenate([np.ones(len(seconds)), np.full(len(names), _PRIOR)])
+    solution = nnls(rows, wanted)[0]
+    return dict(zip(names, (usual_ns * faster * solution).tolist(), strict=True))
+
+
+def _expected_s(image: _Image, costs: Costs) -> float:
+    """Return the time that costs make of an image."""
+    if isinstance(image.expected, Exact):
+        return image.expected.seconds(costs)
+    work = zip((*_HOST, *_STAGES), (*image.host_work, *image.stage_work), strict=True)
+    leaf_ns = costs.leaf_ns if image.tiled else costs.leaf_point_ns
+    in_pixels_ns = leaf_ns * image.pixel_work + costs.leaf_channel_ns * image.leaf_channels
+    return 1e-9 * (sum(getattr(costs, name) * amount for name, amount in work) + in_pixels_ns)
+
+
+def _rms(values: list[float]) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))

@@ -1,0 +1,404 @@
+"""What a factorized image errs by besides its filters: its roots, nodes and leaves."""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Callable, Hashable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
+from scipy.spatial.distance import cdist
+
+from clsas.core.decibels import power
+from clsas.core.geometry import pairwise_range_m
+from clsas.core.lines import some_channels, wavelength_m
+from clsas.exact.tiles import BLOCKS, ROUNDING
+from clsas.factorized.aperture import drift, stretches
+from clsas.factorized.thesis import stage_errors_m
+from clsas.factorized.tree import interpolated_directions, interpolated_nodes
+from clsas.opencl.device import Device
+from clsas.planning.view import View
+from clsas.signal.interpolation import Interpolator
+from clsas.sonar.beam import sines
+
+_FLOAT32 = 4.5e-8  # rms error of a phase in the stages over the phase across a root: measured
+_CHANNELS, _FURTHEST, _PLACES, _PIXELS = 128, 32, 160, 24  # at which errors are evaluated
+_SOME_SPOTS = (0, 7, 14, 16, 23)  # of 5 by 5, in every row and column one
+
+
+def _kept(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Return a function of a view that keeps with it what it returned."""
+
+    @functools.wraps(function)
+    def kept(view: View, *arguments: Hashable) -> Any:
+        key = function.__name__, *arguments
+        if key not in view.kept:
+            view.kept[key] = function(view, *arguments)
+        return view.kept[key]
+
+    return kept
+
+
+def leaf_error(view: View, sides: NDArray[np.int64], device: Device) -> NDArray[np.float64]:
+    """Return the power of the error that expanding leaves of some sizes adds.
+
+    See `layout.lay_out`: the fourth order, in long leaves 0.35 of the largest rms. Off a plane
+    nothing is expanded, and float32 rounds.
+    """
+    if not view.surface.is_plane:
+        radius_m = np.array([view.surface.radius_m(tuple(side)) for side in sides.tolist()])
+        return (ROUNDING * view.highest_cycles_per_m * radius_m) ** 2
+    steps_m = np.linalg.norm(view.surface.steps_m, axis=1)
+    radius_m = np.hypot(*(sides * steps_m).T) / 2
+    block_m = np.hypot(*(np.array(BLOCKS[device.info.width]) * steps_m)) / 2
+    nearest_m = np.maximum(view.nearest_m, 1e-6)
+    remainder_m = 0.35 * radius_m**4 / (8 * nearest_m**3)
+    result = (2 * np.pi * view.highest_cycles_per_m * remainder_m) ** 2
+    if view.beam is not None:
+        result += view.beam.block_error(block_m / nearest_m) ** 2
+        window_sine = np.ptp(np.clip(view.beam.limits, -1, 1))
+        result += (0.1 * (radius_m / nearest_m) ** 4 / window_sine) ** 2
+    return result
+
+
+@dataclass(frozen=True)
+class Errors:
+    """Powers of the errors that filters do not account for.
+
+    Of rounding and of putting channels on the track, of uneven nodes and weights stage by stage,
+    and of expanding leaves.
+    """
+
+    roots: float
+    nodes: tuple[float, ...]
+    leaves: float
+
+    @property
+    def total(self) -> float:
+        """All together."""
+        return self.roots + sum(self.nodes) + self.leaves
+
+
+def other_errors(
+    view: View,
+    sides: Sequence[tuple[int, int]],
+    roots: float,
+    aperture: Interpolator,
+    crowding: tuple[float, ...],
+    beam_cycles: float,
+    device: Device,
+) -> Errors:
+    """Return the errors of a tree; `view` is that within its roots, whose error is known."""
+    last = len(sides) - 1
+    return Errors(
+        roots=roots,
+        nodes=tuple(
+            excess_error(view, side, aperture, crowd, beam_cycles if level == last else 0.0)
+            for level, (side, crowd) in enumerate(zip(sides, crowding, strict=True))
+        ),
+        leaves=float(leaf_error(view, np.array([sides[-1]]), device)[0]),
+    )
+
+
+def _over_relief(
+    view: View, side: tuple[int, int], error: Callable[[NDArray[np.float64]], float]
+) -> float:
+    """Return the mean over the grid of an error that depends on the extents of subimages.
+
+    It grows with the relief's square at least: of as much as the highest root adds, others add no
+    more than by the squares of their relief.
+    """
+    surface = view.surface
+    plane = error(surface.extents(side))
+    relief_m = surface.relief_m(side, view.root)
+    most_m = float(relief_m.max())
+    if most_m <= 0:
+        return plane
+    share = np.average((relief_m / most_m) ** 2, weights=surface.counts(view.root or side))
+    return plane + max(error(surface.extents(side, most_m)) - plane, 0.0) * float(share)
+
+
+@_kept
+def root_error(view: View, side: tuple[int, int]) -> float:
+    """Return the power of the error of roots: of rounding, and of channels put on the mean track.
+
+    The latter is `_off_track`.
+    """
+    off_track = _over_relief(view, side, functools.partial(_off_track, view, side))
+    sides_m = view.extents(side, most=True) * np.linalg.norm(view.surface.steps_m, axis=1)
+    radius_m = np.linalg.norm(sides_m) / 2
+    rounding = (2 * np.pi * _FLOAT32 * view.highest_cycles_per_m * radius_m) ** 2
+    return float(off_track + rounding)
+
+
+def _off_track(view: View, side: tuple[int, int], extents: NDArray[np.float64]) -> float:
+    """Return the power of the error that channels put on the mean track make.
+
+    It is evaluated as it is: over some channels, roots and pixels of these, how a
+    range changes from a root's centre to a pixel for the channel, less the same for the place on
+    the track that stands for it, stretched as the first stage does. That holds what the track does
+    not follow, transmitters and receivers apart, and motion during flight; and with a beam by how
+    much the weights of the two differ.
+    """
+    lines, track = view.lines, view.track
+    spots = np.array(_SOME_SPOTS)
+    seen = view.seen(side)[spots]
+    candidates = np.flatnonzero(np.interp(track.place, track.samples, seen.any(axis=0)))
+    index, counts = _some_off_track(view, candidates)
+    part = replace(track, place=track.place[index])
+    tx_m, rx_m, middle_m = (each[index] for each in (lines.tx_m, lines.rx_m, lines.phase_centres_m))
+    velocity = lines.rx_velocity_m_s
+    moving = velocity if velocity is None else velocity[index]
+    own = view.own_drift if view.own_drift is None else view.own_drift[index]
+    antennas = tx_m, rx_m, moving, lines.sound_speed_m_s
+    seen = np.stack([np.interp(part.place, track.samples, each) for each in seen]) > 0
+    somewhere = seen.any(axis=1)
+    spots, seen = spots[somewhere], seen[somewhere]
+    if not spots.size:
+        return 0.0
+    # [spots, pixels, channels]; the first pixel is the middle of a root.
+    pixels_m = np.stack([_pixels_m(view, extents, spot)[0] for spot in spots])
+    points_m = view.spots_m[spots, None] + pixels_m
+    centres_m, all_m = points_m[:, 0], points_m.reshape(-1, 3)
+    range_m = pairwise_range_m(all_m, *antennas)
+    range_m = range_m.reshape(*points_m.shape[:2], -1)
+    virtual_m = track.positions_m(part.places_seen_from(centres_m, middle_m, own))
+    on_track_m = np.stack([cdist(*each) for each in zip(points_m, virtual_m, strict=True)])
+    on_track_m -= (points_m @ drift(lines))[..., None]
+    range_m, on_track_m = (each[:, 1:] - each[:, :1] for each in (range_m, on_track_m))
+    stretch = stretches(*antennas, drift(lines), view.surface.plane, centres_m, virtual_m)[:, None]
+    stretched_m = on_track_m * stretch
+    wrong = (2 * np.pi * view.highest_cycles_per_m * (range_m - on_track_m - stretched_m)) ** 2
+    # Lines are stretched by turning their phase; their envelope stays.
+    wrong += (2 * np.pi * view.rms_cycles_per_m * stretched_m) ** 2
+    weights = np.ones_like(wrong)
+    if view.beam is not None:
+        directions = interpolated_directions(track.samples, view.along, part.place)
+        virtual = [sines(*each, directions) for each in zip(points_m, virtual_m, strict=True)]
+        channels = [sines(each, middle_m, view.channels_along[index]) for each in points_m]
+        weights, of_virtual = (
+            view.beam.weights(np.stack(each).swapaxes(1, 2)[:, 1:], wavelength_m(lines))
+            for each in (channels, virtual)
+        )
+        wrong = weights**2 * wrong + (weights - of_virtual) ** 2
+    counts = counts * seen[:, None]
+    return float(np.sum(counts * wrong) / max(np.sum(counts * weights**2), 1e-30))
+
+
+def _some_off_track(
+    view: View, candidates: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Return some channels of these, those furthest off the track, and how many each is like.
+
+    Where a track turns sharply a few may be much further off than all others.
+    """
+    if len(candidates) <= _CHANNELS:
+        return candidates, np.ones(len(candidates))
+    by_distance = candidates[np.argsort(view.off_track_m[candidates], kind="stable")]
+    others, furthest = np.split(by_distance, [-_FURTHEST])
+    others.sort()
+    some = others[some_channels(len(others), _CHANNELS - _FURTHEST)]
+    counts = np.repeat([len(others) / len(some), 1.0], [len(some), _FURTHEST])
+    return np.concatenate([some, furthest]), counts
+
+
+@_kept
+def excess_error(
+    view: View,
+    side: tuple[int, int],
+    aperture: Interpolator,
+    crowding: float,
+    beam_cycles: float | None,
+) -> float:
+    """Return the power of the error that a stage's nodes add to that of the aperture's filter.
+
+    See `_between_nodes`.
+    """
+    error = functools.partial(_between_nodes, view, side, aperture, crowding, beam_cycles)
+    return _over_relief(view, side, error)
+
+
+def _between_nodes(
+    view: View,
+    side: tuple[int, int],
+    aperture: Interpolator,
+    crowding: float,
+    beam_cycles: float | None,
+    extents: NDArray[np.float64],
+) -> float:
+    """Return the power of the error between nodes beside that of the aperture's filter.
+
+    The filter takes nodes as equally spaced and weights as constant. Evaluated as it is, for some
+    subimages and pixels of them and where there are channels: steering functions between nodes
+    against what interpolation makes of them; unless `beam_cycles` is None, weighted by the beam
+    at places and nodes alike, since what nodes hold that it does not see is left out.
+    As large as the image where nothing is seen, of which nothing is known.
+    """
+    weighted = view.beam is not None and beam_cycles is not None
+    looked = _looked_at(view, side, weighted, tuple(extents))
+    if looked is None:
+        return 1.0
+    rates = crowding * np.tensordot(extents, view.rates[:, looked.spots], 1)
+    if weighted:
+        rates = rates + beam_cycles * view.beam_rates[looked.spots]
+    nodes = interpolated_nodes(view.track, rates, looked.place, aperture)
+    of_nodes = _steering(view, *looked.pixels, weighted, nodes.place)
+    # A matrix that interpolates at all places of a spot, spot after spot.
+    index = nodes.base[..., None] + np.arange(nodes.taps)
+    index += nodes.place.shape[1] * np.arange(len(index))[:, None, None]
+    weights = nodes.weights.astype(np.float32).ravel()
+    rows = np.arange(0, weights.size + 1, nodes.taps)
+    of_nodes = of_nodes.reshape(-1, of_nodes.shape[-1])
+    interpolate = csr_array((weights, index.ravel(), rows), shape=(len(rows) - 1, len(of_nodes)))
+    away = (interpolate @ of_nodes).reshape(looked.exact.shape) - looked.exact
+    wrong, total = (
+        looked.count @ np.einsum("nsp,nsp->n", each, each, dtype=np.float64)
+        for each in (away, looked.exact)
+    )
+    return float(max(wrong / max(total, 1e-30) - power(aperture.error_db), 0.0))
+
+
+@dataclass(frozen=True, eq=False)
+class _LookedAt:
+    """Some subimages of a size, and steering functions of pixels in them where there are channels.
+
+    Attributes
+    ----------
+    spots : int64 [n]
+        Where they are.
+    count : int64 [n]
+        How many channels see each.
+    place : float64 [n, places]
+        Like those of channels, ascending.
+    pixels : (centres_m, pixels_m, carriers)
+        What `_steering` takes.
+    exact : float32 [n, places, 2 pixels]
+        The steering functions.
+    """
+
+    spots: NDArray[np.int64]
+    count: NDArray[np.int64]
+    place: NDArray[np.float64]
+    pixels: tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]
+    exact: NDArray[np.float32]
+
+
+@_kept
+def _looked_at(
+    view: View, side: tuple[int, int], weighted: bool, extents: tuple[float, ...]
+) -> _LookedAt | None:
+    """Return at what errors between nodes are evaluated, None where nothing is seen."""
+    channels, first, count = _channels_seen(view, side)
+    if not count.any():
+        return None
+    everywhere = weighted and view.beam.jumps  # steps are seen from some spots only
+    spots = np.flatnonzero(count)
+    if not everywhere and np.isin(spots, _SOME_SPOTS).any():
+        spots = np.intersect1d(spots, _SOME_SPOTS)
+    first, count = first[spots], count[spots]
+    # One place beyond those that see anything: edges lie in between.
+    number = np.linspace(first - 1, first + count, _PLACES, axis=1)
+    number = np.clip(number, 0, len(channels) - 1)
+    place = np.interp(number, np.arange(len(channels)), channels)
+    frequencies = view.carriers(_PIXELS)
+    found = [_pixels_m(view, np.array(extents), spot) for spot in spots]
+    pixels_m = np.stack([each_m for each_m, _ in found])
+    carriers = np.stack([frequencies[(share * _PIXELS).astype(int)] for _, share in found])
+    pixels = view.spots_m[spots], pixels_m, carriers
+    return _LookedAt(spots, count, place, pixels, _steering(view, *pixels, weighted, place))
+
+
+def _channels_seen(
+    view: View, side: tuple[int, int]
+) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.int64]]:
+    """Return places of channels, ascending, the first that sees a subimage and how many do.
+
+    The latter of subimages at all spots. The track that sees one may have a gap there. Edges of
+    what is seen lie between the track's samples.
+    """
+    places, samples = np.sort(view.track.place), view.track.samples
+    seen = view.seen(side)
+    begin = samples[np.maximum(seen.argmax(axis=1) - 1, 0)]
+    end = samples[np.minimum(seen.shape[1] - seen[:, ::-1].argmax(axis=1), len(samples) - 1)]
+    end[~seen.any(axis=1)] = -np.inf
+    first = np.searchsorted(places, begin)
+    return places, first, np.maximum(np.searchsorted(places, end, "right") - first, 0)
+
+
+def _steering(
+    view: View,
+    centres_m: NDArray[np.float64],
+    pixels_m: NDArray[np.float64],
+    carriers: NDArray[np.float64],
+    weighted: bool,
+    at: NDArray[np.float64],
+) -> NDArray[np.float32]:
+    """Return steering functions at places on the track, float32 [n, places, 2 pixels].
+
+    Of all pixels the real parts, then the imaginary ones.
+
+    Parameters
+    ----------
+    centres_m : float64 [n, 3]
+        Middles of subimages.
+    pixels_m : float64 [n, pixels + 1, 3]
+        From these: the point of reference, and pixels.
+    carriers : float64 [n, pixels]
+        The frequency of each, cycles per m.
+    weighted : bool
+        Whether the beam weighs them.
+    at : float64 [n, places]
+    """
+    sight = centres_m[:, None] - view.track.positions_m(at)
+    pixels_m = pixels_m.swapaxes(1, 2)
+    square = np.einsum("nsi,nsi->ns", sight, sight)[..., None] + 2 * sight @ pixels_m
+    square += np.einsum("nip,nip->np", pixels_m, pixels_m)[:, None]
+    range_m = np.sqrt(np.maximum(square, 1e-18))
+    turns = carriers[:, None] * (range_m[..., 1:] - range_m[..., :1])
+    angle = (2 * np.pi * (turns - np.rint(turns))).astype(np.float32)
+    result = np.concatenate([np.cos(angle), np.sin(angle)], axis=-1)
+    if weighted:
+        along = interpolated_directions(view.track.samples, view.along, at)
+        sine = np.einsum("nsi,nsi->ns", sight, along)[..., None]
+        sine = (sine + along @ pixels_m[..., 1:]) / range_m[..., 1:]
+        weights = view.beam.weights(sine, wavelength_m(view.lines)).astype(np.float32)
+        result *= np.concatenate([weights, weights], axis=-1)
+    return result
+
+
+def _pixels_m(
+    view: View, extents: NDArray[np.float64], spot: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return pixels of a subimage at a spot from its middle, and that before them, [n + 1, 3].
+
+    Beside them one more number each, from 0 to 1. All are spread evenly by multiples of powers of
+    an irrational number (a Kronecker sequence), others at every spot.
+    """
+    dimensions = len(extents) + 1
+    ratio = 1.0
+    for _ in range(20):  # towards x^(dimensions + 1) = x + 1
+        ratio = (1 + ratio) ** (1 / (dimensions + 1))
+    index = spot * _PIXELS + np.arange(_PIXELS)[:, None]
+    places = (0.5 + index * ratio ** -np.arange(1.0, dimensions + 1)) % 1
+    pixels_m = ((places[:, :-1] - 0.5) * extents) @ view.surface.steps_m
+    return np.concatenate([np.zeros((1, 3)), pixels_m]), places[:, -1]
+
+
+def nearest_errors(view: View, stages: Sequence[tuple[int, int]]) -> tuple[float, list[float]]:
+    """Return the power of the error of nearest beams, THESIS [45], spread evenly, and by stage.
+
+    Range errors of stages are added, not their powers.
+    """
+    centres_m = view.lines.phase_centres_m[np.argsort(view.track.place)]
+    spacing_m = np.linalg.norm(np.diff(centres_m, axis=0), axis=1).mean()
+    image_m = np.max(np.array(view.grid.shape) * np.linalg.norm(view.surface.steps_m, axis=1))
+    errors_m = stage_errors_m(stages, spacing_m, image_m, view.nearest_m)
+
+    def power_of(error_m: float) -> float:
+        return (2 * math.pi * view.lines.carrier_cycles_per_m * error_m) ** 2 / 3
+
+    return power_of(sum(errors_m)), [power_of(error_m) for error_m in errors_m]

@@ -1,0 +1,342 @@
+"""Plans with all that is expected of them: time, error and memory."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from clsas.core.decibels import in_db, power
+from clsas.exact.tiles import STACK
+from clsas.factorized.filters import UPSAMPLING_SHARE, Filters, edges_gain
+from clsas.factorized.plan import CHUNK, LEAST_BATCH, Plan, Stage, grid_digest, lines_digest
+from clsas.factorized.sector import OF_BEAM
+from clsas.opencl import phases
+from clsas.opencl.buffers import (
+    GIVEN_BYTES,
+    GUARD,
+    VECTOR_ROOM,
+    expansion_terms,
+    padded_length,
+    sample_bytes,
+)
+from clsas.opencl.device import Device
+from clsas.planning.costs import Costs
+from clsas.planning.errors import leaf_error
+from clsas.planning.exact_image import Exact
+from clsas.planning.view import View
+from clsas.signal import interpolation
+from clsas.signal.interpolation import PHASES
+
+HALF_ROUNDING = 4e-8
+"""Power of the error that rounding lines to half precision once adds: 2^-11/sqrt(6) rms."""
+_ROOM = 1.06  # for virtual channels, over the most expected
+_ROUNDING_SHARE = 0.1  # of an image's error
+_MOST_CHUNKS = 16  # that a sum in half precision is made of
+MARGIN_DB = 1.0  # between prediction and tolerance, for what measured errors scatter
+OUTSIDE = 0.1  # of the power of the error allowed: what may lie beyond the highest frequency
+_FEW_CHANNELS = 7.0, 30.0  # where no more see a pixel errors scatter much; with steps
+_CACHED_BYTES, _BATCH_BYTES = 16 << 20, 256 << 20  # of a batch, on CPUs and elsewhere
+_MOST_TABLE_BYTES = 64 << 20
+_ROOTS_PREPARED = 16  # enough for few and large arrays
+
+
+def margin_db(view: View) -> float:
+    """Margin between the expected and the predicted error, dB, for the scatter of measured ones.
+
+    It is larger where few channels see a pixel: then the error depends on how these happen to lie
+    between virtual channels, and on whether one lies at a step of the window. It is larger, too,
+    where the power of the lines lies at few frequencies.
+    """
+    channels = view.lines.channels * view.share_seen((16, 16))
+    few = _FEW_CHANNELS[view.beam is not None and view.beam.jumps]
+    return MARGIN_DB + in_db(view.spectrum.scatter * (1 + few / max(channels, 1.0)))
+
+
+@dataclass(frozen=True)
+class Way:
+    """How an image is factorized; attributes as those of `Plan`."""
+
+    sides: tuple[tuple[int, int], ...]
+    filters: Filters
+    nearest: tuple[int, ...] = ()
+    crowding: tuple[float, ...] = ()
+    beam_cycles: float = 0.0
+
+
+def factorized(
+    view: View,
+    way: Way,
+    other_error: float,
+    tolerance_db: float | None,
+    exact: Exact,
+    device: Device,
+    costs: Costs,
+    memory_bytes: int,
+) -> Plan:
+    """Return a plan with all that is expected of it.
+
+    `view` is that within its roots where the aperture is interpolated; `other_error` the power of
+    the errors that the filters do not account for.
+    """
+    lines, sides, nearest = view.lines, way.sides, way.nearest
+    align, aperture, final = way.filters.align, way.filters.aperture, way.filters.final
+    error = other_error + _power_of_filters(way)
+    upsampler = None
+    if not nearest:
+        step = max(int(PHASES / align.upsampling), 1)
+        gain = edges_gain(align, final, len(sides), PHASES / step)
+        most_db = in_db(UPSAMPLING_SHARE * error)
+        upsampler = interpolation.upsampler(view.spectrum, step, gain, most_db)
+    if upsampler is None:
+        resampling = interpolation.resampling(lines.length, align, view.spectrum)
+    else:
+        resampling = upsampler.resampling(lines.length, align.taps // 2, view.spectrum)
+        error += power(upsampler.error_db)
+    halves = view.half_lengths(sides, align, final, resampling)
+    of_aperture = aperture.taps, 2 * aperture.upsampling
+    stages, channels, reach = [], float(lines.channels), []
+    width = device.info.width
+    used = channels * view.share_seen(sides[0])
+    for level, side in enumerate(sides):
+        count = view.subimages(side)
+        samples = -(-(2 * halves[level] + 1) // width) * width
+        seen = view.seen(side)
+        if nearest:
+            used, channels = channels, math.ceil(channels / nearest[level])
+        else:
+            if level:
+                turns = way.crowding[level - 1] * view.turns(sides[level - 1], seen)
+                used = min(channels, view.channels(*of_aperture, turns))
+            turns = way.crowding[level] * view.turns(side, seen)
+            if view.beam is not None and level == len(sides) - 1:
+                turns += way.beam_cycles * view.cycles(view.beam_rates, seen)
+            channels = view.channels(*of_aperture, turns)
+            reach.append(aperture.taps * used / channels)
+        taps = align.taps + aperture.taps
+        line_ns = costs.line_ns(samples, taps, given=level == 0)
+        cost_ns = count * (used * line_ns + costs.subimage_ns)
+        if not level:
+            cost_ns += count * lines.channels * costs.reference_ns
+            sample_ns = costs.upsampled_sample_ns if upsampler is None else costs.filtered_sample_ns
+            cost_ns += sample_ns * lines.channels * resampling.length
+        operations, error_db = count * used * samples, in_db(_power_of_stage(way))
+        stages.append(
+            Stage(*side, count, round(channels), samples, operations, error_db, 1e-9 * cost_ns)
+        )
+    tiled, pixels = view.surface.is_plane, view.slots(side, width)
+    operations = count * pixels * channels
+    cost_ns = costs.leaf_line_ns(pixels, final.taps, tiled=tiled, beam=view.beam is not None)
+    cost_ns *= count * channels
+    if not tiled:
+        cost_ns += count * pixels * costs.group_ns
+    stages.append(
+        Stage(*side, count, round(channels), samples, operations, final.scatter_db, 1e-9 * cost_ns)
+    )
+    tile = _tile(view, sides[-1], device) if nearest else sides[-1]
+    if tolerance_db is not None:
+        error += phases.error(phases.terms_within(tolerance_db)) ** 2
+    half_precision = False
+    if upsampler is not None and tolerance_db is not None and device.info.half_precision:
+        rounding = _half_rounding(view, reach)
+        half_precision = rounding <= _ROUNDING_SHARE * power(tolerance_db)
+        error += rounding if half_precision else 0.0
+    line_bytes = sample_bytes(half_precision) * lines.channels * padded_length(resampling)
+    if upsampler is not None:
+        line_bytes += min(lines.samples.nbytes, GIVEN_BYTES)
+    most_channels = _most_channels(view, way, stages)
+    root_bytes, table_bytes = _root_bytes(
+        view, way, tile, stages, most_channels, width, sample_bytes(half_precision)
+    )
+    room = memory_bytes - line_bytes
+    batch_bytes = _CACHED_BYTES if device.info.kind == "cpu" else _BATCH_BYTES
+    # Tables come in two sets.
+    at_once = max(batch_bytes // root_bytes, LEAST_BATCH)
+    at_once = int(min(room // (root_bytes + 2 * table_bytes), at_once))
+    at_once = min(max(at_once, 1), stages[0].subimages)
+    room = min(room - at_once * root_bytes, _MOST_TABLE_BYTES)
+    of_batch = 2 * at_once * table_bytes
+    prepared = at_once * min(max(int(room // of_batch), 1), -(-_ROOTS_PREPARED // at_once))
+    batches = -(-stages[0].subimages // at_once)
+    besides = 1e-9 * (costs.call_ns + costs.batch_ns * batches * len(sides))
+    return Plan(
+        tolerance_db=tolerance_db,
+        sides=sides,
+        tile=tile,
+        nearest=nearest,
+        align=align,
+        aperture=aperture,
+        final=final,
+        resampling=resampling,
+        upsampler=upsampler,
+        half_precision=half_precision,
+        half_lengths=halves,
+        highest_cycles_per_m=view.highest_cycles_per_m,
+        closest_m=view.nearest_m,
+        roots_at_once=at_once,
+        roots_prepared=prepared,
+        stages=tuple(stages),
+        predicted_error_db=in_db(error) + (0.0 if nearest else margin_db(view)),
+        predicted_seconds=sum(stage.seconds for stage in stages) + besides,
+        exact_seconds=exact.seconds(costs),
+        memory_bytes=int(line_bytes + at_once * root_bytes + 2 * prepared * table_bytes),
+        device=device.info.label,
+        lines_digest=lines_digest(lines),
+        grid_digest=grid_digest(view.grid),
+        beam=view.beam,
+        limits=view.limits,
+        crowding=way.crowding,
+        beam_cycles=way.beam_cycles,
+        most_channels=tuple(math.ceil(most) for _, most in most_channels),
+        band=None if nearest else _band(view, OUTSIDE * power(tolerance_db)),
+    )
+
+
+def _band(view: View, outside: float) -> tuple[float, float]:
+    """Return centre and half the width of the band outside of which lies that share of power."""
+    spectrum = view.spectrum
+    bins = np.searchsorted(np.cumsum(spectrum.share), 1 - outside)
+    return spectrum.centre, float(min((bins + 1) / (2 * len(spectrum.power)), 0.5))
+
+
+def half_precision_error(stages: int) -> float:
+    """Return the power of the error of half precision through some stages, at least.
+
+    Where virtual channels are sums of many it is more: see `_half_rounding`.
+    """
+    return HALF_ROUNDING * (1 + 1.5 * stages)
+
+
+def _half_rounding(view: View, reach: Sequence[float]) -> float:
+    """Return the power of the error that rounding lines to half precision adds.
+
+    reach: the channels that a virtual one is the sum of, stage by stage. Upsampled lines are
+    rounded, and what a stage hands on: sums of incoherent lines so often that it counts as half of
+    their chunks, which grow. Where these are very many a sum no longer takes up what is added.
+    """
+    chunks = np.array(reach) / CHUNK
+    chunks[0] *= view.densest
+    if chunks.max() > _MOST_CHUNKS:
+        return np.inf
+    return HALF_ROUNDING * (1 + float(np.sum(1 + chunks / 2)))
+
+
+def _power_of_stage(way: Way) -> float:
+    """Return the power of the errors that the filters of one stage add."""
+    if way.nearest:
+        return power(way.filters.align.error_db)
+    return power(way.filters.align.scatter_db) + power(way.filters.aperture.error_db)
+
+
+def _power_of_filters(way: Way) -> float:
+    """Return the power of the errors that all filters add."""
+    return len(way.sides) * _power_of_stage(way) + power(way.filters.final.scatter_db)
+
+
+def _most_channels(view: View, way: Way, stages: Sequence[Stage]) -> list[tuple[float, float]]:
+    """Return how many virtual channels the whole aperture has by stage, and at most a subimage.
+
+    The latter with some room, since buffers have it from the beginning.
+    """
+    if way.nearest:
+        return [(stage.channels, _ROOM * stage.channels) for stage in stages[:-1]]
+    taps, density, found = way.filters.aperture.taps, 2 * way.filters.aperture.upsampling, []
+    for level, side in enumerate(way.sides):
+        seen = view.seen(side)
+        everywhere, most = (
+            density * way.crowding[level] * view.turns(side, where, most=True) + taps + 2
+            for where in (np.ones_like(seen), seen)
+        )
+        if view.beam is not None:
+            if level == len(way.sides) - 1:
+                most += density * way.beam_cycles * view.cycles(view.beam_rates, seen, most=True)
+            most *= 1 + OF_BEAM
+        found.append((everywhere, _ROOM * most))
+    return found
+
+
+def _root_bytes(
+    view: View,
+    way: Way,
+    tile: tuple[int, int],
+    stages: Sequence[Stage],
+    most_channels: Sequence[tuple[float, float]],
+    width: int,
+    of_sample: int,
+) -> tuple[float, float]:
+    """Return the device memory that a root takes while it is worked on, and that of its tables.
+
+    See `factorize` and `leaves`.
+    """
+    channels, work, tables, sides = view.lines.channels, 0.0, 0.0, way.sides
+    for level, (everywhere, most) in enumerate(most_channels):
+        side = sides[level]
+        subimages = _subimages(sides[0], side)
+        work += of_sample * subimages * most * (stages[level].samples + 2 * GUARD)
+        tables += subimages * (44 if level else 20) + (channels + 32) * (8 + (12 if level else 20))
+        channels = everywhere
+    normalise = view.beam is not None and view.beam.normalise
+    tables += 40 * channels
+    if view.surface.is_plane:
+        terms = expansion_terms(view.beam)
+        parts, slots = _subimages(sides[0], tile), math.prod(sides[0])
+        references = 0 if tile == sides[-1] else 12
+        work += parts * ((most + VECTOR_ROOM) * (references + 4 * terms) + 24)
+    else:
+        slots = view.most_slots(sides[-1], sides[0], width)
+        parts = slots / (STACK * width)
+        tables += 24 * parts + 12 * slots
+    return work + 8 * (1 + normalise) * slots, tables + 12 * parts
+
+
+def _subimages(root: tuple[int, int], side: tuple[int, int]) -> int:
+    return math.prod(a // b for a, b in zip(root, side, strict=True))
+
+
+def _tile(view: View, leaf: tuple[int, int], device: Device) -> tuple[int, int]:
+    """Return the largest parts of a leaf that may be expanded about their centres."""
+    parts = [
+        (rows, columns)
+        for rows in range(16, min(leaf[0], 64) + 1, 16)
+        for columns in range(4, min(leaf[1], 64) + 1, 4)
+        if leaf[0] % rows == 0 and leaf[1] % columns == 0
+    ]
+    fit = [part for part in parts if leaf_error(view, np.array([part]), device)[0] < 1e-8]
+    return max(fit or parts[:1], key=math.prod)
+
+
+def plain(
+    view: View, tolerance_db: float | None, exact: Exact, device: Device, costs: Costs
+) -> Plan:
+    """Return plain backprojection as a plan."""
+    seconds = exact.seconds(costs)
+    return Plan(
+        tolerance_db=tolerance_db,
+        sides=(),
+        tile=(0, 0),
+        nearest=(),
+        align=None,
+        aperture=None,
+        final=None,
+        resampling=None,
+        upsampler=None,
+        half_precision=False,
+        half_lengths=(),
+        highest_cycles_per_m=view.highest_cycles_per_m,
+        closest_m=0.0,
+        roots_at_once=1,
+        roots_prepared=1,
+        stages=(),
+        predicted_error_db=exact.accuracy_db,
+        accuracy_db=exact.accuracy_db,
+        predicted_seconds=seconds,
+        exact_seconds=seconds,
+        memory_bytes=exact.memory_bytes,
+        device=device.info.label,
+        lines_digest=lines_digest(view.lines),
+        grid_digest=grid_digest(view.grid),
+        beam=view.beam,
+        limits=view.limits,
+    )

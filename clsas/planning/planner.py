@@ -1,0 +1,434 @@
+"""Choosing a plan: what every division costs and errs by, and the fastest within a tolerance."""
+
+from __future__ import annotations
+
+import math
+import weakref
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+
+from clsas.core import validate
+from clsas.core.decibels import in_db, power
+from clsas.core.grid import Grid
+from clsas.core.lines import RangeLines
+from clsas.exact.backprojection import ACCURACY_DB
+from clsas.factorized.filters import ALIGN_TAPS, Choice, Filters, steering_spectrum
+from clsas.factorized.plan import Plan, with_left_out
+from clsas.opencl import phases
+from clsas.opencl.device import Device, open_device
+from clsas.planning import forecast
+from clsas.planning.costs import Costs
+from clsas.planning.costs import defaults as default_costs
+from clsas.planning.costs import measured as measured_costs
+from clsas.planning.errors import excess_error, nearest_errors, other_errors, root_error
+from clsas.planning.exact_image import Exact, expect
+from clsas.planning.forecast import MARGIN_DB, OUTSIDE, Way, margin_db
+from clsas.planning.search import MOST_STAGES, Allowed, Tree, root_limits, search
+from clsas.planning.view import View
+from clsas.signal import interpolation
+from clsas.signal.interpolation import Interpolator
+from clsas.sonar.beam import BeamWindow
+from clsas.sonar.simplify import Model, simplify
+from clsas.sonar.visibility import warn_unreached
+
+BEST_TOLERANCE_DB = -75.0
+"""The tightest tolerance that may be asked for: what float32 leaves of a factorized image."""
+WORST_TOLERANCE_DB = -10.0
+
+TOLERANCE_DB = -50.0
+"""What is taken where nothing is asked of an image."""
+
+NEAREST_UPSAMPLING = 8.0
+"""By how much lines are upsampled before the linear interpolation of given stages."""
+
+_ROOTS_SHARE, _NODES_SHARE, _EDGES_SHARE = 0.25, 0.2, 0.03  # of the error allowed
+_WORTH = 0.95  # of the time of an exact image
+_LEAST_CROWDED, _MOST_CROWDING = 1.05, 2.0  # more nodes at a time, and altogether
+_CROWDING_POWER = 0.08  # of an error that more nodes are to mend
+_LEAST_STEP = 0.02  # of the error allowed
+_LEAST_COVERED = 0.25  # of the sum of weights at the best covered pixel
+_LEAST_SHARE_COVERED, _LEAST_PARTIAL = 0.1, 0.25  # of an image
+_LEAST_BEAM_CYCLES, _MOST_BEAM_CYCLES = 0.5, 64.0
+
+
+def plan(
+    lines: RangeLines,
+    grid: Grid,
+    *,
+    tolerance_db: float | None = None,
+    tolerance_wavelengths: float | None = None,
+    stages: Sequence[tuple[int, int]] | None = None,
+    beam: BeamWindow | None = None,
+    device: Device | str | int | None = None,
+    memory_bytes: int | None = None,
+    costs: Costs | None = None,
+    taps: tuple[int, int] | None = None,
+    depth: int | None = None,
+    full_model: bool = False,
+) -> Plan:
+    """Choose the fastest way to an image of a given error.
+
+    Exactly one of `tolerance_db`, `tolerance_wavelengths` and `stages` must be given.
+
+    Parameters
+    ----------
+    lines : RangeLines
+        What to image.
+    grid : Grid
+        Where.
+    tolerance_db : float
+        Wanted relative rms error against the exact image, dB, from -75 to -10.
+    tolerance_wavelengths : float
+        The same as a range error, in wavelengths of the carrier: that which is spread evenly
+        between minus and plus so much, 4 pi/sqrt(3) radians rms per wavelength.
+    stages : sequence of (QR, QI)
+        Form the image as THESIS chapter 4 does: in every stage QR neighbouring lines are summed
+        and the subimages divided by QI along either side; then the last ones are backprojected.
+        No stage is plain backprojection. Range is interpolated linearly.
+    beam : BeamWindow, optional
+        Weights of the channels.
+    device : Device, str or int, optional
+        Whose costs count; see `clsas.opencl.device.choose`.
+    memory_bytes : int, optional
+        Device memory that may be used. Unless given it is half of the device's, or as much as
+        plain backprojection takes.
+    costs : Costs, optional
+        Instead of those stored for the device.
+    taps : (range, aperture), optional
+        For study, with a tolerance: take filters of so many taps, 4, 6 or 8, however long the
+        image takes, instead of the fastest.
+    depth : int, optional
+        The same of the number of stages, 1 to 5.
+    full_model : bool
+        For study: model every effect, also those whose error lies far below the tolerance.
+
+    Returns
+    -------
+    Plan
+        With empty `sides`, plain backprojection, where nothing is faster: near the aperture, with
+        few channels or pixels, or much relief.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If an argument is not what is allowed, or no way to the image fits the memory: the message
+        names what the least demanding one needs.
+    DeviceError
+        If there is no such device.
+
+    Warns
+    -----
+    ClsasWarning
+        If the tolerance may be missed because lines do not fade towards ends that the grid
+        reaches, or because the lines' band fills all that is sampled; or if no pixel lies within
+        any line's range, or the beam, so that the image will be zero.
+    """
+    validate.instance("lines", lines, RangeLines)
+    validate.instance("grid", grid, Grid)
+    if beam is not None:
+        validate.instance("beam", beam, BeamWindow)
+    given = [tolerance_db, tolerance_wavelengths, stages]
+    if sum(value is not None for value in given) != 1:
+        raise ValueError(
+            "exactly one of tolerance_db, tolerance_wavelengths and stages must be given, "
+            f"got {tolerance_db}, {tolerance_wavelengths}, {stages}"
+        )
+    validate.memory("grid", 8 * grid.size)
+    tolerance_db = tolerance_in_db(tolerance_db, tolerance_wavelengths)
+    if stages is not None:
+        stages = _checked_stages(stages, lines, grid)
+    allowed = _allowed(taps, depth)
+    if allowed is not None and stages is not None:
+        raise ValueError("taps and depth go with a tolerance, not with stages")
+    if costs is not None:
+        validate.instance("costs", costs, Costs)
+    device = open_device(device)
+    costs = costs or measured_costs(device)
+    calibrated, costs = costs is not None, costs or default_costs(device)
+    if memory_bytes is not None:
+        memory_bytes = validate.count("memory_bytes", memory_bytes)
+    model = Model(lines, grid, beam) if full_model else simplify(lines, grid, beam, tolerance_db)
+    view = View(model.lines, model.grid, model.beam, OUTSIDE * power(tolerance_db or 0.0))
+    rest_db = tolerance_db
+    if tolerance_db is not None:
+        view.ambiguity.warn("tolerance_db", tolerance_db)
+        rest_db = view.ambiguity.rest_db(tolerance_db, model.error)
+    found = _chosen(view, rest_db, stages, device, costs, memory_bytes, allowed)
+    error = power(found.predicted_error_db) + view.ambiguity.error_power + model.error
+    found = replace(
+        found, tolerance_db=tolerance_db, predicted_error_db=in_db(error), calibrated=calibrated
+    )
+    if model.left_out:
+        found = with_left_out(found, model, lines, grid, beam)
+    found.kept["lines"] = weakref.ref(lines)
+    # Who forms the image next need not warn again.
+    found.kept["warned"] = warn_unreached(lines, grid, beam, view.channels_along)
+    return found
+
+
+def _chosen(
+    view: View,
+    tolerance_db: float | None,
+    stages: list[tuple[int, int]] | None,
+    device: Device,
+    costs: Costs,
+    memory_bytes: int | None,
+    allowed: Allowed | None,
+) -> Plan:
+    """Return the plan of checked wishes."""
+    beam = view.beam
+    exact = expect(view, ACCURACY_DB if tolerance_db is None else tolerance_db - MARGIN_DB, device)
+    # Backprojection keeps within a device by itself.
+    room = device.info.memory_bytes // 2 if memory_bytes is None else memory_bytes
+    exact_fits = memory_bytes is None or exact.memory_bytes <= memory_bytes
+    least: float = exact.memory_bytes
+    if stages:
+        if view.track is None:
+            raise ValueError("lines must have channels at more than one place for stages")
+        if beam is not None and beam.normalise:
+            raise ValueError("beam must not normalise with stages; clsas.backproject does")
+        found = _nearest(view, stages, exact, device, costs, room)
+        if found.memory_bytes <= room:
+            return found
+        exact_fits, least = False, found.memory_bytes
+    elif stages is None and _divisible(view):
+        # What is gained must be worth an error, and more than predictions scatter.
+        to_beat = _WORTH * exact.seconds(costs) if exact_fits and allowed is None else math.inf
+        found, needed = _fastest(
+            view, tolerance_db, exact, to_beat, device, costs, room, allowed or Allowed()
+        )
+        if found is not None:
+            return found
+        least = min(least, needed)
+    if not exact_fits:
+        raise ValueError(
+            f"memory_bytes must be at least {math.ceil(10 * least / 2**20) / 10:.1f} MiB for this "
+            f"image, got {room / 2**20:.3g} MiB"
+        )
+    return forecast.plain(view, tolerance_db, exact, device, costs)
+
+
+def tolerance_in_db(
+    tolerance_db: float | None, tolerance_wavelengths: float | None
+) -> float | None:
+    """Return the tolerance asked for, or None, after checking it."""
+    if tolerance_db is not None:
+        return validate.number(
+            "tolerance_db", tolerance_db, "dB", least=BEST_TOLERANCE_DB, most=WORST_TOLERANCE_DB
+        )
+    if tolerance_wavelengths is None:
+        return None
+    least, most = (wavelengths(each) for each in (BEST_TOLERANCE_DB, WORST_TOLERANCE_DB))
+    return decibels(
+        validate.number(
+            "tolerance_wavelengths", tolerance_wavelengths, "wavelengths", least=least, most=most
+        )
+    )
+
+
+def _allowed(taps: tuple[int, int] | None, depth: int | None) -> Allowed | None:
+    """Return what was asked for, None where nothing was."""
+    if taps is None and depth is None:
+        return None
+    fields = {}
+    if taps is not None:
+        if not isinstance(taps, (tuple, list)) or len(taps) != 2:
+            raise TypeError(
+                f"taps must be two, in range and along the aperture, got {validate.shown(taps)}"
+            )
+        for each in taps:
+            validate.one_of("taps", validate.count("every entry of taps", each), ALIGN_TAPS)
+        fields = {"align_taps": (taps[0],), "aperture_taps": (taps[1],)}
+    if depth is not None:
+        validate.one_of("depth", validate.count("depth", depth), range(1, MOST_STAGES + 1))
+        fields["stages"] = (depth,)
+    return Allowed(**fields)
+
+
+def _divisible(view: View) -> bool:
+    """Return whether an image can be factorized at all."""
+    if view.track is None or view.grid.size == 1 or not view.sweeps_once:
+        return False
+    if view.beam is None:
+        return True
+    # What is normalised is amplified with its errors where hardly anything is seen.
+    if view.beam.normalise and view.coverage(1).min() < _LEAST_COVERED:
+        return False
+    # Steps of a window that are seen from few pixels cost these more than is expected of all.
+    if view.beam.jumps and 0 < view.share_partial < _LEAST_PARTIAL:
+        return False
+    # Where hardly any pixel sees anything there is as little to gain as is known about errors.
+    return float(view.coverage(2).mean()) >= _LEAST_SHARE_COVERED
+
+
+def _fastest(
+    view: View,
+    tolerance_db: float,
+    exact: Exact,
+    seconds: float,
+    device: Device,
+    costs: Costs,
+    memory_bytes: int,
+    choices: Allowed,
+) -> tuple[Plan | None, float]:
+    """Return the fastest plan within a tolerance, if it takes less than some seconds.
+
+    Beside it, where there is none, the least memory of those that did not fit.
+    """
+    allowed = power(tolerance_db)
+    view, trimmed = view.trimmed(_EDGES_SHARE * allowed), 0.0
+    if view.beam is not None:
+        trimmed = _EDGES_SHARE * allowed
+    most = root_limits(view, _ROOTS_SHARE * allowed)
+    beam_cycles = 0.0 if view.beam is None else _LEAST_BEAM_CYCLES
+    needed = math.inf
+    # The errors of filters and roots, and of phases.
+    least = trimmed + 0.08 * allowed + phases.error(phases.terms_within(tolerance_db)) ** 2
+    besides = least
+    tree: Tree | None = None
+    designed: tuple[Choice, float] | None = None
+    leaf_pixels = 1
+    frequencies, share = view.frequencies
+    steering = steering_spectrum(frequencies / view.highest_cycles_per_m, share)
+    while most is not None:
+        # Roots are often smaller than they might be.
+        roots = root_error(view, most if tree is None else tree.sides[0])
+        spared = besides + roots
+        choice = None
+        if spared < 0.9 * allowed:
+            filters_db = in_db(allowed - spared) - margin_db(view)
+            choice = None if tree is None else tree.filters(view.spectrum, filters_db)
+        elif tree is None:
+            break
+        if tree is None:
+            tree = search(view, filters_db, most, leaf_pixels, beam_cycles, device, costs, choices)
+            if tree is None:
+                break
+            crowding = (1.0,) * len(tree.sides)
+            continue
+        if choice is None:
+            # Fewer stages are of larger subimages, with more nodes.
+            fewer = tuple(n for n in choices.stages if n < len(tree.sides))
+            if not fewer or _MOST_CROWDING not in crowding[:-1]:
+                break
+            choices, tree, besides = replace(choices, stages=fewer), None, least
+            continue
+        if (choice, filters_db) != designed:
+            designed = choice, filters_db
+            filters = choice.design(view.spectrum, steering, len(tree.sides), filters_db)
+        way = Way(tree.sides, filters, crowding=crowding, beam_cycles=beam_cycles)
+        within = view.within(tree.sides[0])
+        others = other_errors(
+            within, way.sides, roots, filters.aperture, crowding, beam_cycles, device
+        )
+        found = forecast.factorized(
+            within, way, others.total + trimmed, tolerance_db, exact, device, costs, memory_bytes
+        )
+        if found.predicted_seconds >= seconds:
+            break
+        if found.predicted_error_db <= tolerance_db:
+            if found.memory_bytes <= memory_bytes:
+                return found, needed
+            needed, tree = min(needed, found.memory_bytes), None
+            rows, columns = found.sides[0]
+            most = (rows // 2, columns) if rows > columns else (rows, columns // 2)
+            continue
+        # What uneven spacing and a beam add falls with the density of nodes; filters must make up
+        # for the rest.
+        share = _NODES_SHARE * allowed / len(found.sides)
+        excess = [max(of_stage - share, 0.0) for of_stage in others.nodes]
+        uneven = partial(excess_error, within, found.sides[-1], found.aperture, crowding[-1], None)
+        if excess[-1] and beam_cycles > 0 and 2 * uneven() < others.nodes[-1]:
+            if beam_cycles >= _MOST_BEAM_CYCLES:
+                break  # no nodes follow a step
+            beam_cycles, excess[-1] = 2 * beam_cycles, 0.0
+        elif excess[-1] and crowding[-1] == _MOST_CROWDING:
+            # Smaller leaves have fewer nodes, less evenly spaced.
+            leaf_pixels, tree = 2 * math.prod(found.sides[-1]), None
+            continue
+        elif not any(excess) or max(crowding) == _MOST_CROWDING:
+            margin = power(-margin_db(view))
+            too_much = margin * (power(found.predicted_error_db) - allowed)
+            besides += 1.3 * too_much + _LEAST_STEP * allowed
+            continue
+        more = (max((1 + each / share) ** _CROWDING_POWER, _LEAST_CROWDED) for each in excess)
+        crowding = tuple(
+            float(min(density * factor, _MOST_CROWDING)) if each else density
+            for density, factor, each in zip(crowding, more, excess, strict=True)
+        )
+    return None, needed
+
+
+def decibels(wavelengths: float) -> float:
+    """Return the relative rms error of range errors spread evenly up to some wavelengths, dB."""
+    return 20 * math.log10(4 * math.pi * wavelengths / math.sqrt(3))
+
+
+def wavelengths(decibels: float) -> float:
+    """Return what `decibels` made an error of."""
+    return 10 ** (decibels / 20) * math.sqrt(3) / (4 * math.pi)
+
+
+def _nearest(
+    view: View,
+    stages: Sequence[tuple[int, int]],
+    exact: Exact,
+    device: Device,
+    costs: Costs,
+    memory_bytes: int,
+) -> Plan:
+    """Return the plan of THESIS chapter 4: nearest beams, linear interpolation in range."""
+    rows, columns = view.grid.shape
+    division = math.prod(divisions for _, divisions in stages)
+    # Whole work-items: 16 rows by 4 columns.
+    leaf = 16 * math.ceil(rows / division / 16), 4 * math.ceil(columns / division / 4)
+    sides = []
+    for _, divisions in reversed(stages):
+        sides.append(leaf)
+        leaf = leaf[0] * divisions, leaf[1] * divisions
+    linear = interpolation.design(2, NEAREST_UPSAMPLING, view.spectrum)
+    filters = Filters(linear, Interpolator(1, 1.0, np.zeros((0, 2, 0)), 0.0, 0.0), linear)
+    way = Way(tuple(sides[::-1]), filters, nearest=tuple(beams for beams, _ in stages))
+    error, by_stage = nearest_errors(view, stages)
+    found = forecast.factorized(view, way, error, None, exact, device, costs, memory_bytes)
+    *divided, last = found.stages
+    divided = [
+        replace(stage, error_db=in_db(power(stage.error_db) + of_beams))
+        for stage, of_beams in zip(divided, by_stage, strict=True)
+    ]
+    return replace(found, stages=(*divided, last))
+
+
+def checked_pairs(stages: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
+    """Return (QR, QI) of every stage, or raise what is wrong with any of them."""
+    try:
+        pairs = [(stage[0], stage[1]) for stage in stages if len(stage) == 2]
+        whole = len(pairs) == len(stages)
+    except TypeError:
+        whole = False
+    if not whole:
+        raise TypeError(f"stages must be a sequence of (QR, QI), got {validate.shown(stages)}")
+    return [
+        (validate.count("QR of stages", beams), validate.count("QI of stages", divisions))
+        for beams, divisions in pairs
+    ]
+
+
+def _checked_stages(stages: Sequence[tuple[int, int]], lines: RangeLines, grid: Grid) -> list:
+    """Return (QR, QI) of every stage, or raise what these lines and this grid do not allow."""
+    pairs = checked_pairs(stages)
+    if not pairs:
+        return pairs
+    if not grid.is_planar:
+        raise ValueError("grid must be a plane for stages")
+    most_beams, most_divisions = lines.channels, max(min(grid.shape), 1)
+    beams, divisions = (math.prod(numbers) for numbers in zip(*pairs, strict=True))
+    if beams > most_beams or divisions > most_divisions:
+        raise ValueError(
+            f"stages must leave a line and a pixel: they sum {beams} of {lines.channels} lines and "
+            f"divide {grid.shape[0]} x {grid.shape[1]} pixels by {divisions} along either side"
+        )
+    return pairs

@@ -1,0 +1,422 @@
+"""How a track sees a grid: what the costs and errors of a factorized image depend on."""
+
+from __future__ import annotations
+
+import copy
+import functools
+import math
+from collections.abc import Hashable, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial import KDTree
+
+from clsas.core.grid import Grid
+from clsas.core.lines import RangeLines, some_channels, wavelength_m
+from clsas.exact.tiles import STACK
+from clsas.factorized.aperture import cycles_per_extent, mean_track, own_drift
+from clsas.factorized.surface import LEAST_SIDE, surface_of, within_roots
+from clsas.factorized.tree import beam_directions, beam_rate
+from clsas.signal.ambiguity import Ambiguity, ambiguity
+from clsas.signal.interpolation import Interpolator, Resampling
+from clsas.signal.spectrum import cycles_per_m_at, measure_spectrum
+from clsas.sonar.beam import BeamWindow, Sight, sines
+
+_NEIGHBOURS = 64  # channels whose density is looked at
+_CHANNELS = 256  # of which it is looked at what they see
+_SPOTS = (0.02, 0.25, 0.5, 0.75, 0.98)  # of rows and columns, where the geometry is looked at
+_OF_SPOTS = np.array([0.135, 0.24, 0.25, 0.24, 0.135])  # what these stand for
+_SHARES = np.outer(_OF_SPOTS, _OF_SPOTS).ravel() / _OF_SPOTS.sum() ** 2
+_EVERYWHERE = np.linspace(0, 1, 17)  # parts of rows and columns
+_BINS = 512  # of a beam
+_MOST_OUTSIDE = 1e-6  # of the lines' power, beyond what counts as their highest frequency
+_MOST_TURNED = 1 / 16  # of a beam, from one channel to the next
+_COARSER = 4  # of the track's samples: where roots are compared
+
+
+class View:
+    """How the track sees the grid at some spots: what costs and errors depend on.
+
+    Attributes
+    ----------
+    surface : Surface
+        Where the grid's pixels lie.
+    spots_m : float64 [spots, 3]
+        Over the whole grid, its corners among them.
+    track_m : float64 [samples, 3]
+        Positions at `track.samples`.
+    spacing : float64 [samples]
+        What each of these stands for, of the track's parameter.
+    limits : (low, high) or None
+        Sines of the aspect angle between which anything is seen.
+    root : (rows, columns) or None
+        Of the roots within which `rates` hold.
+    rates : float64 [axes, spots, samples]
+        Cycles per row, column and metre of relief, and per unit of the track's parameter.
+    kept : dict
+        What was found out about this view before.
+
+    It is made with the share of the lines' power that may lie `outside` of what counts as their
+    band.
+    """
+
+    def __init__(
+        self,
+        lines: RangeLines,
+        grid: Grid,
+        beam: BeamWindow | None,
+        outside: float = _MOST_OUTSIDE,
+    ) -> None:
+        self.lines, self.grid, self.beam = lines, grid, beam
+        self.kept: dict[Hashable, Any] = {}
+        self.spectrum = measure_spectrum(lines, grid)
+        outside = min(outside, _MOST_OUTSIDE)
+        occupied = self.spectrum.frequency[np.cumsum(self.spectrum.share) < 1 - outside]
+        half_band = (occupied[-1] if len(occupied) else 0.5) / lines.range_step_m
+        centre = cycles_per_m_at(lines, self.spectrum.centre)
+        self.highest_cycles_per_m = float(abs(centre) + half_band)
+        mean_square = self.spectrum.share @ self.spectrum.frequency**2
+        self.rms_cycles_per_m = float(np.sqrt(mean_square)) / lines.range_step_m  # of the band
+        self.track, self.limits = mean_track(lines), None if beam is None else beam.limits
+        self.along, self.channels_along = None, None if beam is None else beam.directions(lines)
+        if self.track is None:
+            return
+        self.surface, self.root = surface_of(grid), None
+        self.spots_m = self._pixels_m(_SPOTS)
+        self.track_m, _ = self.track.sampled_m
+        self.spacing = _spacing(self.track.samples)
+        sight = self.spots_m[:, None] - self.track_m
+        self.distance_m = np.maximum(np.linalg.norm(sight, axis=-1), 1e-9)
+        self.sight = sight / self.distance_m[..., None]
+        self.on_track = np.abs(self.track.samples - 0.5) <= 0.5
+        # Between the places that are looked at a pixel may come nearer.
+        dense_m = self._pixels_m(np.linspace(0, 1, 65))
+        steps_m = np.linalg.norm(self.surface.steps_m[:2], axis=1)
+        between_m = steps_m @ (np.array(self.surface.plane.shape) - 1) / 128
+        between_m += self.surface.relief_m(LEAST_SIDE).max() / 2
+        nearest_m = KDTree(dense_m).query(lines.phase_centres_m)[0].min() - between_m
+        self.nearest_m = max(float(nearest_m), 1e-9)
+        self._seen: dict[tuple[int, int], NDArray[np.bool_]] = {}
+        self._within: dict[tuple[int, int], View] = {}
+        self._in_roots: dict[tuple[int, int], NDArray[np.float64]] = {}
+        self._while_seen: dict[tuple[int, int], NDArray[np.float64]] = {}
+        if beam is not None:
+            self.along = beam_directions(self.channels_along, self.track, self.track.samples)
+            self.beam_rates = beam_rate(beam, self.track, self.along, self.spots_m)
+        self.rates = self._rates(np.zeros(len(self.surface.steps_m)), self.spots_m)
+
+    @property
+    def frequencies(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Frequencies of the lines, cycles per m, and the share of their power that each holds.
+
+        That is phase per metre of range, whatever its sign, and above 0.
+        """
+        found, power = self.spectrum.frequency, self.spectrum.share
+        found = self.spectrum.centre + np.concatenate([-found[::-1], found])
+        cycles_per_m = np.abs(cycles_per_m_at(self.lines, found))
+        share = np.concatenate([power[::-1], power]) / 2
+        return np.maximum(cycles_per_m, 1e-3 * self.highest_cycles_per_m), share
+
+    def carriers(self, count: int) -> NDArray[np.float64]:
+        """Return so many of these frequencies that all hold as much of the power."""
+        cycles_per_m, share = self.frequencies
+        place = np.interp((np.arange(count) + 0.5) / count, np.cumsum(share), np.arange(len(share)))
+        return np.interp(place, np.arange(len(share)), cycles_per_m)
+
+    @property
+    def sweeps_once(self) -> bool:
+        """Whether the beam moves over every spot evenly, so that each is seen once.
+
+        Nodes cannot follow a beam that swings with the track as fast as it passes by. As seen from
+        a spot, the aspect angle's sine changes along the track by (1 - sine^2)/distance where the
+        track is straight; half more or less than on average is followed.
+        """
+        if self.beam is None:
+            return True
+        # Neighbours on the track must look much the same way: at a kink a beam may swing past a
+        # spot within a few channels, and one may lead back beside another.
+        along = self.channels_along[np.argsort(self.track.place, kind="stable")]
+        turned = np.linalg.norm(np.diff(along, axis=0), axis=1)
+        if turned.max(initial=0.0) > _MOST_TURNED * np.ptp(np.clip(self.beam.limits, -1, 1)):
+            return False
+        on_track = self.on_track
+        position = self.track_m[on_track]
+        way_m = np.concatenate([[0], np.linalg.norm(np.diff(position, axis=0), axis=1).cumsum()])
+        sine = np.einsum("psi,si->ps", self.sight[:, on_track], self.along[on_track])
+        way_m += 1e-9 * np.arange(len(way_m))  # a track may stand still
+        rate = -np.gradient(sine, way_m, axis=1)
+        rate *= self.distance_m[:, on_track] / np.maximum(1 - sine**2, 1e-3)
+        low, high = self.beam.limits
+        for each in np.where((sine > low) & (sine < high), rate, np.nan):
+            seen = each[np.isfinite(each)]
+            if seen.size and np.ptp(seen) > abs(seen.mean()):
+                return False
+        return True
+
+    def trimmed(self, share: float) -> View:
+        """Return this view without the edges of the beam, where weights are next to nothing.
+
+        At both edges as much is left out as takes `share` of the power of an image of noise.
+        """
+        if self.beam is None:
+            return self
+        low, high = np.clip(self.limits, -1, 1)
+        on_track, bounds = self.on_track, []
+        of_track = sines(self._everywhere_m, self.track_m[on_track], self.along[on_track])
+        # Of channels too, since the track may have gaps; filters reach into these. Everywhere: of
+        # a short aperture a pixel sees a small part of the beam only.
+        for sine in (self._sines_of_channels, of_track):
+            sine = sine[(sine > low) & (sine < high)]
+            power = self.beam.weights(sine, wavelength_m(self.lines)) ** 2
+            place = np.minimum((sine - low) * (_BINS / (high - low)), _BINS - 1).astype(np.int64)
+            power = np.bincount(place, power, _BINS).cumsum()
+            bounds.append(np.searchsorted(power, np.array([share / 2, 1 - share / 2]) * power[-1]))
+        first, last = np.min(bounds, axis=0)[0], np.max(bounds, axis=0)[1]
+        if not 0 < first <= last:
+            return self
+        view = copy.copy(self)
+        view._seen, view._within, view._in_roots, view._while_seen, view.kept = {}, {}, {}, {}, {}
+        for name in ("ends_seen", "slopes_m"):  # these depend on what is seen
+            view.__dict__.pop(name, None)
+        edges = np.linspace(low, high, _BINS + 1)
+        view.limits = float(edges[first]), float(edges[min(last + 1, _BINS)])
+        view.rates = view._rates(np.zeros(len(self.surface.steps_m)), self.spots_m)
+        return view
+
+    def coverage(self, power: int) -> NDArray[np.float64]:
+        """Return sums over channels of a power of the beam's weights, over the largest, [points].
+
+        At points all over the grid; 0 where nothing is seen from anywhere.
+        """
+        weights = self.beam.weights(self._sines_of_channels, wavelength_m(self.lines))
+        sums = (weights**power).sum(axis=0)
+        return sums / max(sums.max(), 1e-30)
+
+    @property
+    def share_partial(self) -> float:
+        """Which part of the image's points sees the track through an edge of the beam."""
+        low, high = self.beam.limits
+        seen = ((self._sines_of_channels > low) & (self._sines_of_channels < high)).mean(axis=0)
+        return float(((seen > 0) & (seen < 1)).mean())
+
+    @functools.cached_property
+    def ambiguity(self) -> Ambiguity:
+        """Errors that the lines themselves leave open."""
+        return ambiguity(self.lines, self.grid, self.spectrum, self.beam, self.channels_along)
+
+    @functools.cached_property
+    def _everywhere_m(self) -> NDArray[np.float64]:
+        return self._pixels_m(_EVERYWHERE)
+
+    @functools.cached_property
+    def _sines_of_channels(self) -> NDArray[np.float64]:
+        """Sines of the aspect angle of all over the grid, [channels, points]; of some channels."""
+        some = some_channels(self.lines.channels, _CHANNELS)
+        position_m, along = self.lines.phase_centres_m[some], self.channels_along[some]
+        return sines(self._everywhere_m, position_m, along)
+
+    @functools.cached_property
+    def off_track_m(self) -> NDArray[np.float64]:
+        """How far channels are off the mean track, [channels]."""
+        away_m = self.lines.phase_centres_m - self.track.positions_m(self.track.place)
+        off_m = np.linalg.norm(away_m, axis=1)
+        if self.own_drift is not None:
+            off_m += np.linalg.norm(self.own_drift, axis=1) * np.median(self.distance_m)
+        return off_m
+
+    @functools.cached_property
+    def own_drift(self) -> NDArray[np.float64] | None:
+        """See `clsas.factorized.aperture.own_drift`."""
+        return own_drift(self.lines)
+
+    @functools.cached_property
+    def densest(self) -> float:
+        """By how much denser than on average channels lie where they lie densest on the track."""
+        place = np.sort(self.track.place)
+        some = min(_NEIGHBOURS, len(place) - 1)
+        closest = float((place[some:] - place[:-some]).min())
+        average = float(place[-1] - place[0]) * some / (len(place) - 1)
+        return average / closest if closest > 0 else np.inf
+
+    def _pixels_m(self, places: Sequence[float]) -> NDArray[np.float64]:
+        """Return positions at some parts of the rows and columns, [n, 3]."""
+        index = np.stack(np.meshgrid(places, places, indexing="ij"), axis=-1).reshape(-1, 2)
+        index = index * (np.array(self.surface.plane.shape) - 1)
+        plane_m = self.surface.plane.origin_m + index @ self.surface.steps_m[:2]
+        # As far off the plane as the pixels around.
+        around = (index // LEAST_SIDE * LEAST_SIDE).astype(np.int64)
+        middle = around + (np.array(LEAST_SIDE) - 1) / 2
+        off_m = self.surface.middles_m(LEAST_SIDE, around) - self.surface.plane.origin_m
+        return plane_m + off_m - middle @ self.surface.steps_m[:2]
+
+    def subimages(self, side: tuple[int, int]) -> int:
+        """Return how many subimages of a size hold a pixel."""
+        if self.surface.is_plane:
+            shape = self.surface.plane.shape
+            return math.prod(-(-n // s) for n, s in zip(shape, side, strict=True))
+        return int((self.surface.counts(side) > 0).sum())
+
+    def slots(self, side: tuple[int, int], width: int) -> float:
+        """Return the pixels of such a subimage, on average, filled up to what is computed together.
+
+        On a plane that is all of it; elsewhere groups of blocks of `width` pixels.
+        """
+        if self.surface.is_plane:
+            return float(math.prod(side))
+        slots = self._filled_up(side, width)
+        return float(slots.sum() / (slots > 0).sum())
+
+    def most_slots(self, side: tuple[int, int], root: tuple[int, int], width: int) -> int:
+        """Return the most of these in a root."""
+        return int(within_roots(np.add, self._filled_up(side, width), side, root).max())
+
+    def _filled_up(self, side: tuple[int, int], width: int) -> NDArray[np.int64]:
+        size = STACK * width
+        return -(-self.surface.counts(side) // size) * size
+
+    def seen(self, side: tuple[int, int]) -> NDArray[np.bool_]:
+        """Return from where channels see anything of subimages at the spots, [spots, samples]."""
+        if self.limits is None:
+            return np.broadcast_to(self.on_track, self.distance_m.shape)
+        if side not in self._seen:
+            half = self.extents(side, most=True) / 2
+            self._seen[side] = self.on_track & (self._boxes.inside_by(self.limits, half) > 0)
+        return self._seen[side]
+
+    @functools.cached_property
+    def _boxes(self) -> Sight:
+        """How the track sees boxes of cells at the spots."""
+        origin_m = self.spots_m[0]
+        return Sight.of(
+            self.spots_m - origin_m, self.surface.steps_m, self.track_m - origin_m, self.along
+        )
+
+    def share_seen(self, side: tuple[int, int], *, most: bool = False) -> float:
+        """Return which part of the channels sees anything of a subimage, on average or at most."""
+        count = np.count_nonzero(self.seen(side), axis=1)
+        return _over_spots(count / np.count_nonzero(self.on_track), most)
+
+    def cycles(
+        self, rates: NDArray[np.float64], seen: NDArray[np.bool_], *, most: bool = False
+    ) -> float:
+        """Return how far a phase turns while it is seen, on average over the grid or at most."""
+        return _over_spots(np.where(seen, rates, 0.0) @ self.spacing, most)
+
+    def turns(self, side: tuple[int, int], seen: NDArray[np.bool_], *, most: bool = False) -> float:
+        """Return `cycles` of the phases of subimages of a size."""
+        rates = np.tensordot(self.extents(side, most=most), self.rates, 1)
+        return self.cycles(rates, seen, most=most)
+
+    def extents(
+        self, side: tuple[int, int], root: tuple[int, int] | None = None, *, most: bool = False
+    ) -> NDArray[np.float64]:
+        """Return the extents of subimages of a size, [axes].
+
+        Their relief is the most in a root, of this view unless given, on average over the roots or
+        at most.
+        """
+        if self.surface.is_plane:
+            return self.surface.extents(side)
+        relief_m = self.surface.relief_m(side, root or self.root)
+        return self.surface.extents(side, float(relief_m.max() if most else relief_m.mean()))
+
+    def channels(self, taps: int, density: float, turns: ArrayLike) -> ArrayLike:
+        """Return the virtual channels of a subimage while whose phase turns by some cycles.
+
+        `taps` and `density`, nodes per cycle, are those of the filter along the aperture, which
+        reaches beyond the track's ends.
+        """
+        return density * turns + 1 + self.ends_seen * (taps / 2 - 0.5)
+
+    @functools.cached_property
+    def ends_seen(self) -> float:
+        """How many ends of the track the beam sees a spot from, on average."""
+        ends = np.flatnonzero(self.on_track)[[0, -1]]
+        return float(self.seen((16, 16))[:, ends].sum(axis=1).mean())
+
+    def within(self, root: tuple[int, int]) -> View:
+        """Return this view with the rates of subimages in roots of a size."""
+        if root not in self._within:
+            view = self._within[root] = copy.copy(self)
+            view.root, view.kept = root, {}
+            view.rates = self._rates(self.extents(root, most=True), self.spots_m)
+        return self._within[root]
+
+    def cycles_in_root(
+        self, root: tuple[int, int], sides: Sequence[tuple[int, int]]
+    ) -> NDArray[np.float64]:
+        """Return `cycles` per extent in a root, while subimages of some sizes are seen.
+
+        Roughly; [sides, axes].
+        """
+        middle = np.arange(len(_SPOTS) ** 2).reshape(len(_SPOTS), -1)[1:-1, 1:-1].ravel()
+        if root not in self._in_roots:
+            extents = self.extents(root, most=True) if any(root) else self.surface.extents(root)
+            rates = self._rates(extents, self.spots_m[middle], _COARSER)
+            self._in_roots[root] = rates.reshape(len(rates), -1) / len(middle)
+        spacing = _spacing(self.track.samples[::_COARSER])
+        for side in sides:
+            if side not in self._while_seen:
+                seen = self.seen(side)[middle, ::_COARSER]
+                self._while_seen[side] = (seen * spacing).ravel()
+        while_seen = np.stack([self._while_seen[side] for side in sides])
+        return while_seen @ self._in_roots[root].T
+
+    def _rates(
+        self, extents: NDArray[np.float64], centres_m: NDArray[np.float64], every: int = 1
+    ) -> NDArray[np.float64]:
+        return cycles_per_extent(
+            self.track,
+            self.surface,
+            centres_m,
+            extents,
+            self.highest_cycles_per_m,
+            self.nearest_m,
+            self.limits,
+            self.along,
+            every,
+        )
+
+    @functools.cached_property
+    def slopes_m(self) -> NDArray[np.float64]:
+        """Largest change of range per row, column and metre of relief, [axes]."""
+        seen = self.seen((16, 16))
+        slopes = np.abs(self.sight @ self.surface.steps_m.T)
+        slopes = slopes[seen] if seen.any() else slopes.reshape(-1, slopes.shape[-1])
+        return 1.02 * slopes.max(axis=0)
+
+    def reach_m(self, side: tuple[int, int]) -> float:
+        """Return by how much a pixel's range may differ from that of its subimage's centre."""
+        radius_m = self.surface.radius_m(side)
+        bend_m = radius_m**2 / (2 * max(self.nearest_m, radius_m))
+        extents = self.surface.extents(side, self.surface.relief_m(side).max())
+        return min(float(extents @ self.slopes_m) / 2 + bend_m, radius_m)
+
+    def half_lengths(
+        self,
+        sides: Sequence[tuple[int, int]],
+        align: Interpolator,
+        final: Interpolator,
+        resampling: Resampling,
+    ) -> tuple[int, ...]:
+        """Return the samples to either side of a centre that the lines of each stage must hold."""
+        samples_per_m = resampling.samples_per_m(self.lines)
+        return tuple(
+            math.ceil(self.reach_m(side) * samples_per_m)
+            + (len(sides) - 1 - level) * (align.taps // 2 + 1)
+            + final.taps // 2
+            + 1
+            for level, side in enumerate(sides)
+        )
+
+
+def _over_spots(values: NDArray[np.float64], most: bool) -> float:
+    """Return the largest of values at the spots, or their mean over the grid."""
+    return float(values.max() if most else values @ _SHARES)
+
+
+def _spacing(samples: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return by what to multiply values at samples for the integral over them (trapezoids)."""
+    halves = np.diff(samples) / 2
+    return np.concatenate([halves, [0.0]]) + np.concatenate([[0.0], halves])

@@ -1,0 +1,1 @@
+"""What an image shows: quality, trade-offs, effects, pictures."""

@@ -1,0 +1,303 @@
+"""Effects that a model of an image holds, and the error of an image without each of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsas.core.decibels import in_db
+from clsas.core.geometry import pairwise_range_m
+from clsas.core.grid import Grid
+from clsas.core.lines import RangeLines, some_channels, wavelength_m
+from clsas.factorized.surface import surface_of
+from clsas.signal.ambiguity import ends_error
+from clsas.signal.spectrum import cycles_per_m_at, measure_spectrum
+from clsas.sonar.beam import BeamWindow, sines
+from clsas.sonar.simplify import APART, MOTION, RELIEF
+from clsas.sonar.system import Sonar, element_pattern
+from clsas.sonar.track import Pointing, Track
+
+SWAY = "sway and yaw beyond a straight track"
+PATTERN = "element pattern"
+BEAM = "beam window"
+ENDS = "ends of lines"
+SINGLE = "single rather than half precision"
+
+KEYS = {
+    MOTION: "[simulate] motion_in_flight = false",
+    APART: "[simulate] phase_centres = true",
+    RELIEF: "",
+    SWAY: "no [track.sway], [track.yaw], ...",
+    PATTERN: "[simulate] element_pattern = false",
+    BEAM: "no [image.beam]",
+    ENDS: "[simulate] range_m",
+    SINGLE: "",
+}
+"""What leaves an effect out of a scene file; nothing does that is decided by grid or device."""
+
+_CHANNELS, _PIXELS = 256, 16  # sampled: channels, and pixels along either side of the grid
+_FREQUENCIES = 8  # of the band, each with as much of the power
+_BEFORE = 1e-12  # of a direction: what lies in the plane of an element's face is before it
+
+
+@dataclass(frozen=True, eq=False)
+class Survey:
+    """What an image is formed of, and what is known of how its lines were made.
+
+    Attributes
+    ----------
+    lines, grid, beam
+        Of the image.
+    sonar, track, pointing
+        Of the lines, or None where they are not known.
+    has_pattern : bool
+        Whether lines hold the sonar's element patterns.
+    has_ends : bool
+        Whether ends of lines are those of data.
+    """
+
+    lines: RangeLines
+    grid: Grid
+    beam: BeamWindow | None = None
+    sonar: Sonar | None = None
+    track: Track | None = None
+    pointing: Pointing | None = None
+    has_pattern: bool = True
+    has_ends: bool = True
+
+    @property
+    def knows_pattern(self) -> bool:
+        """Whether sonar and track tell the element patterns of every channel."""
+        known = self.sonar is not None and self.track is not None
+        return known and not self.sonar.is_omnidirectional
+
+    @property
+    def modelled(self) -> dict[str, bool]:
+        """Whether the image models each effect."""
+        lines = self.lines
+        return {
+            MOTION: lines.rx_velocity_m_s is not None,
+            APART: not np.array_equal(lines.tx_m, lines.rx_m),
+            RELIEF: not surface_of(self.grid).is_plane,
+            SWAY: bool(track_errors_m(lines).any()),
+            PATTERN: self.knows_pattern and self.has_pattern,
+            BEAM: self.beam is not None,
+            ENDS: True,
+        }
+
+    @property
+    def full_lines(self) -> RangeLines:
+        """Lines with the velocity of receivers, also where only the track tells it."""
+        if self.lines.rx_velocity_m_s is not None or self.sonar is None or self.track is None:
+            return self.lines
+        velocity = np.repeat(self.track.velocity_m_s, self.sonar.receivers, axis=0)
+        return replace(self.lines, rx_velocity_m_s=velocity)
+
+
+@dataclass(frozen=True)
+class ErrorWithout:
+    """Error of an image without an effect: dB, and of ranges, wavelengths, rms and at most."""
+
+    error_db: float
+    range_wavelengths: float | None = None
+    most_wavelengths: float | None = None
+
+
+def errors_without(survey: Survey) -> dict[str, ErrorWithout]:
+    """Return the error of an image without each effect, of those that can be told.
+
+    For a sample of channels i and pixels x, all over the grid and its corners among them, ranges
+    without an effect differ by d from those of the full model, in float64, and weights w' from w.
+    The relative error of an image whose channels add up incoherently is then
+
+        sum_ix |w - w' exp(j 2 pi f d)|^2 / sum_ix w^2,
+
+    averaged over the frequencies f of the lines' band (cycles per metre of range). That holds
+    phases and the shift of envelopes, and grows to +3 dB where phases have nothing in common.
+    """
+    lines, beam = survey.lines, survey.beam
+    sample = _Sample.of(survey.full_lines, survey.grid, beam)
+    pattern = _pattern(sample, survey) if survey.knows_pattern else None
+    of_lines = pattern if pattern is not None and survey.has_pattern else 1.0
+    errors = {
+        name: sample.error_of_ranges(range_m, sample.weights * of_lines)
+        for name, range_m in _ranges_without(sample, lines).items()
+    }
+    if pattern is not None:
+        errors[PATTERN] = _error_of_weights(sample.weights * pattern, sample.weights)
+    if beam is not None:
+        with_it, without = sample.weights * of_lines, sample.inside * of_lines
+        errors[BEAM] = _error_of_weights(with_it, without)
+    if survey.has_ends:
+        along = None if beam is None else beam.directions(lines)
+        errors[ENDS] = ErrorWithout(
+            in_db(ends_error(lines, survey.grid, measure_spectrum(lines), beam, along))
+        )
+    return errors
+
+
+def _ranges_without(sample: _Sample, lines: RangeLines) -> dict[str, NDArray[np.float64]]:
+    """Return the ranges of a sample of lines without each effect on them."""
+    some, points_m = sample.lines, sample.points_m
+    moving = some.rx_velocity_m_s, some.sound_speed_m_s
+    middle_m, off_m = some.phase_centres_m, track_errors_m(lines)[sample.channels]
+    ranges_m = {
+        APART: pairwise_range_m(points_m, middle_m, middle_m, *moving),
+        RELIEF: pairwise_range_m(sample.flat_m, some.tx_m, some.rx_m, *moving),
+        SWAY: pairwise_range_m(points_m, some.tx_m - off_m, some.rx_m - off_m, *moving),
+    }
+    if some.rx_velocity_m_s is not None:
+        ranges_m[MOTION] = pairwise_range_m(points_m, some.tx_m, some.rx_m)
+    return ranges_m
+
+
+def band_wavelength_m(lines: RangeLines) -> float:
+    """Return the wavelength at the middle of the lines' band, metres."""
+    centre = measure_spectrum(lines).centre
+    return 2 / max(abs(cycles_per_m_at(lines, centre)), 1e-30)
+
+
+def track_errors_m(lines: RangeLines) -> NDArray[np.float64]:
+    """Return how far channels lie beside where a straight track has them, [channels, 3], metres.
+
+    The track is the line that fits the pings' phase centres best. What all pings have in common
+    is the array's shape: where each has the same number of channels, the mean of each over the
+    pings is no track error.
+    """
+    centres_m = lines.phase_centres_m
+    starts = lines.ping_starts
+    counts = np.diff(np.append(starts, lines.channels))
+    pings_m = np.add.reduceat(centres_m, starts, axis=0) / counts[:, None]
+    middle_m = pings_m.mean(axis=0)
+    direction = np.linalg.svd(pings_m - middle_m, full_matrices=False)[2][0]
+    away_m = centres_m - middle_m
+    away_m = away_m - np.outer(away_m @ direction, direction)
+    if (counts == counts[0]).all():
+        by_ping = away_m.reshape(-1, counts[0], 3)
+        away_m = (by_ping - by_ping.mean(axis=0)).reshape(-1, 3)
+    # What rounding leaves of a straight track is none.
+    size_m = np.abs(centres_m).max()
+    return np.where(np.abs(away_m) > 1e-14 * size_m, away_m, 0.0)
+
+
+@dataclass(frozen=True, eq=False)
+class _Sample:
+    """Some channels and pixels, and how they see each other; arrays are [pixels, channels].
+
+    Attributes
+    ----------
+    channels : int [channels]
+        Which of all these are.
+    lines : RangeLines
+        Theirs, with everything modelled.
+    points_m, flat_m : float64 [pixels, 3]
+        The pixels, and where they lie on the plane without relief.
+    range_m : float64
+        Ranges of the full model.
+    inside, weights : float64
+        1 where a channel's line holds the pixel; the beam's weights there.
+    cycles_per_m : float64 [frequencies]
+        Of the band, each with as much of the power.
+    wavelength_m : float
+        At the middle of the band.
+    """
+
+    channels: NDArray[np.int64]
+    lines: RangeLines
+    points_m: NDArray[np.float64]
+    flat_m: NDArray[np.float64]
+    range_m: NDArray[np.float64]
+    inside: NDArray[np.float64]
+    weights: NDArray[np.float64]
+    cycles_per_m: NDArray[np.float64]
+    wavelength_m: float
+
+    @classmethod
+    def of(cls, lines: RangeLines, grid: Grid, beam: BeamWindow | None) -> _Sample:
+        """Return a sample of some lines and a grid."""
+        some = some_channels(lines.channels, _CHANNELS)
+        part = lines.select(some)
+        points_m, flat_m = _pixels_m(grid)
+        range_m = pairwise_range_m(
+            points_m, part.tx_m, part.rx_m, part.rx_velocity_m_s, part.sound_speed_m_s
+        )
+        inside = (range_m >= part.first_range_m) & (range_m <= part.last_range_m)
+        inside = inside.astype(np.float64)
+        weights = inside
+        if beam is not None:
+            sine = sines(points_m, part.phase_centres_m, beam.directions(lines)[some]).T
+            weights = inside * beam.weights(sine, wavelength_m(lines))
+        spectrum = measure_spectrum(lines)
+        away = np.interp(
+            (np.arange(_FREQUENCIES // 2) + 0.5) / (_FREQUENCIES // 2),
+            np.cumsum(spectrum.share),
+            spectrum.frequency,
+        )
+        centre = cycles_per_m_at(lines, spectrum.centre)
+        beside = np.concatenate([-away, away]) / lines.range_step_m
+        return cls(
+            some, part, points_m, flat_m, range_m, inside, weights, centre + beside,
+            band_wavelength_m(lines),
+        )  # fmt: skip
+
+    def error_of_ranges(
+        self, range_m: NDArray[np.float64], weights: NDArray[np.float64]
+    ) -> ErrorWithout:
+        """Return the error of other ranges."""
+        away_m = range_m - self.range_m
+        square = weights**2
+        total = max(square.sum(), 1e-30)
+        # |1 - exp(j a)|^2 = 4 sin^2(a/2)
+        wrong = np.mean([4 * np.sin(np.pi * f * away_m) ** 2 for f in self.cycles_per_m], axis=0)
+        rms_m = np.sqrt(np.sum(square * away_m**2) / total)
+        most_m = np.abs(away_m).max(where=weights > 0, initial=0.0)
+        # A path is there and back.
+        waves = 2 / self.wavelength_m
+        error_db = in_db(np.sum(square * wrong) / total)
+        return ErrorWithout(error_db, float(rms_m * waves), float(most_m * waves))
+
+
+def _error_of_weights(with_it: NDArray[np.float64], without: NDArray[np.float64]) -> ErrorWithout:
+    """Return the error of other weights."""
+    return ErrorWithout(in_db(np.sum((with_it - without) ** 2) / max(np.sum(with_it**2), 1e-30)))
+
+
+def _pixels_m(grid: Grid) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return pixels all over a grid and those of most relief, and where they lie without it."""
+    places = [np.unique(np.linspace(0, n - 1, _PIXELS).round().astype(int)) for n in grid.shape]
+    index = np.ravel_multi_index(np.ix_(*places), grid.shape).ravel()
+    surface = surface_of(grid)
+    if surface.is_plane:
+        points_m = grid.at(index)
+        return points_m, points_m
+    index = np.append(index, [surface.off_m.argmin(), surface.off_m.argmax()])
+    points_m = grid.at(index)
+    return points_m, points_m - surface.off_m[index, None] * surface.steps_m[2]
+
+
+def _pattern(sample: _Sample, survey: Survey) -> NDArray[np.float64]:
+    """Return the two-way pattern at the carrier, 0 behind an element's face."""
+    lines, sonar = sample.lines, survey.sonar
+    axes = (survey.pointing or Pointing.broadside()).axes(survey.track)
+    axes = axes[sample.channels // sonar.receivers]
+    heard_m = np.broadcast_to(lines.rx_m, (len(sample.points_m), *lines.rx_m.shape))
+    if lines.rx_velocity_m_s is not None:
+        speed = lines.rx_velocity_m_s / lines.sound_speed_m_s
+        heard_m = heard_m + 2 * sample.range_m[..., None] * speed
+    pattern = np.ones_like(sample.range_m)
+    ends = (
+        (lines.tx_m, sonar.tx_length_m, sonar.tx_height_m),
+        (heard_m, sonar.rx_length_m, sonar.rx_height_m),
+    )
+    for position_m, length_m, height_m in ends:
+        way = sample.points_m[:, None] - position_m
+        way /= np.maximum(np.linalg.norm(way, axis=-1, keepdims=True), 1e-30)
+        components = np.einsum("pci,cai->apc", way, axes)
+        pattern *= components[1] > -_BEFORE
+        for size_m, sine in ((length_m, components[0]), (height_m, components[2])):
+            if size_m is not None:
+                frequency_hz, sound = sonar.pulse.carrier_hz, sonar.sound_speed_m_s
+                pattern *= element_pattern(size_m, sine, frequency_hz, sound)
+    return pattern

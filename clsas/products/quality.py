@@ -1,0 +1,358 @@
+"""Image quality: point responses, image-to-image error, entropy and contrast."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from clsas.core import validate
+from clsas.core.grid import Axis, Grid
+from clsas.core.image import Image
+from clsas.core.image_error import complex_values
+
+_LOBES = 10  # side lobes on each side that the ISLR counts
+_SEARCH = 10  # pixels around the given place where the peak is looked for, unless told
+_REACH = 1024  # pixels around the peak that are looked at, at most
+_UPSAMPLING = 32  # points of a cut per pixel
+
+
+@dataclass(frozen=True, eq=False)
+class Cut:
+    """A point response along one axis, and what was measured on it.
+
+    Side lobes are numbered from the main lobe outwards and end at minima of the amplitude; the
+    main lobe is what lies between the first minimum on each side. Pairs are (towards smaller,
+    towards larger coordinate).
+
+    Attributes
+    ----------
+    axis : str
+        What the cut runs along: "x", "y" or "z", or "along columns" or "along rows" of a plane
+        that is not parallel to that coordinate.
+    offset_m : ndarray of float64, shape [points]
+        Distance from the peak, metres.
+    level_db : ndarray of float64, shape [points]
+        Amplitude over the peak's, dB.
+    resolution_m : float
+        Width of the main lobe at half the peak's power (-3.01 dB), metres.
+    pslr_nearest_db : (float, float)
+        Peak of the first side lobe over the main lobe's, dB.
+    pslr_db : (float, float)
+        Peak of the highest side lobe over the main lobe's, dB, as far as the cut reaches.
+    islr_db : float
+        Energy of the `lobes` nearest side lobes on both sides over that of the main lobe, dB.
+    lobes : (int, int)
+        How many whole side lobes the ISLR counts: 10, or less where the cut ends.
+    """
+
+    axis: str
+    offset_m: NDArray[np.float64]
+    level_db: NDArray[np.float64]
+    resolution_m: float
+    pslr_nearest_db: tuple[float, float]
+    pslr_db: tuple[float, float]
+    islr_db: float
+    lobes: tuple[int, int]
+
+
+@dataclass(frozen=True, eq=False)
+class PointResponse:
+    """A point in an image.
+
+    Attributes
+    ----------
+    x_m, y_m, z_m : float
+        Where its peak is, metres.
+    amplitude : float
+        Amplitude of the peak. (There is no phase here: that of the range carrier, which the
+        pixels hold as an alias, is not known between them.)
+    azimuth, range : Cut
+        The cuts through the peak along the image's columns and rows: x and y of a horizontal
+        plane, x and z of one in depth.
+    """
+
+    x_m: float
+    y_m: float
+    z_m: float
+    amplitude: float
+    azimuth: Cut
+    range: Cut
+
+
+def measure_point(
+    image: Image,
+    near: Sequence[float],
+    *,
+    search_m: float | None = None,
+    extent_m: float | None = None,
+) -> PointResponse:
+    """Measure the point response nearby: position, resolution and side lobes.
+
+    Parameters
+    ----------
+    image : Image
+        An image on a plane of any direction or a height map, with pixels no larger than its
+        bandwidth asks for (1 / bandwidth: the carrier need not be sampled).
+    near : (float, float) or (float, float, float)
+        About where the point is, metres. Two numbers are places on the axes of the image
+        (`Grid.sides`), as pictures show them: x, y of a horizontal plane, x, z of one in depth.
+        Three are a position x, y, z; the nearest one on the plane counts.
+    search_m : float, optional
+        How far from there, along columns and along rows, the greatest pixel is taken for the point;
+        10 pixels unless given.
+    extent_m : float, optional
+        How far from the peak side lobes are looked for, metres, to keep other targets out; as
+        far as the image (and 1024 pixels) unless given.
+
+    Returns
+    -------
+    PointResponse
+
+    Raises
+    ------
+    ValueError
+        If the image is one of arbitrary points, `near` is outside it, it is zero there or has no
+        peak, its peak is at the border, `extent_m` is less than a pixel, or the main lobe and a
+        side lobe on each side do not fit in.
+    TypeError
+        If an argument is of a wrong kind.
+
+    Warns
+    -----
+    ClsasWarning
+        If a side lobe is higher than the peak, which then is itself one, or other targets are in.
+
+    Notes
+    -----
+    An image carries the phase exp(j 2 k rho(x)) of its points, which wraps from pixel to pixel
+    where these are larger than a quarter of a wavelength: its spectrum lies anywhere, across the
+    edge of the FFT's too. The phase step between the pixels of the main lobe gives the centre
+    of that spectrum modulo the sampling; with it removed, sinc interpolation is exact.
+    """
+    validate.instance("image", image, Image)
+    across, upward = axes = image.grid.sides
+    for axis in axes:
+        if len(axis.places_m) < 3:
+            raise ValueError(
+                f"image must have 3 or more pixels along {_word(axis)}, got {len(axis.places_m)}"
+            )
+    dx, dy = across.step_m, upward.step_m
+    if extent_m is not None:
+        validate.number("extent_m", extent_m, "m", least=max(abs(dx), abs(dy)))
+    place = _on_axes(image.grid, axes, near)
+    row, column = _find_peak(image.pixels, axes, place, search_m)
+
+    top, left = max(row - _REACH, 0), max(column - _REACH, 0)
+    pixels = image.pixels[top : row + _REACH + 1, left : column + _REACH + 1].astype(np.complex128)
+    row, column = row - top, column - left
+    pixels = _without_carrier(pixels, row, column)
+    row, column, amplitude = _refine_peak(pixels, row, column)
+
+    along_x = _sinc([row], pixels.shape[0])[0] @ pixels
+    along_y = pixels @ _sinc([column], pixels.shape[1])[0]
+    x_m, y_m, z_m = _position_m(image.grid, top + row, left + column)
+    response = PointResponse(
+        x_m=x_m,
+        y_m=y_m,
+        z_m=z_m,
+        amplitude=amplitude,
+        azimuth=_measure_cut(across, along_x, column, amplitude, extent_m),
+        range=_measure_cut(upward, along_y, row, amplitude, extent_m),
+    )
+    highest_db = max(*response.azimuth.pslr_db, *response.range.pslr_db)
+    if highest_db > 0:
+        validate.warn(
+            f"the peak near ({place[0]:.9g}, {place[1]:.9g}) m is {highest_db:.1f} dB lower than a "
+            "side lobe of it: give a nearer place or a larger search_m, or keep other targets out "
+            "by extent_m"
+        )
+    return response
+
+
+def entropy(image: Image | ArrayLike) -> float:
+    """Return the entropy of the intensity, nats: least when an image is best focused.
+
+    -sum p ln p with p = |I|^2 / sum |I|^2: 0 for one bright pixel, ln(size) for a flat image.
+
+    Raises
+    ------
+    ValueError
+        If the image is zero everywhere, or a value is not finite.
+    """
+    share = _intensity(image)
+    share = share[share > 0] / share.sum()
+    return float(-(share * np.log(share)).sum())
+
+
+def contrast(image: Image | ArrayLike) -> float:
+    """Return the contrast of the intensity |I|^2, its standard deviation over its mean.
+
+    0 for a flat image, 1 for fully developed speckle, and the more the sharper.
+
+    Raises
+    ------
+    ValueError
+        If the image is zero everywhere, or a value is not finite.
+    """
+    intensity = _intensity(image)
+    return float(intensity.std() / intensity.mean())
+
+
+def _intensity(image: Image | ArrayLike) -> NDArray[np.float64]:
+    amplitude = np.abs(complex_values("image", image))
+    if not amplitude.any():
+        raise ValueError("image must not be zero everywhere")
+    return (amplitude / amplitude.max()) ** 2
+
+
+def _find_peak(
+    pixels: NDArray,
+    axes: tuple[Axis, Axis],
+    place: NDArray[np.float64],
+    search_m: float | None,
+) -> tuple[int, int]:
+    """Return row and column of the greatest pixel near a place on the axes."""
+    if search_m is not None:
+        validate.positive("search_m", search_m, "m")
+    windows = []
+    for axis, at in zip(axes, place, strict=True):
+        count, index = len(axis.places_m), (at - axis.places_m[0]) / axis.step_m
+        if not -0.5 <= index <= count - 0.5:
+            ends = sorted((axis.places_m[0], axis.places_m[-1]))
+            raise ValueError(
+                f"near must be inside the image: {axis.name} from {ends[0]:g} to {ends[1]:g} m, "
+                f"got {at:g} m"
+            )
+        search = _SEARCH if search_m is None else search_m / abs(axis.step_m)
+        nearest = int(np.clip(round(index), 0, count - 1))
+        first = max(math.ceil(index - search), 0)
+        windows.append(slice(min(first, nearest), max(math.floor(index + search), nearest) + 1))
+    columns, rows = windows
+    amplitude = np.abs(pixels[rows, columns])
+    row, column = np.unravel_index(amplitude.argmax(), amplitude.shape)
+    if amplitude[row, column] == 0:
+        raise ValueError(f"image is zero around near = ({place[0]:g}, {place[1]:g}) m")
+    row, column = int(row) + rows.start, int(column) + columns.start
+    for axis, index in zip(axes, (column, row), strict=True):
+        if not 0 < index < len(axis.places_m) - 1:
+            raise ValueError(
+                f"the peak near ({place[0]:g}, {place[1]:g}) m lies at the image's border "
+                f"({axis.name} = {axis.places_m[index]:g} m): a larger image is needed"
+            )
+    if np.abs(pixels[row - 1 : row + 2, column - 1 : column + 2]).max() > np.abs(
+        pixels[row, column]
+    ):
+        raise ValueError(
+            f"there is no peak around near = ({place[0]:g}, {place[1]:g}) m, only the flank of one "
+            "outside the search: give a nearer place or a larger search_m"
+        )
+    return row, column
+
+
+def _on_axes(grid: Grid, axes: tuple[Axis, Axis], near: Sequence[float]) -> NDArray[np.float64]:
+    """Return where a place, given by two numbers or as a position, is on the axes, metres."""
+    if np.shape(near) != (3,):
+        return validate.array("near", near, np.float64, (2,))
+    position_m = validate.array("near", near, np.float64, (3,))
+    steps = np.stack([grid.column_step_m, grid.row_step_m], axis=1)
+    index = np.linalg.lstsq(steps, position_m - grid.origin_m, rcond=None)[0]
+    return np.array([a.places_m[0] + i * a.step_m for a, i in zip(axes, index, strict=True)])
+
+
+def _position_m(grid: Grid, row: float, column: float) -> tuple[float, float, float]:
+    """Return the position at a row and column between pixels, at the height of the nearest one."""
+    position_m = grid.origin_m + row * grid.row_step_m + column * grid.column_step_m
+    height_m = 0.0 if grid.height_m is None else grid.height_m[round(row), round(column)]
+    x_m, y_m, z_m = position_m + [0, 0, height_m]
+    return float(x_m), float(y_m), float(z_m)
+
+
+def _word(axis: Axis) -> str:
+    return axis.name.removeprefix("along ")
+
+
+def _without_carrier(pixels: NDArray, row: int, column: int) -> NDArray:
+    """Shift the spectrum of the point at a pixel to zero frequency, on both axes."""
+    main_lobe = pixels[row - 1 : row + 2, column - 1 : column + 2]
+    down = np.angle(np.vdot(main_lobe[:-1], main_lobe[1:]))
+    across = np.angle(np.vdot(main_lobe[:, :-1], main_lobe[:, 1:]))
+    rows, columns = (np.arange(n) for n in pixels.shape)
+    return pixels * np.exp(-1j * (down * rows[:, None] + across * columns))
+
+
+def _sinc(positions: ArrayLike, count: int) -> NDArray:
+    """Return the weights [positions, count] that evaluate `count` samples between them."""
+    return np.sinc(np.asarray(positions)[:, None] - np.arange(count))
+
+
+def _refine_peak(pixels: NDArray, row: float, column: float) -> tuple[float, float, float]:
+    """Return row, column and amplitude of the peak of the band-limited image near a pixel."""
+    zoom = np.arange(-16, 17)
+    for step in (1 / 16, 1 / 256, 1 / 4096):
+        rows, columns = row + step * zoom, column + step * zoom
+        near = _sinc(rows, pixels.shape[0]) @ pixels @ _sinc(columns, pixels.shape[1]).T
+        amplitude = np.abs(near)
+        i, j = np.unravel_index(amplitude.argmax(), amplitude.shape)
+        row, column = rows[i], columns[j]
+    return float(row), float(column), float(amplitude[i, j])
+
+
+def _measure_cut(
+    axis: Axis,
+    samples: NDArray,
+    peak: float,
+    amplitude: float,
+    extent_m: float | None,
+) -> Cut:
+    """Measure a line of pixels through the peak, which lies at index `peak` in it."""
+    from scipy import signal  # slow to import
+
+    step_m = axis.step_m
+    fine = signal.resample(samples, _UPSAMPLING * len(samples))
+    offset = (np.arange(len(fine)) / _UPSAMPLING - peak) * step_m
+    # Behind the last sample the periodic interpolation only leads back to the first one.
+    inside = np.arange(len(fine)) <= _UPSAMPLING * (len(samples) - 1)
+    if extent_m is not None:
+        inside &= np.abs(offset) <= extent_m
+    power = np.abs(fine[inside] / amplitude) ** 2
+    offset = offset[inside]
+    if step_m < 0:
+        offset, power = offset[::-1], power[::-1]
+
+    top = int(np.abs(offset).argmin())
+    sides = [power[top::-1], power[top:]]  # both outwards
+    half, main, energy, nearest, highest, counts = 0.0, -power[top], 0.0, [], [], []
+    for side, word in zip(sides, ("smaller", "larger"), strict=True):
+        ends = signal.argrelmin(side)[0]
+        if len(ends) < 2 or side[: ends[0] + 1].min() > 0.5:
+            raise ValueError(
+                f"no whole side lobe at {word} {axis.name} within the image (or extent_m): the "
+                "point is too near the border, or what is around it is not a point response"
+            )
+        below = int(np.argmax(side < 0.5))
+        half += below - (0.5 - side[below]) / (side[below - 1] - side[below])
+        lobes = ends[: _LOBES + 1]
+        main += side[: ends[0]].sum()
+        energy += side[lobes[0] : lobes[-1]].sum()
+        nearest.append(float(_decibels(side[ends[0] : ends[1]].max())))
+        highest.append(float(_decibels(side[ends[0] :].max())))
+        counts.append(len(lobes) - 1)
+    return Cut(
+        axis=axis.name,
+        offset_m=offset,
+        level_db=_decibels(power),
+        resolution_m=float(half * abs(step_m)) / _UPSAMPLING,
+        pslr_nearest_db=tuple(nearest),
+        pslr_db=tuple(highest),
+        islr_db=float(_decibels(energy / main)),
+        lobes=tuple(counts),
+    )
+
+
+def _decibels(power: ArrayLike) -> NDArray:
+    """Return 10 log10(power), not below -300 dB."""
+    return 10 * np.log10(np.maximum(power, 1e-30))

@@ -1,0 +1,1 @@
+"""How lines are sampled: compression, spectra, interpolation in range."""

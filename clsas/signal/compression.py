@@ -1,0 +1,240 @@
+"""From raw echoes to range lines: matched filter, basebanding, band window, resampling."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from fractions import Fraction
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft
+from scipy.interpolate import CubicSpline
+
+from clsas.core import validate
+from clsas.core.fourier import EDGE_PRODUCT, fourier_integral, smooth_edge
+from clsas.core.lines import RangeLines
+from clsas.signal.echoes import Echoes
+from clsas.sonar.system import Pulse
+
+Window = str | float | tuple
+
+# Width, in bandwidths, of the edge that the truncation of the filter gives its band.
+_BAND_EDGE = 0.1
+# Samples of a block of channels in work, complex128.
+_BLOCK = 1 << 22
+
+
+def compress(
+    echoes: Echoes,
+    *,
+    window: Window = "none",
+    oversampling: float = 2.0,
+    bandwidth_hz: float | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> RangeLines:
+    """Compress echoes into range lines.
+
+    Parameters
+    ----------
+    echoes : Echoes
+        Complex baseband, or real passband, which is turned into its analytic signal and mixed to
+        baseband here.
+    window : str, float or tuple
+        Window over the band: "none", or what `scipy.signal.get_window` takes, such as "hamming",
+        "taylor" or ("kaiser", 6.0).
+    oversampling : float
+        Rate of the lines' samples in bandwidths, at least 1. It is met to 1e-6 by a ratio of
+        whole numbers, which `range_step_m` of the result states exactly.
+    bandwidth_hz : float, optional
+        Band kept, centred on the carrier; the pulse's unless given, and needed without a pulse.
+    progress : callable, optional
+        Called as progress(channels done, channels).
+
+    Returns
+    -------
+    RangeLines
+        Starting at the range of each channel's first sample, and as long as a whole pulse is in
+        the recording. A point of amplitude A gives a peak of A, with the phase
+        exp(-j 2 pi fc tau) = exp(-j 2 k rho).
+
+    Raises
+    ------
+    TypeError, ValueError
+        If an argument is of another type or outside its limits, the band is not inside what was
+        sampled, the recording is no longer than the pulse, or the lines do not fit into memory.
+
+    Notes
+    -----
+    The lines are y(t) = sum_n x(t_n) h(t - t_n)/fs, with
+
+        h(t) = integral over the band of W(f) P*(f) exp(j 2 pi f t) df / integral of W |P|^2
+
+    (THESIS [17], [37]); without a pulse P is flat. The sharp ends of the band make h infinitely
+    long. Its part that reaches from one end of the recording to the other is used as it is, and
+    fades out smoothly in the padding behind that, so the sum is that linear convolution:
+    nothing wraps around, and nothing is cut off.
+    """
+    validate.instance("echoes", echoes, Echoes)
+    validate.progress(progress)
+    check_options(window=window, oversampling=oversampling)
+    pulse, rate = echoes.pulse, echoes.sample_rate_hz
+    band = _band(echoes, bandwidth_hz)
+    weights = band_window(window, band)
+    duration = 0.0 if pulse is None else pulse.duration_s
+    whole = echoes.length - 1 - duration * rate
+    if whole < 0:
+        raise ValueError(
+            f"echoes must be longer than the pulse ({duration:g} s), "
+            f"got {(echoes.length - 1) / rate:g} s"
+        )
+
+    fade = EDGE_PRODUCT * rate / (_BAND_EDGE * band)
+    wanted = float(oversampling) * band / rate
+    # The lines, and one padded channel in work before and after resampling.
+    validate.memory(
+        "oversampling" if wanted > 1 else "bandwidth_hz",
+        8 * echoes.channels * whole * wanted + 32 * (echoes.length + fade) * (1 + wanted),
+    )
+    ratio = _fraction(wanted)
+    units = fft.next_fast_len(math.ceil(2 * (echoes.length + fade) / ratio.denominator))
+    padded, resampled = units * ratio.denominator, units * ratio.numerator
+    length = int(whole * ratio + 1e-9) + 1
+
+    outermost = math.ceil((0.5 + _BAND_EDGE) * band * padded / rate)
+    bins = np.arange(-outermost, outermost + 1)
+    # Twice the points where the filter's edges would not fit otherwise; every other one is kept.
+    every = 1 if resampled >= len(bins) else 2
+    response = _filter_response(pulse, band, weights, bins, padded / rate, echoes.length / rate)
+    response *= every * resampled / padded
+
+    samples = np.empty((echoes.channels, length), np.complex64)
+    rows = max(1, _BLOCK // max(padded, every * resampled))
+    for first in range(0, echoes.channels, rows):
+        block = slice(first, first + rows)
+        spectrum = fft.fft(_baseband(echoes, block), padded, workers=-1)
+        lines = np.zeros((len(spectrum), every * resampled), np.complex128)
+        lines[:, bins] = spectrum[:, bins % padded] * response
+        lines = fft.ifft(lines, workers=-1, overwrite_x=True)
+        samples[block] = lines[:, : every * length : every]
+        if progress is not None:
+            progress(min(first + rows, echoes.channels), echoes.channels)
+
+    return RangeLines(
+        samples,
+        first_range_m=echoes.sound_speed_m_s / 2 * echoes.start_time_s,
+        range_step_m=echoes.sound_speed_m_s / (2 * rate) / float(ratio),
+        tx_m=echoes.tx_m,
+        rx_m=echoes.rx_m,
+        carrier_hz=echoes.carrier_hz,
+        sound_speed_m_s=echoes.sound_speed_m_s,
+        rx_velocity_m_s=echoes.rx_velocity_m_s,
+    )
+
+
+def check_options(*, window: Window = "none", oversampling: float = 2.0) -> None:
+    """Raise TypeError or ValueError unless `compress` takes these for any echoes."""
+    band_window(window, 1.0)
+    validate.number("oversampling", oversampling, least=1.0)
+
+
+def band_window(
+    window: Window, bandwidth_hz: float
+) -> Callable[[NDArray[np.float64]], NDArray[np.float64]]:
+    """Return a window as a function of frequency from -bandwidth/2 to bandwidth/2.
+
+    Parameters
+    ----------
+    window : str, float or tuple
+        "none", or what `scipy.signal.get_window` takes; its 4097 symmetric samples are
+        interpolated by cubic splines.
+    bandwidth_hz : float
+        Width of the band.
+
+    Raises
+    ------
+    ValueError
+        If SciPy knows no such window, or it is not finite.
+    """
+    if isinstance(window, str) and window == "none":
+        return np.ones_like
+    from scipy.signal import get_window  # slow to import
+
+    count = 4097
+    try:
+        values = get_window(window, count, fftbins=False)
+    except (ValueError, TypeError, IndexError) as error:
+        raise ValueError(
+            f"window must be 'none' or a window of scipy.signal.get_window, "
+            f"got {validate.shown(window)} ({error})"
+        ) from None
+    values = validate.array("window", values, np.float64, (count,))
+    half = bandwidth_hz / 2
+    return CubicSpline(np.linspace(-half, half, count), values)
+
+
+def _band(echoes: Echoes, bandwidth_hz: float | None) -> float:
+    if bandwidth_hz is None:
+        if echoes.pulse is None:
+            raise ValueError("bandwidth_hz must be given for echoes without a pulse")
+        bandwidth_hz = echoes.pulse.bandwidth_hz
+    limit = echoes.sample_rate_hz
+    if echoes.is_passband:
+        limit = min(2 * echoes.carrier_hz, limit - 2 * echoes.carrier_hz)
+        if limit <= 0:
+            raise ValueError(
+                f"carrier_hz of real echoes must be between 0 and half the sample rate, "
+                f"{echoes.sample_rate_hz / 2:g} Hz, got {echoes.carrier_hz:g} Hz"
+            )
+    return validate.number("bandwidth_hz", bandwidth_hz, "Hz", above=0.0, most=limit)
+
+
+def _fraction(ratio: float) -> Fraction:
+    """Return a ratio of small whole numbers, right to 1e-6."""
+    if ratio > 1:
+        return Fraction(ratio).limit_denominator(1000)
+    return 1 / Fraction(1 / ratio).limit_denominator(1000)
+
+
+def _filter_response(
+    pulse: Pulse | None,
+    band: float,
+    weights: Callable[[NDArray], NDArray],
+    bins: NDArray[np.int_],
+    period_s: float,
+    reach_s: float,
+) -> NDArray[np.complex128]:
+    """Return the transfer function at bins/period of the filter that is whole up to +-reach."""
+
+    def spectrum(frequency: NDArray) -> NDArray:
+        return np.full(len(frequency), 1 / band) if pulse is None else pulse.spectrum(frequency)
+
+    def matched(frequency: NDArray) -> NDArray:
+        return weights(frequency) * spectrum(frequency).conj()
+
+    def energy(frequency: NDArray) -> NDArray:
+        return weights(frequency) * np.abs(spectrum(frequency)) ** 2
+
+    edges = [-band / 2, band / 2]
+    # P turns as fast as its delay, a window some cycles over the band.
+    rate = 8 / band + (0.0 if pulse is None else pulse.duration_s)
+    points = fft.next_fast_len(math.ceil(1.25 * band * period_s))
+    lag = fft.fftfreq(points) * period_s
+    impulse = fourier_integral(matched, edges, lag, sign=1, rate=rate)
+    impulse /= fourier_integral(energy, edges, 0.0, sign=1, rate=rate).real
+    impulse *= smooth_edge((np.abs(lag) - reach_s) / (period_s / 2 - reach_s))
+    return fft.fft(impulse)[bins % points] * (period_s / points)
+
+
+def _baseband(echoes: Echoes, block: slice) -> NDArray:
+    """Return complex baseband samples of some channels.
+
+    Real ones are mixed down and doubled. The band filter that follows drops the image at twice
+    the carrier, which makes it the analytic signal's baseband.
+    """
+    samples = echoes.samples[block]
+    if not echoes.is_passband:
+        return samples.astype(np.complex128)
+    time = echoes.start_time_s[block, None] + np.arange(echoes.length) / echoes.sample_rate_hz
+    cycles = echoes.carrier_hz * time
+    return 2 * samples * np.exp(-2j * np.pi * (cycles - np.rint(cycles)))

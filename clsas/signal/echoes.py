@@ -1,0 +1,127 @@
+"""Raw echoes as received, before compression."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from clsas.core import validate
+from clsas.sonar.system import Pulse
+
+
+@dataclass(frozen=True, eq=False)
+class Echoes:
+    """Raw echoes of every channel and where each was taken.
+
+    Sample n of channel i was taken start_time_s[i] + n/sample_rate_hz after transmission began.
+    A point of amplitude A at two-way delay tau gives A p(t - tau) exp(-j 2 pi fc tau) in complex
+    baseband, with p the pulse's envelope and fc the carrier; in passband the real part of
+    A p(t - tau) exp(+j 2 pi fc (t - tau)).
+
+    Parameters
+    ----------
+    samples : array_like, [channels, length]
+        Complex baseband (kept as complex64), or real passband still on its carrier (float32).
+    start_time_s : array_like, [channels] or scalar
+        Time of the first sample after the start of transmission.
+    sample_rate_hz : float
+        Samples per second.
+    carrier_hz : float
+        Frequency that was mixed out, or that a real signal is still on.
+    tx_m, rx_m : array_like, [channels, 3] or [3]
+        Transmitter and receiver positions at transmission.
+    sound_speed_m_s : float
+        Speed of sound.
+    pulse : Pulse, optional
+        What was transmitted, with the same carrier. None: the echoes are of a pulse too short to
+        need compression.
+    rx_velocity_m_s : array_like, [channels, 3] or [3], optional
+        Velocity of the receivers during the echoes' flight; None is stop-and-hop.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If an array has the wrong kind or shape, is empty or not finite, a number is outside its
+        limits, the pulse's carrier differs, or wider samples are all so small or large that
+        float32 loses their digits.
+    """
+
+    samples: NDArray[np.complex64] | NDArray[np.float32]
+    start_time_s: NDArray[np.float64]
+    sample_rate_hz: float
+    carrier_hz: float
+    tx_m: NDArray[np.float64]
+    rx_m: NDArray[np.float64]
+    sound_speed_m_s: float
+    pulse: Pulse | None = None
+    rx_velocity_m_s: NDArray[np.float64] | None = None
+
+    if TYPE_CHECKING:  # arrays are converted: the constructor takes what holds numbers
+
+        def __init__(
+            self,
+            samples: ArrayLike,
+            start_time_s: ArrayLike,
+            sample_rate_hz: float,
+            carrier_hz: float,
+            tx_m: ArrayLike,
+            rx_m: ArrayLike,
+            sound_speed_m_s: float,
+            pulse: Pulse | None = None,
+            rx_velocity_m_s: ArrayLike | None = None,
+        ) -> None: ...
+
+    def __post_init__(self) -> None:
+        """Check every field and convert it."""
+
+        def put(name: str, value: object) -> None:
+            object.__setattr__(self, name, value)
+
+        dtype = np.complex64 if np.iscomplexobj(self.samples) else np.float32
+        put("samples", validate.array("samples", self.samples, dtype, (None, None)))
+        per_channel: dict[str, tuple[int, ...]] = {
+            "start_time_s": (self.channels,),
+            "tx_m": (self.channels, 3),
+            "rx_m": (self.channels, 3),
+        }
+        if self.rx_velocity_m_s is not None:
+            per_channel["rx_velocity_m_s"] = (self.channels, 3)
+        for name, shape in per_channel.items():
+            value = getattr(self, name)
+            put(name, validate.array(name, value, np.float64, shape, broadcast=True))
+        put("sample_rate_hz", validate.positive("sample_rate_hz", self.sample_rate_hz, "Hz"))
+        put("carrier_hz", validate.number("carrier_hz", self.carrier_hz, "Hz", least=0.0))
+        put("sound_speed_m_s", validate.positive("sound_speed_m_s", self.sound_speed_m_s, "m/s"))
+        if self.pulse is not None:
+            if not isinstance(self.pulse, Pulse):
+                raise TypeError(f"pulse must be a Pulse or None, got {type(self.pulse).__name__}")
+            if self.pulse.carrier_hz != self.carrier_hz:
+                raise ValueError(
+                    f"carrier_hz must be the pulse's {self.pulse.carrier_hz:g} Hz, "
+                    f"got {self.carrier_hz:g} Hz"
+                )
+
+    def __repr__(self) -> str:
+        """Return sizes and rates: the arrays are long."""
+        return (
+            f"Echoes({self.channels} channels of {self.length} samples at "
+            f"{self.sample_rate_hz:.6g} Hz, carrier {self.carrier_hz:.6g} Hz)"
+        )
+
+    @property
+    def channels(self) -> int:
+        """Number of channels."""
+        return self.samples.shape[0]
+
+    @property
+    def length(self) -> int:
+        """Samples per channel."""
+        return self.samples.shape[1]
+
+    @property
+    def is_passband(self) -> bool:
+        """Whether the samples are real and still on their carrier."""
+        return self.samples.dtype.kind == "f"

@@ -1,0 +1,370 @@
+"""Range interpolation: least-squares filters, and how finely lines must be sampled for them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.fft
+from numpy.typing import NDArray
+from scipy.linalg import lstsq
+
+from clsas.core import validate
+from clsas.core.lines import RangeLines
+from clsas.signal.spectrum import Spectrum, cycles_per_m_at
+
+TAPS = (2, 4, 6, 8)
+UPSAMPLINGS = (1.0, 1.25, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0, 12.0, 16.0)
+MOST_UPSAMPLING = 64.0
+
+# Device time per pixel and channel by taps, relative to 4 taps: measured with PoCL and Intel's
+# runtime on an AVX-512 CPU (scripts/bench taps). With AVX2 more taps cost a tenth more.
+COST = {2: 0.75, 4: 1.0, 6: 1.3, 8: 1.55}
+# The same, in such, for one upsampled sample: an FFT on the host.
+_UPSAMPLING_COST = 40.0
+Gain = Callable[[NDArray[np.float64]], NDArray[np.float64]]
+"""A factor of spectra, by the distance from their centre in cycles per sample."""
+_POSITIONS = 17
+_SCATTER_DB = 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class Interpolator:
+    """A filter that evaluates lines between their samples after they are upsampled.
+
+    Attributes
+    ----------
+    taps : int
+        Samples per evaluation: 2, 4, 6 or 8.
+    upsampling : float
+        By how much the lines are upsampled first, by FFT.
+    coefficients : float64 [taps/2, 2, taps/2]
+        Per pair of taps from the innermost, the polynomials E and O, highest power first: the
+        weight of the tap at +-(pair + 1/2) from the middle is E(nu^2) +- nu O(nu^2), with nu in
+        [-1/2, 1/2] the position from the middle.
+    error_db : float
+        Predicted relative rms error of an evaluation of these lines, dB.
+    scatter_db : float
+        What is left of it once the mean of the filter's response over all positions, `response`, is
+        divided out of the lines beforehand.
+    """
+
+    taps: int
+    upsampling: float
+    coefficients: NDArray[np.float64]
+    error_db: float
+    scatter_db: float
+
+    def __post_init__(self) -> None:
+        """Keep the coefficients from being changed."""
+        self.coefficients.flags.writeable = False
+
+    def weights(self, nu: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the taps' weights at positions `nu` from the middle, shape [..., taps]."""
+        nu = np.asarray(nu)
+        square = (nu * nu)[..., None, None]
+        values = np.zeros((*nu.shape, *self.coefficients.shape[:2]))
+        for power in range(self.coefficients.shape[2]):  # the highest first
+            values = values * square + self.coefficients[..., power]
+        even, odd = values[..., 0], values[..., 1] * nu[..., None]
+        return np.concatenate([(even - odd)[..., ::-1], even + odd], axis=-1)
+
+    def response(self, frequency: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the gain at some frequencies, mean over all positions.
+
+        `frequency` is in cycles per (upsampled) sample, from the spectral centre.
+        """
+        nu = np.linspace(-0.5, 0.5, _POSITIONS)
+        place = np.arange(self.taps) - (self.taps - 1) / 2
+        away = place - nu[:, None]
+        turns = np.asarray(frequency)[..., None, None] * away
+        return np.mean(np.sum(self.weights(nu) * np.cos(2 * np.pi * turns), axis=-1), axis=-1)
+
+
+def design(taps: int, upsampling: float, spectrum: Spectrum) -> Interpolator:
+    """Return the interpolator of least rms error for lines of a given spectrum.
+
+    Parameters
+    ----------
+    taps : int
+        2 (linear interpolation), 4, 6 or 8.
+    upsampling : float
+        By how much the lines will be upsampled first, >= 1.
+    spectrum : Spectrum
+        Of the lines before that.
+
+    Notes
+    -----
+    With frequency f in cycles per (upsampled) sample and taps at +-a, a = 1/2, 3/2, ..., a
+    symmetric filter errs by
+
+        2 sum_a E_a(nu^2) cos(2 pi f a) - cos(2 pi f nu)
+        + j [2 nu sum_a O_a(nu^2) sin(2 pi f a) - sin(2 pi f nu)],
+
+    two separate least-squares problems in the polynomials' coefficients, weighted by the power
+    at f.
+    Linear interpolation is the one filter that is given: E = 1/2, O = 1.
+    """
+    f = spectrum.frequency / upsampling
+    nu = np.linspace(-0.5, 0.5, _POSITIONS)
+    turns = 2 * np.pi * np.outer(f, np.arange(taps // 2) + 0.5)
+    even = nu[:, None] ** (2 * np.arange(taps // 2)[::-1])
+    aims = np.cos(2 * np.pi * np.outer(f, nu)), np.sin(2 * np.pi * np.outer(f, nu))
+    bases = (2 * np.cos(turns), even), (2 * np.sin(turns), nu[:, None] * even)
+    # A floor keeps the empty part of the band from making the problem singular.
+    share = np.sqrt(spectrum.power + 1e-13)[:, None]
+    coefficients = np.empty((taps // 2, 2, taps // 2))
+    residuals = []
+    for part, (aim, (of_frequency, of_position)) in enumerate(zip(aims, bases, strict=True)):
+        if taps == 2:
+            solution = np.array([[(0.5, 1.0)[part]]])
+        else:
+            # All products of functions of f and of nu: one after the other.
+            at_positions = lstsq(share * of_frequency, share * aim, lapack_driver="gelsy")[0]
+            solution = lstsq(of_position, at_positions.T, lapack_driver="gelsy")[0].T
+        coefficients[:, part] = solution
+        residuals.append(of_frequency @ solution @ of_position.T - aim)
+    # Turned back by the position it is the response less 1; its mean is real.
+    turned = aims[0] - 1j * aims[1]
+    error = (residuals[0] + 1j * residuals[1]) * turned
+    scatter = (error - (bias := error.mean(axis=1, keepdims=True).real)) / (1 + bias)
+    error_db, scatter_db = (
+        10 * np.log10(max(float(spectrum.power @ np.mean(np.abs(e) ** 2, axis=1)), 1e-30))
+        for e in (error, scatter)
+    )
+    return Interpolator(taps, upsampling, coefficients, error_db, scatter_db)
+
+
+def choose(
+    spectrum: Spectrum,
+    accuracy_db: float,
+    *,
+    taps: int | None = None,
+    upsampling: float | None = None,
+    other_error: float = 0.0,
+    pixels_per_sample: float = np.inf,
+    most_upsampling: Mapping[int, float] | None = None,
+) -> Interpolator:
+    """Return the cheapest interpolator that keeps the error below `accuracy_db`.
+
+    Half a decibel is left for the scatter of measured errors about the predicted one, and up to
+    four where the power lies at few frequencies, so that errors do not average out.
+
+    Parameters
+    ----------
+    spectrum : Spectrum
+        Of the lines.
+    accuracy_db : float
+        Wanted relative rms error, dB, negative.
+    taps, upsampling : int, float, optional
+        Fix one or both; with both, `accuracy_db` plays no part.
+    other_error : float
+        Relative rms error that comes from elsewhere and adds in power.
+    pixels_per_sample : float
+        Pixels over samples of a line: how soon upsampling pays.
+    most_upsampling : mapping of float, optional
+        By taps: prefer not to upsample beyond this (where the device's fast lookup ends).
+
+    Raises
+    ------
+    ValueError
+        If `taps` is not one of 2, 4, 6, 8, `upsampling` is below 1, or the fixed one cannot reach
+        `accuracy_db`.
+    """
+    if taps is not None and not (isinstance(taps, (int, np.integer)) and taps in TAPS):
+        raise ValueError(f"taps must be one of {TAPS}, got {validate.shown(taps)}")
+    if upsampling is not None:
+        upsampling = validate.number("upsampling", upsampling, least=1.0, most=MOST_UPSAMPLING)
+    if taps is not None and upsampling is not None:
+        return design(taps, upsampling, spectrum)
+    power_left = 10 ** (accuracy_db / 10) - other_error**2
+    target_db = 10 * np.log10(max(power_left, 1e-30) / spectrum.scatter) - _SCATTER_DB
+    rates: Sequence[float] = UPSAMPLINGS if upsampling is None else (upsampling,)
+    candidates = []
+    for each_taps in TAPS if taps is None else (taps,):
+        for rate in rates:
+            found = design(each_taps, rate, spectrum)
+            if found.error_db <= target_db:
+                candidates.append(found)
+                break
+    if not candidates:
+        fixed = f"taps={taps}" if taps is not None else f"upsampling={upsampling}"
+        raise ValueError(
+            f"accuracy_db={accuracy_db:g} cannot be reached with {fixed}; "
+            f"the best there is {found.error_db:.1f} dB"
+        )
+
+    def cost(candidate: Interpolator) -> tuple[bool, float]:
+        slow = candidate.upsampling > (most_upsampling or {}).get(candidate.taps, np.inf)
+        upsampling_cost = _UPSAMPLING_COST * candidate.upsampling / pixels_per_sample
+        return slow, COST[candidate.taps] + upsampling_cost
+
+    return min(candidates, key=cost)
+
+
+@dataclass(frozen=True)
+class Resampling:
+    """Where samples go when a line is shifted to its spectral centre and upsampled.
+
+    A line is zero beyond its ends. Upsampled sample m lies at index (m + first) / ratio - lead of
+    the line it came from, and has been turned by -centre_cycles_per_sample (index + lead) cycles.
+
+    Attributes
+    ----------
+    lead : int
+        Zeros that come before a line.
+    period, upsampled_period : int
+        Samples that become so many. With an FFT these are its lengths.
+    shift : int
+        Cycles per period by which lines are turned.
+    first, length : int
+        First upsampled sample that is kept, and how many are.
+    """
+
+    lead: int
+    period: int
+    upsampled_period: int
+    shift: int
+    first: int
+    length: int
+
+    @property
+    def ratio(self) -> float:
+        """Upsampled samples per sample."""
+        return self.upsampled_period / self.period
+
+    @property
+    def centre_cycles_per_sample(self) -> float:
+        """Frequency made zero, cycles per (given) sample."""
+        return self.shift / self.period
+
+    def samples_per_m(self, lines: RangeLines) -> float:
+        """Return the upsampled samples per metre of range."""
+        return self.ratio / lines.range_step_m
+
+    def cycles_per_m(self, lines: RangeLines) -> float:
+        """Return the phase per metre of range at the spectral centre, cycles."""
+        return cycles_per_m_at(lines, self.centre_cycles_per_sample)
+
+    @property
+    def frequency(self) -> NDArray[np.float64]:
+        """Distance of every frequency of the FFT from the spectral centre, cycles per sample."""
+        return np.abs(scipy.fft.fftfreq(self.period))
+
+    def apply(
+        self,
+        samples: NDArray[np.complexfloating],
+        gain: NDArray[np.float64] | None = None,
+    ) -> NDArray[np.complexfloating]:
+        """Return lines [channels, n] upsampled by FFT, [channels, length], in their own precision.
+
+        `gain` multiplies the spectrum at every `frequency`.
+        """
+        padded = np.zeros((len(samples), self.period), samples.dtype)
+        padded[:, self.lead : self.lead + samples.shape[1]] = samples
+        spectrum = scipy.fft.fft(padded, axis=1, overwrite_x=True)
+        if self.shift:
+            spectrum = np.roll(spectrum, -self.shift, axis=1)
+        factor = np.full(self.period, self.ratio, samples.real.dtype)
+        if gain is not None:
+            factor *= gain
+        upper = self.period // 2  # bins of negative frequency, at the end
+        lower, beyond = self.period - upper, self.upsampled_period - upper
+        wide = np.empty((len(samples), self.upsampled_period), samples.dtype)
+        np.multiply(spectrum[:, :lower], factor[:lower], out=wide[:, :lower])
+        wide[:, lower:beyond] = 0
+        np.multiply(spectrum[:, lower:], factor[lower:], out=wide[:, beyond:])
+        result = scipy.fft.ifft(wide, axis=1, overwrite_x=True)
+        return result[:, self.first : self.first + self.length]
+
+
+# Zeros around a line during its FFT, in samples: what a band-limited line rings beyond one end
+# must have died away before it comes in again at the other.
+_GUARD = 64
+
+
+def resampling(length: int, interpolator: Interpolator, spectrum: Spectrum) -> Resampling:
+    """Return how lines of `length` samples are upsampled by FFT for an interpolator."""
+    fft_length = scipy.fft.next_fast_len(length + 2 * _GUARD)
+    upsampled_length = scipy.fft.next_fast_len(round(np.ceil(fft_length * interpolator.upsampling)))
+    ratio = upsampled_length / fft_length
+    beyond = interpolator.taps // 2  # so that the ends are interpolated like the middle
+    first = int(np.ceil(_GUARD * ratio)) - beyond
+    last = int(np.floor((_GUARD + length - 1) * ratio)) + beyond
+    shift = round(spectrum.centre * fft_length)
+    return Resampling(_GUARD, fft_length, upsampled_length, shift, first, last - first + 1)
+
+
+PHASES = 32
+"""By how many filters lines are upsampled."""
+UPSAMPLING_TAPS = (8, 12, 16, 20, 24, 28, 32)
+_FINE = 4096  # of a filtered line's period: how finely it may be turned
+_SAME = 0.5 / 256  # cycles per sample: half of what a measured spectrum resolves
+
+
+@dataclass(frozen=True, eq=False)
+class Upsampler:
+    """Filters that upsample lines by a ratio of whole numbers, and shape their spectrum.
+
+    Attributes
+    ----------
+    step : int
+        Upsampled samples lie 1 / PHASES of it apart.
+    coefficients : float64 [PHASES, taps]
+        Of filters for places p/PHASES beyond a sample. Their taps are the taps/2 samples up to
+        that one, and as many after it.
+    error_db : float
+        Relative rms error of upsampled lines, dB.
+    """
+
+    step: int
+    coefficients: NDArray[np.float64]
+    error_db: float
+
+    def __post_init__(self) -> None:
+        """Keep the coefficients from being changed."""
+        self.coefficients.flags.writeable = False
+
+    @property
+    def taps(self) -> int:
+        """Samples that one upsampled sample is made of."""
+        return self.coefficients.shape[1]
+
+    def resampling(self, length: int, beyond: int, spectrum: Spectrum) -> Resampling:
+        """Return where samples of lines of some length go, with so many beyond either end."""
+        period, upsampled = self.step * _FINE, PHASES * _FINE
+        last = (length - 1) * PHASES // self.step + beyond
+        shift = 0 if abs(spectrum.centre) <= _SAME else round(spectrum.centre * period)
+        return Resampling(0, period, upsampled, shift, -beyond, last + beyond + 1)
+
+
+def upsampler(spectrum: Spectrum, step: int, gain: Gain, most_db: float) -> Upsampler | None:
+    """Return the shortest filters that upsample by PHASES / step and err by no more than some dB.
+
+    None where none do: where lines fill their whole band.
+
+    Notes
+    -----
+    Least squares for every phase: sum_t h_t exp(j 2 pi f x_t) ~ gain(f), with x_t the place of a
+    tap from the upsampled sample, weighted by the power at f.
+    """
+    frequency = spectrum.frequency
+    aim = gain(frequency)
+    weight = np.sqrt(spectrum.power + 1e-13)[:, None]
+    place = np.arange(PHASES // 2 + 1)[:, None, None] / PHASES
+    for taps in UPSAMPLING_TAPS:
+        turns = 2 * np.pi * frequency[:, None] * (np.arange(taps) + 1 - taps // 2 - place)
+        matrix = np.concatenate([weight * np.cos(turns), weight * np.sin(turns)], axis=1)
+        wanted = np.concatenate([weight[:, 0] * aim, np.zeros(len(aim))])
+        q, r = np.linalg.qr(matrix)
+        coefficients = np.linalg.solve(r, np.einsum("pft,f->pt", q, wanted)[..., None])[..., 0]
+        residual = np.einsum("pft,pt->pf", matrix, coefficients) - wanted
+        # Those of the second half mirror those of the first.
+        coefficients = np.concatenate([coefficients, coefficients[-2:0:-1, ::-1]])
+        of_phases = np.sum(residual**2, axis=1)
+        power = (of_phases.sum() + of_phases[1:-1].sum()) / PHASES / (spectrum.power @ aim**2)
+        error_db = 10 * np.log10(max(float(power), 1e-30))
+        if error_db <= most_db:
+            return Upsampler(step, coefficients, error_db)
+    return None

@@ -1,0 +1,283 @@
+"""Spectra of lines: the band they occupy, and how errors at its frequencies weigh in an image."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.fft
+from numpy.typing import NDArray
+from scipy.ndimage import uniform_filter1d
+
+from clsas.core.geometry import pairwise_range_m
+from clsas.core.grid import Grid
+from clsas.core.lines import RangeLines, some_channels
+
+MEASURED_CHANNELS, FEW_CHANNELS = 256, 32  # sampled for a spectrum: with care, in haste
+NEEDED_OVERSAMPLING = 1.05
+"""Sample rate over occupied bandwidth from which on a guard band keeps the band's edges apart."""
+_FREQUENCIES = 128
+_FLOOR_WIDTH = 1 / 64  # cycles per sample: the quietest stretch, which is taken as noise
+_FLOOR_MARGIN = 2.0  # the mean of few periodograms scatters by as much
+_NOISE_LEFT = 0.1  # of the noise's power: peaks above that margin
+_OUTSIDE_BAND = (1e-8, 1e-6, 1e-4)  # of the signal's power: tails of windows and finite lines
+_CLOSING = 1 / 300  # cycles per sample to either side of where the circle closes, that may alias
+_COHERENT_CYCLES = 2.0  # of phase over the aperture, up to which common parts add up
+_COHERENT_CHANNELS, _COHERENT_PLACES, _COHERENT_FREQUENCIES = 128, 3, 256  # sampled
+_FEW_FREQUENCIES = 4.0  # power at one frequency may err by 5 times as predicted
+_LOUDEST = 16  # channels sampled besides those spread evenly
+_SUMMABLE = 1e-20, 1e38  # energies that float32 squares and sums without loss
+_LINES_TOGETHER = 8  # transformed at once: they stay in the processor's caches
+
+
+@dataclass(frozen=True, eq=False)
+class Spectrum:
+    """Mean power spectrum of a set of lines, seen from its own centre.
+
+    Attributes
+    ----------
+    centre : float
+        Centre of the occupied band, cycles per sample, in [-0.5, 0.5).
+    frequency : float64 [n]
+        Distance from the centre, cycles per sample, 0 to 0.5.
+    power : float64 [n]
+        Weight of the errors at that distance, both sides together: share of the power of the lines
+        or, where that is more, of the image. Sums to 1 to 2.
+    oversampling : float
+        Sample rate over the width of the occupied band.
+    aliasing : float
+        Relative error power from aliasing, where the band fills all that is sampled.
+    line_power : float64 [n] or None
+        Share of the power of the lines, where `power` has some of the image.
+    """
+
+    centre: float
+    frequency: NDArray[np.float64]
+    power: NDArray[np.float64]
+    oversampling: float = np.inf
+    aliasing: float = 0.0
+    line_power: NDArray[np.float64] | None = None
+
+    @property
+    def scatter(self) -> float:
+        """Factor by which measured error power may exceed its mean, >= 1.
+
+        At few frequencies errors do not average out.
+        """
+        return 1 + _FEW_FREQUENCIES * float(np.sum(self.share**2))
+
+    @property
+    def share(self) -> NDArray[np.float64]:
+        """Share of the power of the lines at every distance, float64 [n]; sums to 1."""
+        return self.power if self.line_power is None else self.line_power
+
+
+def measure_spectrum(lines: RangeLines, grid: Grid | None = None) -> Spectrum:
+    """Mean power spectrum of the lines, about the middle of their occupied band.
+
+    With a grid, frequencies that add up coherently in its image weigh as much as they do there.
+    """
+    frequency, power, faded = _mean_power(*_sampled_lines(lines, MEASURED_CHANNELS))
+    centre, width, left_out = _occupied_band(frequency, faded)
+    distance = _distance(frequency, centre)
+    share = _histogram(distance, power)
+    if grid is not None:
+        power = np.maximum(power, _image_power(lines, grid, frequency, power))
+    return Spectrum(
+        centre,
+        (np.arange(_FREQUENCIES) + 0.5) / (2 * _FREQUENCIES),
+        _histogram(distance, power),
+        oversampling=1 / width,
+        aliasing=left_out + _aliasing(distance, faded, width),
+        line_power=share,
+    )
+
+
+def _occupied_band(
+    frequency: NDArray[np.float64], power: NDArray[np.float64]
+) -> tuple[float, float, float]:
+    """Middle and width of the occupied band, cycles per sample, and the share it has to leave out.
+
+    Frequencies farther than half a cycle per sample from the middle alias. The band is therefore
+    the narrowest arc of the frequency circle that holds nearly all power above the noise floor: the
+    opposite point lies in the middle of the guard band, however the spectrum is shaped. As little
+    is left outside as a guard band allows.
+    """
+    count = len(power)
+    smoothed = uniform_filter1d(power, max(round(_FLOOR_WIDTH * count), 1), mode="wrap")
+    signal = np.maximum(power - _FLOOR_MARGIN * smoothed.min(), 0.0)
+    if not signal.any():  # white: no arc is better than another
+        return float(np.angle(power @ np.exp(2j * np.pi * frequency)) / (2 * np.pi)), 0.5, 0.0
+    held = np.append(0.0, np.cumsum(np.tile(signal, 2)))
+    least, *_, most = _OUTSIDE_BAND
+    noise = np.clip(_NOISE_LEFT * count * smoothed.min(), least, most)
+    for outside in (noise, *(each for each in _OUTSIDE_BAND if each > noise)):
+        ends = np.searchsorted(held, held[:count] + (1 - outside) * held[count])
+        bins = ends - np.arange(count)
+        first = int(np.argmin(bins))
+        if bins[first] * NEEDED_OVERSAMPLING <= count:
+            break
+    middle = (first + (bins[first] - 1) / 2) / count
+    left_out = 1 - (held[ends[first]] - held[first]) / held[count] if outside > noise else 0.0
+    return float((middle + 0.5) % 1.0 - 0.5), float(bins[first] / count), max(left_out, 0.0)
+
+
+def _histogram(distance: NDArray[np.float64], power: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Power at the `frequency` of a `Spectrum`, shared between the two nearest.
+
+    A filter that fits one frequency only would miss a narrow line beside it.
+    """
+    place = np.clip(2 * _FREQUENCIES * distance - 0.5, 0, _FREQUENCIES - 1)
+    lower = np.minimum(place.astype(np.int64), _FREQUENCIES - 2)
+    above = power * (place - lower)
+    return np.bincount(lower, power - above, _FREQUENCIES) + np.bincount(
+        lower + 1, above, _FREQUENCIES
+    )
+
+
+def _aliasing(distance: NDArray[np.float64], power: NDArray[np.float64], width: float) -> float:
+    """Error power if what lies where the circle closes has aliased, as it may if the band is full.
+
+    It then misses on one side and is wrong on the other, so it counts twice. With a guard band it
+    is noise, on either side alike.
+    """
+    if width <= 1 / NEEDED_OVERSAMPLING:
+        return 0.0
+    closing = max(_CLOSING, 1.5 / len(power))
+    return 2 * float(power[distance > 0.5 - closing].sum())
+
+
+def power_outside(lines: RangeLines, centre: float, half_width: float, most_channels: int) -> float:
+    """Share of the lines' power outside a band, in cycles per sample; of some lines."""
+    frequency, power, _ = _mean_power(*_sampled_lines(lines, most_channels))
+    return float(power[_distance(frequency, centre) > half_width].sum())
+
+
+def _distance(frequency: NDArray[np.float64], centre: float) -> NDArray[np.float64]:
+    """Return how far frequencies are from a centre, cycles per sample, 0 to 0.5."""
+    return np.abs((frequency - centre + 0.5) % 1.0 - 0.5)
+
+
+def _sampled_lines(
+    lines: RangeLines, most_channels: int
+) -> tuple[NDArray[np.complex64], NDArray[np.float32]]:
+    """Sample some channels, spread evenly, and the loudest; return a factor for each too.
+
+    With these factors the sampled channels have the power of all of them.
+    """
+    some = some_channels(lines.channels, most_channels)
+    if len(some) == lines.channels:
+        return lines.samples, np.ones(lines.channels, np.float32)
+    energy = _energy(lines.samples)
+    loudest = np.argpartition(energy, -_LOUDEST)[-_LOUDEST:]
+    even = np.setdiff1d(some, loudest)
+    rest, held = energy.sum() - energy[loudest].sum(), energy[even].sum()
+    weight = np.sqrt(max(rest, 0.0) / held) if held > 0 else 0.0
+    factor = np.append(np.full(len(even), weight), np.ones(len(loudest))).astype(np.float32)
+    return lines.samples[np.append(even, loudest)], factor
+
+
+def _energy(samples: NDArray[np.complex64]) -> NDArray[np.float64]:
+    """Energy of every line, in a unit of its own where squares would leave float32."""
+    parts = samples.view(np.float32)
+    with np.errstate(over="ignore"):
+        energy = np.einsum("ij,ij->i", parts, parts)
+    if not _SUMMABLE[0] < energy.max() < _SUMMABLE[1]:
+        parts = parts / (_largest_part(samples) or 1.0)
+        energy = np.einsum("ij,ij->i", parts, parts)
+    return energy.astype(np.float64)
+
+
+def _mean_power(
+    samples: NDArray[np.complex64], factor: NDArray[np.float32]
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Frequencies, cycles per sample, and the share of the power at each, of lines as they are.
+
+    The last is the share of lines that fade to both ends: it shows the band without the leakage of
+    lines that are cut. `factor` multiplies every line.
+    """
+    largest = _largest_part(samples) or samples.real.dtype.type(1)
+    length = scipy.fft.next_fast_len(max(2 * samples.shape[1], 4))
+    power, faded = np.zeros(length), np.zeros(length)
+    parts = samples.view(samples.real.dtype)
+    blocks = -(-len(parts) // _LINES_TOGETHER)
+    for block, scale in zip(
+        np.array_split(parts, blocks), np.array_split(factor, blocks), strict=True
+    ):
+        scaled = block / largest * scale[:, None]
+        amplitude = scipy.fft.fft(scaled.view(samples.dtype), length)
+        power += _column_power(amplitude)
+        # A Hann window over half of the FFT's length, where the lines lie.
+        around = np.empty_like(amplitude)
+        np.add(amplitude[:, :-4], amplitude[:, 4:], out=around[:, 2:-2])
+        around[:, :2] = amplitude[:, -2:] + amplitude[:, 2:4]
+        around[:, -2:] = amplitude[:, -4:-2] + amplitude[:, :2]
+        around *= 0.5
+        faded += _column_power(np.subtract(amplitude, around, out=around))
+    frequency = scipy.fft.fftfreq(length)
+    if not power.any():
+        power[:] = 1.0
+    if not faded.any():
+        faded = power
+    return frequency, power / power.sum(), faded / faded.sum()
+
+
+def _column_power(amplitude: NDArray[np.complexfloating]) -> NDArray[np.float64]:
+    """Power of every column, summed in double precision."""
+    return np.sum(amplitude.real**2 + amplitude.imag**2, axis=0, dtype=np.float64)
+
+
+def _image_power(
+    lines: RangeLines, grid: Grid, frequency: NDArray[np.float64], power: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Share of an image's power that every frequency of its lines brings.
+
+    What channels have in common near 0 Hz on the carrier, such as a constant offset, adds up in
+    phase over the whole image: its power grows as the square of the channels, that of echoes from
+    all over the scene as their number. The gain is measured by summing some channels in phase at
+    some pixels, and extrapolated to all channels.
+    """
+    some = some_channels(lines.channels, _COHERENT_CHANNELS)
+    if len(some) < 2:
+        return power
+    part = lines.select(some)
+    range_m = pairwise_range_m(
+        grid.spread(_COHERENT_PLACES),
+        part.tx_m,
+        part.rx_m,
+        part.rx_velocity_m_s,
+        part.sound_speed_m_s,
+    )
+    phase_per_m = cycles_per_m_at(lines, frequency)
+    spread_m = float(np.ptp(range_m, axis=1).max())
+    coherent = np.flatnonzero(np.abs(phase_per_m) * spread_m < _COHERENT_CYCLES)
+    if not coherent.size or coherent.size == len(power):
+        return power
+    strongest = np.argsort(power[coherent])[::-1][:_COHERENT_FREQUENCIES]
+    coherent = coherent[strongest]
+    # Samples about a range near all of them keep phases small.
+    scale = _largest_part(part.samples) or 1.0
+    turns = np.exp(-2j * np.pi * np.outer(np.arange(lines.length), frequency[coherent]))
+    scaled = (part.samples.view(np.float32) / scale).view(np.complex64)
+    spectra = scaled @ turns
+    spectra *= np.exp(-2j * np.pi * np.outer(part.first_range_m, phase_per_m[coherent]))
+    spectra *= np.exp(2j * np.pi * part.carrier_cycles_per_m * part.first_range_m)[:, None]
+    steering = np.exp(2j * np.pi * range_m[..., None] * phase_per_m[coherent])
+    summed = np.mean(np.abs(np.einsum("pcf,cf->pf", steering, spectra)) ** 2, axis=0)
+    alone = np.sum(np.abs(spectra) ** 2, axis=0)
+    gain = np.divide(summed, alone, out=np.ones_like(summed), where=alone > 0) - 1
+    gain = 1 + gain * (lines.channels - 1) / (len(some) - 1)
+    found = power.copy()
+    found[coherent] *= np.maximum(gain, 0.0)
+    return found / found.sum()
+
+
+def _largest_part(samples: NDArray[np.complex64]) -> np.float32:
+    """Return the largest real or imaginary part; magnitudes might overflow."""
+    parts = samples.view(samples.real.dtype)
+    return max(parts.max(initial=0.0), -parts.min(initial=0.0))
+
+
+def cycles_per_m_at(lines: RangeLines, frequency: float) -> float:
+    """Return the phase per metre of range, cycles, at a frequency in cycles per sample."""
+    return lines.carrier_cycles_per_m + frequency / lines.range_step_m

@@ -1,0 +1,1 @@
+"""What would be received: scenes and the simulator."""

@@ -1,0 +1,244 @@
+"""Sampling limits of a survey, phase centres and far field (THESIS [22]-[34])."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from clsas.core import validate
+from clsas.core.geometry import bistatic_range_m
+from clsas.core.grid import Grid
+from clsas.sonar.system import Sonar
+from clsas.sonar.track import Track, channels
+
+_SLACK = 0.01  # by which a spacing may exceed its limit
+
+
+@dataclass(frozen=True)
+class Finding:
+    """A sampling limit that a survey does not keep.
+
+    Parameters
+    ----------
+    name : str
+        Which limit: "along_track_spacing" or "ping_rate".
+    message : str
+        What it means, with the numbers and their units.
+    value, limit : float
+        What is and what may be at most, in the unit of the message.
+    """
+
+    name: str
+    message: str
+    value: float
+    limit: float
+
+
+def check_sampling(sonar: Sonar, track: Track, grid: Grid) -> list[Finding]:
+    """Return the sampling limits that this survey of this grid does not keep.
+
+    Checked are the spacing of the phase centres along the track against half an element
+    (THESIS [27], [31]; for elements without a length against what keeps the grating lobes of
+    anything on the grid off the grid), which it may exceed by 1 %, and the ping rate against the
+    last echo from the grid ([24]).
+
+    Parameters
+    ----------
+    sonar : Sonar
+    track : Track
+    grid : Grid
+        What is to be imaged.
+
+    Returns
+    -------
+    list of Finding
+        Empty if all is well.
+
+    Raises
+    ------
+    TypeError
+        If an argument is of another type.
+    """
+    validate.instance("grid", grid, Grid)
+    tx, rx, _ = channels(sonar, track)
+    corners = _corners_m(grid)
+    ranges = bistatic_range_m(corners[:, None], tx, rx)
+    centres = phase_centres_m(tx, rx)
+    return _check_spacing(sonar, centres, corners, ranges) + _check_ping_rate(sonar, track, ranges)
+
+
+def _check_spacing(
+    sonar: Sonar, centres: NDArray, corners: NDArray, ranges: NDArray
+) -> list[Finding]:
+    course = _course(centres)
+    gaps = np.diff(np.sort(centres @ course))
+    spacing = float(gaps.max(initial=0.0))
+    wavelength = sonar.wavelength_m
+    length = sonar.element_length_m
+    if length is not None:
+        limit, meaning = length / 2, f"half the element length of {length:.4g} m"
+    else:
+        way = corners[:, None] - centres
+        distance = np.linalg.norm(way, axis=-1)
+        sine = np.divide(way @ course, distance, out=np.zeros_like(distance), where=distance > 0)
+        spread = float(np.ptp(sine, axis=0).max())
+        limit = wavelength / (2 * spread) if spread else np.inf
+        meaning = "what keeps grating lobes off the grid"
+    # A sway by a few centimetres turns the course a little: grating lobes hardly change.
+    if spacing <= limit * (1 + _SLACK):
+        return []
+    near, far = ranges.min(), ranges.max()
+    lobes = [grating_lobe_m(wavelength, spacing, distance) for distance in (near, far)]
+    return [
+        Finding(
+            "along_track_spacing",
+            f"phase centres are up to {spacing:.4g} m apart along the track, more than {limit:.4g} "
+            f"m, {meaning}: grating lobes {lobes[0]:.4g} m to {lobes[1]:.4g} m beside every "
+            f"target (at the ranges of the grid's corners, {near:.4g} m to {far:.4g} m)",
+            spacing,
+            limit,
+        )
+    ]
+
+
+def _check_ping_rate(sonar: Sonar, track: Track, ranges: NDArray) -> list[Finding]:
+    if track.pings == 1:
+        return []
+    far = float(ranges.max())
+    _, last = receive_interval_s(far, far, sonar.pulse.duration_s, sonar.sound_speed_m_s)
+    rate = float(1 / np.diff(track.time_s).min())
+    if rate * last <= 1 + 1e-6:
+        return []
+    return [
+        Finding(
+            "ping_rate",
+            f"the ping rate of {rate:.4g} Hz is above {1 / last:.4g} Hz: the last echo, from "
+            f"{far:.4g} m, ends {last:.4g} s after its ping, when the next one has been sent",
+            rate,
+            1 / last,
+        )
+    ]
+
+
+def phase_centres_m(tx_m: ArrayLike, rx_m: ArrayLike) -> NDArray[np.float64]:
+    """Return the points midway between transmitters and receivers, [..., 3] (THESIS [32]).
+
+    [32] writes u = u_p + (u_rx - u_tx)/2; that is this midpoint when u_p is where the
+    transmitter is and u_rx, u_tx are positions on the platform.
+    """
+    tx = validate.array("tx_m", np.atleast_2d(tx_m), np.float64, (None, 3))
+    rx = validate.array("rx_m", np.atleast_2d(rx_m), np.float64, (None, 3))
+    return (tx + rx) / 2
+
+
+def phase_centre_error_m(separation_m: float, beam_width_rad: float, range_m: float) -> float:
+    """Return how much the phase-centre approximation errs in two-way path within the beam.
+
+    The path via tx and rx, a distance D apart, is D^2 cos^2(theta)/(4 R) longer than that from and
+    to their midpoint. What varies of it over a beam of full width W is D^2/(4 R) (1 - cos^2(W/2)).
+    The approximation holds where this is well below the wavelength, say below an eighth of
+    it as in [34]. That is THESIS [33], D^2/(4 lambda) (1 - cos^2(W/2)) << R: the thesis calls the
+    right-hand side the distance from phase centre to receiver, but it is the range.
+
+    Parameters
+    ----------
+    separation_m : float
+        Distance between transmitter and receiver.
+    beam_width_rad : float
+        Full azimuth beam width, at most pi.
+    range_m : float
+        Distance to the target.
+    """
+    separation = validate.number("separation_m", separation_m, "m", least=0.0)
+    width = validate.number("beam_width_rad", beam_width_rad, "rad", least=0.0, most=np.pi)
+    distance = validate.positive("range_m", range_m, "m")
+    return separation**2 / (4 * distance) * float(np.sin(width / 2)) ** 2
+
+
+def far_field_m(half_aperture_m: float, wavelength_m: float) -> float:
+    """Return the range 4 u^2/lambda from which on waves look plane to +-u (THESIS [34])."""
+    half = validate.number("half_aperture_m", half_aperture_m, "m", least=0.0)
+    return 4 * half**2 / validate.positive("wavelength_m", wavelength_m, "m")
+
+
+def receive_interval_s(
+    near_m: float, far_m: float, duration_s: float, sound_speed_m_s: float = 1500.0
+) -> tuple[float, float]:
+    """Return when the first echo starts and the last one ends (THESIS [22], [23])."""
+    near = validate.number("near_m", near_m, "m", least=0.0)
+    far = validate.number("far_m", far_m, "m", least=near)
+    duration = validate.number("duration_s", duration_s, "s", least=0.0)
+    sound = validate.positive("sound_speed_m_s", sound_speed_m_s, "m/s")
+    return 2 * near / sound, 2 * far / sound + duration
+
+
+def ping_advance_m(sonar: Sonar) -> float:
+    """Return the farthest a platform may go from ping to ping without a gap of phase centres.
+
+    That is the length of the phase-centre array, half that of the receivers: N d/2 for N receivers
+    d apart (THESIS 2.5), and for one receiver half its length ([31]).
+
+    Raises
+    ------
+    TypeError
+        If `sonar` is not a Sonar.
+    ValueError
+        If the sonar has one receiver and no element length.
+    """
+    validate.instance("sonar", sonar, Sonar)
+    if sonar.receivers > 1:
+        return float(np.ptp(sonar.rx_m[:, 0]) / (sonar.receivers - 1) * sonar.receivers / 2)
+    if sonar.element_length_m is None:
+        raise ValueError("sonar must have an element length or several receivers, got neither")
+    return sonar.element_length_m / 2
+
+
+def ping_rate_limits_hz(
+    speed_m_s: float, advance_m: float, last_echo_s: float
+) -> tuple[float, float]:
+    """Return the lowest and highest ping rate, v/advance <= PRF <= 1/Tf (THESIS [24], [30]).
+
+    With an advance of L/2 the lower one is the thesis's 2 v/L. Where it is above the higher one, no
+    ping rate will do.
+
+    Parameters
+    ----------
+    speed_m_s : float
+        Platform speed.
+    advance_m : float
+        Farthest that the platform may go from ping to ping (`ping_advance_m`).
+    last_echo_s : float
+        When the last echo ends, Tf (`receive_interval_s`).
+    """
+    speed = validate.number("speed_m_s", speed_m_s, "m/s", least=0.0)
+    advance = validate.positive("advance_m", advance_m, "m")
+    return speed / advance, 1 / validate.positive("last_echo_s", last_echo_s, "s")
+
+
+def grating_lobe_m(wavelength_m: float, spacing_m: float, range_m: float) -> float:
+    """Return how far along the track from a target its first grating lobe lies.
+
+    Phase centres d apart repeat their two-way phase at sin theta = lambda/(2 d); at range R
+    that is R lambda/(2 d) along the track (THESIS [26]).
+    """
+    wavelength = validate.positive("wavelength_m", wavelength_m, "m")
+    spacing = validate.positive("spacing_m", spacing_m, "m")
+    return validate.positive("range_m", range_m, "m") * wavelength / (2 * spacing)
+
+
+def _course(centres: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the unit vector along which the phase centres spread most."""
+    return np.linalg.svd(centres - centres.mean(axis=0), full_matrices=False)[2][0]
+
+
+def _corners_m(grid: Grid) -> NDArray[np.float64]:
+    """Return the corners [n, 3] of a plane, or of the box around any other grid."""
+    if grid.is_planar:
+        ends = (slice(None, None, max(1, count - 1)) for count in grid.shape)
+        return grid.positions_m(*ends).reshape(-1, 3)
+    points = grid.positions_m().reshape(-1, 3)
+    return np.stack(
+        np.meshgrid(*np.stack([points.min(axis=0), points.max(axis=0)], axis=1)), axis=-1
+    ).reshape(-1, 3)

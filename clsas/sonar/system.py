@@ -1,0 +1,300 @@
+"""What transmits and receives: the pulse, the elements and where they sit on the platform."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from clsas.core import validate
+from clsas.core.fourier import fourier_integral
+
+BARKER_13 = (1, 1, 1, 1, 1, -1, -1, 1, 1, -1, 1, -1, 1)
+
+# The part of the sampled band that the receiver passes untouched; above it the anti-alias filter
+# falls smoothly to nothing at half the sample rate (see `clsas.simulate`).
+PASSBAND = 0.8
+
+
+@dataclass(frozen=True)
+class Pulse:
+    """A transmitted pulse: a linear chirp or a binary phase code.
+
+    The pulse lasts from t = 0 to `duration_s`; its complex envelope p(t), relative to the
+    carrier, has amplitude 1 (THESIS [5] and section 2.1).
+
+    Parameters
+    ----------
+    carrier_hz : float
+        Centre frequency.
+    bandwidth_hz : float
+        Swept bandwidth of a chirp; chips/duration of a phase code. At most 2 `carrier_hz`.
+    duration_s : float
+        Length of the pulse.
+    code : {"up", "down"} or tuple of +1 and -1
+        Chirp with rising or falling frequency, or the chips of a binary phase code.
+    taper : float
+        Fraction 0..1 of the duration over which a cosine (Tukey) taper rises and falls, half of
+        it at each end; 0 is rectangular.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If a value is not a number or outside its limits, or chips are not +1 and -1.
+    """
+
+    carrier_hz: float
+    bandwidth_hz: float
+    duration_s: float
+    code: str | tuple[int, ...] = "up"
+    taper: float = 0.0
+
+    def __post_init__(self) -> None:  # noqa: D105
+        carrier = validate.positive("carrier_hz", self.carrier_hz, "Hz")
+        validate.positive("duration_s", self.duration_s, "s")
+        validate.number("bandwidth_hz", self.bandwidth_hz, "Hz", above=0.0, most=2 * carrier)
+        validate.number("taper", self.taper, least=0.0, most=1.0)
+        if isinstance(self.code, str):
+            validate.one_of("code", self.code, ("up", "down"))
+            return
+        given = np.ravel(self.code).tolist()
+        if not given or any(chip not in (1, -1) for chip in given):
+            raise ValueError(
+                f"code must be 'up', 'down' or chips of +1 and -1, got {validate.shown(self.code)}"
+            )
+        chips = tuple(int(chip) for chip in given)
+        if not np.isclose(self.bandwidth_hz * self.duration_s, len(chips)):
+            raise ValueError(
+                f"bandwidth_hz of a phase code must be chips/duration = "
+                f"{len(chips) / self.duration_s:g} Hz, got {self.bandwidth_hz:g} Hz"
+            )
+        object.__setattr__(self, "code", chips)
+
+    @classmethod
+    def phase_code(
+        cls,
+        carrier_hz: float,
+        duration_s: float,
+        chips: tuple[int, ...] = BARKER_13,
+        *,
+        taper: float = 0.0,
+    ) -> Pulse:
+        """Return a binary phase code, one chip after the other in equal parts of the duration."""
+        duration = validate.positive("duration_s", duration_s, "s")
+        return cls(carrier_hz, len(chips) / duration, duration, tuple(chips), taper)
+
+    def envelope(self, time_s: ArrayLike) -> NDArray[np.complex128]:
+        """Return the complex envelope p(t); zero before t = 0 and after the duration."""
+        t = np.asarray(time_s, dtype=np.float64)
+        duration = self.duration_s
+        inside = (t >= 0) & (t <= duration)
+        if isinstance(self.code, str):
+            rate = self.bandwidth_hz / duration * (1 if self.code == "up" else -1)
+            value = np.exp(1j * np.pi * rate * (t - duration / 2) ** 2)
+        else:
+            chip = np.clip((t / duration * len(self.code)).astype(int), 0, len(self.code) - 1)
+            value = np.asarray(self.code)[chip].astype(np.complex128)
+        if self.taper:
+            edge = self.taper * duration / 2
+            from_end = np.clip(np.minimum(t, duration - t) / edge, 0, 1)
+            value = value * np.sin(np.pi / 2 * from_end) ** 2
+        return np.where(inside, value, 0)
+
+    def spectrum(self, frequency_hz: ArrayLike) -> NDArray[np.complex128]:
+        """Return P(f), the integral of p(t) exp(-j 2 pi f t) dt in seconds, at any frequency.
+
+        Frequencies are relative to the carrier. Accurate to 1e-12 of the largest value returned,
+        by quadrature between the chips' and the taper's edges.
+        """
+        chips = 1 if isinstance(self.code, str) else len(self.code)
+        edge = self.taper * self.duration_s / 2
+        edges = np.unique(
+            np.concatenate(
+                [
+                    np.linspace(0, self.duration_s, chips + 1),
+                    [edge, self.duration_s - edge],
+                ]
+            )
+        )
+        return fourier_integral(
+            self.envelope, edges, frequency_hz, sign=-1, rate=self.bandwidth_hz / 2
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Sonar:
+    """A platform's transmitter and receivers.
+
+    Positions are in the platform's frame: x forward, y to port (the side that a broadside beam
+    looks to), z up.
+
+    Parameters
+    ----------
+    pulse : Pulse
+        What is transmitted.
+    rx_m : array_like, [receivers, 3]
+        Receiver positions.
+    tx_m : array_like, [3]
+        Transmitter position; the origin unless given.
+    sample_rate_hz : float, optional
+        Rate of the complex baseband samples; twice the pulse's bandwidth unless given, and
+        always at least 1.25 of it, so that the receiver's filter leaves the band untouched.
+    sound_speed_m_s : float
+        Speed of sound.
+    tx_length_m, rx_length_m : float, optional
+        Element lengths along x. None: the element does not direct sound in azimuth.
+    tx_height_m, rx_height_m : float, optional
+        Element heights. None: the element does not direct sound in elevation.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If a value has the wrong type or shape, is not finite or outside its limits.
+    """
+
+    pulse: Pulse
+    rx_m: NDArray[np.float64]
+    tx_m: NDArray[np.float64] = (0.0, 0.0, 0.0)  # type: ignore[assignment]
+    sample_rate_hz: float = None  # type: ignore[assignment]
+    sound_speed_m_s: float = 1500.0
+    tx_length_m: float | None = None
+    rx_length_m: float | None = None
+    tx_height_m: float | None = None
+    rx_height_m: float | None = None
+
+    if TYPE_CHECKING:  # arrays are converted: the constructor takes what holds numbers
+
+        def __init__(
+            self,
+            pulse: Pulse,
+            rx_m: ArrayLike,
+            tx_m: ArrayLike = (0.0, 0.0, 0.0),
+            sample_rate_hz: float | None = None,
+            sound_speed_m_s: float = 1500.0,
+            tx_length_m: float | None = None,
+            rx_length_m: float | None = None,
+            tx_height_m: float | None = None,
+            rx_height_m: float | None = None,
+        ) -> None: ...
+
+    def __post_init__(self) -> None:  # noqa: D105
+        if not isinstance(self.pulse, Pulse):
+            raise TypeError(f"pulse must be a clsas.Pulse, got {type(self.pulse).__name__}")
+        band = self.pulse.bandwidth_hz
+        rate = 2 * band if self.sample_rate_hz is None else self.sample_rate_hz
+        # The last bit of a rate given as exactly 1.25 bandwidths must not matter.
+        least = band / PASSBAND * (1 - 1e-12)
+        fields = {
+            "rx_m": validate.array("rx_m", self.rx_m, np.float64, (None, 3)),
+            "tx_m": validate.array("tx_m", self.tx_m, np.float64, (3,)),
+            "sample_rate_hz": validate.number("sample_rate_hz", rate, "Hz", least=least),
+            "sound_speed_m_s": validate.positive("sound_speed_m_s", self.sound_speed_m_s, "m/s"),
+        }
+        for name in ("tx_length_m", "rx_length_m", "tx_height_m", "rx_height_m"):
+            size = getattr(self, name)
+            fields[name] = None if size is None else validate.positive(name, size, "m")
+        for name, value in fields.items():
+            object.__setattr__(self, name, value)
+
+    @property
+    def receivers(self) -> int:
+        """Number of receivers."""
+        return len(self.rx_m)
+
+    @property
+    def wavelength_m(self) -> float:
+        """Wavelength at the carrier."""
+        return self.sound_speed_m_s / self.pulse.carrier_hz
+
+    @property
+    def element_length_m(self) -> float | None:
+        """The longer of the two element lengths, whose beam is the narrower; None if neither."""
+        lengths = [size for size in (self.tx_length_m, self.rx_length_m) if size is not None]
+        return max(lengths, default=None)
+
+    @property
+    def is_omnidirectional(self) -> bool:
+        """Whether no element has a size, so that no pattern is ever computed."""
+        sizes = (self.tx_length_m, self.rx_length_m, self.tx_height_m, self.rx_height_m)
+        return all(size is None for size in sizes)
+
+    @classmethod
+    def thesis_wide_beam(cls) -> Sonar:
+        """Return the thesis's wide-beam sonar (chapter 5).
+
+        1 MHz (wavelength 1.5 mm), 15 mm elements, 64 receivers. Its 640 phase centres of 10
+        pings over 5.28 m lie 8.25 mm apart, so receivers are 16.5 mm apart and the platform
+        advances 0.528 m per ping. The thesis gives no bandwidth and no pulse: 100 kHz (7.5 mm in
+        range, as in azimuth) and a chirp of 1 ms are chosen here.
+        """
+        pulse = Pulse(carrier_hz=1e6, bandwidth_hz=100e3, duration_s=1e-3)
+        return cls(pulse, line_array(64, 16.5e-3), tx_length_m=15e-3, rx_length_m=15e-3)
+
+    @classmethod
+    def edgetech(cls) -> Sonar:
+        """Return the Edgetech SAS on HUGIN (chapter 6).
+
+        125 kHz, 15 kHz bandwidth, 6 receivers of together 1.2012 m, so 10 cm by 10 cm resolution.
+        The 5 ms chirp and a transmitter as long as a receiver, in the array's middle, are chosen.
+        """
+        pulse = Pulse(carrier_hz=125e3, bandwidth_hz=15e3, duration_s=5e-3)
+        length = 1.2012 / 6
+        return cls(pulse, line_array(6, length), tx_length_m=length, rx_length_m=length)
+
+    @classmethod
+    def sensotek(cls) -> Sonar:
+        """Return one receiver bank of the SENSOTEK SAS for HUGIN (chapter 6).
+
+        96 elements of one wavelength. The carrier is not given; 100 kHz follows from "270 m range
+        at 1.5 m/s with an overlap of 24 elements": 72 phase centres of half a wavelength in
+        2 * 270/1500 s. The bandwidth is "up to 50 kHz"; 37.5 kHz is chosen, for the quoted 2 cm
+        of resolution, and a chirp of 5 ms and a transmitter like a receiver.
+        """
+        pulse = Pulse(carrier_hz=100e3, bandwidth_hz=37.5e3, duration_s=5e-3)
+        length = 1500.0 / 100e3
+        return cls(pulse, line_array(96, length), tx_length_m=length, rx_length_m=length)
+
+
+def line_array(receivers: int, spacing_m: float) -> NDArray[np.float64]:
+    """Return positions [receivers, 3] along x, centred on the origin."""
+    receivers = validate.count("receivers", receivers)
+    validate.memory("receivers", 240 * receivers)  # their paths too, of one ping
+    spacing = validate.positive("spacing_m", spacing_m, "m")
+    positions = np.zeros((receivers, 3))
+    positions[:, 0] = spacing * (np.arange(receivers) - (receivers - 1) / 2)
+    return positions
+
+
+def element_pattern(
+    size_m: float,
+    sine: ArrayLike,
+    frequency_hz: ArrayLike,
+    sound_speed_m_s: float,
+    dtype: type[np.floating] = np.float64,
+) -> NDArray[np.floating]:
+    """Return the amplitude pattern sinc(L/lambda sin theta) of one element (THESIS [9]-[12]).
+
+    Parameters
+    ----------
+    size_m : float
+        Length L of the element along the axis that theta turns away from perpendicular to.
+    sine : array_like
+        sin theta, the direction's component along that axis.
+    frequency_hz : array_like
+        Acoustic frequency (carrier included); broadcasts with `sine`.
+    sound_speed_m_s : float
+        Speed of sound.
+    dtype : numpy.float64 or numpy.float32
+        Of the result. Single precision is several times faster and right to 1e-7 at any angle.
+
+    Returns
+    -------
+    array of `dtype`, 1 on the beam axis, negative in every other side lobe.
+    """
+    phase = np.multiply(np.pi * size_m / sound_speed_m_s * np.asarray(frequency_hz), sine)
+    # Rounded only here: the error of sin(x) grows with x, but that of sin(x)/x does not. It is even
+    # in x, and 1 at the least x that can be divided by.
+    x = np.maximum(np.abs(phase).astype(dtype), np.finfo(dtype).tiny)
+    return np.sin(x) / x

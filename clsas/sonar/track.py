@@ -1,0 +1,303 @@
+"""Where the platform was: its pose at every ping, and the channels and beams that follow."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
+
+from clsas.core import validate
+from clsas.sonar.system import Sonar
+
+Motion = float | ArrayLike | Callable[[NDArray[np.float64]], ArrayLike]
+
+
+@dataclass(frozen=True, eq=False)
+class Track:
+    """The platform's pose at the time of every ping.
+
+    World coordinates: x along-track, y across-track, z up. The platform's frame is x forward,
+    y to port, z up. It is turned into the world by the rotations yaw about z, then pitch about
+    the turned y, then roll about the turned x (intrinsic z-y'-x''), each right-handed: positive
+    yaw turns the bow to port, positive pitch lowers the bow, positive roll lifts port.
+
+    Parameters
+    ----------
+    positions_m : array_like, [pings, 3]
+        Position of the platform's origin at transmission.
+    time_s : array_like, [pings]
+        Time of each transmission, strictly ascending.
+    velocity_m_s : array_like, [pings, 3] or [3]
+        Velocity of the platform during each echo's flight; zero unless given. It is used only
+        where motion during flight is asked for.
+    yaw_rad, pitch_rad, roll_rad : array_like, [pings] or scalar
+        Attitude; zero unless given.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If an array has the wrong kind or shape, is not finite, or time does not ascend.
+    """
+
+    positions_m: NDArray[np.float64]
+    time_s: NDArray[np.float64]
+    velocity_m_s: NDArray[np.float64] = (0.0, 0.0, 0.0)  # type: ignore[assignment]
+    yaw_rad: NDArray[np.float64] = 0.0  # type: ignore[assignment]
+    pitch_rad: NDArray[np.float64] = 0.0  # type: ignore[assignment]
+    roll_rad: NDArray[np.float64] = 0.0  # type: ignore[assignment]
+
+    if TYPE_CHECKING:  # arrays are converted: the constructor takes what holds numbers
+
+        def __init__(
+            self,
+            positions_m: ArrayLike,
+            time_s: ArrayLike,
+            velocity_m_s: ArrayLike = (0.0, 0.0, 0.0),
+            yaw_rad: ArrayLike = 0.0,
+            pitch_rad: ArrayLike = 0.0,
+            roll_rad: ArrayLike = 0.0,
+        ) -> None: ...
+
+    def __post_init__(self) -> None:
+        """Check every field and convert it."""
+
+        def put(name: str, shape: tuple[int | None, ...], *, broadcast: bool = False) -> None:
+            value = getattr(self, name)
+            value = validate.array(name, value, np.float64, shape, broadcast=broadcast)
+            object.__setattr__(self, name, value)
+
+        put("positions_m", (None, 3))
+        put("time_s", (self.pings,))
+        put("velocity_m_s", (self.pings, 3), broadcast=True)
+        for name in ("yaw_rad", "pitch_rad", "roll_rad"):
+            put(name, (self.pings,), broadcast=True)
+        shortest = np.diff(self.time_s).min(initial=np.inf)
+        if shortest <= 0:
+            raise ValueError(f"time_s must ascend strictly, got a step of {shortest:g} s")
+
+    @property
+    def pings(self) -> int:
+        """Number of pings."""
+        return len(self.positions_m)
+
+    @property
+    def rotations(self) -> Rotation:
+        """The rotation from the platform's frame to the world, for every ping."""
+        angles = np.stack([self.yaw_rad, self.pitch_rad, self.roll_rad], axis=1)
+        return Rotation.from_euler("ZYX", angles)
+
+    @classmethod
+    def straight(
+        cls,
+        start_m: ArrayLike,
+        velocity_m_s: ArrayLike,
+        pings: int,
+        ping_interval_s: float,
+        *,
+        surge_m: Motion = 0.0,
+        sway_m: Motion = 0.0,
+        heave_m: Motion = 0.0,
+        yaw_rad: Motion = 0.0,
+        pitch_rad: Motion = 0.0,
+        roll_rad: Motion = 0.0,
+    ) -> Track:
+        """Return a straight course at constant speed, with motion added to it.
+
+        Parameters
+        ----------
+        start_m : array_like, [3]
+            Position at the first ping, at time 0, without the added motion.
+        velocity_m_s : array_like, [3]
+            Velocity along the course. The platform heads along its horizontal part (along x if
+            that is zero).
+        pings : int
+            Number of pings.
+        ping_interval_s : float
+            Time from ping to ping.
+        surge_m, sway_m, heave_m : number, array_like [pings], or function
+            Displacement forward along the heading, to port of it, and up. A function gets the
+            times, float64 [pings], and returns the displacements. The velocity that goes with
+            them (central differences) is added to the track's.
+        yaw_rad, pitch_rad, roll_rad : number, array_like [pings], or function
+            Attitude relative to the heading, level.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If a value has the wrong kind or shape, is not finite, or outside its limits.
+        """
+        start = validate.array("start_m", start_m, np.float64, (3,))
+        velocity = validate.array("velocity_m_s", velocity_m_s, np.float64, (3,))
+        pings = validate.count("pings", pings)
+        validate.memory("pings", 80 * pings)  # the ten numbers of a pose, its time and velocity
+        interval = validate.positive("ping_interval_s", ping_interval_s, "s")
+        time = interval * np.arange(pings, dtype=np.float64)
+        heading = np.arctan2(velocity[1], velocity[0])
+        directions = Rotation.from_euler("Z", heading).as_matrix().T
+        positions = start + velocity * time[:, None]
+        velocities = np.tile(velocity, (pings, 1))
+        moves = {"surge_m": surge_m, "sway_m": sway_m, "heave_m": heave_m}
+        for direction, (name, motion) in zip(directions, moves.items(), strict=True):
+            positions += _at(name, motion, time)[:, None] * direction
+            velocities += _rate(name, motion, time, interval)[:, None] * direction
+        return cls(
+            positions,
+            time,
+            velocities,
+            heading + _at("yaw_rad", yaw_rad, time),
+            _at("pitch_rad", pitch_rad, time),
+            _at("roll_rad", roll_rad, time),
+        )
+
+
+class Channels(NamedTuple):
+    """Element positions of every channel, float64 [channels, 3], in ping-major order."""
+
+    tx_m: NDArray[np.float64]
+    rx_m: NDArray[np.float64]
+    rx_velocity_m_s: NDArray[np.float64] | None
+
+
+def channels(sonar: Sonar, track: Track, *, motion_in_flight: bool = False) -> Channels:
+    """Return where every channel's transmitter and receiver were at transmission.
+
+    Parameters
+    ----------
+    sonar : Sonar
+        Gives the elements on the platform.
+    track : Track
+        Gives the platform in the world.
+    motion_in_flight : bool
+        Also return the receivers' velocity: the platform's (its rotation during an echo's flight
+        is left out).
+
+    Returns
+    -------
+    Channels
+        tx_m, rx_m and rx_velocity_m_s (None unless asked for); channel = ping * receivers +
+        receiver.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If an argument is of another type, or there are more channels than memory holds.
+    """
+    validate.instance("sonar", sonar, Sonar)
+    validate.instance("track", track, Track)
+    validate.instance("motion_in_flight", motion_in_flight, bool)
+    # Nine numbers a channel, and ranges to four points, which every use of them takes.
+    validate.memory("sonar and track", 300 * track.pings * sonar.receivers)
+    turn = track.rotations.as_matrix()
+    tx = track.positions_m + turn @ sonar.tx_m
+    rx = track.positions_m[:, None] + sonar.rx_m @ turn.transpose(0, 2, 1)
+    each = sonar.receivers
+    velocity = np.repeat(track.velocity_m_s, each, axis=0) if motion_in_flight else None
+    return Channels(np.repeat(tx, each, axis=0), rx.reshape(-1, 3), velocity)
+
+
+@dataclass(frozen=True)
+class Pointing:
+    """Where the beams look: the axis that element patterns are measured from.
+
+    Use `broadside`, `squint`, `scan` or `spot`. Elements turn as a whole with their beam.
+
+    Parameters
+    ----------
+    squint_rad : tuple of float
+        Angles forward of broadside (port), one per ping, over and over.
+    depression_rad : float
+        Angle of the axis below the platform's horizontal plane.
+    spot_m : tuple of three floats, optional
+        World position that the axis follows, in place of the angles.
+    """
+
+    squint_rad: tuple[float, ...] = (0.0,)
+    depression_rad: float = 0.0
+    spot_m: tuple[float, float, float] | None = None
+
+    def __post_init__(self) -> None:
+        """Check every field and convert it."""
+        squint = validate.array("squint_rad", self.squint_rad, np.float64, (None,))
+        object.__setattr__(self, "squint_rad", tuple(squint.tolist()))
+        validate.number("depression_rad", self.depression_rad, "rad")
+        if self.spot_m is not None:
+            spot = validate.array("spot_m", self.spot_m, np.float64, (3,))
+            object.__setattr__(self, "spot_m", tuple(spot.tolist()))
+
+    @classmethod
+    def broadside(cls, *, depression_rad: float = 0.0) -> Pointing:
+        """Look to port, square to the platform."""
+        return cls(depression_rad=depression_rad)
+
+    @classmethod
+    def squint(cls, angle_rad: float, *, depression_rad: float = 0.0) -> Pointing:
+        """Look forward of broadside by an angle (aft if negative)."""
+        return cls((angle_rad,), depression_rad)
+
+    @classmethod
+    def scan(cls, angles_rad: ArrayLike, *, depression_rad: float = 0.0) -> Pointing:
+        """Step through angles forward of broadside, one per ping, over and over."""
+        return cls(tuple(np.atleast_1d(angles_rad).tolist()), depression_rad)
+
+    @classmethod
+    def spot(cls, point_m: ArrayLike) -> Pointing:
+        """Follow a point of the world (spotlight)."""
+        return cls(spot_m=point_m)  # type: ignore[arg-type]
+
+    def axes(self, track: Track) -> NDArray[np.float64]:
+        """Return the elements' unit vectors in the world at every ping.
+
+        Returns
+        -------
+        float64 array, [pings, 3 vectors, 3]
+            Along an element's length, the beam axis, and along its height.
+
+        Raises
+        ------
+        TypeError
+            If `track` is not a Track.
+        ValueError
+            If a spot lies straight ahead or astern, where an element's length has no direction.
+        """
+        validate.instance("track", track, Track)
+        if self.spot_m is None:
+            squint = np.resize(self.squint_rad, track.pings)
+            # Squint turns x and y clockwise seen from above; depression then tips the beam down.
+            beam = Rotation.from_euler(
+                "ZX", np.stack([-squint, np.full(track.pings, -self.depression_rad)], axis=1)
+            )
+            return (track.rotations * beam).as_matrix().transpose(0, 2, 1)
+        beam = np.asarray(self.spot_m) - track.positions_m
+        distance = np.linalg.norm(beam, axis=1, keepdims=True)
+        forward = track.rotations.as_matrix()[:, :, 0]
+        along = forward * distance**2 - beam * np.sum(forward * beam, axis=1, keepdims=True)
+        length = np.linalg.norm(along, axis=1, keepdims=True)
+        blind = np.flatnonzero(length <= 1e-9 * distance**2)
+        if blind.size:
+            raise ValueError(
+                f"spot_m must not lie straight ahead or astern of the platform, "
+                f"got {self.spot_m} m at ping {blind[0]}"
+            )
+        along, beam = along / length, beam / distance
+        return np.stack([along, beam, np.cross(along, beam)], axis=1)
+
+
+def _at(name: str, motion: Motion, time: NDArray[np.float64]) -> NDArray[np.float64]:
+    value = motion(time) if callable(motion) else motion
+    return validate.array(name, value, np.float64, time.shape, broadcast=True)
+
+
+def _rate(
+    name: str, motion: Motion, time: NDArray[np.float64], interval: float
+) -> NDArray[np.float64]:
+    """Return the time derivative: of a function locally, of an array from ping to ping."""
+    if callable(motion):
+        step = 1e-3 * interval
+        return (_at(name, motion, time + step) - _at(name, motion, time - step)) / (2 * step)
+    if len(time) == 1:
+        return np.zeros(1)
+    return np.gradient(_at(name, motion, time), interval)

@@ -1,0 +1,1 @@
+"""How we know: an independent oracle, extreme cases, the self test, benchmarks, built-in cases."""

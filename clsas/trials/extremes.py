@@ -1,0 +1,326 @@
+"""Scenes whose ideal image is known, at the extremes of what clsas images.
+
+Lines and images come from `clsas.trials.oracle` alone; of the library a scene takes only
+the containers, `RangeLines`, `Grid` and `BeamWindow`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from clsas.core.grid import Grid
+from clsas.core.lines import RangeLines
+from clsas.sonar.beam import BeamWindow
+from clsas.trials import oracle
+from clsas.trials.oracle import Band, Echo
+
+LIGHT_M_S = 299_792_458.0
+_FILLED, _EDGE = 0.94, 0.01  # of the bandwidth: a pulse's flat part, and its edges' deviation
+_FADED = 6.0  # standard deviations of a Gaussian: 1.5e-8
+_TONES = 24  # per channel, of a noise floor
+_QUANTUM_M = 2.0**-29  # float64 holds sums of multiples of it up to 1.6e7 m
+
+
+@dataclass(frozen=True, eq=False)
+class Known:
+    """Range lines, a grid, and the ideal image there.
+
+    Attributes
+    ----------
+    lines : RangeLines
+    grid : Grid
+    wanted : complex128 [rows, columns]
+    beam : BeamWindow or None
+    """
+
+    lines: RangeLines
+    grid: Grid
+    wanted: NDArray[np.complex128]
+    beam: BeamWindow | None = None
+
+    def error_db(self, pixels: ArrayLike) -> float:
+        """Return the relative rms error of an image of this scene, dB."""
+        return oracle.error_db(pixels, self.wanted)
+
+
+def along_x(channels: int, spacing_m: float, sway_m: float = 0.0) -> NDArray[np.float64]:
+    """Return positions along x about the origin, with random deviations across, [channels, 3]."""
+    x_m = (np.arange(channels) - (channels - 1) / 2) * spacing_m
+    across_m = sway_m * np.random.default_rng(1).normal(size=(channels, 2))
+    return np.column_stack([x_m, across_m])
+
+
+def circle(channels: int, radius_m: float, height_m: float = 0.0) -> NDArray[np.float64]:
+    """Return positions all around the origin, [channels, 3]."""
+    angle = 2 * np.pi * np.arange(channels) / channels
+    return np.column_stack(
+        [radius_m * np.cos(angle), radius_m * np.sin(angle), np.full(channels, height_m)]
+    )
+
+
+def scene(
+    tx_m: NDArray[np.float64],
+    centre_m: Sequence[float],
+    *,
+    carrier_hz: float,
+    bandwidth_hz: float,
+    pixel_m: tuple[float, float],
+    shape: tuple[int, int] = (40, 40),
+    speed_m_s: float = 1500.0,
+    rx_m: NDArray[np.float64] | None = None,
+    rx_velocity_m_s: ArrayLike | None = None,
+    beam: BeamWindow | None = None,
+    targets: int = 5,
+    oversampling: float = 1.5,
+    colour: Callable[[float, float], Sequence[Band]] | None = None,
+    tilt_db: float = 0.0,
+    on_carrier: bool = False,
+    offset: float = 0.0,
+    tail: float = 0.0,
+    noise: float = 0.0,
+    origin_m: Sequence[float] = (0.0, 0.0, 0.0),
+    own_starts: bool = False,
+    relief_m: float = 0.0,
+    seed: int = 0,
+) -> Known:
+    """Return points at random in a horizontal grid, as one sonar receives them.
+
+    Parameters
+    ----------
+    tx_m, rx_m : float64 [channels, 3]
+        Antennas; receivers are the transmitters unless given.
+    centre_m : (x, y, z)
+        Of the grid.
+    carrier_hz, bandwidth_hz, speed_m_s : float
+    pixel_m : (dx, dy)
+    shape : (rows, columns)
+    rx_velocity_m_s : array_like, optional
+        Receivers' velocity in flight.
+    beam : BeamWindow, optional
+        Shape "hann" or "rectangular", with `along` of one direction.
+    targets : int
+        Number of points.
+    oversampling : float
+        Sample rate over bandwidth.
+    colour : callable, optional
+        Returns a pulse's bands from centre and width, cycles per metre. Without one the
+        pulse is flat, or tilted by `tilt_db`.
+    on_carrier : bool
+        Whether lines keep their carrier; `oversampling` must then have room for it.
+    offset : float
+        Constant in every line over the rms of its echoes.
+    tail : float
+        Noise from 0 Hz up to the band, over the rms of the echoes.
+    noise : float
+        Noise all over nine tenths of what is sampled, over the rms of the echoes.
+    origin_m : (x, y, z)
+        What is added to all coordinates.
+    own_starts : bool
+        Whether every line begins at another range.
+    relief_m : float
+        Standard deviation of the pixels' heights over the grid's plane, each another.
+    seed : int
+
+    Returns
+    -------
+    Known
+    """
+    rng = np.random.default_rng(seed)
+    tx, rx = (_quantised(tx_m if each is None else each) for each in (tx_m, rx_m))
+    velocity = 0.0 if rx_velocity_m_s is None else rx_velocity_m_s
+    rows, columns = shape
+    x_m, y_m = (
+        step * (np.arange(count) - (count - 1) / 2)
+        for step, count in zip(pixel_m, (columns, rows), strict=True)
+    )
+    corner = _quantised(np.add(centre_m, [x_m[0], y_m[0], 0]))
+    pixels = corner + np.stack(
+        np.broadcast_arrays(x_m - x_m[0], (y_m - y_m[0])[:, None], 0.0), axis=-1
+    )
+    height_m = relief_m * np.random.default_rng(seed).normal(size=shape)
+    pixels[..., 2] += height_m
+    # Points keep off the border, so that the image holds their main lobes.
+    points = corner + rng.uniform(0.1, 0.9, (targets, 3)) * [np.ptp(x_m), np.ptp(y_m), 0]
+    amplitude = rng.normal(size=(targets, 2)) @ [1, 1j]
+
+    per_m = 2 / speed_m_s
+    centre, width = per_m * carrier_hz, per_m * bandwidth_hz
+    step_m = 1 / (width * oversampling)
+    if colour is None:
+        bands = [Band(centre, _FILLED * width, _EDGE * width, tilt_db=tilt_db)]
+    else:
+        bands = colour(centre, width)
+    at_m = oracle.ranges_m(points, tx, rx, speed_m_s, velocity)
+    of_pixels_m = oracle.ranges_m(pixels, tx, rx, speed_m_s, velocity)
+    echoes = [Echo(at_m, amplitude, bands)]
+
+    fade_m = _FADED / (2 * np.pi * min(band.edge for band in bands))
+    if offset or tail or noise:
+        # What has no range of its own fades with a Gaussian over the whole line.
+        fade_m = max(fade_m, np.ptp(of_pixels_m, axis=1).max())
+    nearest = np.minimum(at_m.min(axis=1), of_pixels_m.min(axis=1))
+    farthest = np.maximum(at_m.max(axis=1), of_pixels_m.max(axis=1))
+    first_m = nearest - fade_m
+    length = int(np.ceil(((farthest - nearest).max() + 2 * fade_m) / step_m)) + 1
+    if own_starts:
+        first_m = first_m - rng.uniform(0, step_m, len(tx))
+    elif np.ptp(first_m) < length * step_m:  # else lines would hold little but zeros
+        length += int(np.ceil(np.ptp(first_m) / step_m))
+        first_m = np.full(len(tx), first_m.min())
+    carrier = 0.0 if on_carrier else centre
+    values = oracle.samples(echoes, first_m, step_m, length, carrier)
+    rms = np.sqrt(np.mean(np.abs(values) ** 2))
+    other = _other(rng, first_m, step_m, length, offset * rms, tail * rms, noise * rms, centre)
+    if other:
+        values += oracle.samples(other, first_m, step_m, length, carrier)
+        echoes = [*echoes, *other]
+
+    weights = 1.0 if beam is None else _weights(beam, pixels, (tx + rx) / 2)
+    origin = np.asarray(origin_m, np.float64)
+    grid = Grid.oriented(corner + origin, [0, pixel_m[1], 0], [pixel_m[0], 0, 0], shape)
+    if relief_m:
+        grid = grid.with_height(height_m)
+    return Known(
+        RangeLines(
+            values,
+            first_m,
+            step_m,
+            tx + origin,
+            rx + origin,
+            0.0 if on_carrier else carrier_hz,
+            speed_m_s,
+            rx_velocity_m_s,
+        ),
+        grid,
+        oracle.image(echoes, of_pixels_m, weights).reshape(shape),
+        beam,
+    )
+
+
+def ultrasonic(channels: int = 160, track: NDArray | None = None, **options: Any) -> Known:
+    """1 MHz, 100 kHz, 42.5 m away: 28 000 wavelengths."""
+    defaults = {
+        "carrier_hz": 1e6, "bandwidth_hz": 1e5, "pixel_m": (4e-3, 4e-3), "shape": (48, 48),
+    }  # fmt: skip
+    track = along_x(channels, 8.25e-3) if track is None else track
+    return scene(track, (0.3, 42.5, 0), **(defaults | options))
+
+
+def array(*, moving: bool, channels: int = 160, **options: Any) -> Known:
+    """Eight receivers beside one transmitter per ping, that stand still or move at up to 17 m/s."""
+    rx = along_x(channels, 8.25e-3)
+    tx = np.repeat(rx[::8], 8, axis=0) + [0.3, 0.1, -0.2]
+    velocity = np.random.default_rng(3).uniform(-10, 10, rx.shape) if moving else None
+    return ultrasonic(track=tx, rx_m=rx, rx_velocity_m_s=velocity, **options)
+
+
+def raw(channels: int = 96, targets: int = 60, oversampling: float = 8.0, **options: Any) -> Known:
+    """30 kHz, 8 kHz on the carrier, sampled at 64 kHz and made analytic."""
+    return scene(
+        along_x(channels, 0.025), (0.2, 12, 0), carrier_hz=3e4, bandwidth_hz=8e3,
+        pixel_m=(0.03, 0.03), on_carrier=True, targets=targets, oversampling=oversampling,
+        **options,
+    )  # fmt: skip
+
+
+def at_1_khz(**options: Any) -> Known:
+    """1 kHz, 200 Hz, 1.5 km away."""
+    return scene(
+        along_x(80, 0.7), (0, 1500, -200), carrier_hz=1e3, bandwidth_hz=200, pixel_m=(6.0, 1.5),
+        **options,
+    )  # fmt: skip
+
+
+def radar(**options: Any) -> Known:
+    """10 GHz, 600 MHz, from an aircraft 8 km away."""
+    return scene(
+        along_x(128, 2.0, sway_m=0.3), (20, 7000, -4000), carrier_hz=1e10, bandwidth_hz=6e8,
+        pixel_m=(0.15, 0.1), speed_m_s=LIGHT_M_S, **options,
+    )  # fmt: skip
+
+
+def closed(**options: Any) -> Known:
+    """100 kHz, 20 kHz, from a circle of 8 m all around the grid."""
+    return scene(
+        circle(300, 8.0, 3.0), (0.1, 0.05, 0), carrier_hz=1e5, bandwidth_hz=2e4,
+        pixel_m=(3e-3, 3e-3), **options,
+    )  # fmt: skip
+
+
+def steps(centre: float, width: float) -> list[Band]:
+    """Return three bands at 0, -15 and -30 dB."""
+    return [
+        Band(centre + shift * width, 0.28 * width, 0.01 * width, 10 ** (level_db / 20))
+        for shift, level_db in ((-0.3, 0), (0, -15), (0.3, -30))
+    ]
+
+
+def line_in_the_spectrum(centre: float, width: float) -> list[Band]:
+    """Return a weak flat band and, near its edge, a tone of 20 dB more."""
+    return [
+        Band(centre, 0.9 * width, 0.01 * width, 0.1),
+        Band(centre + 0.42 * width, 0.0, 0.01 * width, 1.0),
+    ]
+
+
+def _quantised(positions_m: ArrayLike) -> NDArray[np.float64]:
+    """Round positions so that a far origin can be added without rounding."""
+    return np.round(np.asarray(positions_m, np.float64) / _QUANTUM_M) * _QUANTUM_M
+
+
+def _other(
+    rng: np.random.Generator,
+    first_m: NDArray[np.float64],
+    step_m: float,
+    length: int,
+    offset: float,
+    tail: float,
+    noise: float,
+    centre: float,
+) -> list[Echo]:
+    """Return what lines hold besides echoes: a constant, a tail below the band, and noise.
+
+    Amplitudes are rms values over a line.
+    """
+    channels = len(first_m)
+    middle_m = (first_m + (length - 1) / 2 * step_m)[:, None]
+    edge = _FADED / (np.pi * length * step_m)  # fades at both ends
+    # Mean square of the envelope over the line.
+    fullness = np.sqrt(np.sqrt(np.pi) / (2 * _FADED))
+    found = []
+    if offset:
+        found.append(Echo(middle_m, offset / fullness, [Band(0.0, 0.0, edge)]))
+    floor = 0.45 / step_m
+    for level, low, high in (
+        (tail, 0.0, 0.8 * centre),
+        (noise, centre - floor, centre + floor),
+    ):
+        for tone in range(_TONES if level else 0):
+            place = (tone + rng.uniform(0, 1, (channels, 1))) / _TONES
+            value = rng.normal(size=(channels, 1, 2)) @ [1, 1j] / np.sqrt(2 * _TONES)
+            found.append(
+                Echo(
+                    middle_m,
+                    level / fullness * value,
+                    [Band(low + (high - low) * place, 0.0, edge)],
+                )
+            )
+    return found
+
+
+def _weights(
+    beam: BeamWindow, pixels_m: NDArray[np.float64], centres_m: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return the weights of a beam by its definition, [channels, pixels]."""
+    towards = pixels_m.reshape(1, -1, 3) - centres_m[:, None]
+    sine = towards @ beam.along / np.linalg.norm(towards, axis=-1)
+    u = (np.degrees(np.arcsin(sine)) - beam.squint_deg) / beam.width_deg
+    weights = np.where(np.abs(u) < 0.5, np.cos(np.pi * u) ** 2 if beam.shape == "hann" else 1.0, 0)
+    if beam.normalise:
+        weights = weights * len(centres_m) / np.maximum(weights.sum(axis=0), 0.01)
+    return weights

@@ -1,0 +1,231 @@
+"""A test of accuracy on the user's own device, against the oracle."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from clsas.core import validate
+from clsas.core.image import Image
+from clsas.exact.backprojection import backproject
+from clsas.exact.wavenumber import wavenumber
+from clsas.factorized.plan import Plan
+from clsas.mosaics.mosaic import mosaic
+from clsas.opencl.device import Device, DeviceInfo, open_device
+from clsas.planning.costs import Costs
+from clsas.planning.factorize import factorize
+from clsas.planning.planner import plan
+from clsas.sonar.beam import BeamWindow
+from clsas.trials import extremes
+from clsas.trials.extremes import Known, along_x
+
+_WAYS = ((1, False), (4, False), (8, False), (8, True), (16, False))
+_WIDEST = 16
+
+_DIVIDED = Costs(pixel_ns=1e3, point_ns=1e3)
+"""Plans of small images divide them only if nothing else is fast."""
+_FAR_M = (1e7, -1e7, 1e7)
+_WAVENUMBER_DB = -60.0  # what the wavenumber image of these scenes may err by; it takes no request
+
+
+@dataclass(frozen=True)
+class Result:
+    """One image against its ideal.
+
+    Attributes
+    ----------
+    case : str
+        Scene and imager.
+    asked_db : float or None
+        Relative rms error asked for, dB; None where the imager takes none.
+    measured_db : float
+        Relative rms error found.
+    bound_db : float
+        What it may be.
+    """
+
+    case: str
+    asked_db: float | None
+    measured_db: float
+    bound_db: float
+
+    @property
+    def passed(self) -> bool:
+        """Whether the error is within its bound (NaN is not)."""
+        return self.measured_db <= self.bound_db
+
+
+def run(
+    device: Device | str | int | None = None,
+    *,
+    progress: Callable[[int, int], None] | None = None,
+) -> tuple[Result, ...]:
+    """Form images at the extremes and measure their errors against the oracle.
+
+    Scenes reach from 1 kHz to 10 GHz, from one channel to 1000, to a guard band of a tenth and to
+    coordinates of 10 000 km. Every imager takes part: exact, factorized (in single and in half
+    precision), mosaic and wavenumber. A CPU's kernels are built in every way that it is fit for.
+
+    Parameters
+    ----------
+    device : Device, str or int, optional
+        See `clsas.opencl.device.choose`.
+    progress : callable, optional
+        Called as progress(done, total).
+
+    Returns
+    -------
+    tuple of Result
+
+    Raises
+    ------
+    DeviceError
+        If there is no such device.
+    """
+    validate.progress(progress)
+    own = open_device(device)
+    checks = [(own, "", *check) for check in _CHECKS]
+    checks += [
+        (other, f", {name}", "flat", *check)
+        for name, other in variants(own).items()
+        for check in _OF_VARIANTS
+    ]
+    made = functools.cache(lambda name: _SCENES[name]())
+    results = []
+    for done, (used, variant, scene, imager, asked_db) in enumerate(checks):
+        if progress is not None:
+            progress(done, len(checks))
+        known = made(scene)
+        with warnings.catch_warnings():
+            # What counts is the error found, whether or not the library warned of it.
+            warnings.simplefilter("ignore", validate.ClsasWarning)
+            image = form(imager, known, asked_db, used)
+        bound_db = _WAVENUMBER_DB if asked_db is None else asked_db
+        case = f"{scene}, {imager}{variant}"
+        results.append(Result(case, asked_db, known.error_db(image.pixels), bound_db))
+    if progress is not None:
+        progress(len(checks), len(checks))
+    return tuple(results)
+
+
+def form(imager: str, known: Known, asked_db: float | None, device: Device) -> Image:
+    """Return the image of a scene by one of `IMAGERS`."""
+    return IMAGERS[imager](known, asked_db, device)
+
+
+def forced_ways(info: DeviceInfo) -> list[tuple[int, bool]]:
+    """Return the other ways to drive a device: floats of a vector, and whether to permute them.
+
+    Only CPUs have more than one. A compiler that is driven with more lanes than it has may break.
+    """
+    if info.kind != "cpu":
+        return []
+    most = info.width if info.width > 1 else _WIDEST
+    own = (info.width, info.permute)
+    return [way for way in _WAYS if way[0] <= most and way != own]
+
+
+def variants(device: Device) -> dict[str, Device]:
+    """Return a device driven in every other way that it is fit for, by name."""
+    return {
+        f"width {width}{', permuted' if permute else ''}": driven(device, width, permute)
+        for width, permute in forced_ways(device.info)
+    }
+
+
+def driven(device: Device, width: int, permute: bool) -> Device:
+    """Return a device whose kernels are built for vectors of `width` floats, permuted or not."""
+    info = dataclasses.replace(device.info, width=width, permute=permute)
+    if info == device.info:
+        return device
+    return dataclasses.replace(device, info=info, _kernels={})
+
+
+def _exact(known: Known, asked_db: float, device: Device) -> Image:
+    return backproject(
+        known.lines, known.grid, device=device, accuracy_db=asked_db, beam=known.beam
+    )
+
+
+def _factorized(known: Known, asked_db: float, device: Device) -> Image:
+    return factorize(known.lines, known.grid, divided_plan(known, asked_db, device), device=device)
+
+
+def _in_half_precision(known: Known, asked_db: float, device: Device) -> Image:
+    # Every device computes in half precision, but plans take it only where that is fast.
+    able = driven(device, device.info.width, True)
+    chosen = divided_plan(known, asked_db, able)
+    if not chosen.half_precision:
+        raise RuntimeError(f"a plan for {asked_db:g} dB was to take half precision, and did not")
+    return factorize(known.lines, known.grid, chosen, device=device)
+
+
+def divided_plan(known: Known, asked_db: float, device: Device) -> Plan:
+    """Return a plan that divides a scene's image, although it is small."""
+    return plan(
+        known.lines, known.grid, tolerance_db=asked_db, beam=known.beam, device=device,
+        costs=_DIVIDED,
+    )  # fmt: skip
+
+
+def _mosaic(known: Known, asked_db: float, device: Device) -> Image:
+    return mosaic(
+        known.lines, known.grid, tolerance_db=asked_db, beam=known.beam, patches=(2, 2),
+        device=device,
+    ).image()  # fmt: skip
+
+
+def _wavenumber(known: Known, asked_db: float | None, device: Device) -> Image:
+    return wavenumber(known.lines, known.grid, beam=known.beam)
+
+
+IMAGERS = {
+    "exact": _exact,
+    "factorized": _factorized,
+    "half precision": _in_half_precision,
+    "mosaic": _mosaic,
+    "wavenumber": _wavenumber,
+}
+_HANN = BeamWindow(12, "hann", along=[1, 0, 0])
+_SMALL = {"shape": (32, 32)}
+_SCENES: dict[str, Callable[[], Known]] = {
+    "flat": lambda: extremes.ultrasonic(96, **_SMALL),
+    "tilted, guard band 10 %": lambda: extremes.ultrasonic(
+        96, oversampling=1.1, tilt_db=10, **_SMALL
+    ),
+    "noise, guard band 25 %": lambda: extremes.ultrasonic(
+        96, oversampling=1.25, tilt_db=10, noise=0.1, **_SMALL
+    ),
+    "three bands": lambda: extremes.ultrasonic(96, colour=extremes.steps, **_SMALL),
+    "on carrier, 5 % offset": lambda: extremes.raw(64, 30, offset=0.05, **_SMALL),
+    "10 000 km from the origin": lambda: extremes.ultrasonic(96, origin_m=_FAR_M, **_SMALL),
+    "1 kHz": lambda: extremes.at_1_khz(**_SMALL),
+    "10 GHz": lambda: extremes.radar(**_SMALL),
+    "one channel": lambda: extremes.ultrasonic(1, **_SMALL),
+    "1000 channels": lambda: extremes.ultrasonic(1000, targets=2, shape=(12, 12)),
+    "closed track": lambda: extremes.closed(**_SMALL),
+    "bistatic": lambda: extremes.array(moving=False, **_SMALL),
+    "moving receivers": lambda: extremes.array(moving=True, **_SMALL),
+    "Hann beam": lambda: extremes.ultrasonic(
+        track=along_x(400, 0.03), beam=_HANN, targets=3, shape=(24, 24)
+    ),
+}
+_CHECKS = (
+    *((name, "exact", -80.0) for name in _SCENES),
+    ("flat", "exact", -40.0),
+    *(
+        (name, "factorized", -50.0)
+        for name in _SCENES
+        if name not in ("one channel", "1000 channels", "bistatic", "moving receivers")
+    ),
+    ("moving receivers", "factorized", -30.0),
+    ("flat", "factorized", -70.0),
+    ("flat", "half precision", -40.0),
+    ("Hann beam", "mosaic", -50.0),
+    ("Hann beam", "wavenumber", None),
+)
+# Requests whose kernels compilers build soonest: at -80 and -50 dB these take half as long again.
+_OF_VARIANTS = (("exact", -60.0), ("factorized", -35.0))

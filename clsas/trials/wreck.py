@@ -1,0 +1,117 @@
+"""The narrow-beam case: a wreck and its shadow, after THESIS chapter 6.
+
+The scene is `scenes/wreck.toml`. What benchmarks and the scripts in scripts/thesis share is here:
+its range lines, which take minutes to simulate and are kept, and the contrast of its shadow.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsas.core.cache import cache_folder
+from clsas.core.grid import Grid
+from clsas.core.image import Image
+from clsas.core.lines import RangeLines
+from clsas.files.hdf5 import FileFormatError, load, save
+from clsas.files.scene_files import SceneFile, built_in_scene, parse_scene, simulation_digest
+from clsas.signal.compression import compress
+from clsas.simulation.simulator import simulate
+
+X_M, Y_M = (-32.0, 32.0), (36.0, 92.0)
+
+_FOOTPRINT_M = 2.5  # half the way from which a pixel of the wreck is seen, amply
+_SPACING_M = 0.25  # between places where light and shadow are told
+_FLAT_M = 0.3  # height of what counts as sand
+_SURROUNDINGS_M = (12.0, 30.0)  # of the wreck along and across: sand that the shadow is compared to
+
+
+def grid(pixels: int) -> Grid:
+    """Return the whole scene, 64 m x 56 m, in so many pixels along either side."""
+    return Grid.plane((*X_M, pixels), (*Y_M, pixels))
+
+
+def scene() -> SceneFile:
+    """Return the built-in scene."""
+    return parse_scene(built_in_scene("wreck"), name="wreck.toml", folder=Path())
+
+
+def lines(progress: Callable[[int, int], None] | None = None) -> RangeLines:
+    """Return the scene's range lines: simulated once, which takes minutes, and kept in the cache.
+
+    See `clsas.core.cache.cache_folder` for where.
+    """
+    digest = simulation_digest(built_in_scene("wreck"), Path())
+    path = cache_folder() / f"wreck-{digest}.h5"
+    try:
+        kept = load(path)
+        if isinstance(kept, RangeLines):
+            return kept
+    except (FileFormatError, OSError):
+        pass  # not there, or not whole
+    described = scene()
+    sonar, track, targets = described.need("sonar", "track", "targets")
+    echoes = simulate(sonar, track, targets, **described.simulate, progress=progress)
+    made = compress(echoes, **described.compress)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    save(path, made)
+    return made
+
+
+@dataclass(frozen=True, eq=False)
+class Shadow:
+    """Which places of the seabed are lit and which in the wreck's shadow.
+
+    Attributes
+    ----------
+    scene : SceneFile
+    """
+
+    scene: SceneFile
+
+    @cached_property
+    def masks(self) -> tuple[NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_]]:
+        """Positions [n, 2] of sand on and round the wreck, which are in shadow, and which lit.
+
+        In shadow, and lit, from everywhere along the track from where they are seen.
+        """
+        seabed, track = self.scene.need("targets", "track")
+        x_m, y_m = (
+            np.arange(low + _FOOTPRINT_M, high - _FOOTPRINT_M, _SPACING_M)
+            for low, high in (X_M, Y_M)
+        )
+        ground = np.stack(np.meshgrid(x_m, y_m), axis=-1)
+        height_m = seabed.height_m(ground[..., 0], ground[..., 1])
+        points_m = np.concatenate([ground, height_m[..., None]], axis=-1)
+        dark, light = np.ones(height_m.shape, bool), np.ones(height_m.shape, bool)
+        middle_m = track.positions_m.mean(axis=0)
+        for column, x in enumerate(x_m):
+            for offset_m in (-_FOOTPRINT_M, 0.0, _FOOTPRINT_M):
+                eye_m = np.array([x + offset_m, middle_m[1], middle_m[2]])
+                lit = seabed.lit(points_m[:, column], eye_m)
+                dark[:, column] &= ~lit
+                light[:, column] &= lit
+        sand = height_m < _FLAT_M
+        near = np.zeros_like(sand)
+        rows, columns = np.nonzero(dark & sand)
+        along_m, across_m = _SURROUNDINGS_M
+        near[:] = np.abs(ground[..., 0] - x_m[columns].mean()) < along_m + np.ptp(x_m[columns]) / 2
+        near &= np.abs(ground[..., 1] - y_m[rows].mean()) < across_m
+        chosen = sand & near & (dark | light)
+        return ground[chosen], dark[chosen], light[chosen]
+
+    def contrast_db(self, image: Image) -> float:
+        """Return the mean power of lit sand over that of the shadow, dB."""
+        ground, dark, light = self.masks
+        x_m, y_m = image.grid.axes_m
+        column = np.rint((ground[:, 0] - x_m[0]) / (x_m[1] - x_m[0])).astype(int)
+        row = np.rint((ground[:, 1] - y_m[0]) / (y_m[1] - y_m[0])).astype(int)
+        inside = (row >= 0) & (row < len(y_m)) & (column >= 0) & (column < len(x_m))
+        power = np.full(len(ground), np.nan)
+        power[inside] = np.abs(image.pixels[row[inside], column[inside]]) ** 2
+        return float(10 * np.log10(np.nanmean(power[light]) / np.nanmean(power[dark])))

@@ -1,0 +1,278 @@
+"""The command `clsas mosaic`."""
+
+import json
+import os
+import re
+import shutil
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from interrupt import interrupted
+
+import clsas
+from clsas.cli import main
+from clsas.files.scene_files import read_scene
+
+SCENE = """
+[sonar]
+preset = "edgetech"
+
+[track]
+start_m = [-12.0, 0.0, 10.0]
+velocity_m_s = [2.0, 0.0, 0.0]
+pings = 60
+ping_interval_s = 0.2
+
+[track.sway]
+amplitude_m = 0.1
+period_s = 10.0
+
+[[targets]]
+position_m = [0.0, 60.0, 0.0]
+
+[[targets]]
+position_m = [1.5, 57.0, 0.0]
+amplitude = 0.5
+
+[grid]
+x = { start_m = -2, stop_m = 2, count = 80 }
+y = { start_m = 56, stop_m = 61, count = 100 }
+
+[image]
+tolerance_db = -40
+
+[image.beam]
+width_deg = 6
+shape = "hann"
+
+[mosaic]
+patches = [2, 2]
+"""
+
+
+def run(*args, code=0):
+    result = CliRunner().invoke(main, list(map(str, args)))
+    assert result.exit_code == code, result.output
+    return result.stdout, result.stderr
+
+
+def lines_of(made):
+    """The range lines that were simulated."""
+    (path,) = made[0].glob("scene-*.lines.h5")
+    return path
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """A scene, its mosaic, and what the command printed."""
+    folder = tmp_path_factory.mktemp("mosaic")
+    (folder / "scene.toml").write_text(SCENE)
+    return folder, run("mosaic", folder / "scene.toml", "--png", folder / "image.png")
+
+
+def test_a_scene_is_all_it_needs(made):
+    folder, (stdout, stderr) = made
+    assert "2 x 2 patches of 50 x 40 pixels, 4 formed in" in stdout
+    assert "error predicted -40" in stdout
+    told = stderr.splitlines()
+    assert re.search(r"scene-\w{12}\.lines\.h5: range lines, simulated from .*scene.toml$", told[0])
+    assert sum(line.startswith("patch ") for line in told) == 4
+    assert (folder / "image.png").read_bytes().startswith(b"\x89PNG")
+    scene = read_scene(folder / "scene.toml")
+    exact = clsas.backproject(clsas.load(lines_of(made)), scene.grid, beam=scene.image["beam"])
+    image = clsas.Store.opened(folder / "scene.zarr").image()
+    assert clsas.relative_error_db(image, exact) <= -40
+
+
+def test_the_same_command_goes_on(made):
+    folder, _ = made
+    shutil.rmtree(folder / "scene.zarr" / "patches" / "1.0")
+    stdout, stderr = run("mosaic", folder / "scene.toml")
+    assert "1 formed in" in stdout
+    assert "3 were there" in stdout
+    assert "simulated before" in stderr
+    result = json.loads(run("mosaic", folder / "scene.toml", "--json")[0])
+    assert result["before"] == result["finished"] == 4
+    assert result["patches"] == [2, 2]
+    assert result["flags"] == {}
+    assert result["predicted_error_db"] <= -40
+
+
+@pytest.mark.parametrize("workers", [(), ("--workers", "2")], ids=["alone", "workers"])
+def test_ctrl_c_keeps_what_is_finished(made, tmp_path, workers):
+    """It ends with 130, and the same command goes on."""
+    command = ["mosaic", made[0] / "scene.toml", "--lines", lines_of(made)]
+    command += ["-o", tmp_path / "a.zarr", "--patches", "10x8", *workers]
+    code, stderr = interrupted(command, "patch ")
+    assert code == 130
+    assert stderr.splitlines()[-1] == "Interrupted"
+    assert "Traceback" not in stderr
+    stdout, _ = run(*command[:-2] if workers else command)
+    there = int(re.search(r"(\d+) were there", stdout).group(1))
+    assert 0 < there < 80
+    assert f"{80 - there} formed in" in stdout
+
+
+def test_another_scene_has_other_lines(made, tmp_path):
+    """Whatever the files' times; what lies beside the store counts only if it is of the scene."""
+    text = (made[0] / "scene.toml").read_text()
+    kept = tmp_path / lines_of(made).name
+    shutil.copy(lines_of(made), kept)
+    shutil.copy(lines_of(made), tmp_path / "image.lines.h5")
+    (tmp_path / "scene.toml").write_text(text.replace("amplitude = 0.5", "amplitude = 0.7"))
+    os.utime(tmp_path / "scene.toml", (0, 0))
+    _, stderr = run("mosaic", tmp_path / "scene.toml", "-o", tmp_path / "image.zarr")
+    assert "simulated from" in stderr
+    (tmp_path / "scene.toml").write_text(text.replace("start_m = -2", "start_m = -1"))
+    _, stderr = run("mosaic", tmp_path / "scene.toml")
+    assert "simulated before" in stderr  # the grid is no part of them
+
+
+def test_lines_grid_and_beam_from_the_command_line(made, tmp_path):
+    (tmp_path / "empty.toml").write_text("")
+    stdout, _ = run(
+        "mosaic", tmp_path / "empty.toml", "--lines", lines_of(made),
+        "--x", "-2:2:80", "--y", "56:61:100", "--beam-deg", "6", "--beam-shape", "hann",
+        "--tolerance-db", "-40", "--patches", "1x4", "-o", tmp_path / "a.zarr", "--device", "0",
+    )  # fmt: skip
+    assert "1 x 4 patches of 100 x 20 pixels, 4 formed" in stdout
+    image, other = (
+        clsas.Store.opened(path).image() for path in (tmp_path / "a.zarr", made[0] / "scene.zarr")
+    )
+    assert clsas.relative_error_db(image, other) < -37
+
+
+def test_processes_of_this_machine(made, tmp_path):
+    pytest.importorskip("distributed")
+    stdout, stderr = run(
+        "mosaic", made[0] / "scene.toml", "--lines", lines_of(made),
+        "-o", tmp_path / "a.zarr", "--workers", "2",
+    )  # fmt: skip
+    assert "4 formed" in stdout
+    assert sum(line.startswith("patch ") for line in stderr.splitlines()) == 4
+    ours, theirs = (
+        clsas.Store.opened(path).image().pixels
+        for path in (tmp_path / "a.zarr", made[0] / "scene.zarr")
+    )
+    np.testing.assert_array_equal(ours, theirs)
+
+
+def test_a_folder_that_has_ended(made, tmp_path):
+    folder = tmp_path / "survey"
+    folder.mkdir()
+    lines = clsas.load(lines_of(made))
+    for part in range(3):
+        clsas.save(folder / f"{part}.h5", lines.select(slice(120 * part, 120 * part + 120)))
+    (folder / "end").touch()
+    stdout, _ = run(
+        "mosaic", made[0] / "scene.toml", "--lines", folder, "--follow", "-o", tmp_path / "a.zarr"
+    )
+    assert "4 formed" in stdout
+
+
+def test_flags_are_told(made, tmp_path):
+    stdout, _ = run(
+        "mosaic", made[0] / "scene.toml", "--lines", lines_of(made),
+        "--x", "100:104:20", "--y", "56:61:100", "-o", tmp_path / "a.zarr",
+    )  # fmt: skip
+    assert "  patch 0,0; 0,1; 1,0 and 1 more: empty: in no channel's beam and range" in stdout
+
+
+@pytest.mark.parametrize(
+    ("args", "code", "message"),
+    [
+        (["--patches", "2y2"], 2, "'2y2' must be ROWSxCOLUMNS"),
+        (["--patches", "0x2"], 2, "'0x2' must be ROWSxCOLUMNS, at least 1x1"),
+        (["--patches", "90x2"], 1, "patches must leave each some of 100 pixels"),
+        (["--workers", "2", "--scheduler", "tcp://localhost:1"], 2, "exclude each other"),
+        (["--workers", "2", "--device", "0"], 2, "--device plays no part"),
+        (["--lines", "folder", "-o", "./folder"], 2, "--lines and -o must be two files"),
+        (["-o", "new", "--png", "new"], 2, "-o and --png must be two files"),
+        (
+            ["-o", "scene.zarr", "--png", "scene.zarr/all.png"],
+            2,
+            "--png must not lie in the store",
+        ),
+        (["--follow"], 2, "--follow goes with --lines, a folder"),
+        (["--tolerance-db", "-30"], 1, "tolerance_db is -40.0 there, -30.0 given"),
+        (["--tolerance-db", "-300"], 2, "tolerance_db must be"),
+        (["--memory-mib", "0"], 2, "--memory-mib"),
+        (["--device", "abacus", "-o", "new.zarr"], 1, "'abacus'"),
+        (["-o", "no/such/new.zarr"], 1, "no/such"),
+        (["--lines", "none.h5"], 2, "'none.h5' does not exist"),
+        (["--lines", "scene.toml"], 1, "scene.toml is not an HDF5 file"),
+        (["--idle-s", "-1", "--lines", "folder", "--follow"], 2, "idle_s must be"),
+        (["--accuracy-db", "3"], 2, "accuracy_db must be"),
+        (["--idle-s", "5"], 2, "--idle-s goes with --follow"),
+        (["--idle-s", "0.1", "--lines", "folder", "--follow"], 1, "folder has no file"),
+    ],
+)
+def test_errors_are_one_message(made, monkeypatch, args, code, message):
+    monkeypatch.chdir(made[0])
+    (made[0] / "folder").mkdir(exist_ok=True)
+    before = sorted(path.name for path in made[0].iterdir())
+    _, stderr = run("mosaic", "scene.toml", *args, code=code)
+    assert message in stderr
+    assert "Traceback" not in stderr
+    assert sorted(path.name for path in made[0].iterdir()) == before
+
+
+def test_nothing_is_simulated_for_patches_that_cannot_be(tmp_path):
+    (tmp_path / "scene.toml").write_text(SCENE)
+    _, stderr = run("mosaic", tmp_path / "scene.toml", "--patches", "90x2", code=1)
+    assert "patches must leave each some of 100 pixels" in stderr
+    assert [path.name for path in tmp_path.iterdir()] == ["scene.toml"]
+
+
+def test_a_scheduler_that_is_not_there(made, monkeypatch):
+    pytest.importorskip("distributed")
+    monkeypatch.setattr("clsas.cli.mosaics._SCHEDULER_S", 0.5)
+    _, stderr = run("mosaic", made[0] / "scene.toml", "--scheduler", "tcp://127.0.0.1:9", code=1)
+    assert "--scheduler tcp://127.0.0.1:9 cannot be reached" in stderr
+
+
+def test_lines_that_were_simulated_are_not_written_over(made, monkeypatch):
+    monkeypatch.chdir(made[0])
+    name = lines_of(made).name
+    before = lines_of(made).read_bytes()
+    _, stderr = run("mosaic", "scene.toml", "--png", name, code=2)
+    assert f"the file's name must end in .png, got {name!r}" in stderr
+    assert lines_of(made).read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    ("mosaic", "args", "message"),
+    [
+        ("", ["-o", "a.png", "--png", "a.png"], "-o and --png must be two files"),
+        ('store = "a.png"', ["--png", "a.png"], "--png and the store must be two files"),
+        ('lines = "folder"', ["-o", "folder"], "mosaic.lines and -o must be two files"),
+        ('lines = "a"', ["--png", "./a"], "mosaic.lines and --png must be two files"),
+        ('lines = "folder"\nstore = "folder"', [], "the range lines and the store must be two"),
+    ],
+)
+def test_what_a_scene_names_is_not_written_over(tmp_path, monkeypatch, mosaic, args, message):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "scene.toml").write_text(SCENE + mosaic)
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "a").touch()
+    _, stderr = run("mosaic", "scene.toml", *args, code=2)
+    assert message in stderr
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a", "folder", "scene.toml"]
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("patches = [2]", "[mosaic] patches must be a list of 2"),
+        ("patches = [0, 2]", "[mosaic] every entry of patches must be"),
+        ("memory_mib = 0", "[mosaic] memory_mib must be"),
+        ('lines = "none.h5"', "[mosaic] lines must be a file or folder"),
+        ("patch = 2", "unknown key 'patch' in [mosaic]: did you mean 'patches'"),
+    ],
+)
+def test_errors_of_scene_files(tmp_path, line, message):
+    (tmp_path / "scene.toml").write_text(SCENE.replace("patches = [2, 2]", line))
+    _, stderr = run("mosaic", tmp_path / "scene.toml", code=1)
+    assert message in stderr
+    assert [path.name for path in tmp_path.iterdir()] == ["scene.toml"]

@@ -1,0 +1,120 @@
+"""Files appear whole or not at all; leftovers of killed writers are removed."""
+
+import errno
+import os
+import signal
+import subprocess
+import sys
+
+import pytest
+
+from clsas.core.atomic import creating, replacing
+
+
+@pytest.mark.parametrize("names", [None, "the temporary one"])
+def test_a_full_disk_names_the_file_that_was_to_be_written(tmp_path, names):
+    """Not the temporary one, nor nothing as the system does; what was there stays."""
+    path = tmp_path / "image.h5"
+    path.write_text("before")
+
+    def write():
+        with replacing(path) as part:
+            part.write_text("half")
+            raise OSError(errno.ENOSPC, "No space left on device", names and str(part))
+
+    with pytest.raises(OSError, match="No space left") as caught:
+        write()
+    assert caught.value.filename == str(path)
+    assert [each.name for each in tmp_path.iterdir()] == ["image.h5"]
+    assert path.read_text() == "before"
+
+
+def killed_in(statement, folder):
+    """Kill a process while it writes; return what it left."""
+    program = f"""
+import os, signal
+from pathlib import Path
+from clsas.core.atomic import creating, replacing
+path = Path({str(folder / "a.h5")!r})
+with {statement} as part:
+    (part / "x" if part.is_dir() else part).write_text("half")
+    os.kill(os.getpid(), signal.SIGKILL)
+"""
+    done = subprocess.run([sys.executable, "-c", program], check=False)
+    assert done.returncode == -signal.SIGKILL
+    return list(folder.glob(".clsas-*.part"))
+
+
+@pytest.mark.parametrize("statement", ["replacing(path)", "creating(path)"])
+def test_the_next_writer_removes_what_a_killed_one_left(tmp_path, statement):
+    assert len(killed_in(statement, tmp_path)) == 1
+    with replacing(tmp_path / "b.h5") as part:
+        part.write_text("whole")
+    assert [path.name for path in tmp_path.iterdir()] == ["b.h5"]
+
+
+def test_what_another_writer_is_at_stays(tmp_path):
+    with creating(tmp_path / "folder") as folder, replacing(tmp_path / "a") as first:
+        (folder / "x").write_text("x")
+        with replacing(tmp_path / "b") as second:
+            second.write_text("b")
+        first.write_text("a")
+    assert (tmp_path / "folder" / "x").read_text() == "x"
+    assert [(tmp_path / name).read_text() for name in "ab"] == ["a", "b"]
+    assert len(list(tmp_path.iterdir())) == 3
+
+
+def test_names_alike_stay(tmp_path):
+    """Another program's, and what cannot be opened as a file of ours: a link, a pipe."""
+    (tmp_path / ".other-0.part").touch()
+    (tmp_path / "precious").write_text("precious")
+    (tmp_path / ".clsas-0.part").symlink_to(tmp_path / "precious")
+    os.mkfifo(tmp_path / ".clsas-1.part")
+    with replacing(tmp_path / "a") as part:
+        part.write_text("a")
+    assert (tmp_path / "precious").read_text() == "precious"
+    assert (tmp_path / ".other-0.part").exists()
+
+
+def test_a_temporary_taken_for_a_leftover_is_made_anew(tmp_path, monkeypatch):
+    """Another writer may remove it after it was made and before it is locked."""
+    import fcntl
+
+    flock, calls = fcntl.flock, []
+
+    def raced(descriptor, operation):
+        if not calls:
+            for path in tmp_path.glob(".clsas-*.part"):
+                path.unlink()
+        calls.append(operation)
+        flock(descriptor, operation)
+
+    monkeypatch.setattr(fcntl, "flock", raced)
+    with replacing(tmp_path / "a") as part:
+        part.write_text("a")
+    assert len(calls) == 2
+    assert (tmp_path / "a").read_text() == "a"
+
+
+def test_contents_reach_the_disk_before_the_name(tmp_path, monkeypatch):
+    done = []
+    sync, rename = os.fsync, os.replace
+
+    def synced(descriptor):
+        done.append("folder" if os.path.isdir(f"/proc/self/fd/{descriptor}") else "file")
+        sync(descriptor)
+
+    monkeypatch.setattr(os, "fsync", synced)
+    monkeypatch.setattr(os, "replace", lambda *paths: done.append("name") or rename(*paths))
+    with replacing(tmp_path / "a") as part:
+        part.write_text("a")
+    assert done == ["file", "name", "folder"]
+
+
+def test_a_folder_that_another_made_meanwhile_stays(tmp_path):
+    with creating(tmp_path / "a") as part:
+        (part / "ours").touch()
+        (tmp_path / "a").mkdir()
+        (tmp_path / "a" / "theirs").touch()
+    assert [path.name for path in (tmp_path / "a").iterdir()] == ["theirs"]
+    assert [path.name for path in tmp_path.iterdir()] == ["a"]

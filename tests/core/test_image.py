@@ -1,0 +1,42 @@
+import numpy as np
+import pytest
+
+from clsas.core.grid import Grid
+from clsas.core.image import Image, holds_any
+
+
+@pytest.mark.parametrize("shape", [(1,), (3, 5), (300, 400), (70_000,)])
+def test_any_pixel_is_found_wherever_it_is(shape):
+    pixels = np.zeros(shape, np.complex64)
+    assert not holds_any(pixels)
+    for index in (0, pixels.size // 2, pixels.size - 1):
+        pixels.reshape(-1)[index] = 1e-30j
+        assert holds_any(pixels)
+        pixels[:] = 0
+
+
+PIXELS = np.arange(6).reshape(2, 3) + 1j
+IMAGE = Image(PIXELS, Grid.plane((0, 1, 3), (0, 1, 2)))
+
+
+def test_numpy_takes_an_image_as_its_pixels():
+    assert np.asarray(IMAGE).dtype == np.complex64
+    assert np.shares_memory(np.asarray(IMAGE), IMAGE.pixels)
+    np.testing.assert_array_equal(IMAGE, PIXELS)
+    np.testing.assert_allclose(np.abs(IMAGE), np.abs(PIXELS), rtol=1e-6)
+    assert np.asarray(IMAGE, np.complex128).dtype == np.complex128
+
+
+def test_a_copy_is_made_when_asked_for():
+    copied = np.array(IMAGE)
+    copied[:] = 0  # may be written, unlike the image's own
+    assert np.asarray(IMAGE).any()
+    assert not np.shares_memory(IMAGE.__array__(copy=True), IMAGE.pixels)
+    assert np.shares_memory(IMAGE.__array__(copy=False), IMAGE.pixels)
+    with pytest.raises(ValueError, match="copy must not be False where complex64 becomes"):
+        IMAGE.__array__(np.complex128, copy=False)
+
+
+def test_phases_are_not_lost():
+    with pytest.raises(TypeError, match="dtype must be complex, as pixels are, got float64"):
+        np.asarray(IMAGE, float)

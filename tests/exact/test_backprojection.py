@@ -1,0 +1,509 @@
+import dataclasses
+
+import numpy as np
+import pytest
+from cases import (
+    APERTURE,
+    CARRIER,
+    ORDINARY,
+    STEP,
+    along_x,
+    beside,
+    bistatic,
+    height_map,
+    lines_over,
+    made,
+    moving,
+    noise,
+    oriented,
+    own_starts,
+    patch,
+    points,
+    rounding_error_db,
+    thesis,
+    thesis_lines,
+    true_error_db,
+)
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from clsas.core.grid import Grid
+from clsas.core.image import Image
+from clsas.core.image_error import relative_error_db
+from clsas.core.lines import RangeLines
+from clsas.core.validate import ClsasWarning
+from clsas.exact.backprojection import backproject, prepare
+from clsas.exact.lookup import lookup_options, lookup_room
+from clsas.exact.reference import same_interpolator
+from clsas.exact.run import execute
+from clsas.exact.tiles import BLOCKS, STACK, Groups, Tiles
+from clsas.opencl.device import list_devices
+from clsas.simulation.scenes import PointTargets
+from clsas.simulation.simulator import simulate_lines
+
+FINE = {"taps": 8, "upsampling": 4}  # an interpolator whose own error is below -100 dB
+
+
+# Accuracy
+
+
+@pytest.mark.parametrize("case", ORDINARY, ids=lambda case: case.__name__)
+def test_rounding_stays_below_80_db(case, device):
+    assert rounding_error_db(case, device) <= -80
+
+
+@pytest.mark.parametrize(("taps", "upsampling"), [(2, 5.0), (4, 4.0), (8, 2.0)])
+@pytest.mark.parametrize("case", [thesis, height_map], ids=lambda case: case.__name__)
+def test_rounding_does_not_depend_on_the_interpolator(case, device, taps, upsampling):
+    assert rounding_error_db(case, device, taps=taps, upsampling=upsampling) <= -80
+
+
+def test_the_cases_take_both_ways():
+    """A plane far away is expanded in tiles, everything else goes in groups."""
+    assert isinstance(prepare(*made(thesis)).layout, Tiles)
+    assert isinstance(prepare(*made(moving)).layout, Tiles)
+    assert isinstance(prepare(*made(height_map)).layout, Groups)
+    assert isinstance(prepare(*made(points)).layout, Groups)
+
+
+# How far a mean over a few hundred pixels strays from what is expected, dB.
+SCATTER_DB = 0.6
+
+
+@pytest.mark.parametrize("accuracy_db", [-30, -50, -60, -80])
+@pytest.mark.parametrize("case", [thesis, own_starts], ids=lambda case: case.__name__)
+def test_the_true_error_is_what_was_asked_for(case, platform, accuracy_db):
+    image = backproject(*made(case), device=platform, accuracy_db=accuracy_db)
+    assert true_error_db(case, image) <= accuracy_db + SCATTER_DB
+
+
+@pytest.mark.parametrize("case", ORDINARY, ids=lambda case: case.__name__)
+def test_the_default_accuracy_is_60_db(case):
+    assert true_error_db(case, backproject(*made(case))) <= -60 + SCATTER_DB
+
+
+@pytest.mark.parametrize(
+    ("taps", "upsampling"), [(2, 1.0), (2, 4.0), (4, 1.5), (4, 3.0), (6, 1.25), (6, 2.0), (8, 1.5)]
+)
+def test_the_predicted_error_is_the_measured_one(taps, upsampling):
+    preparation = prepare(*made(thesis), taps=taps, upsampling=upsampling)
+    measured = true_error_db(thesis, execute(preparation))
+    assert measured == pytest.approx(preparation.interpolator.error_db, abs=1.5)
+
+
+@pytest.mark.parametrize("mirrored", [False, True])
+@pytest.mark.parametrize("parts", [1, 2, STACK])
+@pytest.mark.parametrize("taps", [2, 4, 6, 8])
+def test_samples_are_looked_up_wherever_pixels_lie(device, taps, parts, mirrored):
+    """The furthest pixel of a part of a work-item lies in range, just within a window."""
+    track = APERTURE[len(APERTURE) // 2 :][:16]
+    upsampling, nowhere = 8.0, patch(1.3, 41)
+    some = prepare(
+        thesis_lines(nowhere, track), nowhere, device=device, taps=taps, upsampling=upsampling
+    )
+    width = device.info.width if device.info.permute else 16
+    block_rows, block_columns = BLOCKS[width]
+    away = np.array([(STACK // parts * block_rows - 1) / 2, block_columns / 2])
+    pitch_m = 0.99 * lookup_room(taps, width) / some.samples_per_m / np.linalg.norm(away)
+    down, across = away / np.linalg.norm(away)
+    row_m, column_m = pitch_m * np.array([[across, down, 0], [-down, across, 0]])
+    if mirrored:
+        row_m, column_m = pitch_m * np.array([[across, -down, 0], [down, across, 0]])
+    grid = Grid.oriented([track[8, 0], 42, 0], row_m, column_m, (32, 8))
+    lines = thesis_lines(grid, track)
+    preparation = prepare(lines, grid, device=device, taps=taps, upsampling=upsampling)
+    layout = preparation.layout
+    assert isinstance(layout, Tiles)
+    options = lookup_options(device, layout, lines, preparation.samples_per_m, taps)
+    if device.info.permute:
+        assert (options["PERMUTE"], options["WINDOWS"]) == (1, parts)
+    wanted = same_interpolator(preparation, grid.positions_m())
+    assert relative_error_db(execute(preparation), wanted) <= -80
+
+
+@pytest.mark.parametrize("channels", [1, 15, 16, 17, 511, 513])
+def test_any_number_of_channels(device, channels):
+    grid = patch(1.3, 42, 9, 7)
+    lines = thesis_lines(grid, APERTURE[:channels])
+    preparation = prepare(lines, grid, device=device, **FINE)
+    wanted = same_interpolator(preparation, grid.positions_m())
+    assert relative_error_db(execute(preparation), wanted) <= -80
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (1, 40), (3, 5), (17, 33), (65, 2)])
+@pytest.mark.parametrize("kind", ["plane", "heights", "points"])
+def test_any_shape_of_grid(device, shape, kind):
+    grid = patch(1.3, 42, shape[1], shape[0])
+    if kind == "heights":
+        grid = grid.with_height(np.random.default_rng(1).normal(0, 0.3, shape))
+    if kind == "points":
+        grid = Grid.points(grid.positions_m())
+    lines = thesis_lines(grid, APERTURE[::64])
+    preparation = prepare(lines, grid, device=device, **FINE)
+    wanted = same_interpolator(preparation, grid.positions_m())
+    image = execute(preparation)
+    assert image.pixels.shape == shape
+    assert relative_error_db(image, wanted) <= -80
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.data())
+def test_any_geometry(data):
+    """Antennas, motion and planes of any direction at 1 MHz, imaged on the default device."""
+    rng = np.random.default_rng(data.draw(st.integers(0, 2**32 - 1)))
+    distance_m = data.draw(st.sampled_from([0.3, 3.0, 30.0, 300.0]))
+    tx = rng.normal(0, 0.3, (20, 3)) * distance_m
+    rx = tx + rng.normal(0, 0.05, (20, 3)) if data.draw(st.booleans()) else tx
+    velocity = rng.uniform(-5, 5, (20, 3)) if data.draw(st.booleans()) else None
+    steps = rng.normal(0, 2e-3, (2, 3))
+    centre = rng.normal(size=3)
+    centre *= distance_m / np.linalg.norm(centre)
+    grid = Grid.oriented(centre, *steps, (19, 23))
+    lines = thesis_lines(grid, tx, rx, velocity=velocity, own_start=True)
+    preparation = prepare(lines, grid, **FINE)
+    wanted = same_interpolator(preparation, grid.positions_m())
+    assert relative_error_db(execute(preparation), wanted) <= -80
+
+
+# Physics
+
+
+@pytest.mark.parametrize("amplitude", [1, -2j, 3 * np.exp(1.1j)])
+def test_a_point_keeps_its_amplitude_and_phase(platform, amplitude):
+    rng = np.random.default_rng(2)
+    track = APERTURE[::10] + rng.normal(0, 0.05, APERTURE[::10].shape)
+    target = [0.31, 41.7, -3.2]
+    lines = simulate_lines(
+        track, beside(track, 0.1, 0, 0), PointTargets([target], [amplitude]),
+        carrier_hz=CARRIER, bandwidth_hz=1e5, rx_velocity_m_s=[2.0, 0, 0],
+    )  # fmt: skip
+    image = backproject(lines, Grid.points([target]), device=platform, accuracy_db=-60)
+    assert abs(image.pixels[0] / (len(track) * amplitude) - 1) <= 1e-3
+
+
+def test_a_gaussian_pulse_gives_the_closed_form(platform):
+    """Lines p(r) exp(-2jk rho) with a pulse known everywhere need no reference code."""
+    track, target = along_x(40, 0.02), np.array([[0.1, 8.0, -1.0]])
+    grid = patch(0.08, 7.95, 21, 17, z=-1.0)
+    rho = np.linalg.norm(target - track, axis=1)
+    r = 7.0 + STEP * np.arange(400)
+    k = 2 * np.pi * CARRIER / 1500
+    pulse_m = 3 * STEP
+    samples = np.exp(-(((r - rho[:, None]) / pulse_m) ** 2) - 2j * k * rho[:, None])
+    lines = RangeLines(samples, 7.0, STEP, track, track, CARRIER, 1500.0)
+    range_m = np.linalg.norm(grid.positions_m()[..., None, :] - track, axis=-1)
+    wanted = np.exp(-(((range_m - rho) / pulse_m) ** 2) + 2j * k * (range_m - rho)).sum(axis=-1)
+    image = backproject(lines, grid, device=platform, accuracy_db=-80)
+    assert relative_error_db(image, wanted) <= -80
+
+
+def test_backprojection_is_the_adjoint_of_simulation(device):
+    """<A x, y> = <x, A^H y>, with A from amplitudes to lines of a flat band.
+
+    A's point response is sinc(2 B r/c), sampled `oversampling` times as finely as that takes. Its
+    matched sum over the samples of a line within the band is `oversampling` times the line's
+    value, so that A^H is `oversampling` times backprojection.
+    """
+    rng = np.random.default_rng(3)
+    oversampling, band = 1.6, 1e5
+    step = 1500 / (2 * oversampling * band)
+    tx = APERTURE[::20] + rng.normal(0, 0.1, (32, 3))
+    geometry = {"tx_m": tx, "rx_m": beside(tx, 0.2, 0, 0.1), "rx_velocity_m_s": [2.0, 1, 0]}
+    x = rng.normal(size=(60, 2)) @ [1, 1j]
+    where = rng.uniform([-1, 41, -3], [1, 42, -2], (60, 3))
+    first, length = 39.0, 1200
+    ax = simulate_lines(
+        scene=PointTargets(where, x), carrier_hz=CARRIER, bandwidth_hz=band,
+        oversampling=oversampling, first_range_m=first, length=length, **geometry,
+    )  # fmt: skip
+    # y: bursts within the band (to -120 dB) that end within the lines.
+    n = np.arange(length)
+    y = np.zeros((32, length), complex)
+    for _ in range(30):
+        at, frequency = rng.uniform(300, 800, (32, 1)), rng.uniform(-0.15, 0.15, (32, 1))
+        y += (rng.normal(size=(32, 1, 2)) @ [1, 1j]) * np.exp(
+            -(((n - at) / 9) ** 2) + 2j * np.pi * frequency * n
+        )
+    lines = RangeLines(
+        y, first, step, tx, geometry["rx_m"], CARRIER, 1500.0, geometry["rx_velocity_m_s"]
+    )
+    image = backproject(lines, Grid.points(where), device=device, accuracy_db=-80)
+    left = np.vdot(ax.samples.astype(complex), y)
+    right = np.vdot(x, oversampling * image.pixels.astype(complex))
+    size = np.linalg.norm(x) * np.linalg.norm(oversampling * image.pixels)
+    assert abs(left) > 0.01 * size  # the two sides do not vanish
+    assert abs(left - right) <= 1e-4 * size
+
+
+def test_a_point_beyond_a_line_gets_exactly_nothing(device):
+    """Half of the grid lies beyond the end of one line, and a part before its beginning."""
+    grid = Grid.plane((0, 0, 1), (40, 42, 400))
+    track = np.zeros((1, 3))
+    lines = RangeLines(np.ones((1, 100), complex), 40.4, STEP, track, track, CARRIER, 1500.0)
+    pixels = backproject(lines, grid, device=device, taps=4, upsampling=2).pixels[:, 0]
+    place = (grid.axes_m[1] - 40.4) / STEP
+    inside = (place >= 0) & (place <= 99)
+    beyond = (place < -2) | (place > 99 + 2)  # a filter: 4 taps at twice the rate
+    assert beyond.sum() > 250
+    assert not pixels[beyond].any()
+    assert np.all(np.abs(pixels[inside]) > 0.3)
+
+
+def test_far_parts_of_a_grid_get_exactly_nothing(device):
+    """Points from 1 m to 1000 km, of which one line sees 40 to 43 m."""
+    rng = np.random.default_rng(4)
+    away = np.concatenate([10 ** rng.uniform(0, 6, 500), rng.uniform(40.5, 42.5, 50)])
+    way = rng.normal(size=(550, 3))
+    grid = Grid.points(way * (away / np.linalg.norm(way, axis=1))[:, None])
+    lines = RangeLines(noise(1, 500), 40.0, STEP, [0, 0, 0], [0, 0, 0], CARRIER, 1500.0)
+    preparation = prepare(lines, grid, device=device, **FINE)
+    pixels = execute(preparation).pixels
+    place = (away - 40) / STEP
+    beyond = (place < -3) | (place > 502)
+    assert beyond.sum() > 400
+    assert not pixels[beyond].any()
+    assert relative_error_db(pixels, same_interpolator(preparation, grid.points_m)) <= -80
+
+
+# Invariants
+
+
+def rotation(seed):
+    q, r = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))
+    q *= np.sign(np.diag(r))
+    return q * np.linalg.det(q)
+
+
+@pytest.mark.parametrize("case", [bistatic, moving, oriented], ids=lambda case: case.__name__)
+@pytest.mark.parametrize("motion", ["shift", "rotation"])
+def test_where_the_scene_lies_does_not_matter(case, platform, motion):
+    lines, grid = made(case)
+    turn = rotation(1) if motion == "rotation" else np.eye(3)
+    shift = np.array([1024.5, -512.25, 64.125]) if motion == "shift" else np.zeros(3)
+    velocity = lines.rx_velocity_m_s
+    there = dataclasses.replace(
+        lines,
+        tx_m=lines.tx_m @ turn.T + shift,
+        rx_m=lines.rx_m @ turn.T + shift,
+        rx_velocity_m_s=None if velocity is None else velocity @ turn.T,
+    )
+    grid_there = Grid.oriented(
+        turn @ grid.origin_m + shift, turn @ grid.row_step_m, turn @ grid.column_step_m, grid.shape
+    )
+    image = backproject(there, grid_there, device=platform, **FINE)
+    assert relative_error_db(image.pixels, backproject(lines, grid, device=platform, **FINE)) <= -80
+
+
+def test_transmitter_and_receiver_may_be_exchanged(platform):
+    lines, grid = made(bistatic)
+    exchanged = dataclasses.replace(lines, tx_m=lines.rx_m, rx_m=lines.tx_m)
+    one, other = (backproject(each, grid, device=platform, **FINE) for each in (lines, exchanged))
+    assert relative_error_db(other, one) <= -100
+
+
+@pytest.mark.parametrize("case", [bistatic, height_map], ids=lambda case: case.__name__)
+def test_a_receiver_that_stands_still_may_be_called_moving(case, platform):
+    lines, grid = made(case)
+    still = dataclasses.replace(lines, rx_velocity_m_s=[0.0, 0, 0])
+    image = backproject(still, grid, device=platform, **FINE)
+    assert relative_error_db(image, backproject(lines, grid, device=platform, **FINE)) <= -100
+
+
+def similar_lines(grid):
+    """Lines of one power spectrum, so that any part of them gets the same interpolator."""
+    lines = lines_over(grid, APERTURE, carrier_hz=CARRIER, step_m=STEP)
+    turn = np.exp(2j * np.pi * np.random.default_rng(5).random((640, 1)))
+    return dataclasses.replace(lines, samples=lines.samples[:1] * turn)
+
+
+@pytest.mark.parametrize("case", ["plane", "heights"])
+@pytest.mark.parametrize(("first", "most_db"), [(70, -120), (7, -105)])
+def test_parts_add_up_to_the_whole(platform, case, first, most_db):
+    """Few channels may be computed in smaller tiles, which round otherwise."""
+    grid = patch(1.3, 42)
+    if case == "heights":
+        grid = grid.with_height(np.full(grid.shape, 0.25))
+    lines = similar_lines(grid)
+    image = None
+    for part in (slice(0, first), slice(first, 300), slice(300, 640)):
+        image = backproject(lines.select(part), grid, device=platform, accumulate=image, **FINE)
+    whole = backproject(lines, grid, device=platform, **FINE)
+    assert relative_error_db(image, whole) <= most_db
+
+
+def test_accumulation_leaves_its_argument_alone(platform):
+    grid = patch(1.3, 42, 5, 3)
+    lines = thesis_lines(grid, APERTURE[::64])
+    before = Image(np.full((3, 5), 1 + 2j), patch(1.3, 42, 5, 3))  # an equal grid, not the same
+    image = backproject(lines, grid, device=platform, accumulate=before)
+    alone = backproject(lines, grid, device=platform)
+    np.testing.assert_array_equal(before.pixels, np.full((3, 5), 1 + 2j))
+    np.testing.assert_array_equal(image.pixels, before.pixels + alone.pixels)
+
+
+def test_the_order_of_channels_does_not_matter(platform):
+    lines, grid = made(own_starts)
+    lines = lines.select(slice(0, 200))
+    order = np.random.default_rng(6).permutation(200)
+    image = backproject(lines.select(order), grid, device=platform, **FINE)
+    assert relative_error_db(image, backproject(lines, grid, device=platform, **FINE)) <= -110
+
+
+def test_it_is_linear(platform):
+    one, grid = made(own_starts)
+    other = dataclasses.replace(one, samples=noise(one.channels, one.length, seed=9))
+    a, b = 0.3 - 2j, 1.5j
+    both = dataclasses.replace(one, samples=a * one.samples + b * other.samples)
+    image, of_one, of_other = (
+        backproject(lines, grid, device=platform, **FINE).pixels for lines in (both, one, other)
+    )
+    assert relative_error_db(image, a * of_one + b * of_other) <= -90
+
+
+def test_it_gives_the_same_twice(platform):
+    first, second = (backproject(*made(bistatic), device=platform).pixels for _ in range(2))
+    np.testing.assert_array_equal(first, second)
+
+
+def test_part_of_a_grid_is_part_of_the_image(platform):
+    lines, grid = made(bistatic)
+    whole = backproject(lines, grid, device=platform, **FINE).pixels[5:30, 3:20]
+    part = backproject(lines, grid.window(slice(5, 30), slice(3, 20)), device=platform, **FINE)
+    assert relative_error_db(part, whole) <= -80
+
+
+# Progress and interruption
+
+
+@pytest.mark.parametrize("case", [bistatic, points], ids=lambda case: case.__name__)
+def test_progress_rises_to_its_end(platform, case):
+    calls = []
+    backproject(*made(case), device=platform, progress=lambda *call: calls.append(call))
+    done, total = np.array(calls).T
+    assert len(calls) >= 2
+    assert np.all(np.diff(done) > 0)
+    assert np.all(total == total[0])
+    assert done[-1] == total[0]
+
+
+def test_an_interrupted_run_leaves_the_device_usable(platform):
+    def interrupt(done, total):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        backproject(*made(bistatic), device=platform, progress=interrupt)
+    assert rounding_error_db(bistatic, platform) <= -80
+
+
+# Bad input
+
+
+@pytest.fixture(scope="module")
+def good():
+    grid = patch(1.3, 42, 4, 4)
+    return {"lines": thesis_lines(grid, APERTURE[::64]), "grid": grid}
+
+
+@pytest.mark.parametrize(
+    ("argument", "value", "error", "says"),
+    [
+        ("lines", np.zeros((2, 3), complex), TypeError, "lines must be .*RangeLines.*ndarray"),
+        ("grid", (5, 5), TypeError, "grid must be .*Grid.*tuple"),
+        (
+            "grid",
+            Grid.plane((-1, 1, 10**6), (30, 31, 10**6)),
+            ValueError,
+            "grid must ask for at most .* GiB",
+        ),
+        ("device", 1.5, TypeError, "device must be .*1.5"),
+        ("device", True, TypeError, "device must be .*True"),
+        ("accuracy_db", 0, ValueError, "accuracy_db must be .*< 0.*dB.*got 0"),
+        ("accuracy_db", -86, ValueError, "accuracy_db must be .*>= -85.*got -86"),
+        ("accuracy_db", np.nan, ValueError, "accuracy_db .*finite.*nan"),
+        ("accuracy_db", None, TypeError, "accuracy_db must be .*None"),
+        ("accuracy_db", "-60 dB", TypeError, "accuracy_db must be .*-60 dB"),
+        ("taps", 5, ValueError, r"taps must be one of \(2, 4, 6, 8\), got 5"),
+        ("taps", 0, ValueError, "taps must be one of .*got 0"),
+        ("taps", 4.5, ValueError, "taps must be one of .*got 4.5"),
+        ("upsampling", 0.9, ValueError, "upsampling must be .*>= 1.*got 0.9"),
+        ("upsampling", 1e9, ValueError, "upsampling must be .*<= 64.*got 1e"),
+        ("upsampling", np.inf, ValueError, "upsampling .*finite.*inf"),
+        ("beam", 20.0, TypeError, "beam must be .*BeamWindow.*float"),
+        ("accumulate", np.zeros((4, 4), complex), TypeError, "accumulate must be .*Image"),
+    ],
+)
+def test_bad_arguments_are_named(good, argument, value, error, says):
+    with pytest.raises(error, match=says):
+        backproject(**(good | {argument: value}))
+
+
+def test_taps_of_another_kind_are_refused_by_name(good):
+    with pytest.raises((TypeError, ValueError), match="taps"):
+        backproject(**good, taps=4.0)
+
+
+def test_an_accuracy_out_of_reach_says_what_is_within(good):
+    with pytest.raises(ValueError, match=r"accuracy_db=-80.* taps=2; the best there is -\d"):
+        backproject(**good, accuracy_db=-80, taps=2)
+
+
+@pytest.mark.parametrize("other", [patch(1.3, 42.1, 4, 4), patch(1.3, 42, 4, 5)])
+def test_accumulation_needs_the_same_grid(good, other):
+    image = Image(np.zeros(other.shape, complex), other)
+    with pytest.raises(ValueError, match="accumulate must be an image on the same grid"):
+        backproject(**good, accumulate=image)
+
+
+def test_a_wrong_grid_is_named_also_beside_an_image(good):
+    image = Image(np.zeros((4, 4), complex), good["grid"])
+    with pytest.raises(TypeError, match="grid must be"):
+        backproject(good["lines"], "grid", accumulate=image)
+
+
+@pytest.mark.parametrize("kind", ["plane", "points"])
+@pytest.mark.parametrize("y", [4.0, 400.0, -4000.0])
+def test_a_grid_that_no_line_reaches_warns_and_is_zero(good, platform, y, kind):
+    grid = patch(1.3, y, 9, 7)
+    if kind == "points":
+        grid = Grid.points(grid.positions_m())
+    with pytest.warns(ClsasWarning, match=r"span 41\.\d+ to 4\d\.\d+ m, the grid lies at .*\d m"):
+        image = backproject(good["lines"], grid, device=platform)
+    assert not image.pixels.any()
+
+
+def test_the_warning_points_at_the_caller(good):
+    with pytest.warns(ClsasWarning) as caught:
+        backproject(good["lines"], patch(1.3, 400, 2, 2))
+    assert caught[0].filename == __file__
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (4, 4)])
+def test_a_small_grid_just_short_of_a_line_warns_too(platform, shape):
+    """What a tile holds beyond the grid's own pixels does not count."""
+    grid = Grid.oriented([0, 42, 0], [0, 0.01, 0], [0.01, 0, 0], shape)
+    lines = RangeLines(noise(1, 500), 42.08, STEP, [0, 0, 0], [0, 0, 0], CARRIER, 1500.0)
+    with pytest.warns(ClsasWarning, match="no pixel"):
+        image = backproject(lines, grid, device=platform)
+    assert not image.pixels.any()
+
+
+def test_lines_of_zeros_give_zeros_without_a_warning(good, platform):
+    lines = dataclasses.replace(good["lines"], samples=np.zeros_like(good["lines"].samples))
+    assert not backproject(lines, good["grid"], device=platform).pixels.any()
+
+
+def test_one_sample_is_a_line(platform):
+    """The shortest line: a pulse as wide as a sample."""
+    grid = Grid.points([[0, 42, 0], [0, 42 + 4 * STEP, 0]])
+    lines = RangeLines([[2 - 1j]], 42.0, STEP, [0, 0, 0], [0, 0, 0], CARRIER, 1500.0)
+    pixels = backproject(lines, grid, device=platform, taps=8, upsampling=8).pixels
+    phase = np.exp(2j * lines.wavenumber_rad_m * 42.0)
+    assert pixels[0] == pytest.approx((2 - 1j) * phase, abs=2e-3)
+    assert pixels[1] == 0
+
+
+def test_a_device_may_be_named(good):
+    for info in list_devices():
+        by_index = backproject(**good, device=info.index)
+        by_name = backproject(**good, device=info.label)
+        np.testing.assert_array_equal(by_index.pixels, by_name.pixels)

@@ -1,0 +1,200 @@
+import dataclasses
+
+import numpy as np
+import pytest
+from cases import along_x, beside, patch
+
+from clsas.core.grid import Grid
+from clsas.exact.tiles import BLOCKS, GEOMETRY_ERROR, STACK, Groups, Tiles, allowed, lay_out
+from clsas.sonar.beam import BeamWindow
+
+CYCLES_PER_M = 2 * 1e6 / 1500
+TRACK = along_x(20, 0.2)
+WIDTHS = sorted(BLOCKS)
+
+
+def positions_of(layout):
+    """Position of every pixel slot, float64 [parts, part_pixels, 3]."""
+    if isinstance(layout, Groups):
+        return layout.centre_m[:, None] + layout.offset_m
+    local = np.arange(layout.side) - (layout.side - 1) / 2
+    row, column = local[:, None, None], local[:, None]
+    offsets = row * layout.grid.row_step_m + column * layout.grid.column_step_m
+    return layout.centres_m(slice(None))[:, None] + offsets.reshape(-1, 3)
+
+
+def distances_of(layout):
+    return np.linalg.norm(positions_of(layout) - layout.centres_m(slice(None))[:, None], axis=-1)
+
+
+def scattered(points, size_m, seed=0):
+    return Grid.points(
+        beside(np.random.default_rng(seed).uniform(0, size_m, (points, 3)), 0, 40, 0)
+    )
+
+
+@pytest.mark.parametrize("width", WIDTHS)
+def test_a_far_plane_is_cut_into_tiles(width):
+    assert isinstance(lay_out(patch(0, 40), TRACK, CYCLES_PER_M, width), Tiles)
+
+
+@pytest.mark.parametrize(
+    "grid",
+    [
+        patch(0, 0.1),
+        patch(0, 40).with_height(np.zeros((33, 40))),
+        Grid.points(patch(0, 40).positions_m()),
+        Grid.plane((0, 100, 50), (40, 140, 50)),
+    ],
+    ids=["near", "heights", "points", "coarse"],
+)
+def test_everything_else_is_grouped(grid):
+    assert isinstance(lay_out(grid, TRACK, CYCLES_PER_M, 16), Groups)
+
+
+def test_tiles_shrink_towards_the_antennas():
+    fine = {"pitch": 0.5e-3}
+    sides = [lay_out(patch(0, y, **fine), TRACK, CYCLES_PER_M, 16).side for y in (40.0, 3.0, 1.0)]
+    assert sides[0] > sides[-1]
+    assert sides == sorted(sides, reverse=True)
+
+
+def test_tiles_shrink_where_a_beam_amplifies_errors_of_weights():
+    """As in a normalised image next to the edge of what is seen."""
+    grid, beam = patch(0, 4, pitch=2e-2), BeamWindow(18, "hamming")
+    found = [
+        lay_out(grid, TRACK, 20.0, 8, error=allowed(-31), beam=beam, fullness=fullness)
+        for fullness in (1.0, 0.1, 0.001)
+    ]
+    sides = [each.side if isinstance(each, Tiles) else 0 for each in found]
+    assert sides[0] > sides[-1]
+    assert sides == sorted(sides, reverse=True)
+
+
+# Tiles
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (16, 16), (17, 33), (100, 5)])
+@pytest.mark.parametrize("side", [16, 32])
+def test_tiles_hold_every_pixel_where_it_lies(shape, side):
+    grid = Grid.oriented([3, 40, -2], [0.001, 0.01, 0], [0.01, 0.002, 0.003], shape)
+    tiles = Tiles(grid, side, 4)
+    padded = (
+        positions_of(tiles)
+        .reshape(tiles.down, tiles.across, side, side, 3)
+        .swapaxes(1, 2)
+        .reshape(tiles.down * side, tiles.across * side, 3)
+    )
+    np.testing.assert_allclose(padded[: shape[0], : shape[1]], grid.positions_m(), atol=1e-12)
+    assert tiles.parts == tiles.down * tiles.across
+    assert (tiles.down - 1) * side < shape[0] <= tiles.down * side
+
+
+def test_tiles_collect_rows_of_the_padded_plane():
+    tiles = Tiles(patch(0, 40, 40, 33), 16, 4)
+    padded = np.arange(48 * 48).reshape(48, 48).astype(np.complex64)
+    image = tiles.collect(padded.ravel())
+    np.testing.assert_array_equal(image, padded[:33, :40])
+    assert image.flags.c_contiguous
+
+
+def test_the_radius_of_a_tile_is_its_largest_distance():
+    grid = Grid.oriented([3, 40, -2], [0.008, 0.01, 0], [0.01, 0.002, 0.003], (40, 40))
+    tiles = Tiles(grid, 16, 4)
+    assert tiles.radius_m == pytest.approx(distances_of(tiles).max(), rel=1e-12)
+
+
+def test_centres_of_some_tiles_are_some_of_the_centres():
+    tiles = Tiles(patch(0, 40, 100, 90), 16, 4)
+    np.testing.assert_array_equal(tiles.centres_m(slice(5, 9)), tiles.centres_m(slice(None))[5:9])
+
+
+# Groups
+
+GRIDS = {
+    "one": scattered(1, 1.0),
+    "few": scattered(5, 1e-3),
+    "volume": scattered(700, 0.3),
+    "sparse": scattered(300, 1e4),
+    "same": Grid.points(np.tile([1.0, 40, 0], (333, 1))),
+    "cube": Grid.points(beside(np.random.default_rng(1).uniform(0, 0.1, (3, 4, 5, 3)), 0, 40, 0)),
+    "row": Grid.points(patch(0, 40, 200, 1).positions_m()),
+    "heights": patch(0, 40, 37, 35).with_height(np.random.default_rng(2).normal(0, 0.1, (35, 37))),
+    "cliff": patch(0, 40, 37, 35).with_height(np.arange(35 * 37).reshape(35, 37) % 7 * 30.0),
+    "near": patch(-0.1, 0.01, 37, 35),
+}
+
+
+@pytest.fixture(params=GRIDS.values(), ids=GRIDS.keys())
+def grid(request):
+    return request.param
+
+
+@pytest.mark.parametrize("width", WIDTHS)
+def test_groups_hold_every_pixel_where_it_lies(grid, width):
+    groups = lay_out(grid, TRACK, CYCLES_PER_M, width)
+    assert isinstance(groups, Groups)
+    assert groups.index.shape == (groups.parts, STACK * width) == groups.offset_m.shape[:2]
+    np.testing.assert_array_equal(np.unique(groups.index), np.arange(grid.size))
+    wanted = grid.positions_m().reshape(-1, 3)[groups.index]
+    rounding = np.abs(groups.offset_m).max() * 2.0**-24 + 1e-14 * np.abs(wanted).max()
+    np.testing.assert_allclose(positions_of(groups), wanted, atol=rounding)
+
+
+@pytest.mark.parametrize("width", WIDTHS)
+@pytest.mark.parametrize("cycles_per_m", [1.0, CYCLES_PER_M, 1e6])
+def test_groups_stay_within_the_radius_that_float32_allows(grid, width, cycles_per_m):
+    groups = lay_out(grid.with_height(np.zeros(grid.shape)) if grid.is_planar else grid, TRACK,
+                     cycles_per_m, width)  # fmt: skip
+    assert isinstance(groups, Groups)
+    assert groups.radius_m == pytest.approx(distances_of(groups).max(), rel=1e-6)
+    # Half a unit in the last place of a phase of so many cycles.
+    phase_error = 2 * np.pi * groups.radius_m * cycles_per_m * 2.0**-24
+    assert phase_error <= 3 * GEOMETRY_ERROR
+
+
+@pytest.mark.parametrize("width", WIDTHS)
+@pytest.mark.parametrize("name", ["few", "volume", "same", "cube", "row", "heights", "near"])
+def test_neighbours_share_a_group(name, width):
+    """Groups are few: pixels that lie close together are not spread over many."""
+    grid = GRIDS[name]
+    groups = lay_out(grid, TRACK, 1.0, width)
+    assert groups.parts <= 2 * -(-grid.size // (STACK * width)) + 8
+
+
+def test_groups_collect_every_pixel(grid):
+    groups = lay_out(grid, TRACK, CYCLES_PER_M, 4)
+    image = groups.collect(groups.index.ravel().astype(np.complex64))
+    np.testing.assert_array_equal(image, np.arange(grid.size).reshape(grid.shape))
+
+
+@pytest.mark.parametrize("width", WIDTHS)
+def test_blocks_are_no_larger_than_groups(grid, width):
+    groups = lay_out(grid, TRACK, CYCLES_PER_M, width)
+    assert groups.block_radius_m <= 2 * groups.radius_m * (1 + 1e-6)
+    if width == 1:
+        assert groups.block_radius_m == 0
+
+
+def test_a_plane_without_a_carrier_is_laid_out_too():
+    layout = lay_out(patch(0, 40), TRACK, 0.0, 16)
+    assert layout.parts >= 1
+    heights = dataclasses.replace(patch(0, 40), height_m=np.zeros((33, 40)))
+    assert np.isfinite(lay_out(heights, TRACK, 0.0, 16).radius_m)
+
+
+@pytest.mark.parametrize("width", WIDTHS)
+def test_no_pixel_is_further_than_allowed_from_where_its_samples_are_looked_up(width):
+    grid = Grid.oriented([0, 40, 0], [0.001, 0.004, 0.003], [0.004, 0.0025, -0.001], (64, 64))
+    tiles, (rows, columns) = Tiles(grid, 64, width), BLOCKS[width]
+    item = np.arange(STACK * rows * columns).reshape(STACK * rows, columns)
+    row, column = np.divmod(item, columns)
+    place_m = row[..., None] * grid.row_step_m + column[..., None] * grid.column_step_m
+    found = set()
+    for most_m in np.geomspace(1e-4, 0.2, 60):
+        parts = tiles.windows(most_m)
+        found.add(parts)
+        for part in np.split(place_m, parts) if parts else []:
+            middle_m = part[:, max(columns // 2 - 1, 0)].mean(axis=0)
+            assert np.linalg.norm(part - middle_m, axis=-1).max() <= most_m * (1 + 1e-9)
+    assert found == {0, 1, 2, STACK}

@@ -1,0 +1,323 @@
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+from factorizing import (
+    BEAMS,
+    EXACT_IS_SLOW,
+    around,
+    made,
+    moving_array,
+    over,
+    peak_device_bytes,
+    planned,
+    straight,
+    swaying,
+)
+
+from clsas.core.grid import Grid
+from clsas.exact.backprojection import backproject
+from clsas.factorized.plan import Plan, grid_digest, lines_digest
+from clsas.opencl.device import open_device
+from clsas.planning import costs
+from clsas.planning.planner import plan
+from clsas.sonar.beam import BeamWindow
+
+
+@pytest.fixture(scope="module")
+def chosen():
+    return planned(swaying, -50)
+
+
+@pytest.fixture(scope="module")
+def given_stages():
+    return plan(*made(straight), stages=[(4, 2), (4, 2)])
+
+
+@pytest.fixture(scope="module")
+def exact():
+    return plan(*made(straight), stages=[])
+
+
+@pytest.fixture(params=["chosen", "given_stages", "exact"])
+def any_plan(request):
+    return request.getfixturevalue(request.param)
+
+
+# Text
+
+
+def changeable(plan):
+    """A plan's JSON as a dict that may be changed: without its digest."""
+    values = json.loads(plan.to_json())
+    del values["digest"]
+    return values
+
+
+def test_text_gives_the_same_plan(any_plan):
+    again = Plan.from_json(any_plan.to_json())
+    assert again.to_json() == any_plan.to_json()
+    for field in dataclasses.fields(Plan):
+        if field.name not in ("align", "aperture", "final", "upsampler", "beam"):
+            assert getattr(again, field.name) == getattr(any_plan, field.name), field.name
+
+
+@pytest.mark.parametrize("along", [None, [1.0, 0.1, 0], "every channel"])
+def test_text_holds_the_beam(along):
+    lines, grid = made(straight)
+    if along == "every channel":
+        along = np.tile([1.0, 0.02, 0], (lines.channels, 1))
+    beam = dataclasses.replace(BEAMS[2], along=along)
+    chosen = plan(lines, grid, tolerance_db=-40, beam=beam, costs=EXACT_IS_SLOW)
+    again = Plan.from_json(chosen.to_json()).beam
+    q = np.linspace(-1, 1, 1000)
+    np.testing.assert_array_equal(again.weights(q), beam.weights(q))
+    np.testing.assert_allclose(again.directions(lines), beam.directions(lines), atol=1e-15)
+
+
+@pytest.mark.parametrize(
+    "text", ["", "{", "[]", "{}", "null", "5", "NaN", "\x00", '"plan"', "[[]]", None, 5]
+)
+def test_text_that_is_no_plan_is_refused(text):
+    with pytest.raises((ValueError, TypeError), match=r"text must be a plan as of Plan\.to_json"):
+        Plan.from_json(text)
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("sides", "ab"),
+        ("sides", [[0, 0]]),
+        ("sides", [[64, 64], [48, 16]]),
+        ("sides", None),
+        ("tile", [3, 3]),
+        ("tile", [16]),
+        ("align", "filter"),
+        ("align", None),
+        ("aperture", None),
+        ("final", None),
+        ("resampling", None),
+        ("resampling", {}),
+        ("upsampler", 3),
+        ("upsampler", {}),
+        ("upsampler", {"step": 0, "coefficients": [[0.0] * 16] * 32, "error_db": -60.0}),
+        ("upsampler", {"step": 20, "coefficients": [[0.0] * 16] * 31, "error_db": -60.0}),
+        ("upsampler", {"step": 20, "coefficients": [[float("nan")] * 16] * 32, "error_db": 0.0}),
+        ("half_precision", 1),
+        ("half_precision", None),
+        ("limits", [0.1, 0.2]),
+        ("crowding", [1e9, 1e9, 1e9]),
+        ("beam_cycles", 1e9),
+        ("tile", [16, 4]),
+        ("half_lengths", []),
+        ("half_lengths", "ab"),
+        ("half_lengths", [-5, -5, -5]),
+        ("highest_cycles_per_m", "many"),
+        ("roots_at_once", 0),
+        ("stages", [1]),
+        ("beam", 7),
+        ("predicted_error_db", "low"),
+        ("tolerance_db", "low"),
+        ("tolerance_db", []),
+        ("nearest", ["x"]),
+    ],
+)
+def test_a_plan_with_a_wrong_value_is_refused(chosen, field, value):
+    """Before a device reads what is not there."""
+    values = changeable(chosen)
+    with pytest.raises((ValueError, TypeError)):
+        Plan.from_json(json.dumps(values | {field: value}))
+
+
+@pytest.mark.parametrize("coefficients", ["none", [[1.0]], [[[None]]], []])
+@pytest.mark.parametrize("name", ["align", "aperture", "final"])
+def test_a_filter_that_is_none_is_refused(chosen, name, coefficients):
+    values = changeable(chosen)
+    values[name]["coefficients"] = coefficients
+    with pytest.raises((ValueError, TypeError)):
+        Plan.from_json(json.dumps(values))
+
+
+def test_a_plan_with_a_field_too_many_or_too_few_is_refused(chosen):
+    values = changeable(chosen)
+    with pytest.raises(ValueError, match="unknown"):
+        Plan.from_json(json.dumps(values | {"unknown": 1}))
+    del values["sides"]
+    with pytest.raises(ValueError, match="sides"):
+        Plan.from_json(json.dumps(values))
+
+
+# What it is
+
+
+def test_it_is_immutable(any_plan):
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        any_plan.tolerance_db = -20.0
+    for each in (any_plan, Plan.from_json(any_plan.to_json())):
+        for name in ("sides", "tile", "nearest", "half_lengths", "stages"):
+            assert isinstance(getattr(each, name), tuple), name
+
+
+def test_a_changed_number_is_found(chosen):
+    text = chosen.to_json()
+    Plan.from_json(json.dumps(json.loads(text), indent=None, sort_keys=True))  # says the same
+    position = text.index('"coefficients"') + 60
+    position += next(i for i, c in enumerate(text[position:]) if c in "12345678")
+    changed = text[:position] + str(int(text[position]) + 1) + text[position + 1 :]
+    with pytest.raises(ValueError, match="its digest differs"):
+        Plan.from_json(changed)
+
+
+@pytest.mark.parametrize("text", ["[" * 100_000, '{"a":' * 100_000, "[]", "5", "", "{", '{"a": 1}'])
+def test_other_text_is_no_plan(text):
+    with pytest.raises(ValueError, match=r"text must be a plan as of Plan\.to_json"):
+        Plan.from_json(text)
+
+
+@pytest.mark.parametrize("name", ["align", "aperture", "final"])
+def test_its_filters_are_read_only(chosen, name):
+    for each in (chosen, Plan.from_json(chosen.to_json())):
+        with pytest.raises(ValueError, match="read-only"):
+            getattr(each, name).coefficients[...] = 0
+
+
+def test_its_stages_divide_those_before(chosen, given_stages):
+    for each in (chosen, given_stages):
+        for (rows, columns), (fewer_rows, fewer_columns) in zip(
+            each.sides[:-1], each.sides[1:], strict=True
+        ):
+            assert rows % fewer_rows == columns % fewer_columns == 0
+            assert (rows, columns) != (fewer_rows, fewer_columns)
+        assert each.sides[-1][0] % each.tile[0] == each.sides[-1][1] % each.tile[1] == 0
+
+
+def test_it_describes_itself(chosen):
+    text = chosen.describe()
+    assert "tolerance -50 dB" in text
+    assert f"predicted error {chosen.predicted_error_db:.1f} dB" in text
+    lines = text.splitlines()
+    assert max(map(len, lines[1:])) <= 100
+    table = [line for line in lines[2:] if line.split()[0] != "stage"]
+    assert len(table) == len(chosen.sides) + 1
+    for (rows, columns), line in zip(chosen.sides, table, strict=False):
+        assert f"{rows} x {columns}" in line
+    assert len({len(line) for line in table}) == 1  # columns that line up
+
+
+@pytest.mark.parametrize(("asked", "told"), [(-12.338089, "-12.34 dB"), (-50.5, "-50.5 dB")])
+def test_a_tolerance_is_told_sensibly(chosen, asked, told):
+    text = dataclasses.replace(chosen, tolerance_db=asked).describe()
+    assert f"tolerance {told};" in text
+
+
+def test_given_stages_describe_themselves(given_stages):
+    text = given_stages.describe()
+    assert "stages as given" in text
+    assert "sums of 4, 4 neighbours" in text
+
+
+def test_plain_backprojection_says_so(exact):
+    assert "Plain backprojection" in exact.describe()
+    # Nobody asked for a tolerance.
+    assert "nearest beam" not in exact.describe()
+
+
+@pytest.mark.parametrize("beam", [None, BeamWindow(8, "hann", normalise=True)], ids=str)
+@pytest.mark.parametrize("case", [straight, moving_array, "points", "one pixel", "few channels"])
+def test_device_memory_of_plain_backprojection(monkeypatch, case, beam):
+    if case == "points":
+        lines, grid = over(Grid.points(around(0, 40).positions_m()))
+    elif callable(case):
+        lines, grid = made(case)
+    else:
+        lines, grid = over(around(0, 40, shape=(1, 1) if case == "one pixel" else (150, 160)))
+        lines = lines.select(slice(100, 220)) if case == "few channels" else lines
+    planned = plan(lines, grid, stages=[], beam=beam).memory_bytes
+    peak = peak_device_bytes(
+        monkeypatch, lambda: backproject(lines, grid, accuracy_db=-60, beam=beam), None
+    )
+    assert 0.5 * planned <= peak <= 1.01 * planned
+
+
+# Digests
+
+
+def changed_lines():
+    lines, _ = made(straight)
+    yield "tx_m", lines.tx_m + [1e-9, 0, 0]
+    yield "rx_m", lines.rx_m + [0, 0, 1e-9]
+    yield "first_range_m", lines.first_range_m + 1e-9
+    yield "range_step_m", lines.range_step_m * (1 + 1e-12)
+    yield "carrier_hz", lines.carrier_hz + 1e-6
+    yield "sound_speed_m_s", lines.sound_speed_m_s + 1e-6
+    yield "rx_velocity_m_s", [1e-9, 0, 0]
+    yield "samples", lines.samples[:, :-1]
+
+
+def test_lines_of_another_geometry_are_other_lines():
+    lines, _ = made(straight)
+    for field, value in changed_lines():
+        other = dataclasses.replace(lines, **{field: value})
+        assert lines_digest(other) != lines_digest(lines), field
+
+
+def test_louder_lines_are_the_same_lines():
+    lines, _ = made(straight)
+    louder = dataclasses.replace(lines, samples=2 * lines.samples)
+    assert lines_digest(louder) == lines_digest(lines)
+
+
+def test_grids_are_told_apart():
+    grid = around(0, 40, shape=(4, 6))
+    others = (
+        around(1e-9, 40, shape=(4, 6)),
+        around(0, 40, shape=(6, 4)),
+        around(0, 40, shape=(4, 6), z=1e-9),
+        around(0, 40, shape=(4, 6), pixel_m=(0.015, 0.0151)),
+        grid.with_height(np.zeros((4, 6))),
+        type(grid).points(grid.positions_m()),
+    )
+    assert len({grid_digest(each) for each in (grid, *others)}) == 7
+    assert grid_digest(around(0, 40, shape=(4, 6))) == grid_digest(grid)
+
+
+def test_a_plan_knows_its_lines_and_grid(chosen):
+    lines, grid = made(swaying)
+    chosen.check(lines, grid)
+    other_lines, _ = over(around(0, 40))
+    with pytest.raises(ValueError, match="another line geometry"):
+        chosen.check(other_lines, grid)
+    with pytest.raises(ValueError, match="another grid geometry"):
+        chosen.check(lines, around(0, 41))
+
+
+def test_it_says_whether_times_are_of_this_device(chosen, monkeypatch, tmp_path):
+    lines, grid = made(straight)
+    monkeypatch.setenv("CLSAS_CACHE", str(tmp_path))
+    usual = plan(lines, grid, tolerance_db=-50)
+    assert not usual.calibrated
+    words = "Times follow from default costs, not from any measured on this device: `clsas calib"
+    assert words in usual.describe()
+    assert words in plan(lines, grid, stages=[]).describe()
+    device = open_device()
+    costs.save(device, costs.defaults(device))
+    measured = plan(lines, grid, tolerance_db=-50)
+    assert measured.calibrated
+    assert "default costs" not in measured.describe()
+    assert Plan.from_json(usual.to_json()).calibrated is False
+
+
+def test_json_may_leave_out_filters(chosen):
+    short, whole = chosen.to_json(filters=False), chosen.to_json()
+    assert len(short) < 0.5 * len(whole)
+    left_out = {"coefficients"}
+    values = json.loads(whole)
+    del values["digest"]  # which is of whole plans
+    assert values.keys() == json.loads(short).keys()
+    for name, value in values.items():
+        if isinstance(value, dict):
+            value = {key: part for key, part in value.items() if key not in left_out}
+        assert json.loads(short)[name] == value
+    with pytest.raises(ValueError, match=r"a plan as of Plan\.to_json: it lacks 'coef"):
+        Plan.from_json(short)

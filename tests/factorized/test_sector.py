@@ -1,0 +1,155 @@
+import numpy as np
+import pytest
+from factorizing import BEAMS, EXACT_IS_SLOW, around, over, swaying
+
+from clsas.core.geometry import bistatic_range_m
+from clsas.factorized import tree
+from clsas.factorized.sector import Geometry
+from clsas.factorized.surface import surface_of
+from clsas.planning.planner import plan
+from clsas.sonar.beam import BeamWindow
+from clsas.trials import bench
+
+HANN = BEAMS[0]
+
+
+@pytest.fixture(scope="module")
+def wide():
+    """A beam that leaves most of the track unseen, over a scene beyond both ends of it."""
+    case = bench.scaled(512)
+    lines, grid = case.lines(), case.grid
+    chosen = plan(lines, grid, tolerance_db=-40, beam=case.beam, costs=EXACT_IS_SLOW)
+    return Geometry(lines, surface_of(grid), chosen)
+
+
+def beside():
+    grid = around(0, 12, pixel_m=(0.015, 0.05), shape=(130, 150))
+    track = np.stack([(np.arange(700) - 349.5) * 0.012, *np.zeros((2, 700))], axis=1)
+    return over(grid, track)[0], grid
+
+
+@pytest.fixture(scope="module", params=["whole", "gap"])
+def any_track(request, wide):
+    """The same, and with pings missing over more than a root and its beam."""
+    if request.param == "whole":
+        return wide
+    case = bench.scaled(512)
+    lines = case.lines()
+    lines = lines.select(np.flatnonzero(np.abs(lines.tx_m[:, 0] - 2) > 8))
+    beam = BeamWindow(3.0, "hann")
+    chosen = plan(lines, case.grid, tolerance_db=-40, beam=beam, costs=EXACT_IS_SLOW)
+    return Geometry(lines, surface_of(case.grid), chosen)
+
+
+# What is formed
+
+
+def test_what_is_formed_is_what_was_planned(wide):
+    sector = wide.sector(wide.division.roots)
+    for level, (need, stage) in enumerate(zip(sector.needs, wide.plan.stages, strict=False)):
+        formed = (need.end - need.begin).sum() * stage.samples
+        assert 0.75 <= formed / stage.operations <= 1.35, f"stage {level + 1}"
+    pixels = np.prod(wide.plan.sides[-1]) * (need.last - need.first).sum()
+    assert 0.75 <= pixels / wide.plan.stages[-1].operations <= 1.35
+
+
+def test_both_ends_of_the_track_are_alike(wide):
+    sector = wide.sector(wide.division.roots)
+    need = sector.needs[-1]
+    x_m = sector.root_m[:, 0]
+    assert abs(x_m.min() + x_m.max()) < 0.1  # metres: pixels are mirrored but for half of one
+    left, right = ((need.last - need.first)[x_m == end].mean() for end in (x_m.min(), x_m.max()))
+    assert left == pytest.approx(right, rel=0.1, abs=1.5)
+
+
+def test_nothing_is_formed_that_no_channel_reaches(wide):
+    sector = wide.sector(wide.division.roots)
+    counts = np.full(len(sector.roots), sector.place.shape[1])
+    for nodes, need in zip(sector.nodes, sector.needs, strict=True):
+        assert (need.end <= counts[:, None]).all()
+        counts = nodes.base[np.arange(len(counts)), counts - 1] + nodes.taps
+        assert (need.last <= counts[:, None]).all()
+
+
+def test_subimages_use_what_their_parents_have(any_track):
+    wide = any_track
+    sector = wide.sector(wide.division.roots)
+    for level in range(1, len(sector.needs)):
+        need, above = sector.needs[level], sector.needs[level - 1]
+        parents, used = wide.division.parents(level), need.end > need.begin
+        assert (need.begin >= above.first[:, parents])[used].all()
+        assert (need.end <= above.last[:, parents])[used].all()
+
+
+# Together or one by one
+
+
+@pytest.mark.parametrize("case", [beside, swaying], ids=["straight", "swaying"])
+def test_roots_do_not_depend_on_those_prepared_beside_them(case):
+    lines, grid = case()
+    chosen = plan(lines, grid, tolerance_db=-40, costs=EXACT_IS_SLOW)
+    geometry = Geometry(lines, surface_of(grid), chosen)
+    roots = geometry.division.roots
+    together = geometry.sector(roots)
+    for index in range(len(roots)):
+        alone = geometry.sector(roots[index : index + 1])
+        for level, nodes in enumerate(alone.nodes):
+            count = int(alone.needs[level].last.max())
+            for name in ("first", "last", "begin", "end"):
+                mine = getattr(alone.needs[level], name)[0]
+                np.testing.assert_array_equal(mine, getattr(together.needs[level], name)[index])
+            np.testing.assert_allclose(
+                nodes.position_m[0, :count],
+                together.nodes[level].position_m[index, :count],
+                atol=1e-9,
+            )
+
+
+def test_leaves_are_seen_from_wherever_they_are_seen_alone():
+    lines, grid = beside()
+    chosen = plan(lines, grid, tolerance_db=-40, beam=HANN, costs=EXACT_IS_SLOW)
+    geometry = Geometry(lines, surface_of(grid), chosen)
+    sector = geometry.sector(geometry.division.roots)
+    last = len(geometry.plan.sides) - 1
+    leaves = geometry.division.corners(last, sector.roots)
+    half_m = np.array(geometry.plan.sides[-1])[:, None] / 2
+    half_m = half_m * [grid.row_step_m, grid.column_step_m]
+    start, stop = tree.seen_from(
+        chosen.limits,
+        geometry.track,
+        geometry.along,
+        geometry.division.centres_m(last, leaves),
+        half_m,
+    )
+    need, place = sector.needs[-1], sector.nodes[-1].place
+    counts = np.full(len(sector.roots), sector.place.shape[1])
+    for nodes in sector.nodes:  # as far as channels reach
+        counts = nodes.base[np.arange(len(counts)), counts - 1] + nodes.taps
+    inside = np.all(leaves < grid.shape, axis=-1)
+    for root, leaf in np.argwhere(inside & (stop > start)):
+        mine = np.flatnonzero(
+            (place[root] >= start[root, leaf]) & (place[root] <= stop[root, leaf])
+        )
+        mine = mine[mine < counts[root]]
+        assert need.first[root, leaf] <= mine.min()
+        assert need.last[root, leaf] > mine.max()
+
+
+# How roots see channels
+
+
+def test_references_are_ranges_and_phases(wide):
+    lines, resampling = wide.lines, wide.plan.resampling
+    sector = wide.sector(wide.division.roots[:3])
+    found = wide.references(sector)
+    line = found["order"]
+    range_m = bistatic_range_m(sector.root_m[:, None], lines.tx_m[line], lines.rx_m[line])
+    index = (range_m - lines.first_range_m[line]) / lines.range_step_m
+    centre = found["start"] + found["nu"].astype(float) + (wide.plan.align.taps - 1) / 2
+    # Of two channels the places differ as their ranges do, in upsampled samples.
+    away = (centre - centre[:, :1]) / resampling.ratio
+    np.testing.assert_allclose(away, index - index[:, :1], atol=1e-4)
+    cycles = lines.carrier_cycles_per_m * range_m
+    cycles += (index + resampling.lead) * resampling.centre_cycles_per_sample
+    wrong = found["cycles"] - cycles
+    assert np.abs(wrong - np.rint(wrong)).max() < 1e-5

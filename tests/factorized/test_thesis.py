@@ -1,0 +1,138 @@
+import numpy as np
+import pytest
+from cases import along_x, beside, patch, thesis_lines
+
+from clsas import plan
+from clsas.factorized.thesis import operations, plan_errors_m, range_error_m, stage_errors_m
+
+SPACING_M, SIDE_M, NEAREST_M = 8.25e-3, 5.0, 40.0  # THESIS chapter 5
+
+
+def largest_by_angle(half_length_m, range_m, away_rad):
+    """The largest [40] over directions of the beam and places up to some angle from it."""
+    angle = np.linspace(0, np.pi, 721)[:, None]
+    away = np.linspace(-away_rad, away_rad, 41)
+    return np.abs(range_error_m(range_m, half_length_m, angle, away)).max()
+
+
+def test_operations_of_the_worked_example():
+    counts = operations([(2, 2), (2, 2)], 640, (3757, 1990), 1024**2)
+    assert counts == [9_617_920, 10_188_800, 167_772_160]
+    assert sum(counts) == 187_578_880
+    assert operations([], 640, (), 1024**2) == [671_088_640]
+
+
+def test_operations_of_lines_that_do_not_divide():
+    # 10 lines in threes are 4; every line of a stage costs gamma more.
+    assert operations([(3, 2), (2, 1)], 10, (100, 50), 1000, gamma=5) == [
+        10 * (4 * 100 + 5),
+        4 * (4 * 50 + 5),
+        2 * 1000,
+    ]
+
+
+def test_stage_errors_far_away():
+    # 2 x 8.25 mm x 2.5 m / (4 x 40 m), in every stage of QR = QI.
+    assert stage_errors_m([(2, 2)] * 3, SPACING_M, SIDE_M, NEAREST_M) == pytest.approx(
+        [2.578125e-4] * 3, rel=1e-12
+    )
+    # Thesis 5.2.1: QI = 4, QR = 2 is lambda/11.6, not lambda/30.3.
+    (error_m,) = stage_errors_m([(2, 4)], SPACING_M, SIDE_M, NEAREST_M)
+    assert 1.5e-3 / error_m == pytest.approx(11.636, abs=1e-3)
+
+
+def test_stage_errors_near_the_aperture():
+    # Subapertures of 2, 4 and 8 m, subimages of 8, 4 and 2 m, and Rmin = 4 m.
+    assert stage_errors_m([(2, 2)] * 3, 1.0, 16.0, 4.0) == [1.0, 1.0, 1.0]
+    assert stage_errors_m([(2, 2)] * 3, 1.0, 16.0, 3.999) == [
+        16 / (4 * 3.999),
+        4 / 2,
+        2 / 2,
+    ]
+
+
+def test_range_error_against_the_places_themselves():
+    # The end of the subaperture at (t, 0); the beam's point and the other at r under a and a + b.
+    random = np.random.default_rng(1)
+    r, t = random.uniform(1, 50, 200), random.uniform(0, 50, 200)
+    a, b = random.uniform(0, np.pi, 200), random.uniform(-1, 1, 200)
+    end = np.stack([t, 0 * t])
+    places = [r * np.stack([np.cos(angle), np.sin(angle)]) for angle in (a, a + b)]
+    at_beam, away = (np.linalg.norm(place - end, axis=0) for place in places)
+    np.testing.assert_allclose(range_error_m(r, t, a, b), away - at_beam, atol=1e-12)
+
+
+@pytest.mark.parametrize("length_m", [0.0165, 5.28, 20.0, 39.9])
+@pytest.mark.parametrize("side_m", [0.1, 2.5, 20.0])
+def test_the_formula_bounds_the_sector(length_m, side_m):
+    """[40] <= [45] at every range, over the sector that a subimage's side spans across the beam."""
+    (bound_m,) = stage_errors_m([(1, 1)], length_m, side_m, NEAREST_M)
+    errors = [
+        largest_by_angle(length_m / 2, range_m, side_m / 2 / range_m)
+        for range_m in (NEAREST_M, 1.3 * NEAREST_M, 5 * NEAREST_M)
+    ]
+    assert max(errors) <= bound_m * (1 + 1e-9)
+    assert errors[0] >= 0.98 * bound_m
+
+
+@pytest.mark.parametrize("length_m", [40.1, 100.0, 1000.0])
+def test_the_formula_bounds_long_subapertures(length_m):
+    (bound_m,) = stage_errors_m([(1, 1)], length_m, 10.0, NEAREST_M)
+    largest_m = largest_by_angle(length_m / 2, NEAREST_M, 5 / NEAREST_M)
+    assert bound_m == 5
+    assert largest_m <= bound_m
+    # Tight only where half the subaperture is as long as the range: the branch changes too early.
+    assert (largest_m >= 0.98 * bound_m) == (length_m >= 2 * NEAREST_M)
+
+
+@pytest.mark.parametrize("squint_deg", [0, 7, 15, 22.5, 45, 70])
+def test_the_formula_does_not_bound_oblique_squares(squint_deg):
+    """A corner is (cos + sin) of the squint farther across the beam; the aperture shrinks by cos.
+
+    At 22.5 degrees that is (1 + sqrt 2)/2, 21 % more than [45] says.
+    """
+    (bound_m,) = stage_errors_m([(1, 1)], 0.05, 0.1, NEAREST_M)
+    squint = np.radians(squint_deg)
+    centre = NEAREST_M * np.array([np.sin(squint), np.cos(squint)])
+    place = centre + np.array([0.05, -0.05])
+    angle, beam = np.arctan2(*place[::-1]), np.arctan2(*centre[::-1])
+    error_m = abs(range_error_m(np.linalg.norm(place), 0.025, beam, angle - beam))
+    ratio = np.cos(squint) * (np.cos(squint) + np.sin(squint))
+    assert error_m / bound_m == pytest.approx(ratio, rel=0.005)
+    assert ratio <= (1 + np.sqrt(2)) / 2 + 1e-12
+
+
+STAGES = [[(2, 2)], [(3, 8)], [(8, 2)], [(2, 2)] * 3, [(4, 8), (2, 2)]]
+
+
+@pytest.mark.parametrize("stages", STAGES)
+@pytest.mark.parametrize("bistatic", [False, True])
+def test_errors_of_a_plan(stages, bistatic):
+    """Followed through the stages they stay below [45], by the place of the outermost channel."""
+    grid = patch(-SIDE_M / 2, NEAREST_M, 1024, 1024, SIDE_M / 1024)
+    tx = along_x(640, SPACING_M)
+    lines = thesis_lines(grid, tx, beside(tx, 0.05, 0.0, 0.0) if bistatic else None)
+    random = np.random.default_rng(2)
+    corners = [[0, 0], [0, 1023], [511, 511], [512, 512], [1023, 0]]
+    pixels = np.concatenate([corners, random.integers(0, 1024, (200, 2))])
+    errors_m = plan_errors_m(plan(lines, grid, stages=stages), lines, grid, pixels)
+    assert errors_m.shape == (len(pixels), 640)
+    bounds_m = stage_errors_m(stages, SPACING_M, SIDE_M, NEAREST_M)
+    shares = [(beams - 1) / beams for beams, _ in stages]
+    expected_m = np.dot(bounds_m, shares)
+    # Oblique by up to 7 degrees: by up to 12 % more.
+    assert 0.85 * expected_m <= np.abs(errors_m).max() <= 1.12 * expected_m
+    # Stages err independently: in power they add up to less than their maxima do.
+    rms_m = np.sqrt(np.mean(errors_m**2))
+    spread = [
+        (beams**2 - 1) / 3 / beams**2 * e**2 for (beams, _), e in zip(stages, bounds_m, strict=True)
+    ]
+    assert rms_m == pytest.approx(np.sqrt(np.sum(spread) / 3), rel=0.15)
+
+
+def test_a_plan_without_sums_errs_nowhere():
+    grid = patch(0.0, 42.5, 64, 64)
+    lines = thesis_lines(grid, along_x(40, SPACING_M))
+    pixels = np.stack(np.meshgrid(np.arange(64), np.arange(64)), axis=-1).reshape(-1, 2)
+    errors_m = plan_errors_m(plan(lines, grid, stages=[(1, 2), (1, 2)]), lines, grid, pixels)
+    assert np.abs(errors_m).max() < 1e-12

@@ -1,0 +1,430 @@
+import dataclasses
+import hashlib
+import os
+import subprocess
+import sys
+
+import h5py
+import numpy as np
+import pytest
+
+from clsas.core import validate
+from clsas.core.grid import Grid
+from clsas.core.image import Image
+from clsas.core.lines import RangeLines
+from clsas.files import hdf5 as io
+from clsas.files.hdf5 import FileFormatError, load, read_geometry, read_samples, save, to_xarray
+from clsas.signal.echoes import Echoes
+from clsas.sonar.system import Pulse
+
+RNG = np.random.default_rng(3)
+
+
+def noise(*shape):
+    return RNG.normal(size=shape)
+
+
+def complex_noise(*shape):
+    return (noise(*shape) + 1j * noise(*shape)).astype(np.complex64)
+
+
+PLANE = Grid.plane(x=(1e6, 1e6 + 0.7, 5), y=(40, 41 / 3, 3), z=-1 / 3)
+TX, RX = 1e7 + noise(4, 3), 1e7 + noise(4, 3)
+# -0, the smallest and the largest number are among the bits to be kept.
+SAMPLES = complex_noise(4, 6)
+SAMPLES[0, :3] = [complex(-0.0, 0.0), np.finfo(np.float32).smallest_subnormal, 3.4e38]
+OBJECTS = {
+    "plane": PLANE,
+    "oriented": Grid.oriented(noise(3), noise(3), noise(3), (2, 3)),
+    "height map": PLANE.with_height(noise(3, 5)),
+    "points": Grid.points(noise(2, 3, 4, 3)),
+    "image": Image(complex_noise(3, 5), PLANE),
+    "image of points": Image(complex_noise(7), Grid.points(noise(7, 3))),
+    "lines": RangeLines(SAMPLES, noise(4), 1 / 3, TX, RX, 1e6 / 3, 1500.1),
+    "moving lines": RangeLines(SAMPLES, 40, 0.1, TX, RX, 0, 1500, noise(4, 3)),
+    "echoes": Echoes(SAMPLES, 0.1, 1e5 / 3, 1e6, TX, RX, 1500, Pulse(1e6, 1e5 / 3, 1e-3, "down")),
+    "phase code": Echoes(
+        SAMPLES, noise(4), 1e5, 1e6, TX, RX, 1500, Pulse.phase_code(1e6, 1e-3), noise(4, 3)
+    ),
+    "passband without a pulse": Echoes(noise(4, 6).astype(np.float32), 0, 1e6, 2e5, TX, RX, 1500),
+}
+EVERY_OBJECT = pytest.mark.parametrize("obj", OBJECTS.values(), ids=OBJECTS.keys())
+
+
+def digest(obj):
+    """One number for every bit, type and name in an object."""
+    if dataclasses.is_dataclass(obj):
+        text = repr([(f.name, digest(getattr(obj, f.name))) for f in dataclasses.fields(obj)])
+        text = type(obj).__name__ + text
+    elif isinstance(obj, np.ndarray):
+        text = f"{obj.dtype.str} {obj.shape} {hashlib.sha256(obj.tobytes()).hexdigest()}"
+    else:
+        text = f"{type(obj).__name__} {obj!r}"
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def run_beside(code, *arguments):
+    """What Python code that may import this module prints in another process."""
+    folders = [os.path.dirname(__file__), *sys.path]
+    return subprocess.run(
+        [sys.executable, "-c", code, *arguments],
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, folders))},
+        stdout=subprocess.PIPE,
+        text=True,
+        check=True,
+    ).stdout
+
+
+@EVERY_OBJECT
+def test_round_trip_keeps_every_bit(obj, tmp_path):
+    save(tmp_path / "file.h5", obj)
+    assert digest(load(tmp_path / "file.h5")) == digest(obj)
+    assert os.listdir(tmp_path) == ["file.h5"]
+
+
+def test_another_process_reads_every_bit(tmp_path):
+    paths = [str(tmp_path / f"{name}.h5") for name in OBJECTS]
+    for path, obj in zip(paths, OBJECTS.values(), strict=True):
+        save(path, obj)
+    code = "import sys, test_io as t\nfor p in sys.argv[1:]: print(t.digest(t.load(p)))"
+    assert run_beside(code, *paths).split() == [digest(obj) for obj in OBJECTS.values()]
+
+
+def test_schema_is_the_documented_one(tmp_path):
+    save(tmp_path / "image.h5", OBJECTS["image"])
+    with h5py.File(tmp_path / "image.h5") as file:
+        assert dict(file.attrs) == {"format": b"clsas", "version": 1, "kind": b"image"}
+        assert set(file) == {"pixels", "grid"}
+        assert set(file["grid"]) == {"origin_m", "row_step_m", "column_step_m"}
+        assert file["grid"].attrs["kind"] == b"grid"
+        assert list(file["grid"].attrs["shape"]) == [3, 5]
+        np.testing.assert_array_equal(file["pixels"], OBJECTS["image"].pixels)
+
+
+def test_a_file_by_another_program_loads(tmp_path):
+    with h5py.File(tmp_path / "lines.h5", "w") as file:
+        file.attrs.update(format="clsas", version=1, kind="range_lines", range_step_m=0.1)
+        file.attrs.update(carrier_hz=100_000, sound_speed_m_s=1500)
+        file["samples"] = np.ones((2, 3), np.complex128)
+        file["first_range_m"] = [1, 2]
+        file["tx_m"] = file["rx_m"] = np.zeros((2, 3), ">f4")
+    lines = load(tmp_path / "lines.h5")
+    assert lines.samples.dtype == np.complex64
+    assert lines.tx_m.dtype == np.float64
+    assert lines.rx_velocity_m_s is None
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt, RuntimeError])
+@pytest.mark.parametrize("exists", [False, True])
+def test_an_interrupted_save_leaves_nothing(error, exists, tmp_path, monkeypatch):
+    path = tmp_path / "file.h5"
+    if exists:
+        path.write_bytes(b"what was there")
+    begun = []
+
+    def interrupted(_):
+        begun.extend(os.listdir(tmp_path))
+        raise error
+
+    monkeypatch.setattr(io.os, "fsync", interrupted)
+    with pytest.raises(error):
+        save(path, OBJECTS["lines"])
+    assert len(set(begun) - {"file.h5"}) == 1  # it was being written, under another name
+    assert os.listdir(tmp_path) == (["file.h5"] if exists else [])
+    assert not exists or path.read_bytes() == b"what was there"
+
+
+FULL_DISK = """
+import errno, resource, sys, test_io as t
+resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, 10_000))
+for path in sys.argv[1:]:
+    try:
+        t.save(path, t.RangeLines(t.complex_noise(4, 5000), 40, 0.1, t.TX, t.RX, 0, 1500))
+    except OSError as error:
+        print(errno.errorcode[error.errno])
+"""
+
+
+def test_a_full_disk_is_an_error_and_leaves_nothing(tmp_path):
+    (tmp_path / "old.h5").write_bytes(b"what was there")
+    done = run_beside(FULL_DISK, str(tmp_path / "new.h5"), str(tmp_path / "old.h5"))
+    assert done.split() == ["EFBIG", "EFBIG"]  # and the interpreter ended well
+    assert os.listdir(tmp_path) == ["old.h5"]
+    assert (tmp_path / "old.h5").read_bytes() == b"what was there"
+
+
+def test_save_replaces(tmp_path):
+    for name in ("lines", "plane"):
+        save(tmp_path / "file.h5", OBJECTS[name])
+    assert digest(load(tmp_path / "file.h5")) == digest(PLANE)
+
+
+def test_save_names_bad_input(tmp_path):
+    with pytest.raises(TypeError, match=r"obj must be of type Grid or RangeLines or .*, got dict"):
+        save(tmp_path / "file.h5", {})
+    with pytest.raises(FileNotFoundError, match="there is no folder"):
+        save(tmp_path / "none" / "file.h5", PLANE)
+    with pytest.raises(IsADirectoryError, match="it is a folder"):
+        save(tmp_path, PLANE)
+    with pytest.raises(ValueError, match="path must be a path, got an empty one"):
+        save("", PLANE)
+    with pytest.raises(TypeError, match="path must be a path, got None"):
+        load(None)
+    assert os.listdir(tmp_path) == []
+
+
+def test_load_leaves_missing_files_to_python(tmp_path):
+    with pytest.raises(FileNotFoundError):
+        load(tmp_path / "none.h5")
+    with pytest.raises(IsADirectoryError):
+        load(tmp_path)
+
+
+@pytest.mark.parametrize("content", [b"", b"not HDF5 at all", b"\x89PNG\r\n\x1a\n" + bytes(1000)])
+def test_load_refuses_what_is_not_hdf5(content, tmp_path):
+    path = tmp_path / "file.h5"
+    path.write_bytes(content)
+    with pytest.raises(FileFormatError, match=r"file\.h5 is not an HDF5 file"):
+        load(path)
+
+
+def change(file, name):
+    """Damage an open file of range lines in a way."""
+    match name:
+        case "foreign":
+            del file.attrs["format"]
+        case "of another format":
+            file.attrs["format"] = "NetCDF"
+        case "newer":
+            file.attrs["version"] = 2
+        case "of version 0":
+            file.attrs["version"] = 0
+        case "without version":
+            del file.attrs["version"]
+        case "of unknown kind":
+            file.attrs["kind"] = "hologram"
+        case "without kind":
+            del file.attrs["kind"]
+        case "without samples":
+            del file["samples"]
+        case "without step":
+            del file.attrs["range_step_m"]
+        case "of one channel too many":
+            del file["tx_m"]
+            file["tx_m"] = np.zeros((5, 3))
+        case "with NaN":
+            file["first_range_m"][1] = np.nan
+        case "with text":
+            file.attrs["carrier_hz"] = "much"
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("foreign", "is an HDF5 file, but not one of clsas"),
+        ("of another format", "is an HDF5 file, but not one of clsas"),
+        ("newer", "is of format version 2, newer than this clsas, which reads up to 1"),
+        ("of version 0", "is of format version 0, but the first one is 1"),
+        ("without version", "is damaged: .*version"),
+        ("of unknown kind", "holds an object of unknown kind 'hologram'"),
+        ("without kind", "holds an object of unknown kind None"),
+        ("without samples", "lacks samples of the range_lines"),
+        ("without step", "lacks range_step_m of the range_lines"),
+        ("of one channel too many", r"is damaged: tx_m must have shape \(4, 3\)"),
+        ("with NaN", "is damaged: first_range_m must be finite, got 1 NaN"),
+        ("with text", "is damaged: carrier_hz must be one real number in Hz"),
+    ],
+)
+def test_load_names_what_is_wrong(name, words, tmp_path):
+    path = tmp_path / "file.h5"
+    save(path, OBJECTS["lines"])
+    with h5py.File(path, "r+") as file:
+        change(file, name)
+    with pytest.raises(FileFormatError, match=rf"file\.h5 {words}"):
+        load(path)
+
+
+@pytest.mark.parametrize("chunks", [None, (2, 4)])
+@pytest.mark.parametrize("shape", [(4, 6), (10**6, 10**6)])
+def test_samples_never_written_are_refused(shape, chunks, tmp_path):
+    path = tmp_path / "file.h5"
+    save(path, OBJECTS["lines"])
+    with h5py.File(path, "r+") as file:
+        del file["samples"]
+        samples = file.create_dataset("samples", shape, np.complex64, chunks=chunks)
+        if chunks is not None:
+            samples[:2, :6] = samples[2:4, :4] = 1  # all but one of the chunks of the small one
+    with pytest.raises(FileFormatError, match=r"file\.h5 lacks a part of /samples, of shape"):
+        load(path)
+
+
+def elsewhere(file, name, folder):
+    """Put something in the place of a dataset whose values lie in another file or place."""
+    del file[name]
+    match folder.name:
+        case "external link":
+            file[name] = h5py.ExternalLink(folder / "other.h5", name)
+        case "soft link":
+            file[name] = h5py.SoftLink("/first_range_m")
+        case "external storage":
+            file.create_dataset(name, (4, 3), "f8", external=[(folder / "other.h5", 0, 96)])
+        case "virtual dataset":
+            layout = h5py.VirtualLayout((4, 3), "f8")
+            layout[...] = h5py.VirtualSource(folder / "other.h5", name, (4, 3))
+            file.create_virtual_dataset(name, layout)
+
+
+@pytest.mark.parametrize("name", ["samples", "tx_m"])
+@pytest.mark.parametrize(
+    "way", ["external link", "soft link", "external storage", "virtual dataset"]
+)
+def test_only_the_file_itself_is_read(way, name, tmp_path):
+    folder = tmp_path / way
+    folder.mkdir()
+    path = folder / "file.h5"
+    for each in (path, folder / "other.h5"):
+        save(each, OBJECTS["lines"])
+    with h5py.File(path, "r+") as file:
+        elsewhere(file, name, folder)
+    with pytest.raises(FileFormatError, match=rf"file\.h5 must hold {name} itself, got a "):
+        load(path)
+    with pytest.raises(FileFormatError, match=rf"file\.h5 must hold {name} itself, got a "):
+        read_geometry(path)
+    if name == "samples":
+        with pytest.raises(FileFormatError, match=r"file\.h5 must hold samples itself"):
+            read_samples(path, slice(1), slice(1))
+
+
+def test_an_object_is_no_part_of_itself(tmp_path):
+    path = tmp_path / "file.h5"
+    save(path, OBJECTS["echoes"])
+    with h5py.File(path, "r+") as file:
+        del file["pulse"]
+        file["pulse"] = file["/"]
+    with pytest.raises(FileFormatError, match="holds another object as pulse of the echoes"):
+        load(path)
+
+
+def test_what_does_not_fit_into_memory_is_refused_before_it_is_read(tmp_path, monkeypatch):
+    path = tmp_path / "file.h5"
+    save(path, OBJECTS["lines"])
+    with h5py.File(path, "r+") as file:
+        del file["samples"]
+        shape = 4, 1 << 20
+        file.create_dataset("samples", data=np.zeros(shape, np.complex64), compression="gzip")
+    assert path.stat().st_size < 1 << 20
+    assert load(path).samples.shape == shape
+    monkeypatch.setattr(validate, "_memory_bytes", lambda: 10 << 20)
+    monkeypatch.setattr(h5py.Dataset, "__getitem__", None)
+    words = r"file\.h5 is too large: reading /samples must ask for at most 0.00977 GiB"
+    with pytest.raises(FileFormatError, match=words):
+        load(path)
+    with pytest.raises(FileFormatError, match=words):
+        read_samples(path, slice(0, 4), slice(0, 1 << 20))
+
+
+@pytest.mark.parametrize("values", [np.array([b"x"] * 4), np.ones(4, "?")], ids=["text", "bool"])
+def test_other_than_numbers_are_refused(values, tmp_path):
+    path = tmp_path / "file.h5"
+    save(path, OBJECTS["lines"])
+    with h5py.File(path, "r+") as file:
+        del file["first_range_m"]
+        file["first_range_m"] = values
+    with pytest.raises(FileFormatError, match="must hold first_range_m as numbers, got"):
+        load(path)
+
+
+def test_a_pipe_or_device_is_refused_unopened(tmp_path):
+    os.mkfifo(tmp_path / "pipe.h5")
+    for path, kind in ((tmp_path / "pipe.h5", "a pipe"), ("/dev/zero", "a device")):
+        with pytest.raises(FileFormatError, match=f"must be an ordinary file, got {kind}"):
+            load(path)
+
+
+def test_a_pulse_alone_is_no_file(tmp_path):
+    path = tmp_path / "file.h5"
+    save(path, OBJECTS["echoes"])
+    with h5py.File(path, "r+") as file:
+        for name, value in file["pulse"].attrs.items():
+            file.attrs[name] = value
+    with pytest.raises(FileFormatError, match="holds only a Pulse"):
+        load(path)
+
+
+def test_truncated_files_are_refused(tmp_path):
+    save(tmp_path / "whole.h5", OBJECTS["lines"])
+    whole = (tmp_path / "whole.h5").read_bytes()
+    path = tmp_path / "file.h5"
+    for size in range(0, len(whole), 97):
+        path.write_bytes(whole[:size])
+        with pytest.raises(FileFormatError, match=r"file\.h5 is (damaged|not an HDF5 file)"):
+            load(path)
+
+
+def test_damaged_bytes_never_become_data(tmp_path):
+    save(tmp_path / "whole.h5", OBJECTS["lines"])
+    whole = (tmp_path / "whole.h5").read_bytes()
+    path = tmp_path / "file.h5"
+    found = 0
+    for position in RNG.integers(0, len(whole), 400):
+        damaged = bytearray(whole)
+        damaged[position] ^= 1 << RNG.integers(8)
+        path.write_bytes(damaged)
+        try:
+            assert digest(load(path)) == digest(OBJECTS["lines"])  # bytes that nothing uses
+        except FileFormatError:
+            found += 1
+    assert found > 200
+
+
+def test_xarray_of_an_image():
+    image = OBJECTS["image"]
+    array = to_xarray(image)
+    assert array.dims == ("y", "x")
+    assert np.shares_memory(array.values, image.pixels)
+    for name, axis in zip(("x", "y"), PLANE.axes_m, strict=True):
+        np.testing.assert_array_equal(array[name], axis)
+        assert array[name].attrs["units"] == "m"
+    assert float(array.z) == -1 / 3
+    assert array.sel(x=1e6 + 0.7, y=40, method="nearest").item() == image.pixels[0, 4]
+
+
+@pytest.mark.parametrize("name", ["oriented", "height map", "points", "image of points"])
+def test_xarray_positions_are_the_grids(name):
+    obj = OBJECTS[name]
+    grid = obj.grid if isinstance(obj, Image) else obj
+    converted = to_xarray(obj)
+    dims = converted.z.dims
+    assert converted.z.shape == grid.shape
+    assert converted.z.attrs["units"] == "m"
+    x, y, z = (converted[axis].broadcast_like(converted.z).transpose(*dims) for axis in "xyz")
+    np.testing.assert_allclose(np.stack([x, y, z], -1), grid.positions_m(), rtol=1e-15)
+
+
+def test_xarray_of_lines():
+    lines = OBJECTS["moving lines"]
+    data = to_xarray(lines)
+    assert data.samples.dims == ("channel", "sample")
+    assert data.tx_m.dims == ("channel", "axis")
+    assert data.rx_velocity_m_s.attrs["units"] == "m s-1"
+    assert data.attrs["carrier_hz"] == 0
+    assert data.first_range_m.attrs["units"] == data.range_offset_m.attrs["units"] == "m"
+    last = (data.first_range_m + data.range_offset_m)[:, -1]
+    np.testing.assert_allclose(last, lines.last_range_m)
+    np.testing.assert_array_equal(data.rx_m.sel(axis="z"), lines.rx_m[:, 2])
+
+
+def test_xarray_of_echoes():
+    data = to_xarray(OBJECTS["phase code"])
+    assert data.attrs["pulse_carrier_hz"] == 1e6
+    assert len(data.attrs["pulse_code"]) == 13
+    assert data.time_offset_s[1] == 1e-5
+    assert data.start_time_s.attrs["units"] == "s"
+
+
+def test_xarray_names_bad_input(monkeypatch):
+    with pytest.raises(TypeError, match="obj must be of type Grid or"):
+        to_xarray(np.ones(3))
+    monkeypatch.setitem(sys.modules, "xarray", None)
+    with pytest.raises(ImportError, match="pip install xarray"):
+        to_xarray(PLANE)

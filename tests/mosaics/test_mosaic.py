@@ -1,0 +1,847 @@
+"""Mosaics: as exact as asked for, seamless, resumable, distributed, growing."""
+
+import dataclasses
+import json
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import textwrap
+import threading
+import time
+from types import MappingProxyType, SimpleNamespace
+
+import h5py
+import numpy as np
+import pytest
+from cases import along_x, lines_over
+
+import clsas
+from clsas.core.grid import Grid
+from clsas.core.image_error import relative_error_db
+from clsas.core.validate import ClsasWarning
+from clsas.mosaics.store import Store
+from clsas.mosaics.survey import END
+from clsas.opencl.device import list_devices
+from clsas.sonar.beam import BeamWindow
+
+GRID = Grid.plane((-4, 4, 80), (30, 40, 60))
+LINES = lines_over(GRID, along_x(160, 0.05), carrier_hz=100e3, step_m=0.03)
+BEAM = BeamWindow(8.0, "hann")
+WISH = {"accuracy_db": -70, "beam": BEAM, "patches": (2, 4)}
+
+
+@pytest.fixture(scope="module")
+def exact():
+    return clsas.backproject(LINES, GRID, beam=BEAM, accuracy_db=-80)
+
+
+@pytest.fixture
+def file(tmp_path):
+    clsas.save(tmp_path / "lines.h5", LINES)
+    return tmp_path / "lines.h5"
+
+
+def test_patches_make_the_image(platform, exact):
+    image = clsas.mosaic(LINES, GRID, **WISH, device=platform).image()
+    assert image.grid is GRID
+    assert relative_error_db(image, exact) < -65
+
+
+def test_every_patch_has_its_own_pixels(exact):
+    seen = []
+    for patch in clsas.mosaic(LINES, GRID, **WISH):
+        seen.append((patch.row, patch.column))
+        expected = GRID.positions_m(patch.rows, patch.columns)
+        np.testing.assert_allclose(patch.grid.positions_m(), expected, atol=1e-9)
+        assert 0 < patch.record.channels < 160  # the beam's
+        assert not patch.record.flags
+    assert sorted(seen) == list(np.ndindex(2, 4))
+
+
+def test_a_store_holds_pixels_and_records(file, tmp_path, exact):
+    mosaic = clsas.mosaic(file, GRID, tmp_path / "image.zarr", **WISH)
+    assert len(mosaic) == 8
+    assert not mosaic.finished
+    for patch in mosaic:
+        assert Store.opened(tmp_path / "image.zarr").records()[patch.row, patch.column] == (
+            patch.record
+        )
+    store = Store.opened(tmp_path / "image.zarr")
+    assert relative_error_db(store.image(), exact) < -65
+    np.testing.assert_allclose(store.grid.positions_m(), GRID.positions_m(), atol=1e-12)
+    for record in store.records().values():
+        assert record.predicted_error_db == -70
+        assert record.seconds > 0
+
+
+def test_a_store_opens_in_xarray(file, tmp_path, exact):
+    xarray = pytest.importorskip("xarray")
+    for _ in clsas.mosaic(file, GRID, tmp_path / "image.zarr", **WISH):
+        pass
+    data = xarray.open_zarr(tmp_path / "image.zarr", consolidated=False)
+    assert data.pixels.dims == ("y", "x")
+    np.testing.assert_allclose(data.x, GRID.axes_m[0])
+    assert np.abs(data.pixels.values).max() == pytest.approx(np.abs(exact.pixels).max(), rel=1e-3)
+
+
+def test_the_overview_keeps_power_and_place(file, tmp_path, exact):
+    for _ in clsas.mosaic(file, GRID, tmp_path / "image.zarr", **WISH):
+        pass
+    overview = Store.opened(tmp_path / "image.zarr").overview(20)
+    assert overview.grid.shape == (15, 20)
+    blocks = np.abs(exact.pixels).reshape(15, 4, 20, 4) ** 2
+    np.testing.assert_allclose(np.abs(overview.pixels) ** 2, blocks.mean(axis=(1, 3)), rtol=1e-2)
+    expected = GRID.positions_m().reshape(15, 4, 20, 4, 3).mean(axis=(1, 3))
+    np.testing.assert_allclose(overview.grid.positions_m(), expected, atol=1e-9)
+
+
+def test_the_directions_are_those_of_the_whole_track():
+    """A swaying track's, which the channels that see a patch would tell otherwise."""
+    track = LINES.tx_m.copy()
+    track[:, 1] += 0.2 * np.sin(track[:, 0])
+    lines = lines_over(GRID, track, carrier_hz=100e3, step_m=0.03)
+    beam = BeamWindow(8.0, "rectangular")
+    reference = clsas.backproject(lines, GRID, beam=beam, accuracy_db=-80)
+    image = clsas.mosaic(lines, GRID, **(WISH | {"beam": beam})).image()
+    assert relative_error_db(image, reference) < -65
+
+
+class TestFactorized:
+    """A larger scene, of which every patch is worth factorizing."""
+
+    GRID = Grid.plane((-5.1, 5.1, 512), (40, 50.2, 512))
+    BEAM = BeamWindow(20.0, "hann")
+    TOLERANCE_DB = -40.0
+
+    @pytest.fixture(scope="class")
+    @classmethod
+    def scene(cls):
+        lines = lines_over(cls.GRID, along_x(1200, 0.025), carrier_hz=120e3, step_m=0.02)
+        return lines, clsas.backproject(lines, cls.GRID, beam=cls.BEAM, accuracy_db=-80)
+
+    @pytest.fixture(scope="class")
+    @classmethod
+    def formed(cls, scene):
+        """The whole image, and its patches."""
+        patches = []
+        mosaic = clsas.mosaic(
+            scene[0], cls.GRID, tolerance_db=cls.TOLERANCE_DB, beam=cls.BEAM, patches=(2, 2)
+        )
+        return mosaic.image(patches.append), patches
+
+    def test_every_patch_is_as_good_as_predicted(self, scene, formed):
+        for patch in formed[1]:
+            assert patch.record.plan["sides"]  # not plain backprojection
+            exact = clsas.Image(scene[1].pixels[patch.rows, patch.columns], patch.grid)
+            measured = relative_error_db(patch.image, exact)
+            assert measured <= patch.record.predicted_error_db <= self.TOLERANCE_DB
+
+    def test_there_are_no_seams(self, scene, formed):
+        """Along borders the error is what it is elsewhere, and neighbours agree."""
+        image, exact = formed[0].pixels, scene[1].pixels
+        level = np.sqrt(np.mean(np.abs(exact) ** 2))
+        error = np.abs(image - exact) / level
+        for border in (error[254:258], error[:, 254:258]):
+            assert 20 * np.log10(np.sqrt(np.mean(border**2))) <= self.TOLERANCE_DB + 1
+        # The step across the border, beyond the exact image's own.
+        for a, b in ((np.s_[255], np.s_[256]), (np.s_[:, 255], np.s_[:, 256])):
+            step = (image[a] - image[b]) - (exact[a] - exact[b])
+            step_db = 20 * np.log10(np.sqrt(np.mean(np.abs(step) ** 2)) / level)
+            assert step_db <= self.TOLERANCE_DB + 4
+
+    def test_a_record_holds_its_plan(self, formed):
+        record = formed[1][0].record
+        plan = clsas.Plan.from_json(json.dumps(record.plan))
+        assert plan.tolerance_db == self.TOLERANCE_DB
+        assert plan.predicted_error_db == record.predicted_error_db
+
+
+def test_a_normalising_beam(tmp_path):
+    """What it multiplies by is that of all channels, not of those that a patch sees."""
+    beam = BeamWindow(8.0, "hann", normalise=True)
+    exact = clsas.backproject(LINES, GRID, beam=beam, accuracy_db=-80)
+    image = clsas.mosaic(LINES, GRID, **(WISH | {"beam": beam})).image()
+    assert relative_error_db(image, exact) < -65
+    clsas.save(tmp_path / "lines.h5", LINES)
+    with pytest.raises(ValueError, match="beam must not normalise with a folder"):
+        clsas.mosaic(tmp_path, GRID, **(WISH | {"beam": beam}))
+
+
+def test_height_maps_and_points():
+    x, y = GRID.axes_m
+    hill = 0.3 * np.exp(-(np.add.outer((y - 35) ** 2, x**2)))
+    for grid in (GRID.with_height(hill), Grid.points(GRID.with_height(hill).positions_m())):
+        exact = clsas.backproject(LINES, grid, beam=BEAM, accuracy_db=-80)
+        image = clsas.mosaic(LINES, grid, **WISH).image()
+        assert relative_error_db(image, exact) < -65
+
+
+def test_an_image_larger_than_memory_is_refused():
+    """Before anything is formed."""
+    grid = Grid.plane((-4, 4, 10**7), (30, 40, 10**7))
+    with pytest.raises(ValueError, match=r"the mosaic must ask for at most .* GiB"):
+        clsas.mosaic(LINES, grid, beam=BEAM).image()
+
+
+def test_the_thesis_stages_work_in_patches():
+    patches = list(clsas.mosaic(LINES, GRID, stages=[(2, 2), (2, 2)], beam=BEAM, patches=(2, 2)))
+    assert [len(patch.record.plan["nearest"]) for patch in patches] == [2] * 4
+
+
+def test_patches_that_do_not_divide_the_grid(exact):
+    patches = []
+    image = clsas.mosaic(LINES, GRID, **(WISH | {"patches": (7, 3)})).image(patches.append)
+    assert {patch.image.grid.shape for patch in patches} == {(9, 27), (9, 26), (6, 27), (6, 26)}
+    assert relative_error_db(image, exact) < -65
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"patches": (50, 4)}, "patches must leave each some of 60 pixels: 50 patches of 2"),
+        ({"patches": (61, 4)}, "patches must leave each some of 60 pixels"),
+        ({"patches": (0, 4)}, "every entry of patches must be .* got 0"),
+        ({"patches": 4}, r"patches must be \(rows, columns\) of patches, got 4"),
+        ({"patches": (1, 2, 3)}, r"patches must be \(rows, columns\) of patches"),
+        ({"tolerance_db": -40}, "at most one of tolerance_db, .* must be given"),
+        ({"accuracy_db": 3}, "accuracy_db must be .* dB, got 3"),
+        ({"memory_bytes": -1}, "memory_bytes must be"),
+        ({"patches": None, "memory_bytes": 1000}, "memory_bytes must be at least .* MiB"),
+        ({"beam": 8.0}, "beam must be"),
+        ({"device": []}, "device must name at least one device"),
+        ({"follow_s": 1.0}, "source must be a folder where follow_s is given"),
+    ],
+)
+def test_bad_arguments(wrong, message):
+    with pytest.raises((TypeError, ValueError), match=message):
+        clsas.mosaic(LINES, GRID, **(WISH | wrong))
+
+
+def test_bad_grids():
+    with pytest.raises(ValueError, match="grid must have two axes"):
+        clsas.mosaic(LINES, Grid.points([[0.0, 30.0, 0.0]]))
+    with pytest.raises(TypeError, match="grid must be"):
+        clsas.mosaic(LINES, (3, 4))
+
+
+def test_a_wish_is_checked_before_any_patch():
+    with pytest.raises(ValueError, match=r"tolerance_db must be .* got -200"):
+        clsas.mosaic(LINES, GRID, tolerance_db=-200)
+    with pytest.raises(ValueError, match="tolerance_wavelengths must be"):
+        clsas.mosaic(LINES, GRID, tolerance_wavelengths=-1)
+    with pytest.raises(TypeError, match="stages must be"):
+        clsas.mosaic(LINES, GRID, stages=3)
+
+
+def test_a_patch_that_no_channel_sees_is_empty_and_flagged(tmp_path):
+    """Half of the scene lies behind the beams, and some beyond the lines' end."""
+    grid = Grid.plane((-4, 120, 64), (30, 40, 20))
+    mosaic = clsas.mosaic(LINES, grid, tmp_path / "a.zarr", **(WISH | {"patches": (1, 4)}))
+    patches = []
+    image = mosaic.image(patches.append)
+    assert image.pixels[:, :16].any()
+    assert not image.pixels[:, 16:].any()
+    assert [patch.record.is_empty for patch in patches] == [False, True, True, True]
+    for patch in patches[1:]:
+        assert not patch.image.pixels.any()
+        assert patch.record.flags == ("empty: in no channel's beam and range",)
+        assert patch.record.predicted_error_db is None
+
+
+def test_missing_samples_are_flagged(file, tmp_path):
+    with h5py.File(file, "r+") as lines:
+        lines["samples"][20:24] = np.nan
+    kept = np.delete(np.arange(160), slice(20, 24))
+    along = BEAM.directions(LINES)
+    reference = clsas.backproject(
+        LINES.select(kept), GRID, beam=dataclasses.replace(BEAM, along=along[kept])
+    )
+    patches = []
+    image = clsas.mosaic(file, GRID, tmp_path / "a.zarr", **WISH).image(patches.append)
+    assert relative_error_db(image, reference) < -58
+    flagged = [patch for patch in patches if patch.record.flags]
+    assert 0 < len(flagged) < len(patches)
+    assert flagged[0].record.missing_channels == 4
+    assert flagged[0].record.gap_m == pytest.approx(0.25)
+    assert "4 of" in flagged[0].record.flags[0]
+    assert "a gap of 0.25 m" in flagged[0].record.flags[1]
+
+
+@pytest.mark.parametrize("wish", [{}, {"accuracy_db": None, "tolerance_db": -65}])
+def test_missing_channels_weigh_nothing(file, wish, monkeypatch):
+    """Neither with a beam that divides by what channels weigh, nor in a plan."""
+    monkeypatch.setattr(sys.modules["clsas.mosaics.mosaic"], "_WORTH_A_PLAN", 0)
+    beam = BeamWindow(8.0, "hann", normalise=True)
+    kept = np.random.default_rng(1).random(160) > 0.2
+    with h5py.File(file, "r+") as lines:
+        for channel in np.flatnonzero(~kept):
+            lines["samples"][channel] = np.nan
+    along = beam.directions(LINES)[kept]
+    reference = clsas.backproject(
+        LINES.select(kept), GRID, beam=dataclasses.replace(beam, along=along), accuracy_db=-80
+    )
+    image = clsas.mosaic(file, GRID, **(WISH | {"beam": beam} | wish)).image()
+    # It is a mean times the number of all channels.
+    of_all = 160 / np.count_nonzero(kept)
+    assert relative_error_db(image.pixels, of_all * reference.pixels) < -65
+
+
+@pytest.mark.parametrize(
+    ("samples", "says"),
+    [
+        (np.ones((160, 9), np.float32), r"samples that are complex numbers.* got float32"),
+        (np.ones((160, 9), np.int16), "got int16"),
+        (np.complex64(1), r"got complex64 of shape \(\)"),
+        ("group", "lacks samples"),
+        (None, "lacks samples"),
+    ],
+)
+def test_lines_without_complex_samples_are_refused(file, samples, says):
+    with h5py.File(file, "r+") as lines:
+        del lines["samples"]
+        if isinstance(samples, str):
+            lines.create_group("samples")
+        elif samples is not None:
+            lines["samples"] = samples
+    with pytest.raises(clsas.FileFormatError, match=says):
+        clsas.mosaic(file, GRID, **WISH)
+
+
+def test_lost_pings_are_flagged():
+    lines = LINES.select(np.delete(np.arange(160), slice(70, 80)))
+    flags = {patch.record.flags for patch in clsas.mosaic(lines, GRID, **WISH)}
+    assert ("a gap of 0.55 m between pings",) in flags
+
+
+class TestOnceMore:
+    def test_what_the_store_has_is_not_formed_again(self, file, tmp_path, exact):
+        mosaic = clsas.mosaic(file, GRID, tmp_path / "a.zarr", **WISH)
+        running = iter(mosaic)
+        first = next(running)
+        running.close()
+        assert (first.row, first.column) in mosaic.finished
+        # Also what was begun when the loop was left.
+        assert mosaic.finished == Store.opened(tmp_path / "a.zarr").records()
+        left = 8 - len(mosaic.finished)
+        assert len(list(mosaic)) == left
+        assert len(mosaic.finished) == 8
+        assert not list(mosaic)
+        assert relative_error_db(mosaic.image(), exact) < -65
+
+    def test_without_a_store_everything_is(self):
+        mosaic = clsas.mosaic(LINES, GRID, **WISH)
+        assert len(list(mosaic)) == len(list(mosaic)) == 8
+
+
+class TestResuming:
+    def test_what_is_finished_is_kept(self, file, tmp_path, exact):
+        path = tmp_path / "image.zarr"
+        running = iter(clsas.mosaic(file, GRID, path, **WISH))
+        for _ in range(3):
+            next(running)
+        running.close()
+        kept = {place: (path / "patches" / "{}.{}".format(*place)) for place in np.ndindex(2, 4)}
+        times = {p: f.stat().st_mtime_ns for p, f in kept.items() if f.exists()}
+        assert 3 <= len(times) < 8
+        mosaic = clsas.mosaic(file, GRID, path, **WISH)
+        assert set(mosaic.finished) == set(times)
+        assert {(patch.row, patch.column) for patch in mosaic} == set(kept) - set(times)
+        assert all(kept[place].stat().st_mtime_ns == then for place, then in times.items())
+        assert relative_error_db(Store.opened(path).image(), exact) < -65
+        assert not list(clsas.mosaic(file, GRID, path, **WISH))
+
+    def test_the_image_has_what_was_there_and_what_was_not(self, tmp_path):
+        path = tmp_path / "a.zarr"
+        before = clsas.mosaic(LINES, GRID, path, **WISH).image()
+        chunk = path / "pixels" / "c" / "1" / "2"
+        chunk.write_bytes(chunk.read_bytes()[:100])
+        patches = []
+        with pytest.warns(ClsasWarning, match="patch 1,2: its pixels are not those"):
+            mosaic = clsas.mosaic(LINES, GRID, path, **WISH)
+        again = mosaic.image(patches.append)
+        np.testing.assert_array_equal(again.pixels, before.pixels)
+        told = [(patch.row, patch.column) for patch in patches]
+        assert told[-1] == (1, 2)  # after those that were there
+        assert sorted(told) == list(np.ndindex(2, 4))
+        there = clsas.mosaic(LINES, GRID, path, **WISH)
+        assert len(there.finished) == 8
+        np.testing.assert_array_equal(there.image().pixels, before.pixels)
+
+    def test_after_kill(self, file, tmp_path, exact):
+        """Kill -9 in the middle, again and again."""
+        program = f"""
+            import clsas, pickle, sys
+            grid, wish = pickle.load(open({str(tmp_path / "wish")!r}, "rb"))
+            for patch in clsas.mosaic({str(file)!r}, grid, {str(tmp_path / "a.zarr")!r}, **wish):
+                print(patch.row, patch.column, flush=True)
+        """
+        import pickle
+
+        wish = WISH | {"patches": (6, 8)}
+        (tmp_path / "wish").write_bytes(pickle.dumps((GRID, wish)))
+        formed = []
+        for kills in range(4):
+            process = subprocess.Popen(
+                [sys.executable, "-c", textwrap.dedent(program)], stdout=subprocess.PIPE, text=True
+            )
+            for line in process.stdout:
+                formed.append(line)
+                if kills < 3 and len(formed) % 9 == 8:
+                    process.send_signal(signal.SIGKILL)
+                    break
+            formed += process.stdout.readlines()
+            assert process.wait() == (-signal.SIGKILL if kills < 3 else 0)
+        assert len(set(formed)) == len(formed)  # none twice
+        # One may have been finished, and not yet told, when the process died.
+        assert 45 <= len(formed) <= 48
+        assert relative_error_db(Store.opened(tmp_path / "a.zarr").image(), exact) < -65
+
+    @pytest.mark.parametrize(
+        ("change", "message"),
+        [
+            ({"accuracy_db": -60}, "accuracy_db is -70 there, -60 given"),
+            ({"accuracy_db": None, "tolerance_db": -40}, "tolerance_db is None there, -40 given"),
+            ({"beam": None}, "beam is .*width_deg.* there, None given"),
+            ({"patches": (2, 2)}, "patches of 30 x 20 pixels there, of 30 x 40 given"),
+            ({"grid": Grid.plane((-4, 4, 80), (30, 41, 60))}, "the grid lies elsewhere"),
+            ({"grid": Grid.plane((-4, 4, 40), (30, 40, 60))}, r"pixels is \[60, 80\] there"),
+            ({"lines": LINES.select(slice(1, None))}, "the range lines are others"),
+        ],
+    )
+    def test_other_inputs_are_refused(self, tmp_path, change, message):
+        next(iter(clsas.mosaic(LINES, GRID, tmp_path / "a.zarr", **WISH)))
+        before = len(Store.opened(tmp_path / "a.zarr").records())
+        change = {"lines": LINES, "grid": GRID} | WISH | change
+        with pytest.raises(ValueError, match=f"made with other inputs: .*{message}"):
+            clsas.mosaic(change.pop("lines"), change.pop("grid"), tmp_path / "a.zarr", **change)
+        assert len(Store.opened(tmp_path / "a.zarr").records()) == before
+
+    def test_a_store_without_a_finished_patch_may_be_deleted(self, tmp_path):
+        """By the user: another process may be about to write to it."""
+        path = tmp_path / "a.zarr"
+        wrong = clsas.mosaic(LINES, GRID, path, stages=[(64, 64)], patches=(2, 4))
+        with pytest.raises(ValueError, match="patch 0,0: stages must leave a line and a pixel"):
+            list(wrong)
+        other = WISH | {"patches": (3, 4)}
+        with pytest.raises(ValueError, match="or delete it: no patch of it was finished"):
+            clsas.mosaic(LINES, GRID, path, **other)
+        assert path.exists()
+        shutil.rmtree(path)
+        assert len(list(clsas.mosaic(LINES, GRID, path, **other))) == 12
+
+    @pytest.mark.parametrize(
+        ("name", "value"),
+        [
+            ("predicted_error_db", "x"),
+            ("predicted_error_db", float("nan")),
+            ("seconds", None),
+            ("channels", "9"),
+            ("survey_channels", 5.0),
+        ],
+    )
+    def test_a_patch_with_a_damaged_record_is_formed_again(self, tmp_path, name, value):
+        path = tmp_path / "a.zarr"
+        assert len(list(clsas.mosaic(LINES, GRID, path, **WISH))) == 8
+        record = path / "patches" / "1.2" / "zarr.json"
+        stored = json.loads(record.read_text())
+        stored["attributes"][name] = value
+        record.write_text(json.dumps(stored))
+        with pytest.warns(ClsasWarning, match="patch 1,2: its record does not match its checksum"):
+            again = list(clsas.mosaic(LINES, GRID, path, **WISH))
+        assert [(patch.row, patch.column) for patch in again] == [(1, 2)]
+
+    def test_a_store_of_an_older_schema_is_refused(self, tmp_path):
+        next(iter(clsas.mosaic(LINES, GRID, tmp_path / "a.zarr", **WISH)))
+        header = tmp_path / "a.zarr" / "zarr.json"
+        text = json.loads(header.read_text())
+        text["attributes"]["version"] = 0
+        header.write_text(json.dumps(text))
+        with pytest.raises(ValueError, match="is a mosaic of version 0, this clsas works with"):
+            clsas.mosaic(LINES, GRID, tmp_path / "a.zarr", **WISH)
+
+    def test_lines_with_other_samples_are_refused(self, tmp_path):
+        next(iter(clsas.mosaic(LINES, GRID, tmp_path / "a.zarr", **WISH)))
+        samples = LINES.samples.copy()
+        samples[77] *= 5
+        changed = dataclasses.replace(LINES, samples=samples)
+        with pytest.raises(ValueError, match="the range lines are others"):
+            clsas.mosaic(changed, GRID, tmp_path / "a.zarr", **WISH)
+
+    @pytest.mark.parametrize("damage", ["removed", "cut"])
+    def test_pixels_that_are_not_there_are_formed_again(self, tmp_path, damage):
+        list(clsas.mosaic(LINES, GRID, tmp_path / "a.zarr", **WISH))
+        before = Store.opened(tmp_path / "a.zarr").image().pixels
+        chunk = tmp_path / "a.zarr" / "pixels" / "c" / "1" / "2"
+        if damage == "cut":
+            chunk.write_bytes(chunk.read_bytes()[:100])
+        else:
+            chunk.unlink()
+        with pytest.warns(ClsasWarning, match="patch 1,2: its pixels are"):
+            again = list(clsas.mosaic(LINES, GRID, tmp_path / "a.zarr", **WISH))
+        assert [(patch.row, patch.column) for patch in again] == [(1, 2)]
+        np.testing.assert_array_equal(Store.opened(tmp_path / "a.zarr").image().pixels, before)
+
+    @pytest.mark.parametrize("name", ["pixels/zarr.json", "zarr.json"])
+    @pytest.mark.parametrize("text", ["", "{}", '{"attributes": {"format": "clsas mosaic"}}'])
+    def test_a_damaged_store_is_told(self, tmp_path, name, text):
+        next(iter(clsas.mosaic(LINES, GRID, tmp_path / "a.zarr", **WISH)))
+        (tmp_path / "a.zarr" / name).write_text(text)
+        with pytest.raises(ValueError, match=r"a.zarr (is damaged|exists and is not|is a mosaic)"):
+            clsas.mosaic(LINES, GRID, tmp_path / "a.zarr", **WISH)
+
+    def test_a_file_written_anew_is_read_anew(self, file, tmp_path):
+        clsas.mosaic(file, GRID, **WISH).image()
+        moved = dataclasses.replace(LINES, tx_m=LINES.tx_m + 0.3, rx_m=LINES.rx_m + 0.3)
+        clsas.save(file, moved)
+        image = clsas.mosaic(file, GRID, **WISH).image()
+        exact = clsas.backproject(moved, GRID, beam=BEAM, accuracy_db=-80)
+        assert relative_error_db(image, exact) < -65
+
+    def test_a_folder_of_something_else_is_left_alone(self, tmp_path):
+        (tmp_path / "letter.txt").write_text("dear")
+        with pytest.raises(ValueError, match="exists and is not a mosaic of clsas"):
+            clsas.mosaic(LINES, GRID, tmp_path, **WISH)
+        assert [path.name for path in tmp_path.iterdir()] == ["letter.txt"]
+
+    def test_a_record_cut_off_is_formed_again(self, tmp_path):
+        list(clsas.mosaic(LINES, GRID, tmp_path / "a.zarr", **WISH))
+        record = tmp_path / "a.zarr" / "patches" / "1.2" / "zarr.json"
+        record.write_text(record.read_text()[:50])
+        with pytest.warns(ClsasWarning, match="patch 1,2: its record cannot be read"):
+            again = list(clsas.mosaic(LINES, GRID, tmp_path / "a.zarr", **WISH))
+        assert [(patch.row, patch.column) for patch in again] == [(1, 2)]
+
+
+def test_a_full_disk_keeps_what_is_finished(file, tmp_path):
+    program = """
+        import clsas, pickle, resource, signal, sys
+        from clsas.mosaics.store import Store
+        signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+        grid, wish = pickle.load(open("wish", "rb"))
+        mosaic = clsas.mosaic("lines.h5", grid, "a.zarr", **wish)
+        formed = 0
+        try:
+            for patch in mosaic:
+                formed += 1
+                if formed == 3:
+                    resource.setrlimit(resource.RLIMIT_FSIZE, (2000, 2000))
+        except OSError as error:
+            print(formed, type(error).__name__, error)
+    """
+    import pickle
+
+    (tmp_path / "wish").write_bytes(pickle.dumps((GRID, WISH)))
+    done = subprocess.run(
+        [sys.executable, "-c", textwrap.dedent(program)], cwd=tmp_path, text=True,
+        capture_output=True, check=True,
+    )  # fmt: skip
+    assert "too large" in done.stdout
+    assert re.search(r"a\.zarr/pixels/c/\d/\d'$", done.stdout.strip())  # not a temporary file
+    kept = Store.opened(tmp_path / "a.zarr").records()
+    assert 3 <= len(kept) < 8
+    assert len(list(clsas.mosaic(file, GRID, tmp_path / "a.zarr", **WISH))) == 8 - len(kept)
+
+
+def test_a_store_that_cannot_be_made(tmp_path):
+    with pytest.raises(OSError, match="no such folder"):
+        clsas.mosaic(LINES, GRID, tmp_path / "none" / "a.zarr", **WISH)
+    (tmp_path / "file").write_text("")
+    with pytest.raises((OSError, ValueError), match="file"):
+        clsas.mosaic(LINES, GRID, tmp_path / "file", **WISH)
+
+
+@pytest.mark.skipif(not os.geteuid(), reason="nothing is read-only to root")
+def test_a_store_that_is_read_only(tmp_path):
+    list(clsas.mosaic(LINES, GRID, tmp_path / "a.zarr", **WISH))
+    (tmp_path / "a.zarr").chmod(0o500)
+    with pytest.raises(PermissionError):
+        clsas.mosaic(LINES, GRID, tmp_path / "a.zarr", **WISH)
+
+
+@pytest.mark.skipif(len(list_devices()) < 2, reason="one OpenCL device only")
+def test_devices_side_by_side(exact):
+    infos = list_devices()[:2]
+    mosaic = clsas.mosaic(
+        LINES, GRID, **(WISH | {"patches": (6, 8)}), device=[info.index for info in infos]
+    )
+    patches = []
+    assert relative_error_db(mosaic.image(patches.append), exact) < -65
+    assert {patch.record.device for patch in patches} == {info.label for info in infos}
+
+
+class TestDistributed:
+    def test_a_worker_that_dies_is_made_up_for(self, file, tmp_path):
+        distributed = pytest.importorskip("distributed")
+        for _ in clsas.mosaic(file, GRID, tmp_path / "local.zarr", **WISH):
+            pass
+        with (
+            distributed.LocalCluster(
+                n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None
+            ) as cluster,
+            distributed.Client(cluster) as client,
+        ):
+            first = next(iter(client.run(os.getpid).values()))
+            places = []
+            path = tmp_path / "distributed.zarr"
+            for patch in clsas.mosaic(file, GRID, path, client=client, **WISH):
+                places.append((patch.row, patch.column))
+                if len(places) == 2:
+                    os.kill(first, signal.SIGKILL)
+        assert sorted(places) == sorted(np.ndindex(2, 4))
+        local, other = (
+            Store.opened(tmp_path / f"{n}.zarr").image().pixels for n in ("local", "distributed")
+        )
+        np.testing.assert_array_equal(local, other)
+
+    def test_only_workers_need_a_device(self, file, tmp_path, monkeypatch):
+        monkeypatch.setattr("clsas.opencl.device._raw_devices", list)
+        client = SimpleNamespace(get_executor=None)
+        mosaic = clsas.mosaic(file, GRID, tmp_path / "a.zarr", client=client, **WISH)
+        assert len(mosaic) == 8
+
+    @pytest.mark.parametrize(
+        ("wrong", "message"),
+        [
+            ({"store": None}, "store must be given with a client"),
+            ({"source": LINES}, "source must be a path with a client"),
+            ({"device": 0}, "device must be left out with a client"),
+        ],
+    )
+    def test_bad_arguments(self, file, tmp_path, wrong, message):
+        arguments = {"source": file, "store": tmp_path / "a.zarr"} | wrong
+        with pytest.raises(ValueError, match=message):
+            clsas.mosaic(grid=GRID, client=SimpleNamespace(get_executor=None), **arguments)
+
+
+class TestFollowing:
+    GRID = Grid.plane((-30, 10, 200), (30, 33, 12))
+    TRACK = along_x(1200, 0.05)
+    WISH = MappingProxyType({"accuracy_db": -70, "beam": BEAM, "patches": (1, 10)})
+
+    @pytest.fixture(scope="class")
+    @classmethod
+    def lines(cls):
+        return lines_over(cls.GRID, cls.TRACK, carrier_hz=100e3, step_m=0.03, own_start=True)
+
+    @pytest.fixture
+    def record(self, lines, tmp_path):
+        """Return a function that adds files to a folder, of 200 channels each."""
+        folder = tmp_path / "survey"
+        folder.mkdir()
+
+        def add(parts):
+            for part in parts:
+                clsas.save(folder / f"{part}.h5", lines.select(slice(200 * part, 200 * part + 200)))
+
+        return folder, add
+
+    def test_patches_are_formed_while_files_arrive(self, lines, record, tmp_path):
+        folder, add = record
+        beam = dataclasses.replace(BEAM, track_pings=101)
+        reference = clsas.backproject(lines, self.GRID, beam=beam, accuracy_db=-80)
+        add([0, 1])
+        formed, late = [], threading.Event()
+
+        def more():
+            for part in (2, 3, 4, 5):
+                time.sleep(0.3)
+                add([part])
+                if part == 3:
+                    late.wait(60)  # the rest comes once patches are there
+            (folder / END).touch()
+
+        recorder = threading.Thread(target=more)
+        recorder.start()
+        path = tmp_path / "a.zarr"
+        for patch in clsas.mosaic(folder, self.GRID, path, **self.WISH, follow_s=60):
+            formed.append((patch.column, patch.record.survey_channels))
+            late.set()
+        recorder.join()
+        assert sorted(column for column, _ in formed) == list(range(10))  # none twice
+        assert formed[0][1] <= 800  # of 1200
+        assert relative_error_db(Store.opened(path).image(), reference) < -65
+
+    def test_it_ends_when_nothing_comes(self, record, tmp_path):
+        folder, add = record
+        add(range(3))
+        patches = list(
+            clsas.mosaic(folder, self.GRID, tmp_path / "a.zarr", **self.WISH, follow_s=1)
+        )
+        assert len(patches) == 10
+        assert not (folder / END).exists()
+
+    @pytest.mark.parametrize(("squint_deg", "column"), [(0.0, 160), (40.0, 160), (-40.0, 0)])
+    def test_no_patch_is_formed_too_early(self, lines, squint_deg, column):
+        """Not either with a beam that looks ahead, or back."""
+        module = sys.modules["clsas.mosaics.mosaic"]
+        beam = BeamWindow(8.0, "hann", squint_deg=squint_deg, along=(1.0, 0.0, 0.0))
+        patch = self.GRID.window(slice(0, 12), slice(column, column + 10))
+        counts = np.arange(20, 1201, 20)
+        sights = [
+            module._Sight.of(module.open_survey(lines.select(slice(0, n))), beam) for n in counts
+        ]
+        last = np.flatnonzero(sights[-1].sees(patch))[-1]
+        passed = [sight.has_passed(patch, sight.settled) for sight in sights]
+        assert not any(passed[: np.searchsorted(counts, last + 1)])
+        assert last < 1000
+        assert passed[np.searchsorted(counts, last + 200)]  # and soon
+
+    def test_a_survey_is_followed_once_more(self, record, tmp_path):
+        """Files are in the store's inputs once, whoever looked when they came."""
+        folder, add = record
+        add(range(2))
+        mosaic = clsas.mosaic(folder, self.GRID, tmp_path / "a.zarr", **self.WISH, follow_s=1)
+        add(range(2, 4))
+        (folder / END).touch()
+        formed = list(mosaic)
+        assert len(formed) == 10
+        assert not list(mosaic)
+        again = clsas.mosaic(folder, self.GRID, tmp_path / "a.zarr", **self.WISH, follow_s=1)
+        assert len(again.finished) == 10
+
+    def test_a_survey_that_grew_twice_goes_on(self, record, tmp_path):
+        """The store's inputs hold every file in its order."""
+        folder, add = record
+        add(range(2))
+        path = tmp_path / "a.zarr"
+        mosaic = clsas.mosaic(folder, self.GRID, path, **self.WISH, follow_s=3)
+        add([2])
+        later = threading.Timer(1.5, add, ([3],))
+        later.start()
+        list(mosaic)
+        later.join()
+        assert len(Store.opened(path)._attributes()["inputs"]["parts"]) == 4
+        assert len(clsas.mosaic(folder, self.GRID, path, **self.WISH).finished) == 10
+
+    def test_later_channels_make_a_patch_anew(self, lines, record, tmp_path):
+        folder, add = record
+        add(range(4))
+        path = tmp_path / "a.zarr"
+        assert len(list(clsas.mosaic(folder, self.GRID, path, **self.WISH))) == 10
+        add(range(4, 6))
+        again = {patch.column for patch in clsas.mosaic(folder, self.GRID, path, **self.WISH)}
+        assert 9 in again
+        assert 0 not in again
+        beam = dataclasses.replace(BEAM, track_pings=101)
+        reference = clsas.backproject(lines, self.GRID, beam=beam, accuracy_db=-80)
+        assert relative_error_db(Store.opened(path).image(), reference) < -65
+
+    def test_a_second_leg_while_following_again(self, lines, record, tmp_path):
+        """Patches finished in an earlier run, and those begun as the last file came, too."""
+        folder, add = record
+        add(range(6))
+        path = tmp_path / "a.zarr"
+        running = iter(clsas.mosaic(folder, self.GRID, path, **self.WISH, follow_s=5))
+        for _ in range(5):
+            next(running)
+        running.close()
+        mosaic = clsas.mosaic(folder, self.GRID, path, **self.WISH, follow_s=5)
+        assert len(mosaic.finished) >= 5
+        # The way back, beside the first.
+        back = lines.select(np.arange(1199, -1, -1))
+        aside_m = np.array([0.0, 2.0, 0.0])
+        back = dataclasses.replace(back, tx_m=back.tx_m + aside_m, rx_m=back.rx_m + aside_m)
+        clsas.save(folder / "7.h5", back)
+        (folder / END).touch()
+        image = mosaic.image()
+        store = Store.opened(path)
+        assert {record.survey_channels for record in store.records().values()} == {2400}
+        np.testing.assert_array_equal(image.pixels, store.image().pixels)
+        assert not list(clsas.mosaic(folder, self.GRID, path, **self.WISH))
+
+    def test_a_worker_opens_every_file_once(self, lines, record, monkeypatch):
+        """But again should it be another one meanwhile."""
+        mosaic, survey = sys.modules["clsas.mosaics.mosaic"], sys.modules["clsas.mosaics.survey"]
+        read, opened = survey.read_geometry, []
+        monkeypatch.setattr(
+            survey, "read_geometry", lambda path: opened.append(path.name) or read(path)
+        )
+        folder, add = record
+
+        def seen():
+            """Return the channels that a worker knows, and the files that it opened for it."""
+            files = mosaic._files(survey.open_survey(folder))
+            opened.clear()
+            return mosaic._opened(files, None).survey.channels, list(opened)
+
+        add(range(2))
+        assert seen() == (400, ["0.h5", "1.h5"])
+        add(range(2, 4))
+        assert seen() == (800, ["2.h5", "3.h5"])
+        clsas.save(folder / "0.h5", lines.select(slice(0, 100)))
+        add([4])
+        assert seen() == (900, [f"{n}.h5" for n in range(5)])
+
+    def test_a_folder_that_stays_empty(self, tmp_path):
+        (tmp_path / "none").mkdir()
+        with pytest.raises(ValueError, match="has no file"):
+            clsas.mosaic(tmp_path / "none", self.GRID, **self.WISH, follow_s=0.1)
+
+
+@pytest.mark.skipif(not os.path.exists("/proc/self/status"), reason="Linux tells the most memory")
+def test_lines_larger_than_memory_are_read_in_parts(tmp_path):
+    """200 km of track, 30 GB of samples, of which next to nothing is on the disk."""
+    pings, length = 640_000, 6000
+    small = LINES
+    track = along_x(pings, 0.05)
+    first = pings // 2 - 80
+    assert np.allclose(track[first : first + 160], small.tx_m, atol=1e-6)
+    clsas.save(tmp_path / "lines.h5", small)
+    with h5py.File(tmp_path / "lines.h5", "r+") as file:
+        for name, values in (
+            ("tx_m", track),
+            ("rx_m", track),
+            ("first_range_m", np.full(pings, small.first_range_m[0])),
+        ):
+            attributes = dict(file[name].attrs)
+            del file[name]
+            file.create_dataset(name, data=values).attrs.update(attributes)
+        attributes = dict(file["samples"].attrs)
+        del file["samples"]
+        samples = file.create_dataset("samples", (pings, length), np.complex64, chunks=(64, 1000))
+        samples.attrs.update(attributes)
+        samples[first : first + 160, : small.length] = small.samples
+        assert samples.id.get_storage_size() < 4e6 < 1e-3 * samples.nbytes
+    script = textwrap.dedent(
+        """
+        import pathlib, sys
+        sys.path.append("..")
+        import numpy as np, clsas
+        from test_mosaic import BEAM, GRID, LINES
+
+        def most_kib():  # of this process, not of the one that it was made from
+            lines = pathlib.Path("/proc/self/status").read_text().splitlines()
+            return next(int(line.split()[1]) for line in lines if line.startswith("VmHWM"))
+
+        clsas.backproject(LINES, GRID, beam=BEAM, accuracy_db=-70)  # the driver's own
+        before = most_kib()
+        image = clsas.mosaic(sys.argv[1], GRID, accuracy_db=-70, beam=BEAM, patches=(2, 4)).image()
+        print(most_kib() - before)
+        np.save(sys.argv[2], image.pixels)
+        """
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", script, tmp_path / "lines.h5", tmp_path / "image.npy"],
+        check=True,
+        capture_output=True,
+        text=True,
+        cwd=os.path.dirname(__file__),
+    )
+    assert int(done.stdout) / 1024 < 500  # MiB, of 30 GB
+    exact = clsas.backproject(LINES, GRID, beam=BEAM, accuracy_db=-80)
+    assert relative_error_db(np.load(tmp_path / "image.npy"), exact.pixels) < -65
+
+
+def test_workers_of_a_machine_take_a_device_each(tmp_path, monkeypatch):
+    """And share them where there are more; what one leaves the next takes."""
+    module = sys.modules["clsas.mosaics.mosaic"]
+    monkeypatch.setattr(module, "_side_by_side", lambda: ("first", "second"))
+    monkeypatch.setattr(module.tempfile, "gettempdir", lambda: str(tmp_path))
+    claim = module._claimed.__wrapped__  # as every process calls it, once
+    workers = [claim() for _ in range(5)]
+    assert [device for device, _ in workers] == ["first", "second", "first", "second", "first"]
+    os.close(workers[1][1])
+    assert claim()[0] == "second"

@@ -1,0 +1,281 @@
+"""Stores on disk: damage is found, writes are durable, older versions are refused."""
+
+import json
+import os
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from cases import along_x, lines_over
+from click.testing import CliRunner
+
+import clsas
+from clsas.cli import main
+from clsas.core.grid import Grid
+from clsas.mosaics.record import is_intact, read_attributes
+from clsas.mosaics.store import Store
+
+GRID = Grid.plane((-4, 4, 40), (30, 40, 30))
+LINES = lines_over(GRID, along_x(60, 0.1), carrier_hz=100e3, step_m=0.03)
+WISH = {"accuracy_db": -50, "beam": clsas.BeamWindow(8.0, "hann"), "patches": (2, 3)}
+CHUNK = Path("pixels/c/1/2")
+RECORD = Path("patches/1.2/zarr.json")
+
+
+@pytest.fixture(scope="module")
+def kept(tmp_path_factory):
+    """The files of a store, by path in it."""
+    path = tmp_path_factory.mktemp("kept") / "a.zarr"
+    list(clsas.mosaic(LINES, GRID, path, **WISH))
+    return {each.relative_to(path): each.read_bytes() for each in path.rglob("*") if each.is_file()}
+
+
+@pytest.fixture
+def path(kept, tmp_path):
+    """A store of its own for a test."""
+    for name, content in kept.items():
+        (tmp_path / "a.zarr" / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / "a.zarr" / name).write_bytes(content)
+    return tmp_path / "a.zarr"
+
+
+def flip(path, bit):
+    content = bytearray(path.read_bytes())
+    content[bit // 8] ^= 1 << bit % 8
+    path.write_bytes(content)
+
+
+def zero(path):
+    path.write_bytes(bytes(path.stat().st_size))
+
+
+def check_mended(path, kept):
+    """A run warns, forms the one damaged patch and ends with the same pixels."""
+    with pytest.warns(clsas.ClsasWarning, match=r"a\.zarr is damaged .* again: patch 1,2: its"):
+        mosaic = clsas.mosaic(LINES, GRID, path, **WISH)
+    assert [(patch.row, patch.column) for patch in mosaic] == [(1, 2)]
+    assert not Store.opened(path).damage()
+    for name, content in kept.items():
+        if name.parts[:2] == ("pixels", "c"):
+            assert (path / name).read_bytes() == content
+
+
+def test_all_is_well_of_a_whole_store(path, kept):
+    assert not Store.opened(path).damage()
+    assert len(clsas.mosaic(LINES, GRID, path, **WISH).finished) == 6
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda path: flip(path, 0),
+        lambda path: flip(path, 8 * path.stat().st_size - 40),  # the last of the pixels
+        lambda path: flip(path, 8 * path.stat().st_size - 1),  # of the checksum
+        zero,
+        lambda path: path.write_bytes((path.parent / "1").read_bytes()),  # another patch's
+        lambda path: path.unlink(),
+    ],
+    ids=["first bit", "last bit", "checksum", "zeroed", "exchanged", "gone"],
+)
+def test_damaged_pixels_are_found_and_formed_again(path, kept, damage):
+    damage(path / CHUNK)
+    store = Store.opened(path)
+    assert list(store.damage()) == [(1, 2)]
+    for read in (store.image, store.read, store.overview, lambda: store.image(slice(20, None))):
+        with pytest.raises(ValueError, match="patch 1,2: its pixels"):
+            read()
+    assert store.image(slice(0, 15)).pixels.any()  # of other patches
+    check_mended(path, kept)
+
+
+def test_a_finished_mosaic_does_not_hand_out_damage(path):
+    """Also where the damage came after the store was verified."""
+    mosaic = clsas.mosaic(LINES, GRID, path, **WISH)
+    flip(path / CHUNK, 1000)
+    with pytest.raises(ValueError, match="patch 1,2: its pixels do not match their checksum"):
+        mosaic.image()
+
+
+def test_any_bit_of_a_record_is_found_or_plays_no_part(path, kept):
+    chance = np.random.default_rng(1)
+    expected = read_attributes((path / RECORD).parent)
+    found = 0
+    for bit in chance.integers(0, 8 * len(kept[RECORD]), 300):
+        (path / RECORD).write_bytes(kept[RECORD])
+        flip(path / RECORD, int(bit))
+        store = Store.opened(path)
+        if store.damage():
+            found += 1
+            assert (1, 2) not in store.records()
+        else:  # a blank, or Zarr's own part of the document
+            assert read_attributes((path / RECORD).parent) == expected
+    assert found > 200
+    (path / RECORD).write_bytes(kept[RECORD].replace(b'"channels": ', b'"channels": 1'))
+    check_mended(path, kept)
+
+
+@pytest.mark.parametrize("name", ["zarr.json", "pixels/zarr.json"])
+def test_any_bit_of_the_layout_is_found_or_plays_no_part(path, kept, name):
+    chance = np.random.default_rng(2)
+    whole = Store.opened(path).image()
+    found = 0
+    for bit in chance.integers(0, 8 * len(kept[Path(name)]), 200):
+        (path / name).write_bytes(kept[Path(name)])
+        flip(path / name, int(bit))
+        try:
+            image = Store.opened(path).image()
+        except ValueError:
+            found += 1
+            continue
+        np.testing.assert_array_equal(image.pixels, whole.pixels)
+        np.testing.assert_array_equal(image.grid.positions_m(), whole.grid.positions_m())
+    assert found > 20
+
+
+def test_a_damaged_height_map_is_found(tmp_path):
+    grid = GRID.with_height(np.linspace(0, 1, GRID.size).reshape(GRID.shape))
+    list(clsas.mosaic(LINES, grid, tmp_path / "a.zarr", **WISH))
+    store = Store.opened(tmp_path / "a.zarr")
+    np.testing.assert_array_equal(store.image().grid.height_m, grid.height_m)
+    (chunk,) = [each for each in (tmp_path / "a.zarr/height/c").rglob("*") if each.is_file()]
+    flip(chunk, 500)
+    with pytest.raises(ValueError, match=r"a\.zarr is damaged: height cannot be read"):
+        _ = store.grid
+
+
+def test_a_store_without_checksums_is_refused_by_its_version(path):
+    document = json.loads((path / "zarr.json").read_text())
+    document["attributes"]["version"] = 1
+    (path / "zarr.json").write_text(json.dumps(document))
+    for work in (Store.opened, lambda path: clsas.mosaic(LINES, GRID, path, **WISH)):
+        with pytest.raises(ValueError, match="of version 1, this clsas works with version 2"):
+            work(path)
+
+
+def test_pixels_reach_the_disk_before_the_record_has_its_name(tmp_path, monkeypatch):
+    list(clsas.mosaic(LINES, GRID, tmp_path / "a.zarr", **WISH))
+    events = []
+    sync, rename = os.fsync, os.replace
+
+    def synced(descriptor):
+        events.append(("sync", os.readlink(f"/proc/self/fd/{descriptor}")))
+        sync(descriptor)
+
+    def renamed(source, target):
+        events.append(("name", str(source), str(target)))
+        rename(source, target)
+
+    store = Store.opened(tmp_path / "a.zarr")
+    pixels, record = store.read(slice(15, 30), slice(28, 42)), store.records()[1, 2]
+    monkeypatch.setattr(os, "fsync", synced)
+    monkeypatch.setattr(os, "replace", renamed)
+    store.write(1, 2, slice(15, 30), slice(28, 42), pixels, record)
+    chunk, document = (str(store.path / name) for name in (CHUNK, RECORD))
+    names = [event for event in events if event[0] == "name"]
+    assert [target for _, _, target in names] == [chunk, document]
+    order = [
+        ("sync", os.path.dirname(document)),  # the former record is gone
+        ("sync", names[0][1]), names[0], ("sync", os.path.dirname(chunk)),
+        ("sync", names[1][1]), names[1], ("sync", os.path.dirname(document)),
+    ]  # fmt: skip
+    assert events == order
+
+
+def test_a_patch_that_is_written_anew_has_no_record_meanwhile(path, monkeypatch):
+    """A run that is killed then must not leave the old record with new pixels."""
+    store = Store.opened(path)
+    record = store.records()[1, 2]
+
+    def killed(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("clsas.mosaics.durable.write_pixels", killed)
+    with pytest.raises(KeyboardInterrupt):
+        store.write(1, 2, slice(15, 30), slice(28, 42), np.ones((15, 12), np.complex64), record)
+    assert (1, 2) not in store.records()
+    assert not store.damage()
+
+
+@pytest.mark.parametrize("folder", ["pixels/c/1", "patches/1.2", "."])
+def test_leftovers_of_killed_runs_are_removed(path, folder):
+    (path / RECORD).unlink()
+    left = path.parent if folder == "." else path / folder
+    (left / ".clsas-0.part").write_text("half")
+    (path.parent / ".clsas-1.part").mkdir()
+    if folder == ".":
+        clsas.save(path.parent / "lines.h5", LINES)
+        assert not list(path.parent.glob(".clsas-*"))
+    else:
+        list(clsas.mosaic(LINES, GRID, path, **WISH))
+        assert not list(path.rglob(".clsas-*"))
+
+
+def test_other_software_verifies_pixels_too(path):
+    zarr = pytest.importorskip("zarr")
+    flip(path / CHUNK, 77)
+    with pytest.raises(ValueError, match="checksum"):
+        _ = zarr.open_array(path / "pixels", mode="r")[:]
+
+
+def test_the_checksum_is_as_described(path):
+    """As docs/mosaic.md describes it for other software."""
+    import zlib
+
+    attributes = json.loads((path / RECORD).read_text())["attributes"]
+    assert is_intact(attributes)
+    expected = attributes.pop("crc32")
+    text = json.dumps(attributes, sort_keys=True, separators=(",", ":"))
+    assert expected == f"{zlib.crc32(text.encode()):08x}"
+    assert attributes["pixels_crc32c"] == (path / CHUNK).read_bytes()[-4:].hex()
+
+
+class TestCommand:
+    @staticmethod
+    def run(*arguments, code):
+        result = CliRunner().invoke(main, ["mosaic", *map(str, arguments)])
+        assert result.exit_code == code, result.output
+        return result.stdout
+
+    def test_verify(self, path):
+        scene = path.with_suffix(".toml")  # the store beside it is the default
+        scene.write_text("")
+        assert "6 patches match their checksums, none damaged" in self.run(
+            scene, "--verify", code=0
+        )
+        zero(path / CHUNK)
+        (path / "patches/0.0/zarr.json").write_text("{")
+        before = {each: each.stat().st_mtime_ns for each in path.rglob("*")}
+        said = self.run(scene, "--verify", "-o", path, code=1)
+        assert "4 patches match their checksums, 2 damaged" in said
+        assert "  patch 0,0: its record cannot be read" in said
+        assert "  patch 1,2: its pixels" in said
+        found = json.loads(self.run(scene, "--verify", "--json", code=1))
+        assert list(found["damaged"]) == ["0,0", "1,2"]
+        assert {each: each.stat().st_mtime_ns for each in path.rglob("*")} == before
+
+    def test_verify_without_a_store(self, tmp_path):
+        (tmp_path / "a.toml").write_text("")
+        result = CliRunner().invoke(main, ["mosaic", str(tmp_path / "a.toml"), "--verify"])
+        assert result.exit_code == 1
+        assert result.stderr == f"Error: there is no mosaic: {tmp_path / 'a.zarr'}\n"
+
+
+@pytest.mark.filterwarnings("ignore:no pixel of the grid")
+def test_the_snippets_of_the_documentation_run_where_patches_are_unseen(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    clsas.save("lines.h5", LINES)
+    text = (Path(__file__).parents[2] / "docs" / "mosaic.md").read_text()
+    snippets = [s for s in re.findall(r"```python\n(.*?)```", text, re.S) if "Client" not in s]
+    assert len(snippets) == 3
+    pytest.importorskip("xarray")
+    # Few pixels, most of which lie beyond the track and the recorded ranges.
+    small = snippets[0].replace("(0, 500, 10001)", "(0, 500, 56)")
+    small = small.replace("(30, 130, 2001)", "(30, 130, 48)").replace("tol", "patches=(2, 5), tol")
+    names = {"lines": LINES}
+    part = snippets[2].replace("slice(2000, 3000)", "slice(20, 30)")
+    for snippet in (small, snippets[1], part):
+        exec(snippet, names)
+    records = Store.opened("image.zarr").records().values()
+    assert {record.has_pixels for record in records} == {True, False}
+    assert names["worst"] <= -40

@@ -1,0 +1,160 @@
+"""Surveys are read by slices, and imaged as if they had been read whole."""
+
+from dataclasses import replace
+
+import h5py
+import numpy as np
+import pytest
+from cases import along_x, lines_over
+
+from clsas.core.geometry import pairwise_range_m
+from clsas.core.grid import Grid
+from clsas.core.image_error import relative_error_db
+from clsas.exact.backprojection import backproject
+from clsas.files.hdf5 import FileFormatError, save
+from clsas.mosaics.survey import END, files_of, has_ended, largest_gap_m, open_files, open_survey
+
+GRID = Grid.plane((-3, 3, 61), (30, 90, 121))
+TRACK = along_x(120, 0.05)
+LINES = lines_over(GRID, TRACK, carrier_hz=100e3, step_m=0.03)
+PATCH = GRID.window(slice(40, 60), slice(20, 50))
+
+
+@pytest.fixture
+def folder(tmp_path):
+    for index, channels in enumerate((slice(0, 50), slice(50, 51), slice(51, 120))):
+        save(tmp_path / f"{index}.h5", LINES.select(channels))
+    return tmp_path
+
+
+def ranges_of(grid):
+    range_m = pairwise_range_m(grid.positions_m().reshape(-1, 3), TRACK, TRACK, None, 1500.0)
+    return range_m.min(axis=0), range_m.max(axis=0)
+
+
+def test_geometry_is_that_of_the_lines(folder):
+    survey = open_survey(folder)
+    for name in ("tx_m", "rx_m", "first_range_m"):
+        np.testing.assert_array_equal(getattr(survey.geometry, name), getattr(LINES, name))
+    assert survey.channels == 120
+    assert set(survey.length) == {LINES.length}
+    assert survey.geometry.samples.shape == (120, 1)
+
+
+@pytest.mark.parametrize("how", ["memory", "file", "folder"])
+def test_what_is_read_is_what_was_recorded(how, folder, tmp_path):
+    save(tmp_path / "whole.hdf5", LINES)
+    survey = open_survey({"memory": LINES, "file": tmp_path / "whole.hdf5", "folder": folder}[how])
+    seen = np.zeros(120, bool)
+    seen[[3, 4, 48, 50, 52, 119]] = True
+    near_m, far_m = ranges_of(PATCH)
+    lines, missing = survey.read(seen, near_m, far_m)
+    assert not missing.any()
+    assert lines.length < LINES.length / 2
+    assert survey.extent(seen, near_m, far_m) == (lines.channels, lines.length)
+    np.testing.assert_array_equal(lines.tx_m, TRACK[seen])
+    for line, channel in zip(range(6), np.flatnonzero(seen), strict=True):
+        place = (lines.first_range_m[line] - LINES.first_range_m[channel]) / LINES.range_step_m
+        assert place == pytest.approx(round(place), abs=1e-6)
+        first = int(np.floor((near_m[channel] - lines.first_range_m[line]) / lines.range_step_m))
+        last = int(np.ceil((far_m[channel] - lines.first_range_m[line]) / lines.range_step_m))
+        assert first >= 32
+        inside = slice(first - 32, last + 33)
+        there = LINES.samples[channel, round(place) :][: lines.length]
+        np.testing.assert_array_equal(lines.samples[line, inside], there[inside])
+
+
+def test_cut_lines_give_the_same_image(platform):
+    survey = open_survey(LINES)
+    lines, _ = survey.read(np.ones(120, bool), *ranges_of(PATCH))
+    exact = backproject(LINES, PATCH, device=platform, accuracy_db=-85)
+    cut = backproject(lines, PATCH, device=platform, accuracy_db=-85)
+    assert relative_error_db(cut, exact) < -78
+
+
+def test_nothing_is_read_beyond_what_is_recorded():
+    survey = open_survey(LINES)
+    lines, _ = survey.read(np.ones(120, bool), np.full(120, -1e3), np.full(120, 1e3))
+    np.testing.assert_array_equal(lines.samples, LINES.samples)
+    np.testing.assert_array_equal(
+        survey.within(np.full(120, 1e3), np.full(120, 2e3)), np.zeros(120, bool)
+    )
+
+
+def test_channels_without_samples_are_told(tmp_path):
+    save(tmp_path / "lines.h5", LINES)
+    with h5py.File(tmp_path / "lines.h5", "r+") as file:
+        file["samples"][7] = np.nan
+        file["samples"][9] = 0
+    lines, missing = open_survey(tmp_path / "lines.h5").read(np.ones(120, bool), *ranges_of(PATCH))
+    assert list(np.flatnonzero(missing)) == [7, 9]
+    assert not lines.samples[[7, 9]].any()
+    assert np.isfinite(lines.samples).all()
+
+
+def test_gaps_between_pings():
+    none = np.zeros(120, bool)
+    assert largest_gap_m(LINES, none) == 0
+    missing = none.copy()
+    missing[60:64] = True
+    assert largest_gap_m(LINES, missing) == pytest.approx(0.25)
+    dropped = LINES.select(~missing)
+    assert largest_gap_m(dropped, np.zeros(116, bool)) == pytest.approx(0.25)
+
+
+def test_a_digest_changes_with_what_it_is_of():
+    digest = open_survey(LINES).digests()
+    assert digest == open_survey(replace(LINES)).digests()
+    moved = replace(LINES, tx_m=LINES.tx_m + 1e-6)
+    louder = replace(LINES, samples=2 * LINES.samples)
+    assert len({*digest, *open_survey(moved).digests(), *open_survey(louder).digests()}) == 3
+
+
+def test_a_survey_grows_by_files_that_follow(folder):
+    before = open_survey(folder)
+    save(folder / "3.h5", LINES.select(slice(0, 10)))
+    grown = open_files(files_of(folder), before)
+    assert grown.channels == 130
+    assert grown.digests(3) == grown.digests()[3:]
+    assert grown.digests()[:3] == before.digests()
+    save(folder / "25.h5", LINES.select(slice(0, 10)))
+    with pytest.raises(ValueError, match=r"whose names follow the last one, 3\.h5, got 25\.h5"):
+        open_files(files_of(folder), grown)
+    (folder / "25.h5").unlink()
+    (folder / "3.h5").unlink()
+    with pytest.raises(ValueError, match="got fewer files"):
+        open_files(files_of(folder), grown)
+
+
+def test_a_file_that_changed_is_not_read(folder):
+    survey = open_survey(folder)
+    save(folder / "0.h5", LINES.select(slice(0, 49)))
+    with pytest.raises(FileFormatError, match=r"0\.h5 is not what it was"):
+        survey.read(np.ones(120, bool), *ranges_of(PATCH))
+
+
+def test_a_folder_ends_with_a_file_named_end(folder):
+    assert not has_ended(folder)
+    (folder / END).touch()
+    assert has_ended(folder)
+    assert [path.name for path in files_of(folder)] == ["0.h5", "1.h5", "2.h5"]
+
+
+def test_errors(folder, tmp_path):
+    with pytest.raises(TypeError, match="source must be a path, got 3"):
+        open_survey(3)
+    with pytest.raises(FileNotFoundError):
+        open_survey(tmp_path / "none.h5")
+    save(folder / "3.h5", replace(LINES, carrier_hz=99e3))
+    with pytest.raises(ValueError, match=r"3.h5: carrier_hz must be .* 100000, got 99000"):
+        open_survey(folder)
+    save(folder / "3.h5", replace(LINES, rx_velocity_m_s=[1.0, 0, 0]))
+    with pytest.raises(ValueError, match="rx_velocity_m_s must be in every file"):
+        open_survey(folder)
+    save(folder / "3.h5", GRID)
+    with pytest.raises(FileFormatError, match="must hold range lines, got 'grid'"):
+        open_survey(folder)
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    with pytest.raises(ValueError, match=r"must hold range lines: the folder .*empty has no file"):
+        open_survey(empty)

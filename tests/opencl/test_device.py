@@ -1,0 +1,354 @@
+import dataclasses
+import re
+import time
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+import pyopencl as cl
+import pytest
+
+from clsas.opencl import device as module
+from clsas.opencl.device import (
+    ENVIRONMENT_VARIABLE,
+    DeviceError,
+    choose,
+    kernel_source,
+    list_devices,
+    open_device,
+)
+
+FOLDERS = (Path(module.__file__).parents[1] / "cl", Path(module.__file__).parents[2] / "cl")
+SOURCES = sorted(path.name for folder in FOLDERS for path in folder.glob("*.*"))
+OPTIONS = {
+    "WIDTH": 1,
+    "TAPS": 4,
+    "TILE_ROWS": 16,
+    "TILE_COLUMNS": 16,
+    "PERMUTE": 0,
+    "WINDOWS": 1,
+    "BISTATIC": 0,
+    "MOVING": 0,
+    "PHASE_TERMS": 6,
+}
+
+
+@pytest.fixture(autouse=True)
+def no_wish(monkeypatch):
+    monkeypatch.delenv(ENVIRONMENT_VARIABLE, raising=False)
+
+
+@pytest.fixture
+def nothing(monkeypatch):
+    """A machine without any device."""
+    monkeypatch.setattr(module, "_raw_devices", list)
+
+
+def test_every_device_is_described():
+    devices = list_devices()
+    assert [info.index for info in devices] == list(range(len(devices)))
+    for info in devices:
+        assert info.label == f"{info.platform}: {info.name}"
+        assert info.kind in ("gpu", "cpu", "accelerator")
+        assert info.width in ((1, 4, 8, 16) if info.kind == "cpu" else (1,))
+        assert not info.permute or info.width in (8, 16)
+        assert info.driver
+        assert info.compute_units >= 1
+        assert 0 < info.max_buffer_bytes <= info.memory_bytes
+
+
+VECTORS = {
+    "AVX-512": ("", (16, True)),
+    "AVX2": ("#undef __AVX512F__", (8, True)),
+    "AVX": ("#undef __AVX512F__\n#undef __AVX2__", (8, False)),
+    "none": ("#undef __AVX512F__\n#undef __AVX2__\n#undef __AVX__", (4, False)),
+    "broken": ("#error", (4, False)),
+}
+
+
+@pytest.mark.parametrize(("macros", "most"), VECTORS.values(), ids=VECTORS)
+def test_vectors_are_no_wider_than_the_compilers(macros, most, monkeypatch):
+    before = list_devices()
+    of_file = module.kernel_source
+    monkeypatch.setattr(module, "kernel_source", lambda name: f"{macros}\n{of_file(name)}")
+    module._compiled_vectors.cache_clear()
+    try:
+        for info, narrow in zip(before, list_devices(), strict=True):
+            vectors = info.width, info.permute
+            assert (narrow.width, narrow.permute) == min(vectors, most)
+    finally:
+        module._compiled_vectors.cache_clear()
+
+
+def test_it_agrees_with_opencl():
+    raw = [device for platform in cl.get_platforms() for device in platform.get_devices()]
+    for info, device in zip(list_devices(), raw, strict=True):
+        assert info.name == device.name.strip()
+        assert info.platform == device.platform.name
+        assert info.memory_bytes > 0.1 * device.global_mem_size  # PoCL's follows what is free
+
+
+def test_chosen_by_index():
+    for info in list_devices():
+        for wish in (info.index, str(info.index)):
+            chosen, why = choose(wish)
+            assert chosen.index == info.index
+            assert why == f"asked for as {info.index}"
+
+
+def test_chosen_by_a_part_of_its_name():
+    devices = list_devices()
+    for info in devices:
+        first = next(each for each in devices if each.platform == info.platform)
+        for wish in (info.platform, info.platform.upper(), info.platform[1:].lower()):
+            assert choose(wish)[0].index == first.index
+
+
+def several_devices():
+    """An Intel CPU that two platforms drive, and a GPU beside them."""
+    info = list_devices()[0]
+    told = (
+        ("Portable Computing Language", "pthread-Intel(R) Xeon(R)", "cpu", 16),
+        ("Intel(R) OpenCL", "Intel(R) Xeon(R)", "cpu", 1),
+        ("NVIDIA CUDA", "NVIDIA H200", "gpu", 1),
+        ("NVIDIA CUDA", "NVIDIA H200", "gpu", 1),
+    )
+    return [
+        dataclasses.replace(info, index=i, platform=platform, name=name, kind=kind, width=width)
+        for i, (platform, name, kind, width) in enumerate(told)
+    ]
+
+
+@pytest.mark.parametrize(
+    ("wish", "index"),
+    [("pocl", 0), ("PoCL", 0), ("intel", 1), ("nvidia", 2), ("cpu", 0), ("gpu", 2), ("h200", 2)],
+)
+def test_chosen_by_kind_and_platform(wish, index, monkeypatch):
+    monkeypatch.setattr(module, "list_devices", several_devices)
+    assert choose(wish) == (several_devices()[index], f"asked for as {wish!r}")
+    monkeypatch.setenv(ENVIRONMENT_VARIABLE, wish)
+    assert choose()[0].index == index
+
+
+def test_a_kind_that_is_not_there_is_told(monkeypatch):
+    monkeypatch.setattr(module, "list_devices", lambda: several_devices()[:2])
+    words = "No device matches 'gpu', asked for. Available: 0: Portable Computing Language: "
+    with pytest.raises(DeviceError, match=re.escape(words)):
+        choose("gpu")
+
+
+def test_chosen_by_the_environment(monkeypatch):
+    info = list_devices()[-1]
+    monkeypatch.setenv(ENVIRONMENT_VARIABLE, str(info.index))
+    chosen, why = choose()
+    assert chosen.index == info.index
+    assert ENVIRONMENT_VARIABLE in why
+
+
+def test_a_wish_goes_before_the_environment(monkeypatch):
+    monkeypatch.setenv(ENVIRONMENT_VARIABLE, "nothing like it")
+    assert choose(0)[0].index == 0
+    with pytest.raises(DeviceError, match=f"'nothing like it'.*{ENVIRONMENT_VARIABLE}"):
+        choose()
+
+
+def test_threads_do_not_set_each_others_arguments(platform):
+    """Of a kernel that is slow to be handed them, as one is between two threads' turns."""
+    entered, most = 0, 0
+
+    class Slow:
+        function_name = "slow"
+
+        def set_scalar_arg_dtypes(self, kinds):
+            pass
+
+        def __call__(self, *args, **kwargs):
+            nonlocal entered, most
+            entered += 1
+            most = max(most, entered)
+            time.sleep(0.01)
+            entered -= 1
+
+    slow = Slow()
+    with ThreadPoolExecutor(4) as threads:
+        for done in [threads.submit(platform.run, slow, (1,), n) for n in range(8)]:
+            done.result()
+    assert most == 1
+
+
+def test_gpus_go_before_cpus(monkeypatch):
+    info = dataclasses.replace(list_devices()[0], width=1)
+    kinds = ("accelerator", "cpu", "gpu", "gpu")
+    several = [dataclasses.replace(info, index=i, kind=kind) for i, kind in enumerate(kinds)]
+    monkeypatch.setattr(module, "list_devices", lambda: several)
+    chosen, why = choose()
+    assert (chosen.index, why) == (2, "the first GPU")
+    monkeypatch.setattr(module, "list_devices", lambda: several[:2])
+    chosen, why = choose()
+    assert (chosen.index, why) == (1, "the first CPU; there is no GPU")
+    wide = dataclasses.replace(info, index=2, kind="cpu", width=8)
+    monkeypatch.setattr(module, "list_devices", lambda: [*several[:2], wide])
+    assert choose() == (wide, "the first CPU with vectors of 8; there is no GPU")
+
+
+@pytest.mark.parametrize("wish", ["no such device", 99, "99", -1, "-1"])
+def test_an_unknown_device_names_those_there_are(wish):
+    with pytest.raises(DeviceError) as error:
+        choose(wish)
+    assert repr(wish).strip("'") in str(error.value)
+    for info in list_devices():
+        assert f"{info.index}: {info.label}" in str(error.value)
+
+
+@pytest.mark.parametrize("wish", [1.0, True, ["0"], b"0"])
+def test_a_wish_of_a_wrong_type_is_refused(wish):
+    with pytest.raises(TypeError, match=re.escape(f"a name, an index or None, got {wish!r}")):
+        choose(wish)
+
+
+def test_an_index_may_come_from_numpy():
+    assert choose(np.int64(0))[0].index == 0
+
+
+@pytest.mark.parametrize("wish", [None, 0, "portable"])
+def test_no_device_at_all_says_how_to_get_one(nothing, wish):
+    assert list_devices() == []
+    with pytest.raises(DeviceError) as error:
+        open_device(wish)
+    for part in ("No OpenCL device", "pip install 'pyopencl[pocl]", "/etc/OpenCL/vendors", ".libs"):
+        assert part in str(error.value)
+
+
+def test_a_loader_without_a_driver_is_no_device(monkeypatch):
+    def fail():
+        raise cl.LogicError("clGetPlatformIDs failed: PLATFORM_NOT_FOUND_KHR")
+
+    monkeypatch.setattr(cl, "get_platforms", fail)
+    assert list_devices() == []
+
+
+def test_a_platform_without_a_device_is_passed_over(monkeypatch):
+    class Empty:
+        def get_devices(self):
+            raise cl.RuntimeError("clGetDeviceIDs failed: DEVICE_NOT_FOUND")
+
+    platforms = cl.get_platforms()
+    names = [info.label for info in list_devices()]
+    monkeypatch.setattr(cl, "get_platforms", lambda: [Empty(), *platforms])
+    assert [info.label for info in list_devices()] == names
+
+
+def test_opened_once():
+    device = open_device(0)
+    assert open_device("0") is device
+    assert open_device(device) is device
+    assert open_device(device.info.platform).info.platform == device.info.platform
+
+
+def test_kernels_are_built_once(platform):
+    kernel = platform.kernel("backproject", "backproject_tiles", **OPTIONS)
+    assert platform.kernel("backproject", "backproject_tiles", **OPTIONS) is kernel
+    reordered = dict(reversed(OPTIONS.items()))
+    assert platform.kernel("backproject", "backproject_tiles", **reordered) is kernel
+    other = platform.kernel("backproject", "backproject_tiles", **(OPTIONS | {"TAPS": 2}))
+    assert other is not kernel
+
+
+def test_a_program_is_built_once_for_all_its_kernels(platform, monkeypatch):
+    options = OPTIONS | {"TAPS": 6}
+    platform.kernel("backproject", "backproject_tiles", **options)
+    monkeypatch.setattr(cl, "Program", None)  # nothing more may be built
+    assert platform.kernel("backproject", "expand_tiles", **options)
+    assert platform.kernel("backproject", "backproject_points", **options)
+
+
+def test_only_the_programs_used_last_are_kept(platform, monkeypatch):
+    monkeypatch.setattr(module, "_MOST_PROGRAMS", 3)
+    device = dataclasses.replace(platform, _kernels={})
+    first = device.kernel("peak", "peak", WIDTH=1)
+    for unused in range(5):
+        assert device.kernel("peak", "peak", WIDTH=1) is first  # used again and again
+        device.kernel("peak", "peak", WIDTH=1, UNUSED=unused)
+    assert len(device._kernels) == 3
+    for unused in range(3):
+        device.kernel("peak", "peak", WIDTH=1, UNUSED=unused)
+    assert len(device._kernels) == 3
+    again = device.kernel("peak", "peak", WIDTH=1)
+    assert again is not first
+    assert first.function_name == again.function_name  # what a run holds goes on living
+
+
+def test_kernels_are_released_with_the_last_that_holds_them(platform):
+    """Those of Program.all_kernels have a reference too many, and never are."""
+    kernel = platform.kernel("backproject", "backproject_tiles", **OPTIONS)
+    assert kernel.reference_count == 1
+
+
+def test_a_failed_build_shows_the_compilers_log(platform, monkeypatch):
+    broken = "__kernel void broken(__global float *x) { x[0] = no_such_variable; }"
+    monkeypatch.setattr(module, "kernel_source", lambda name: broken * name.endswith(".cl"))
+    with pytest.raises(DeviceError) as error:
+        platform.kernel("some_file", "broken", WIDTH=1)
+    message = str(error.value)
+    assert "no_such_variable" in message
+    assert "some_file.cl" in message
+    assert "-DWIDTH=1" in message
+    assert platform.info.label in message
+
+
+@pytest.mark.filterwarnings("ignore::pyopencl.CompilerWarning")
+def test_the_vector_widths_give_their_values(device):
+    """Uploads, a build and a run: the smallest job, through the header all kernels share."""
+    width = device.info.width
+    source = (
+        kernel_source("common.h")
+        + """
+        __kernel void turn(__global const float *t, __global float *sine, __global float *cosine)
+        {
+            const int i = get_global_id(0) * WIDTH;
+            vfloat s, c;
+            sincos_cycles(LOAD(t + i), &s, &c);
+            STORE(s, sine + i);
+            STORE(c, cosine + i);
+        }"""
+    )
+    program = cl.Program(device.context, source).build([f"-DWIDTH={width}"])
+    rng = np.random.default_rng(1)
+    t = np.concatenate([rng.uniform(-0.5, 0.5, 3000), rng.uniform(-3e3, 3e3, 1000), np.zeros(96)])
+    t = t.astype(np.float32)
+    t[-9:] = np.arange(-4, 5) / 4
+    sine, cosine = np.empty_like(t), np.empty_like(t)
+    buffers = [device.upload(t), device.buffer(t.nbytes), device.buffer(t.nbytes)]
+    device.run(cl.Kernel(program, "turn"), (len(t) // width,), *buffers)
+    cl.enqueue_copy(device.queue, sine, buffers[1])
+    cl.enqueue_copy(device.queue, cosine, buffers[2])
+    angle = 2 * np.pi * t.astype(np.float64)
+    assert np.abs(sine - np.sin(angle)).max() <= 2e-6
+    assert np.abs(cosine - np.cos(angle)).max() <= 2e-6
+
+
+def test_a_profile_counts_and_times_what_runs_within(platform):
+    kernel = platform.kernel("peak", "peak", WIDTH=platform.info.width)
+    result = platform.buffer(4 * 64)
+    platform.run(kernel, (64,), 1, 0.5, result)
+    with platform.profile() as times:
+        for steps in (1, 10000, 10000):
+            platform.run(kernel, (64,), steps, 0.5, result)
+    peak = times.pop("peak")
+    assert peak.count == 3
+    assert 0 < peak.minimum_s < peak.median_s <= peak.maximum_s
+    assert peak.total_s == pytest.approx(peak.minimum_s + peak.median_s + peak.maximum_s)
+    assert not times
+
+
+def test_the_sources_are_found():
+    assert {"common.h", "backproject.cl"} <= set(SOURCES)
+
+
+@pytest.mark.parametrize("name", SOURCES)
+def test_no_kernel_needs_double_precision(name):
+    code = re.sub(r"/\*.*?\*/|//[^\n]*", "", kernel_source(name), flags=re.DOTALL)
+    assert "__kernel" in code or "vfloat" in code
+    assert not re.search(r"\b(double\d*|cl_khr_fp64|as_double\d*|convert_double\d*)\b", code)
+    # A literal without its f is a double.
+    assert not re.findall(r"(?<![\w.])(?:\d+\.\d*|\.\d+|\d+[eE])(?:[eE]?[+-]?\d+)?(?![\w.])", code)

@@ -1,0 +1,57 @@
+"""Kernels read nothing that was not written: memory that holds anything changes no image."""
+
+from functools import cache
+
+import numpy as np
+import pyopencl as cl
+import pytest
+
+from clsas.opencl.device import Device
+from clsas.sonar.beam import BeamWindow
+from clsas.trials import extremes, selftest
+from clsas.trials.extremes import along_x
+
+BEAM = BeamWindow(12, "hann", along=[1, 0, 0], normalise=True)
+SCENES = {
+    "plane": lambda: extremes.ultrasonic(70, shape=(37, 29)),
+    "relief": lambda: extremes.ultrasonic(70, shape=(37, 29), relief_m=0.05),
+    "beam": lambda: extremes.ultrasonic(track=along_x(90, 0.1), beam=BEAM, shape=(21, 19)),
+    "moving": lambda: extremes.array(moving=True, shape=(21, 19)),
+}
+REQUESTS = (("exact", -80.0), ("exact", -40.0), ("factorized", -55.0), ("half precision", -30.0))
+
+
+@cache
+def made(name):
+    return SCENES[name]()
+
+
+@pytest.fixture
+def poison(monkeypatch):
+    """Fill every new buffer with NaN, once it is switched on; the list holds their sizes."""
+    filled = []
+    make = Device.buffer
+
+    def poisoned(self, bytes_):
+        buffer = make(self, bytes_)
+        cl.enqueue_fill_buffer(self.queue, buffer, np.uint8(255), 0, buffer.size).wait()
+        filled.append(buffer.size)
+        return buffer
+
+    def switch_on():
+        monkeypatch.setattr(Device, "buffer", poisoned)
+        return filled
+
+    return switch_on
+
+
+@pytest.mark.parametrize(("imager", "asked_db"), REQUESTS)
+@pytest.mark.parametrize("name", SCENES)
+def test_what_unused_memory_holds_does_not_matter(name, imager, asked_db, device, poison):
+    known = made(name)
+    wanted = selftest.form(imager, known, asked_db, device).pixels
+    filled = poison()
+    found = selftest.form(imager, known, asked_db, device).pixels
+    assert filled
+    assert known.error_db(found) <= asked_db
+    assert found.tobytes() == wanted.tobytes()

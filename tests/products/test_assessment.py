@@ -1,0 +1,375 @@
+"""What assess says an effect does to an image is what leaving it out does."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from cases import along_x, beside, lines_over
+from click.testing import CliRunner
+
+import clsas
+from clsas.cli import main
+from clsas.core.grid import Grid
+from clsas.core.image_error import relative_error_db
+from clsas.exact.reference import ideal
+from clsas.files import scene_files as config
+from clsas.products.assessment import assess, survey_lines
+from clsas.products.effects import BEAM, ENDS, KEYS, PATTERN, SINGLE, SWAY, track_errors_m
+from clsas.sonar.beam import BeamWindow
+from clsas.sonar.simplify import APART, MOTION, RELIEF
+
+CHANNELS, CARRIER, STEP = 96, 300e3, 0.012
+APERTURE = along_x(CHANNELS, 0.02)
+GRID = Grid.plane((-0.9, 0.9, 64), (20.0, 21.8, 64), -3.0)
+PIXELS = np.random.default_rng(0).permutation(GRID.size)[:300]
+DEVICE = None
+
+
+def lines_on(grid, tx, rx=None, **others):
+    return lines_over(grid, tx, rx, carrier_hz=CARRIER, step_m=STEP, **others)
+
+
+def measured_db(lines, other, grid=GRID, on=None, beam=None, without=None):
+    """The error of other lines, pixels or weights, by float64 images."""
+    full = ideal(lines, grid.at(PIXELS), beam=beam)
+    return relative_error_db(ideal(other, (on or grid).at(PIXELS), beam=without), full)
+
+
+@pytest.mark.parametrize("speed_m_s", [0.01, 0.1, 1.0])
+def test_motion_during_flight(speed_m_s):
+    lines = lines_on(GRID, APERTURE, velocity=[[speed_m_s, 0.0, 0.0]] * CHANNELS)
+    found = assess(lines, GRID)[MOTION]
+    assert found.modelled
+    assert found.error_db == pytest.approx(
+        measured_db(lines, replace(lines, rx_velocity_m_s=None)), abs=1.0
+    )
+    assert found.range_wavelengths < found.most_wavelengths
+
+
+@pytest.mark.parametrize("apart_m", [0.01, 0.05, 0.2])
+def test_transmitter_and_receiver_apart(apart_m):
+    lines = lines_on(GRID, APERTURE, beside(APERTURE, apart_m, 0, 0))
+    middle_m = lines.phase_centres_m
+    found = assess(lines, GRID)[APART]
+    wanted_db = measured_db(lines, replace(lines, tx_m=middle_m, rx_m=middle_m))
+    assert found.modelled
+    assert found.error_db == pytest.approx(wanted_db, abs=1.0)
+    # b^2/8R of broadside, in wavelengths of the way there and back
+    assert found.most_wavelengths == pytest.approx(
+        apart_m**2 / (8 * 20.2) / (1500 / CARRIER) * 2, rel=0.1
+    )
+
+
+@pytest.mark.parametrize("relief_m", [1e-5, 1e-4, 1e-3])
+def test_relief(relief_m):
+    heights_m = relief_m * np.random.default_rng(2).normal(size=GRID.shape)
+    grid = GRID.with_height(heights_m)
+    lines = lines_on(grid, APERTURE)
+    found = assess(lines, grid)[RELIEF]
+    assert found.modelled
+    assert found.error_db == pytest.approx(measured_db(lines, lines, grid, GRID), abs=2.0)
+
+
+@pytest.mark.parametrize("sway_m", [1e-5, 1e-4, 5e-3])
+def test_sway_beyond_a_straight_track(sway_m):
+    off_m = sway_m * np.sin(np.arange(CHANNELS) / 7.0)
+    tx_m = APERTURE + np.stack([0 * off_m, off_m, off_m], axis=-1)
+    lines = lines_on(GRID, tx_m)
+    straight_m = tx_m - track_errors_m(lines)
+    found = assess(lines, GRID)[SWAY]
+    wanted_db = measured_db(lines, replace(lines, tx_m=straight_m, rx_m=straight_m))
+    assert found.modelled
+    assert found.error_db == pytest.approx(wanted_db, abs=1.0)
+
+
+def test_beam_window():
+    lines = lines_on(GRID, APERTURE)
+    beam = BeamWindow(6.0, "hann")
+    found = assess(lines, GRID, beam=beam)[BEAM]
+    assert found.modelled
+    assert found.error_db == pytest.approx(measured_db(lines, lines, beam=beam), abs=1.0)
+    assert assess(lines, GRID)[BEAM].error_db is None
+
+
+def test_an_array_is_no_sway():
+    """Rows of receivers lie beside the track in every ping alike; a yaw turns them differently."""
+    sonar = replace(
+        clsas.Sonar.edgetech(), rx_m=[[0.2, 0, 0.1], [0, 0, -0.1], [-0.2, 0, 0.1]], tx_m=[0, 0, 0.4]
+    )
+    course = dict(start_m=(-3, 0, 9), velocity_m_s=(1, 0.3, 0), pings=20, ping_interval_s=0.3)
+    for yaw_rad, least, most in ((0.0, 0.0, 1e-12), (0.1 * np.sin(np.arange(20)), 0.005, 0.05)):
+        track = clsas.Track.straight(**course, yaw_rad=yaw_rad)
+        tx_m, rx_m, _ = clsas.channels(sonar, track)
+        off_m = track_errors_m(lines_on(GRID, tx_m, rx_m))
+        assert least <= np.abs(off_m).max() <= most
+
+
+def test_element_patterns_are_those_of_the_simulator():
+    """Images of points all over the grid, with and without patterns."""
+    sonar = clsas.Sonar(
+        clsas.Pulse(CARRIER, 40e3, 1e-3),
+        clsas.sonar.line_array(4, 0.04),
+        tx_length_m=0.02,
+        rx_length_m=0.03,
+    )
+    track = clsas.Track.straight((-0.9, 0, 0), (1, 0, 0), 24, 0.08)
+    random = np.random.default_rng(3)
+    grid = Grid.plane((-1.5, 1.5, 64), (10.0, 12.0, 64))
+    places = np.stack(
+        [random.uniform(-1.5, 1.5, 400), random.uniform(10, 12, 400), np.zeros(400)], -1
+    )
+    points = clsas.PointTargets(places, random.normal(size=400) + 1j * random.normal(size=400))
+    with_it, without = (
+        clsas.compress(clsas.simulate(sonar, track, points, element_pattern=on))
+        for on in (True, False)
+    )
+    found = assess(with_it, grid, sonar=sonar, track=track)[PATTERN]
+    pixels = random.permutation(grid.size)[:500]
+    wanted = ideal(with_it, grid.at(pixels))
+    error_db = relative_error_db(ideal(without, grid.at(pixels)), wanted)
+    assert found.modelled
+    assert found.error_db == pytest.approx(error_db, abs=2.0)
+    missing = assess(without, grid, sonar=sonar, track=track, element_pattern=False)
+    assert PATTERN in missing.missing
+    assert MOTION in missing.missing or missing[MOTION].needed is False
+
+
+def test_what_is_needed_follows_the_tolerance():
+    lines = lines_on(GRID, APERTURE, velocity=[[0.01, 0.0, 0.0]] * CHANNELS)
+    error_db = assess(lines, GRID)[MOTION].error_db
+    for beyond_db, needed in ((12.5, True), (13.5, False)):  # a twentieth is 13 dB
+        found = assess(lines, GRID, tolerance_db=error_db + beyond_db)
+        assert found[MOTION].needed is needed
+        assert (MOTION in found.spare) is not needed
+
+
+def test_effects_that_are_not_there_do_nothing():
+    found = assess(lines_on(GRID, APERTURE), GRID)
+    for name in (APART, RELIEF, SWAY):
+        assert not found[name].modelled
+        assert found[name].error_db < -250
+        assert found[name].needed is False
+    assert found[MOTION].error_db is None  # nobody knows how fast it was
+    assert found[MOTION].needed is None
+    assert found[ENDS].error_db < -80  # these lines fade
+    assert found.spare == () or found.spare == (ENDS,)
+    assert [effect.name for effect in found.effects] == list(KEYS)
+
+
+def test_imagers_leave_out_what_the_table_says():
+    grid = Grid.plane((-0.9, 0.9, 512), (20.0, 21.8, 512))
+    lines = lines_on(grid, APERTURE, beside(APERTURE, 0.01, 0, 0))
+    found = assess(lines, grid, tolerance_db=-40, repeats=1)
+    assert found[APART].left_out
+    assert found.measured
+    assert (found[SINGLE].seconds is None) == (
+        not clsas.plan(lines, grid, tolerance_db=-40).half_precision
+    )
+    assert found.simple_seconds > 0
+    assert "measured" in found.describe()
+    assert clsas.plan(lines, grid, tolerance_db=-40).left_out == (APART,)
+
+
+def test_half_precision_is_told_of(platform):
+    grid = Grid.plane((-0.9, 0.9, 512), (20.0, 21.8, 512))
+    lines = lines_on(grid, APERTURE.repeat(4, axis=0) + along_x(4 * CHANNELS, 0.005))
+    for tolerance_db in (-40, -70):
+        chosen = clsas.plan(lines, grid, tolerance_db=tolerance_db, device=platform)
+        found = assess(lines, grid, tolerance_db=tolerance_db, device=platform)[SINGLE]
+        if chosen.is_exact or not platform.info.half_precision:
+            assert found.needed is None
+        else:
+            assert found.needed is not chosen.half_precision
+            assert -76 < found.error_db < -60
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "says"),
+    [
+        ({"lines": 1}, TypeError, "lines must be"),
+        ({"grid": 1}, TypeError, "grid must be"),
+        ({"beam": 20.0}, TypeError, "beam must be"),
+        ({"tolerance_db": -80}, ValueError, "tolerance_db must be .*>= -75"),
+        ({"repeats": -1}, ValueError, "repeats must be at least 0"),
+        ({"sonar": 1}, TypeError, "sonar must be"),
+        (
+            {
+                "sonar": clsas.Sonar.edgetech(),
+                "track": clsas.Track.straight((0, 0, 0), (1, 0, 0), 3, 1.0),
+            },
+            ValueError,
+            "must have the channels of the lines, 96, got 6 receivers and 3 pings",
+        ),
+    ],
+)
+def test_wrong_arguments_are_named(change, error, says):
+    given = {"lines": lines_on(GRID, APERTURE), "grid": GRID} | change
+    with pytest.raises(error, match=says):
+        assess(**given)
+
+
+def test_lines_of_a_survey_have_its_geometry_and_band():
+    scene = config.parse_scene(config.built_in_scene("thesis_wide_beam"), name="", folder=None)
+    lines = survey_lines(scene.sonar, scene.track, scene.grid, motion_in_flight=True)
+    tx_m, rx_m, velocity = clsas.channels(scene.sonar, scene.track, motion_in_flight=True)
+    assert np.array_equal(lines.tx_m, tx_m)
+    assert np.array_equal(lines.rx_m, rx_m)
+    assert np.array_equal(lines.rx_velocity_m_s, velocity)
+    together = survey_lines(scene.sonar, scene.track, scene.grid, phase_centres=True)
+    assert np.allclose(together.tx_m, (tx_m + rx_m) / 2)
+    assert together.tx_m is together.rx_m or np.array_equal(together.tx_m, together.rx_m)
+
+
+SCENE = """
+[sonar]
+receivers = 4
+spacing_m = 0.04
+tx_length_m = 0.02
+rx_length_m = 0.02
+[sonar.pulse]
+carrier_hz = 300e3
+bandwidth_hz = 40e3
+duration_s = 1e-3
+[track]
+start_m = [-0.9, 0.0, 0.0]
+velocity_m_s = [1.0, 0.0, 0.0]
+pings = 24
+ping_interval_s = 0.08
+[track.sway]
+amplitude_m = 0.001
+period_s = 1.0
+[[targets]]
+position_m = [0.0, 10.5, 0.0]
+[simulate]
+SIMULATE
+[grid]
+x = { start_m = -0.2, stop_m = 0.2, count = 64 }
+y = { start_m = 10.4, stop_m = 10.6, count = 64 }
+[image]
+tolerance_db = -30
+"""
+
+
+def run(*arguments):
+    return CliRunner().invoke(main, [str(argument) for argument in arguments])
+
+
+def table(*arguments):
+    result = run("assess", *arguments, "--json")
+    assert result.exit_code == 0, result.output
+    found = json.loads(result.stdout)
+    return found, {effect["name"]: effect for effect in found["effects"]}
+
+
+@pytest.fixture
+def scene(tmp_path):
+    def write(simulate="", name="scene.toml", changes=None):
+        text = SCENE.replace("SIMULATE", simulate)
+        for old, new in (changes or {}).items():
+            assert old in text
+            text = text.replace(old, new)
+        path = tmp_path / name
+        path.write_text(text)
+        return path
+
+    return write
+
+
+def test_a_scene_is_assessed_before_it_is_simulated(scene):
+    found, effects = table(scene())
+    assert found["tolerance_db"] == -30
+    assert set(effects) == set(KEYS)
+    assert not effects[MOTION]["modelled"]
+    assert effects[MOTION]["error_db"] is not None
+    assert effects[PATTERN]["modelled"]
+    assert effects[SWAY]["modelled"]
+    assert effects[ENDS]["error_db"] is None
+    text = run("assess", scene()).stdout
+    assert "4096" not in text
+    assert "64 x 64 pixels from 96 channels, tolerance -30 dB, wavelength 5 mm" in text
+    for name in KEYS:
+        assert name in text
+
+
+def test_what_a_scene_may_leave_out_is_told_with_the_key(scene):
+    """And leaving it out, the scene images the same within the tolerance."""
+    slow = {
+        "[1.0, 0": "[0.01, 0",
+        "interval_s = 0.08": "interval_s = 8.0",
+        "period_s = 1.0": "period_s = 60.0",
+        "length_m = 0.02": "length_m = 1e-3",
+    }
+    full = "motion_in_flight = true\nelement_pattern = true"
+    found, effects = table(scene(full, changes=slow), "--tolerance-db", "-10")
+    keys = {
+        MOTION: "motion_in_flight = false",
+        PATTERN: "element_pattern = false",
+        APART: "phase_centres = true",
+    }
+    spare = {name: key for name, key in keys.items() if name in found["spare"]}
+    assert set(spare) == {MOTION, PATTERN}
+    for name, key in spare.items():
+        assert effects[name]["key"] == f"[simulate] {key}"
+        assert key in run("assess", scene(full, changes=slow), "--tolerance-db", "-10").stdout
+    given = {"motion_in_flight": "true", "element_pattern": "true"}
+    given |= dict(key.split(" = ") for key in spare.values())
+    images = []
+    for name, table_ in (
+        ("full", full),
+        ("less", "\n".join(f"{k} = {v}" for k, v in given.items())),
+    ):
+        described = config.read_scene(scene(table_, f"{name}.toml", slow))
+        echoes = clsas.simulate(
+            described.sonar, described.track, described.targets, **described.simulate
+        )
+        images.append(clsas.backproject(clsas.compress(echoes), described.grid))
+    assert relative_error_db(images[1].pixels, images[0].pixels) < -10
+
+
+def test_lines_are_assessed_with_the_scene_that_made_them(scene, tmp_path):
+    path, echoes, lines = scene(), tmp_path / "echoes.h5", tmp_path / "lines.h5"
+    assert run("simulate", path, "-o", echoes).exit_code == 0
+    assert run("compress", echoes, "-o", lines).exit_code == 0
+    found, effects = table(lines, "--scene", path)
+    of_scene = table(path)[1]
+    for name in (MOTION, APART, SWAY, PATTERN):
+        assert effects[name]["error_db"] == pytest.approx(of_scene[name]["error_db"], abs=1.5)
+    assert effects[ENDS]["error_db"] is not None
+    # Without the scene nobody knows patterns or velocities.
+    bare = table(lines, "--x", "-0.2:0.2:64", "--y", "10.4:10.6:64")[1]
+    assert bare[PATTERN]["error_db"] is None
+    assert bare[MOTION]["error_db"] is None
+    assert found["channels"] == 96
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["--stages", "2x2"], "--stages has no tolerance"),
+        (["--scene", "SCENE"], "--scene goes with LINES.H5"),
+        (["--repeats", "-1"], "--repeats"),
+    ],
+)
+def test_wrong_usage(scene, arguments, says):
+    path = scene()
+    result = run("assess", path, *(str(path) if a == "SCENE" else a for a in arguments))
+    assert result.exit_code == 2
+    assert says in result.output
+
+
+def test_a_scene_without_a_survey_is_refused(tmp_path):
+    path = tmp_path / "grid.toml"
+    path.write_text(SCENE[SCENE.index("[grid]") :])
+    result = run("assess", path)
+    assert result.exit_code == 1
+    assert "missing table [sonar]" in result.output
+
+
+def test_every_key_is_one_of_scene_files():
+    """What leaves an effect out of a simulation can be written as the table tells it."""
+    for name, key in KEYS.items():
+        if " = " in key:
+            table_, setting = key.split("] ")
+            described = config.parse_scene(f"{table_}]\n{setting}".encode(), name=name, folder=None)
+            assert described.simulate

@@ -1,0 +1,96 @@
+import numpy as np
+import pytest
+from cases import noise
+
+from clsas.core.grid import Grid
+from clsas.core.lines import RangeLines
+from clsas.exact.reference import ideal
+from clsas.signal.spectrum import measure_spectrum
+
+
+def lines_of(samples):
+    return RangeLines(samples, 10.0, 0.01, [0, 0, 0], [0, 0, 0], 1e5, 1500.0)
+
+
+@pytest.mark.parametrize("centre", [-0.45, -0.2, 0.0, 0.3, 0.49])
+@pytest.mark.parametrize("occupied", [0.1, 0.6])
+def test_the_spectrum_is_measured_about_its_centre(centre, occupied):
+    lines = lines_of(noise(40, 500, occupied=occupied, centre=centre))
+    spectrum = measure_spectrum(lines)
+    assert spectrum.centre == pytest.approx(centre, abs=0.01)
+    assert spectrum.power.sum() == pytest.approx(1, abs=1e-12)
+    inside = spectrum.frequency < occupied / 2
+    level = spectrum.power[inside]
+    assert level.sum() > 0.97
+    assert level[1:-2].std() < 0.2 * level.mean()
+
+
+def test_lines_of_zeros_have_a_spectrum():
+    spectrum = measure_spectrum(lines_of(np.zeros((2, 50), complex)))
+    assert -0.5 <= spectrum.centre <= 0.5
+    np.testing.assert_allclose(spectrum.power.reshape(8, -1).sum(axis=1), 1 / 8, rtol=0.3)
+
+
+@pytest.mark.parametrize("scale", [1e-35, 1e-20, 1e18, 1e30])
+def test_the_spectrum_does_not_depend_on_the_unit(scale):
+    samples = noise(3, 300, centre=0.2)
+    spectrum, scaled = (measure_spectrum(lines_of(a * samples)) for a in (1.0, scale))
+    assert scaled.centre == pytest.approx(spectrum.centre, abs=1e-4)
+    np.testing.assert_allclose(scaled.power, spectrum.power, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    "filled", [slice(None, 500, 10), slice(1, None, 4), slice(3, None, 8), slice(777, 778)]
+)
+def test_the_spectrum_is_that_of_the_channels_which_hold_anything(filled):
+    """Elements of an array may be dead, in regular steps."""
+    samples = np.zeros((1000, 100), complex)
+    samples[filled] = noise(len(samples[filled]), 200, occupied=0.4, centre=0.25)[:, 50:150]
+    assert measure_spectrum(lines_of(samples)).centre == pytest.approx(0.25, abs=0.02)
+
+
+@pytest.mark.parametrize("occupied", [0.5, 0.9])
+@pytest.mark.parametrize("tilt_db", [0, 20, -20])
+@pytest.mark.parametrize("noise_db", [-200, -30])
+def test_the_centre_is_the_middle_of_the_occupied_band(occupied, tilt_db, noise_db):
+    """However the band is tilted, and in noise: so the guard band is as wide on both sides."""
+    rng = np.random.default_rng(3)
+    frequency = np.fft.fftfreq(2000)
+    gain = 10 ** (tilt_db / 20 * frequency / occupied) * (np.abs(frequency) < occupied / 2)
+    samples = np.fft.ifft(gain * (rng.normal(size=(20, 2000, 2)) @ [1, 1j]))
+    level = 10 ** (noise_db / 20) * np.sqrt(np.mean(np.abs(samples) ** 2) / 2)
+    samples += level * (rng.normal(size=(20, 2000, 2)) @ [1, 1j])
+    spectrum = measure_spectrum(lines_of(samples * np.exp(2j * np.pi * 0.3 * np.arange(2000))))
+    assert spectrum.centre == pytest.approx(0.3, abs=0.01)
+    assert spectrum.oversampling == pytest.approx(1 / occupied, rel=0.03)
+
+
+def test_a_common_offset_weighs_as_in_the_image():
+    """It adds up in phase over the image, echoes from everywhere do not."""
+    x_m = 0.02 * np.arange(200)
+    track = np.column_stack([x_m, 0 * x_m, 0 * x_m])
+    band = noise(200, 1000, occupied=0.1, centre=0.35)
+    band /= np.sqrt(np.mean(np.abs(band) ** 2))
+    # A little below 0 Hz too, so that nothing else lies as far from the centre as 0 Hz.
+    band += 0.1 * noise(200, 1000, occupied=0.02, centre=-0.2, seed=1)
+    offset = np.full(band.shape, np.sqrt(1e-3), complex)
+    grid = Grid.plane((1.5, 2.5, 20), (12.0, 13.0, 20))
+
+    def share_at_zero(samples, *grids):
+        lines = RangeLines(samples, 10.0, 0.005, track, track, 0.0, 1500.0)
+        spectrum = measure_spectrum(lines, *grids)
+        assert 1 - 1e-9 <= spectrum.power.sum() <= 2
+        near = np.abs(spectrum.frequency - abs(spectrum.centre)) < 0.02
+        return spectrum.power[near].sum(), ideal(lines, grid.positions_m())
+
+    alone, _ = share_at_zero(band + offset)
+    weighed, image = share_at_zero(band + offset, grid)
+    _, of_offset = share_at_zero(offset, grid)
+    in_image = np.linalg.norm(of_offset) ** 2 / np.linalg.norm(image) ** 2
+    assert alone == pytest.approx(1e-3, rel=0.2)
+    assert in_image > 50 * alone
+    assert weighed == pytest.approx(in_image, rel=0.3)
+    # Offsets that differ from channel to channel do not add up.
+    turns = np.exp(2j * np.pi * np.random.default_rng(0).uniform(size=(200, 1)))
+    scattered, _ = share_at_zero(band + offset * turns, grid)
+    assert scattered < 3e-3

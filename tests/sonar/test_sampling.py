@@ -1,0 +1,203 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from clsas.core.geometry import bistatic_range_m
+from clsas.core.grid import Grid
+from clsas.sonar.sampling import (
+    check_sampling,
+    far_field_m,
+    grating_lobe_m,
+    phase_centre_error_m,
+    phase_centres_m,
+    ping_advance_m,
+    ping_rate_limits_hz,
+    receive_interval_s,
+)
+from clsas.sonar.system import Pulse, Sonar, line_array
+from clsas.sonar.track import Track, channels
+
+GRID = Grid.plane(x=(0, 5, 64), y=(40, 45, 64))
+WIDE = Sonar.thesis_wide_beam()
+
+
+def track(sonar, advance, interval=0.2, pings=10):
+    return Track.straight([0, 0, 0], [advance / interval, 0, 0], pings, interval)
+
+
+def test_receive_interval_and_ping_rates():
+    first, last = receive_interval_s(40.0, 45.0, 1e-3, 1500.0)
+    assert first == pytest.approx(80 / 1500)  # [22]
+    assert last == pytest.approx(90 / 1500 + 1e-3)  # [23]
+    low, high = ping_rate_limits_hz(1.5, 0.2 / 2, last)
+    assert low == pytest.approx(2 * 1.5 / 0.2)  # 2 v/L [30]
+    assert high == pytest.approx(1 / last)  # [24]
+
+
+def test_advance_of_the_thesis_systems():
+    assert ping_advance_m(WIDE) == pytest.approx(0.528)
+    assert ping_advance_m(Sonar.edgetech()) == pytest.approx(0.6006)
+    assert ping_advance_m(Sonar(WIDE.pulse, [[0, 0, 0]], rx_length_m=0.1)) == 0.05  # [31]
+    # SENSOTEK: 1.5 m/s and 270 m with an overlap of 24 of its 96 elements.
+    sensotek = Sonar.sensotek()
+    _, high = ping_rate_limits_hz(1.5, ping_advance_m(sensotek), 2 * 270 / 1500)
+    assert 1.5 / high == pytest.approx(ping_advance_m(sensotek) * 72 / 96)
+    with pytest.raises(ValueError, match="sonar must have an element length or several receivers"):
+        ping_advance_m(Sonar(WIDE.pulse, [[0, 0, 0]]))
+
+
+def test_phase_centres_are_midpoints():
+    sonar = replace(WIDE, tx_m=[0.2, 0, 0])
+    tx, rx, _ = channels(sonar, track(sonar, 0.528))
+    centres = phase_centres_m(tx, rx)
+    # [32] with u_p the transmitter's position.
+    np.testing.assert_allclose(centres[:, 0], tx[:, 0] + (rx[:, 0] - tx[:, 0]) / 2)
+    # Gapless: 640 of them, evenly over 5.28 m.
+    np.testing.assert_allclose(np.diff(np.sort(centres[:, 0])), 8.25e-3, atol=1e-12)
+
+
+def test_phase_centre_error_is_the_paths_variation_over_the_beam():
+    separation, width, distance = 0.5, np.radians(20), 60.0
+    tx, rx = np.array([-separation / 2, 0, 0]), np.array([separation / 2, 0, 0])
+    angles = np.array([0, width / 2])
+    points = distance * np.stack([np.sin(angles), np.cos(angles), 0 * angles], axis=1)
+    excess = 2 * bistatic_range_m(points, tx, rx) - 2 * distance
+    found = phase_centre_error_m(separation, width, distance)
+    assert found == pytest.approx(excess[0] - excess[1], rel=1e-3)
+    # The thesis's form [33]: error/lambda = (D^2/(4 lambda) (1 - cos^2)) / R.
+    assert found == pytest.approx(separation**2 / 4 * (1 - np.cos(width / 2) ** 2) / distance)
+
+
+def test_far_field():
+    # Half of the thesis's 5.28 m: not before 18.6 km; there the wave bends lambda/8 over it.
+    distance = far_field_m(2.64, 1.5e-3)
+    assert distance == pytest.approx(4 * 2.64**2 / 1.5e-3)
+    assert np.hypot(distance, 2.64) - distance == pytest.approx(1.5e-3 / 8, rel=1e-3)
+
+
+def test_grating_lobe_is_where_the_aperture_repeats():
+    """The array factor of phase centres d apart peaks again at sin theta = lambda/(2 d)."""
+    wavelength, spacing, distance = 1.5e-3, 8.25e-3, 40.0
+    lobe = grating_lobe_m(wavelength, spacing, distance)
+    sine = lobe / distance
+    u = spacing * np.arange(64)
+    factor = abs(np.exp(4j * np.pi / wavelength * u * sine).mean())
+    assert factor == pytest.approx(1)
+    assert lobe == pytest.approx(3.636, abs=1e-3)
+
+
+def test_a_well_sampled_survey_has_no_findings():
+    sonar = replace(WIDE, rx_m=line_array(64, 15e-3))
+    assert check_sampling(sonar, track(sonar, 0.48), GRID) == []
+
+
+def test_spacing_finding_carries_its_numbers():
+    (finding,) = check_sampling(WIDE, track(WIDE, 0.528), GRID)
+    assert finding.name == "along_track_spacing"
+    assert finding.value == pytest.approx(8.25e-3)
+    assert finding.limit == pytest.approx(7.5e-3)
+    assert "0.00825 m apart along the track, more than 0.0075 m" in finding.message
+    assert "half the element length of 0.015 m" in finding.message
+    ranges = [float(part) for part in finding.message.split("(")[1].split() if part[0].isdigit()]
+    lobes = finding.message.split("grating lobes ")[1].split()
+    assert float(lobes[0]) == pytest.approx(grating_lobe_m(1.5e-3, 8.25e-3, ranges[0]), rel=1e-3)
+    assert float(lobes[3]) == pytest.approx(grating_lobe_m(1.5e-3, 8.25e-3, ranges[1]), rel=1e-3)
+
+
+def test_sway_of_a_course_hardly_changes_its_spacing():
+    """At exactly the limit the course's direction, turned a little by sway, decides nothing."""
+    sonar = replace(WIDE, rx_m=line_array(64, 15e-3))
+    for sway_m in (0.0, 0.005):
+        survey = Track.straight(
+            [0, 0, 0], [2.4, 0, 0], 10, 0.2, sway_m=lambda t, most=sway_m: most * np.sin(3 * t)
+        )
+        assert check_sampling(sonar, survey, GRID) == []
+
+
+def test_gap_between_pings_is_found_on_any_course():
+    sonar = replace(WIDE, rx_m=line_array(64, 15e-3))
+    for course in ([1, 0, 0], [0, 1, 0], [0.6, -0.8, 0]):
+        velocity = np.array(course) * 0.6 / 0.2
+        survey = Track.straight([0, 0, 0], velocity, 10, 0.2)
+        (finding,) = check_sampling(sonar, survey, GRID)
+        assert finding.value == pytest.approx(0.6 - 0.48 + 7.5e-3)
+
+
+def test_ping_rate_finding_carries_its_numbers():
+    sonar = replace(WIDE, rx_m=line_array(64, 15e-3))
+    (finding,) = check_sampling(sonar, track(sonar, 0.48, interval=0.05), GRID)
+    assert finding.name == "ping_rate"
+    assert finding.value == pytest.approx(20.0)
+    farthest = np.hypot(45, 5 + 0.48)
+    assert finding.limit == pytest.approx(1 / (2 * farthest / 1500 + 1e-3), rel=0.02)
+    assert "the ping rate of 20 Hz is above" in finding.message
+
+
+def test_omnidirectional_elements_are_held_to_the_grid():
+    """Grating lobes of anything on the grid stay off the grid, with nothing to spare."""
+    sonar = Sonar(Pulse(100e3, 20e3, 1e-3), [[0, 0, 0]])
+    grid = Grid.plane(x=(-5, 5, 11), y=(40, 50, 11))
+    # At sin theta = 5/sqrt(5^2 + 40^2) to either side.
+    spread = 2 * 5 / np.hypot(5, 40)
+    limit = 15e-3 / (2 * spread)
+    sparse, dense = (
+        Track.straight([-0.05, 0, 0], [advance, 0, 0], 3, 1.0)
+        for advance in (1.02 * limit, 0.97 * limit)
+    )
+    (finding,) = check_sampling(sonar, sparse, grid)
+    assert finding.limit == pytest.approx(limit, rel=0.01)
+    assert "keeps grating lobes off the grid" in finding.message
+    assert check_sampling(sonar, dense, grid) == []
+
+
+def test_any_grid_is_checked():
+    sonar = Sonar.edgetech()
+    survey = track(sonar, 0.4, interval=0.05, pings=20)
+    plane = Grid.plane(x=(0, 10, 5), y=(40, 60, 5), z=-5.0)
+    points = Grid.points(plane.positions_m())
+    heights = plane.with_height(np.zeros((5, 5)))
+    expected = check_sampling(sonar, survey, plane)
+    assert [finding.name for finding in expected] == ["ping_rate"]
+    assert check_sampling(sonar, survey, points) == expected
+    assert check_sampling(sonar, survey, heights) == expected
+
+
+def test_one_ping_of_one_receiver_and_one_point():
+    sonar = Sonar(Pulse(100e3, 20e3, 1e-3), [[0, 0, 0]])
+    assert check_sampling(sonar, Track([[0, 0, 0]], [0.0]), Grid.points([[0, 0, 0]])) == []
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: receive_interval_s(40, 30, 1e-3), "far_m must be finite and >= 40 m, got 30"),
+        (lambda: receive_interval_s(-1, 30, 1e-3), "near_m must be finite and >= 0 m, got -1"),
+        (lambda: ping_rate_limits_hz(1, 0, 1), "advance_m must be finite and > 0 m, got 0"),
+        (lambda: ping_rate_limits_hz(1, 1, 0), "last_echo_s must be finite and > 0 s, got 0"),
+        (lambda: grating_lobe_m(0, 1, 1), "wavelength_m must be finite and > 0 m, got 0"),
+        (lambda: far_field_m(1, -1), "wavelength_m must be finite and > 0 m, got -1"),
+        (lambda: phase_centre_error_m(1, 4, 1), "beam_width_rad must be .* <= 3.14159 rad, got 4"),
+        (lambda: phase_centre_error_m(1, 1, 0), "range_m must be finite and > 0 m, got 0"),
+        (lambda: phase_centres_m([0, 0], [0, 0, 0]), r"tx_m must have shape \(any, 3\)"),
+    ],
+)
+def test_bad_arguments(call, message):
+    with pytest.raises(ValueError, match=message):
+        call()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ((None, track(WIDE, 0.5), GRID), "sonar must be of type Sonar, got NoneType"),
+        ((WIDE, GRID, GRID), "track must be of type Track, got Grid"),
+        ((WIDE, track(WIDE, 0.5), None), "grid must be of type Grid, got NoneType"),
+    ],
+)
+def test_arguments_of_another_type(arguments, message):
+    with pytest.raises(TypeError, match=message):
+        check_sampling(*arguments)
+    if arguments[0] is None:
+        with pytest.raises(TypeError, match=message):
+            ping_advance_m(arguments[0])

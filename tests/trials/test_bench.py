@@ -1,0 +1,116 @@
+import csv
+import dataclasses
+import json
+from importlib.machinery import SourceFileLoader
+from importlib.util import module_from_spec, spec_from_loader
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from clsas.sonar.beam import BeamWindow
+from clsas.trials import bench
+
+SCRIPT = Path(__file__).parents[2] / "scripts" / "bench"
+SMALL = bench.Case(200, 8.25e-3, 1e6, 100e3, (-0.3, 0.3), (40.0, 40.6), 128)
+
+
+def test_cases_are_sampled():
+    """Channels and pixels are close enough for the beam, the grid and the band."""
+    for name, case in bench.FACTORIZED.items():
+        wavelength_m = 1500 / case.carrier_hz
+        grid = case.grid
+        assert grid.shape == (case.pixels, case.pixels)
+        x_m, y_m = grid.axes_m
+        assert y_m[1] - y_m[0] < 1500 / (2 * case.bandwidth_hz), name
+        if case.beam is not None:
+            sine = np.sin(np.radians(case.beam.width_deg / 2))
+            assert case.spacing_m < wavelength_m / (4 * sine) * 1.01, name
+            assert x_m[1] - x_m[0] == pytest.approx(0.02, rel=1e-3)
+
+
+def test_scaled_cases_keep_what_they_look_like_in_wavelengths():
+    base, scaled = bench.scaled(2048), bench.scaled(512)
+    assert (base.channels, base.pixels, scaled.channels, scaled.pixels) == (2048, 2048, 512, 512)
+    assert base.carrier_hz == 120e3
+    assert scaled.spacing_m == pytest.approx(4 * base.spacing_m)
+    for name in ("carrier_hz", "bandwidth_hz"):
+        assert getattr(scaled, name) == pytest.approx(getattr(base, name) / 4)
+    assert (base.x_m, base.y_m, base.beam) == (scaled.x_m, scaled.y_m, scaled.beam)
+
+
+@pytest.mark.parametrize("beam", [None, BeamWindow(1.5, "hann")])
+def test_factorized_against_exact(beam, monkeypatch):
+    case = dataclasses.replace(SMALL, beam=beam)
+    monkeypatch.setitem(bench.FACTORIZED, "small", case)
+    seen = []
+    result = bench.run_factorized(
+        "small", tolerance_db=-40, repeats=2, progress=lambda *done: seen.append(done)
+    )
+    assert seen == [(1, 3), (2, 3), (3, 3)]
+    assert result["case"] == "small"
+    assert (result["channels"], result["pixels"]) == (200, [128, 128])
+    assert result["tolerance_db"] == -40
+    assert result["error_db"] < -38
+    assert result["predicted_error_db"] <= -40
+    assert result["plan"].startswith("Plan: tolerance -40 dB")
+    for key in ("seconds", "again_seconds", "exact_seconds", "default_seconds"):
+        assert 0 < result[key]["min"] <= result[key]["median"] <= result[key]["max"]
+    for key, speedup in (("seconds", "speedup"), ("again_seconds", "speedup_again")):
+        ratio = result["exact_seconds"]["median"] / result[key]["median"]
+        assert result[speedup] == pytest.approx(ratio)
+    ratio = result["default_seconds"]["median"] / result["seconds"]["median"]
+    assert result["speedup_over_default"] == pytest.approx(ratio)
+    assert result["plan_seconds"] > 0
+    assert result["predicted_seconds"] > 0
+    assert {"device", "driver", "samples"} < result.keys()
+    assert json.loads(json.dumps(result)) == result
+
+
+def test_unknown_cases_are_refused():
+    with pytest.raises(
+        ValueError, match=r"case must be one of 'bp-thesis', 'bp-2k', got 'ffbp-2k'"
+    ):
+        bench.run("ffbp-2k")
+    with pytest.raises(ValueError, match=r"case must be one of 'ffbp-thesis', .* got 'bp-2k'"):
+        bench.run_factorized("bp-2k")
+
+
+@pytest.fixture
+def script():
+    """scripts/bench as a module."""
+    loader = SourceFileLoader("bench_script", str(SCRIPT))
+    module = module_from_spec(spec_from_loader("bench_script", loader))
+    loader.exec_module(module)
+    return module
+
+
+def test_scaling_fits_exponents_and_writes_them(script, monkeypatch, tmp_path, capsys):
+    pytest.importorskip("matplotlib")
+
+    def measured(case, **_):
+        """Times that grow as N^2 and N^3."""
+        n = case.pixels / 256
+        figures = dict.fromkeys(["plan_seconds", "error_db", "predicted_error_db"], -50.0)
+        times = {"seconds": {"median": 0.1 * n**2}, "exact_seconds": {"median": n**3}}
+        return {"device": "abacus", "driver": "1.0", "speedup": 10 * n, **times, **figures}
+
+    monkeypatch.setattr(bench, "run_factorized", measured)
+    script.scaling(None, 1024, tmp_path / "s.csv", tmp_path / "s.png")
+    told = capsys.readouterr().out
+    assert "N^2.00 (factorized), N^3.00 (exact)" in told
+    assert "| 1024 | 1.6 | 64 |" in told
+    with open(tmp_path / "s.csv", newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [row["N"] for row in rows] == ["256", "512", "1024"]
+    assert float(rows[1]["exact_s"]) == 8
+    assert (tmp_path / "s.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_the_table_of_factorized_cases(script, monkeypatch, capsys):
+    monkeypatch.setattr(bench, "FACTORIZED", {"small": SMALL})
+    script.factorized([None])
+    header, _, row = capsys.readouterr().out.splitlines()
+    assert "speedup" in header
+    assert row.startswith("| small | ")
+    assert header.count("|") == row.count("|")

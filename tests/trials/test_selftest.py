@@ -1,0 +1,76 @@
+"""The test that users run on their own devices."""
+
+import json
+import math
+
+import pytest
+from click.testing import CliRunner
+
+from clsas.cli import main
+from clsas.trials import selftest
+
+
+@pytest.fixture
+def small(monkeypatch):
+    """One exact and one factorized image on the device as it is."""
+    monkeypatch.setattr(selftest, "forced_ways", lambda info: [])
+    monkeypatch.setattr(
+        selftest, "_CHECKS", (("flat", "exact", -60.0), ("flat", "factorized", -40.0))
+    )
+
+
+def test_every_image_is_within_its_bound(platform, monkeypatch):
+    """Other ways to drive a CPU are tested elsewhere."""
+    monkeypatch.setattr(selftest, "forced_ways", lambda info: [])
+    told = []
+    results = selftest.run(platform, progress=lambda *done: told.append(done))
+    assert [result for result in results if not result.passed] == []
+    assert told == [(done, len(results)) for done in range(len(results) + 1)]
+    imagers = {result.case.rsplit(", ", 1)[1] for result in results}
+    assert imagers == {"exact", "factorized", "half precision", "mosaic", "wavenumber"}
+
+
+def test_other_ways_to_drive_a_device_are_tested_too(platform, monkeypatch):
+    monkeypatch.setattr(selftest, "_CHECKS", ())
+    monkeypatch.setattr(selftest, "_WAYS", ((1, False), (4, False)))
+    own = (platform.info.width, platform.info.permute)
+    results = selftest.run(platform)
+    assert len(results) == 2 * len({(1, False), (4, False)} - {own})
+    assert all(result.passed for result in results)
+    assert all("width" in result.case for result in results)
+
+
+def test_plans_of_the_scenes_are_factorized(platform):
+    """Else the factorized imager would not be tested."""
+    for scene, imager, asked_db in selftest._CHECKS:
+        if imager == "factorized":
+            known = selftest._SCENES[scene]()
+            assert not selftest.divided_plan(known, asked_db, platform).is_exact, scene
+
+
+def test_a_result_that_is_no_number_has_not_passed():
+    assert not selftest.Result("", -60, math.nan, -60).passed
+    assert not selftest.Result("", -60, -59.9, -60).passed
+    assert selftest.Result("", None, -60.0, -60).passed
+
+
+def test_the_command_prints_a_table(small):
+    result = CliRunner().invoke(main, ["selftest"])
+    assert result.exit_code == 0
+    assert "flat, exact" in result.stdout
+    assert "2 of 2 within bounds" in result.stdout
+
+
+def test_a_miss_is_told_and_is_exit_code_1(small, monkeypatch):
+    monkeypatch.setattr(selftest, "IMAGERS", selftest.IMAGERS | {"exact": _doubled})
+    result = CliRunner().invoke(main, ["selftest", "--json"])
+    assert result.exit_code == 1
+    found = json.loads(result.stdout)
+    assert not found["passed"]
+    assert [each["verdict"] for each in found["results"]] == ["MISSED", "ok"]
+    assert found["results"][0]["measured_db"] == pytest.approx(0, abs=0.1)
+
+
+def _doubled(known, asked_db, device):
+    image = selftest._exact(known, asked_db, device)
+    return type(image)(2 * image.pixels, image.grid)
