@@ -217,7 +217,7 @@ def tradeoff(measured: Tradeoff, *, title: str = "") -> Figure:
         If `measured` is of another type.
     """
     if not hasattr(measured, "front"):
-        raise TypeError(f"measured must be a Tradeoff, got {validate.shown(measured)}")
+        raise TypeError(f"measured must be of type Tradeoff, got {validate.shown(measured)}")
     figure = _figure(7.0, 5.0)
     from matplotlib import ticker
 

@@ -228,7 +228,7 @@ def test_printable_keeps_lines_and_text():
 
 def test_memory_heeds_the_limit_of_the_address_space():
     script = (
-        "import resource; from clsas import validate; validate.memory('x', 3 << 30);"
+        "import resource; from clsas.core import validate; validate.memory('x', 3 << 30);"
         "resource.setrlimit(resource.RLIMIT_AS, (2 << 30,) * 2); validate.memory('x', 3 << 30)"
     )
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)

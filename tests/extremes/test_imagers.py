@@ -92,7 +92,7 @@ def promised(asked_db, predicted_db, records):
 
 @pytest.mark.parametrize("asked_db", [-80, -50, -30])
 @pytest.mark.parametrize("name", CASES)
-@pytest.mark.filterwarnings("always::clsas.validate.ClsasWarning")
+@pytest.mark.filterwarnings("always::clsas.core.validate.ClsasWarning")
 def test_exact(name, asked_db, platform, recwarn):
     known = made(name)
     prepared = prepare(
@@ -104,7 +104,7 @@ def test_exact(name, asked_db, platform, recwarn):
 
 @pytest.mark.parametrize("asked_db", [-65, -50, -35])
 @pytest.mark.parametrize("name", CASES)
-@pytest.mark.filterwarnings("always::clsas.validate.ClsasWarning")
+@pytest.mark.filterwarnings("always::clsas.core.validate.ClsasWarning")
 def test_factorized(name, asked_db, platform, recwarn):
     known = made(name)
     chosen = plan(

@@ -86,7 +86,7 @@ def test_another_process_reads_every_bit(tmp_path):
     paths = [str(tmp_path / f"{name}.h5") for name in OBJECTS]
     for path, obj in zip(paths, OBJECTS.values(), strict=True):
         save(path, obj)
-    code = "import sys, test_io as t\nfor p in sys.argv[1:]: print(t.digest(t.load(p)))"
+    code = "import sys, test_hdf5 as t\nfor p in sys.argv[1:]: print(t.digest(t.load(p)))"
     assert run_beside(code, *paths).split() == [digest(obj) for obj in OBJECTS.values()]
 
 
@@ -135,7 +135,7 @@ def test_an_interrupted_save_leaves_nothing(error, exists, tmp_path, monkeypatch
 
 
 FULL_DISK = """
-import errno, resource, sys, test_io as t
+import errno, resource, sys, test_hdf5 as t
 resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, 10_000))
 for path in sys.argv[1:]:
     try:

@@ -18,6 +18,7 @@ from clsas.products.assessment import assess, survey_lines
 from clsas.products.effects import BEAM, ENDS, KEYS, PATTERN, SINGLE, SWAY, track_errors_m
 from clsas.sonar.beam import BeamWindow
 from clsas.sonar.simplify import APART, MOTION, RELIEF
+from clsas.sonar.system import line_array
 
 CHANNELS, CARRIER, STEP = 96, 300e3, 0.012
 APERTURE = along_x(CHANNELS, 0.02)
@@ -109,7 +110,7 @@ def test_element_patterns_are_those_of_the_simulator():
     """Images of points all over the grid, with and without patterns."""
     sonar = clsas.Sonar(
         clsas.Pulse(CARRIER, 40e3, 1e-3),
-        clsas.sonar.line_array(4, 0.04),
+        line_array(4, 0.04),
         tx_length_m=0.02,
         rx_length_m=0.03,
     )
