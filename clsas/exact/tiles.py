@@ -92,7 +92,7 @@ class Tiles:
             offset = np.arange(count) % self.side - (self.side - 1) / 2
             found_m2 += np.mean(offset**2) * float(step_m @ step_m)
             whole_m2 += (self.side**2 - 1) / 12 * float(step_m @ step_m)
-        return math.sqrt(found_m2 / whole_m2)
+        return math.sqrt(found_m2 / whole_m2) if whole_m2 else 1.0
 
     @property
     def block_radius_m(self) -> float:

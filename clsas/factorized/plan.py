@@ -17,6 +17,7 @@ from clsas.core import validate
 from clsas.core.grid import Grid
 from clsas.core.lines import RangeLines
 from clsas.core.reading import parse_json
+from clsas.factorized.estimates import ErrorBudget, Work, estimate_of
 from clsas.opencl import phases
 from clsas.signal.interpolation import PHASES, UPSAMPLING_TAPS, Interpolator, Resampling, Upsampler
 from clsas.sonar.beam import BeamWindow
@@ -130,6 +131,8 @@ class Plan:
     left_out : tuple of str
         Effects that the image does without, since their error lies far below the tolerance: see
         `clsas.sonar.simplify`.
+    work, errors : Work, ErrorBudget or None
+        What the predicted time and error are made of; None in plans of older versions.
     """
 
     tolerance_db: float | None
@@ -164,6 +167,8 @@ class Plan:
     band: tuple[float, float] | None = None
     calibrated: bool = True
     left_out: tuple[str, ...] = ()
+    work: Work | None = None
+    errors: ErrorBudget | None = None
 
     def __post_init__(self) -> None:
         """Check what sizes buffers and indices."""
@@ -313,7 +318,7 @@ class Plan:
         )
         if self.is_exact:
             reason = "" if self.tolerance_db is None else ": no factorization is faster within it"
-            return "\n".join([*lines, f"Plain backprojection{reason}.", *usual])
+            return "\n".join([*lines, f"Plain backprojection{reason}.", *self._causes(), *usual])
         taps = f"{self.align.taps} taps in range at {self.resampling.ratio:.2f} x the lines' rate"
         if self.nearest:
             beams = f"sums of {', '.join(map(str, self.nearest))} neighbours"
@@ -351,7 +356,13 @@ class Plan:
         widths = [max(map(len, column)) for column in zip(*table, strict=True)]
         for row in table:
             lines.append("  ".join(f"{cell:>{w}}" for cell, w in zip(row, widths, strict=True)))
-        return "\n".join([*lines, *usual])
+        return "\n".join([*lines, *self._causes(), *usual])
+
+    def _causes(self) -> list[str]:
+        """Return what the predicted error is made of, line by line."""
+        if self.errors is None:
+            return []
+        return ["Error by cause, with its margin; powers add up:", *self.errors.describe()]
 
     def to_json(self, *, filters: bool = True) -> str:
         """Return this plan as text that `from_json` reads.
@@ -415,6 +426,9 @@ class Plan:
             values["crowding"] = tuple(values["crowding"])
             values["left_out"] = tuple(values.get("left_out", ()))
             values["stages"] = tuple(Stage(**stage) for stage in values["stages"])
+            for name, kind in (("work", Work), ("errors", ErrorBudget)):
+                if values.get(name) is not None:
+                    values[name] = estimate_of(kind, values[name])
             return cls(**values)
         except (TypeError, ValueError, KeyError, AttributeError, OverflowError) as error:
             what = f"it lacks {error}" if isinstance(error, KeyError) else error

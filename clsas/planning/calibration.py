@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import product
@@ -25,7 +25,6 @@ from clsas.planning.exact_image import Exact, expect
 from clsas.planning.factorize import factorize
 from clsas.planning.planner import plan
 from clsas.planning.view import View
-from clsas.signal.interpolation import COST
 from clsas.simulation.scenes import PointTargets
 from clsas.simulation.simulator import simulate_lines
 from clsas.sonar.beam import BeamWindow
@@ -83,48 +82,15 @@ class _Image:
         """By how much two halves of the runs differ: logarithm of the ratio of least times."""
         return math.log(min(self.seconds[::2]) / min(self.seconds[1::2]))
 
-    @property
-    def host_work(self) -> list[float]:
-        """How often it takes what `_HOST` costs."""
-        e = self.expected
-        if isinstance(e, Exact):
-            grouped = 0.0 if self.tiled else e.parts * e.part_pixels
-            lines = self.channels * e.samples
-            return [1.0, lines, 0.0, 0.0, 0.0, grouped, e.parts * self.channels]
-        roots = e.stages[0].subimages
-        batches = -(-roots // e.roots_at_once)
-        lines = self.channels * e.resampling.length
-        last = e.stages[-1]
-        grouped = 0.0 if self.tiled else last.operations / last.channels
-        by_fft, filtered = (lines, 0.0) if e.upsampler is None else (0.0, lines)
-        stages = batches * len(e.sides)
-        return [1.0, by_fft, filtered, roots * self.channels, stages, grouped, 0.0]
-
-    @property
-    def stage_work(self) -> list[float]:
-        """How often it takes what `_STAGES` cost."""
-        if isinstance(self.expected, Exact):
-            return [0.0] * len(_STAGES)
-        stages = self.expected.stages[:-1]
-        operations = sum(s.operations for s in stages)
-        taps = self.expected.align.taps + self.expected.aperture.taps
-        subimages = float(sum(s.subimages for s in stages))
-        return [subimages, operations, operations * taps, stages[0].operations]
-
-    @property
-    def leaf_channels(self) -> float:
-        """Virtual channels of all subimages of the last stage."""
-        if isinstance(self.expected, Exact):
-            return 0.0
-        return float(self.expected.stages[-1].subimages * self.expected.stages[-1].channels)
+    def work(self, names: Sequence[str]) -> list[float]:
+        """Return how often it does what some costs are of."""
+        work = self.expected.work
+        return [float(getattr(work, name.removesuffix("_ns"))) for name in names]
 
     @property
     def pixel_work(self) -> float:
-        """Pixels times channels, as many as with 4 taps take as long."""
-        e = self.expected
-        if isinstance(e, Exact):
-            return self.channels * e.parts * e.part_pixels * COST[e.taps]
-        return e.stages[-1].operations * COST[e.final.taps]
+        """Pixels times channels, as many as take as long with 4 taps."""
+        return sum(self.work(_PIXELS))
 
 
 _HOST = (
@@ -137,6 +103,7 @@ _HOST = (
     "part_ns",
 )
 _STAGES = ("subimage_ns", "sample_ns", "sample_tap_ns", "given_sample_ns")
+_PIXELS = ("leaf_ns", "leaf_point_ns", "pixel_ns", "point_ns")
 
 
 def calibrate(
@@ -187,7 +154,9 @@ def calibrate(
             progress(done + 1, total)
     costs = _fitted(images, stored.defaults(device))
     scatter = _rms([image.scatter for image in images])
-    misfit = _rms([math.log(_expected_s(image, costs) / min(image.seconds)) for image in images])
+    misfit = _rms(
+        [math.log(costs.seconds(image.expected.work) / min(image.seconds)) for image in images]
+    )
     wrong = []
     if not scatter <= _MOST_SCATTER:
         wrong.append(f"times of the same image differ by {math.expm1(scatter):.0%} between runs")
@@ -272,23 +241,24 @@ def _fitted(images: list[_Image], usual: Costs) -> Costs:
     least_squares = partial(_least_squares, usual)
     leaves = least_squares(
         ("leaf_channel_ns", "leaf_ns"),
-        [[image.leaf_channels, image.pixel_work] for image in tiled],
+        [image.work(("leaf_channel_ns", "leaf_ns")) for image in tiled],
         [image.in_pixels for image in tiled],
     )
     of_points = [
-        (1e9 * image.in_pixels - leaves["leaf_channel_ns"] * image.leaf_channels) / image.pixel_work
+        (1e9 * image.in_pixels - leaves["leaf_channel_ns"] * image.expected.work.leaf_channel)
+        / image.pixel_work
         for image in plans
         if not image.tiled
     ]
     pixel_ns = per_pixel([i for i in exact if i.tiled and not i.expected.weighted])
     weighted = [i for i in exact if i.expected.weighted]
     of_beam = [1e9 * image.in_pixels - pixel_ns * image.pixel_work for image in weighted]
-    pairs = [image.pixel_work / COST[image.expected.taps] for image in weighted]
+    pairs = [image.expected.work.beam for image in weighted]
     return Costs(
-        **least_squares(_HOST, [image.host_work for image in images], of_host),
+        **least_squares(_HOST, [image.work(_HOST) for image in images], of_host),
         **least_squares(
             _STAGES,
-            [image.stage_work for image in plans],
+            [image.work(_STAGES) for image in plans],
             [image.in_stages for image in plans],
         ),
         **leaves,
@@ -311,16 +281,6 @@ def _least_squares(
     wanted = np.concatenate([np.ones(len(seconds)), np.full(len(names), _PRIOR)])
     solution = nnls(rows, wanted)[0]
     return dict(zip(names, (usual_ns * faster * solution).tolist(), strict=True))
-
-
-def _expected_s(image: _Image, costs: Costs) -> float:
-    """Return the time that costs make of an image."""
-    if isinstance(image.expected, Exact):
-        return image.expected.seconds(costs)
-    work = zip((*_HOST, *_STAGES), (*image.host_work, *image.stage_work), strict=True)
-    leaf_ns = costs.leaf_ns if image.tiled else costs.leaf_point_ns
-    in_pixels_ns = leaf_ns * image.pixel_work + costs.leaf_channel_ns * image.leaf_channels
-    return 1e-9 * (sum(getattr(costs, name) * amount for name, amount in work) + in_pixels_ns)
 
 
 def _rms(values: list[float]) -> float:

@@ -6,49 +6,21 @@ import json
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 
+import numpy as np
 from numpy.typing import ArrayLike
 
 from clsas.core import reading, validate
 from clsas.core.atomic import replacing
 from clsas.core.cache import cache_folder
+from clsas.factorized.estimates import Work
 from clsas.opencl.device import Device
-from clsas.signal.interpolation import COST
 
 
 @dataclass(frozen=True)
 class Costs:
-    """Times of the parts of imaging, nanoseconds; the defaults are of 2 AVX-512 cores with PoCL.
+    """What each thing that imaging does takes, nanoseconds; see `Work` for what these are.
 
-    `defaults` returns those for a device.
-
-    Attributes
-    ----------
-    call_ns : float
-        Per image, however it is formed: what is decided first, buffers, launches.
-    upsampled_sample_ns, filtered_sample_ns : float
-        Per sample of the upsampled lines, by FFT on the host and by filters.
-    reference_ns : float
-        Per root subimage and channel, on the host.
-    batch_ns : float
-        Per stage of a batch of roots: launches, tables, transfers.
-    subimage_ns : float
-        Per subimage in a stage.
-    sample_ns, sample_tap_ns : float
-        Per aligned sample in a stage, and per tap of either filter.
-    given_sample_ns : float
-        More in the first stage, whose lines come from main memory.
-    leaf_channel_ns : float
-        Per subimage and virtual channel of the last stage.
-    leaf_ns, leaf_point_ns : float
-        Per pixel and virtual channel of the last stage, with 4 taps, on a plane and off it.
-    group_ns : float
-        Per pixel off a plane: to put it into a group, on the host.
-    part_ns : float
-        Per tile, or group, and channel of an exact image: references, on the host.
-    pixel_ns, point_ns : float
-        Per pixel and channel of an exact image, with 4 taps, in tiles and in groups.
-    beam_ns : float
-        Per pixel and channel of either, where a beam weighs it.
+    The defaults are of 2 AVX-512 cores with PoCL; `defaults` returns those for a device.
     """
 
     call_ns: float = 1.2e7
@@ -74,22 +46,13 @@ class Costs:
         for field in fields(self):
             validate.number(field.name, getattr(self, field.name), "ns", least=0.0)
 
-    def line_ns(self, samples: ArrayLike, taps: int, *, given: bool) -> ArrayLike:
-        """Return the cost of a channel of a subimage in a stage, by the taps of both filters.
-
-        `given` is whether that is the first.
-        """
-        of_sample = self.sample_ns + self.sample_tap_ns * taps + self.given_sample_ns * given
-        return samples * of_sample
-
-    def leaf_line_ns(self, pixels: ArrayLike, taps: int, *, tiled: bool, beam: bool) -> ArrayLike:
-        """Return the cost of a virtual channel of a leaf that is backprojected."""
-        leaf_ns = self.leaf_ns if tiled else self.leaf_point_ns
-        return pixels * (leaf_ns * COST[taps] + self.beam_ns * beam) + self.leaf_channel_ns
-
-    def pair_ns(self, taps: int, *, tiled: bool, beam: bool) -> float:
-        """Return the cost of a pixel and channel of an exact image."""
-        return (self.pixel_ns if tiled else self.point_ns) * COST[taps] + self.beam_ns * beam
+    def seconds(self, work: Work) -> ArrayLike:
+        """Return the time that work takes: amounts times costs, added up."""
+        total_ns: ArrayLike = 0.0
+        for name, amount in vars(work).items():
+            if np.ndim(amount) or amount:
+                total_ns = total_ns + getattr(self, f"{name}_ns") * amount
+        return 1e-9 * total_ns
 
 
 _AVX2 = Costs(

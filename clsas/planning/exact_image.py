@@ -13,10 +13,10 @@ from clsas.exact.backprojection import antennas_and_phase, fullness_of
 from clsas.exact.lookup import most_upsampling
 from clsas.exact.run import Blocks, band_parts, blocks_of
 from clsas.exact.tiles import STACK, Tiles
+from clsas.factorized.estimates import Work, backprojecting, upsampling
 from clsas.opencl import phases
 from clsas.opencl.buffers import VECTOR_ROOM, channel_pitch
 from clsas.opencl.device import Device
-from clsas.planning.costs import Costs
 from clsas.planning.view import View
 from clsas.signal import interpolation
 from clsas.sonar.beam import INTERVALS
@@ -53,14 +53,19 @@ class Exact:
     samples: int
     memory_bytes: int
 
-    def seconds(self, costs: Costs) -> float:
-        """Return the time that it is expected to take."""
-        pair_ns = costs.pair_ns(self.taps, tiled=self.tiled, beam=self.weighted)
-        part_ns = costs.part_ns + self.part_pixels * pair_ns
-        of_lines_ns = self.channels * self.samples * costs.upsampled_sample_ns
-        of_groups_ns = 0.0 if self.tiled else self.parts * self.part_pixels * costs.group_ns
-        of_parts_ns = self.parts * self.seen * part_ns
-        return 1e-9 * (costs.call_ns + of_lines_ns + of_groups_ns + of_parts_ns)
+    @property
+    def work(self) -> Work:
+        """What it does."""
+        lines = upsampling(self.channels * self.samples, filtered=False)
+        pixels = backprojecting(
+            self.parts,
+            self.part_pixels,
+            self.seen,
+            self.taps,
+            tiled=self.tiled,
+            weighted=self.weighted,
+        )
+        return Work(call=1.0) + lines + pixels
 
 
 def expect(view: View, accuracy_db: float, device: Device) -> Exact:

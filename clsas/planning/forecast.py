@@ -4,12 +4,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from clsas.core.decibels import in_db, power
 from clsas.exact.tiles import STACK
+from clsas.factorized.estimates import (
+    ErrorBudget,
+    Work,
+    backprojecting_leaves,
+    combining,
+    upsampling,
+)
 from clsas.factorized.filters import UPSAMPLING_SHARE, Filters, edges_gain
 from clsas.factorized.plan import CHUNK, LEAST_BATCH, Plan, Stage, grid_digest, lines_digest
 from clsas.factorized.sector import OF_BEAM
@@ -69,7 +76,7 @@ class Way:
 def factorized(
     view: View,
     way: Way,
-    other_error: float,
+    other_errors: ErrorBudget,
     tolerance_db: float | None,
     exact: Exact,
     device: Device,
@@ -78,26 +85,26 @@ def factorized(
 ) -> Plan:
     """Return a plan with all that is expected of it.
 
-    `view` is that within its roots where the aperture is interpolated; `other_error` the power of
-    the errors that the filters do not account for.
+    `view` is that within its roots where the aperture is interpolated; `other_errors` are those
+    that the filters do not account for.
     """
     lines, sides, nearest = view.lines, way.sides, way.nearest
     align, aperture, final = way.filters.align, way.filters.aperture, way.filters.final
-    error = other_error + _power_of_filters(way)
+    errors = replace(other_errors, **_filter_errors(way))
     upsampler = None
     if not nearest:
         step = max(int(PHASES / align.upsampling), 1)
         gain = edges_gain(align, final, len(sides), PHASES / step)
-        most_db = in_db(UPSAMPLING_SHARE * error)
+        most_db = in_db(UPSAMPLING_SHARE * errors.total)
         upsampler = interpolation.upsampler(view.spectrum, step, gain, most_db)
     if upsampler is None:
         resampling = interpolation.resampling(lines.length, align, view.spectrum)
     else:
         resampling = upsampler.resampling(lines.length, align.taps // 2, view.spectrum)
-        error += power(upsampler.error_db)
+        errors = replace(errors, upsampling=power(upsampler.error_db))
     halves = view.half_lengths(sides, align, final, resampling)
     of_aperture = aperture.taps, 2 * aperture.upsampling
-    stages, channels, reach = [], float(lines.channels), []
+    stages, channels, reach, work = [], float(lines.channels), [], Work(call=1.0)
     width = device.info.width
     used = channels * view.share_seen(sides[0])
     for level, side in enumerate(sides):
@@ -116,33 +123,35 @@ def factorized(
             channels = view.channels(*of_aperture, turns)
             reach.append(aperture.taps * used / channels)
         taps = align.taps + aperture.taps
-        line_ns = costs.line_ns(samples, taps, given=level == 0)
-        cost_ns = count * (used * line_ns + costs.subimage_ns)
+        of_stage = combining(count * used, samples, taps, given=level == 0)
+        of_stage += Work(subimage=count)
         if not level:
-            cost_ns += count * lines.channels * costs.reference_ns
-            sample_ns = costs.upsampled_sample_ns if upsampler is None else costs.filtered_sample_ns
-            cost_ns += sample_ns * lines.channels * resampling.length
+            of_stage += Work(reference=count * lines.channels)
+            upsampled = lines.channels * resampling.length
+            of_stage += upsampling(upsampled, filtered=upsampler is not None)
+        work += of_stage
         operations, error_db = count * used * samples, in_db(_power_of_stage(way))
-        stages.append(
-            Stage(*side, count, round(channels), samples, operations, error_db, 1e-9 * cost_ns)
-        )
+        seconds = costs.seconds(of_stage)
+        stages.append(Stage(*side, count, round(channels), samples, operations, error_db, seconds))
     tiled, pixels = view.surface.is_plane, view.slots(side, width)
     operations = count * pixels * channels
-    cost_ns = costs.leaf_line_ns(pixels, final.taps, tiled=tiled, beam=view.beam is not None)
-    cost_ns *= count * channels
-    if not tiled:
-        cost_ns += count * pixels * costs.group_ns
-    stages.append(
-        Stage(*side, count, round(channels), samples, operations, final.scatter_db, 1e-9 * cost_ns)
+    of_leaves = backprojecting_leaves(
+        count * channels, pixels, final.taps, tiled=tiled, weighted=view.beam is not None
     )
+    if not tiled:
+        of_leaves += Work(group=count * pixels)
+    work += of_leaves
+    error_db, seconds = final.scatter_db, costs.seconds(of_leaves)
+    stages.append(Stage(*side, count, round(channels), samples, operations, error_db, seconds))
     tile = _tile(view, sides[-1], device) if nearest else sides[-1]
     if tolerance_db is not None:
-        error += phases.error(phases.terms_within(tolerance_db)) ** 2
+        of_phases = phases.error(phases.terms_within(tolerance_db)) ** 2
+        errors = replace(errors, phases=of_phases)
     half_precision = False
     if upsampler is not None and tolerance_db is not None and device.info.half_precision:
         rounding = _half_rounding(view, reach)
         half_precision = rounding <= _ROUNDING_SHARE * power(tolerance_db)
-        error += rounding if half_precision else 0.0
+        errors = replace(errors, half_precision=rounding if half_precision else 0.0)
     line_bytes = sample_bytes(half_precision) * lines.channels * padded_length(resampling)
     if upsampler is not None:
         line_bytes += min(lines.samples.nbytes, GIVEN_BYTES)
@@ -160,7 +169,9 @@ def factorized(
     of_batch = 2 * at_once * table_bytes
     prepared = at_once * min(max(int(room // of_batch), 1), -(-_ROOTS_PREPARED // at_once))
     batches = -(-stages[0].subimages // at_once)
-    besides = 1e-9 * (costs.call_ns + costs.batch_ns * batches * len(sides))
+    work += Work(batch=float(batches * len(sides)))
+    if not nearest:
+        errors = errors.times(power(margin_db(view)))
     return Plan(
         tolerance_db=tolerance_db,
         sides=sides,
@@ -178,9 +189,9 @@ def factorized(
         roots_at_once=at_once,
         roots_prepared=prepared,
         stages=tuple(stages),
-        predicted_error_db=in_db(error) + (0.0 if nearest else margin_db(view)),
-        predicted_seconds=sum(stage.seconds for stage in stages) + besides,
-        exact_seconds=exact.seconds(costs),
+        predicted_error_db=errors.total_db,
+        predicted_seconds=float(costs.seconds(work)),
+        exact_seconds=float(costs.seconds(exact.work)),
         memory_bytes=int(line_bytes + at_once * root_bytes + 2 * prepared * table_bytes),
         device=device.info.label,
         lines_digest=lines_digest(lines),
@@ -191,6 +202,8 @@ def factorized(
         beam_cycles=way.beam_cycles,
         most_channels=tuple(math.ceil(most) for _, most in most_channels),
         band=None if nearest else _band(view, OUTSIDE * power(tolerance_db)),
+        work=work,
+        errors=errors,
     )
 
 
@@ -230,9 +243,16 @@ def _power_of_stage(way: Way) -> float:
     return power(way.filters.align.scatter_db) + power(way.filters.aperture.error_db)
 
 
-def _power_of_filters(way: Way) -> float:
-    """Return the power of the errors that all filters add."""
-    return len(way.sides) * _power_of_stage(way) + power(way.filters.final.scatter_db)
+def _filter_errors(way: Way) -> dict[str, float]:
+    """Return the errors that all filters add, by their names in the budget."""
+    align, aperture, final = way.filters.align, way.filters.aperture, way.filters.final
+    stages, last = len(way.sides), power(final.scatter_db)
+    if way.nearest:
+        return {"range_filters": stages * power(align.error_db) + last}
+    return {
+        "range_filters": stages * power(align.scatter_db) + last,
+        "aperture_filters": stages * power(aperture.error_db),
+    }
 
 
 def _most_channels(view: View, way: Way, stages: Sequence[Stage]) -> list[tuple[float, float]]:
@@ -311,7 +331,7 @@ def plain(
     view: View, tolerance_db: float | None, exact: Exact, device: Device, costs: Costs
 ) -> Plan:
     """Return plain backprojection as a plan."""
-    seconds = exact.seconds(costs)
+    seconds = float(costs.seconds(exact.work))
     return Plan(
         tolerance_db=tolerance_db,
         sides=(),
@@ -339,4 +359,6 @@ def plain(
         grid_digest=grid_digest(view.grid),
         beam=view.beam,
         limits=view.limits,
+        work=exact.work,
+        errors=ErrorBudget(exact=power(exact.accuracy_db)),
     )

@@ -15,6 +15,7 @@ from clsas.core.decibels import in_db, power
 from clsas.core.grid import Grid
 from clsas.core.lines import RangeLines
 from clsas.exact.backprojection import ACCURACY_DB
+from clsas.factorized.estimates import ErrorBudget
 from clsas.factorized.filters import ALIGN_TAPS, Choice, Filters, steering_spectrum
 from clsas.factorized.plan import Plan, with_left_out
 from clsas.opencl import phases
@@ -157,9 +158,18 @@ def plan(
         view.ambiguity.warn("tolerance_db", tolerance_db)
         rest_db = view.ambiguity.rest_db(tolerance_db, model.error)
     found = _chosen(view, rest_db, stages, device, costs, memory_bytes, allowed)
-    error = power(found.predicted_error_db) + view.ambiguity.error_power + model.error
+    errors = replace(
+        found.errors,
+        line_ends=view.ambiguity.ends,
+        aliasing=view.ambiguity.aliasing,
+        left_out=model.error,
+    )
     found = replace(
-        found, tolerance_db=tolerance_db, predicted_error_db=in_db(error), calibrated=calibrated
+        found,
+        tolerance_db=tolerance_db,
+        predicted_error_db=errors.total_db,
+        errors=errors,
+        calibrated=calibrated,
     )
     if model.left_out:
         found = with_left_out(found, model, lines, grid, beam)
@@ -196,7 +206,7 @@ def _chosen(
         exact_fits, least = False, found.memory_bytes
     elif stages is None and _divisible(view):
         # What is gained must be worth an error, and more than predictions scatter.
-        to_beat = _WORTH * exact.seconds(costs) if exact_fits and allowed is None else math.inf
+        to_beat = _WORTH * costs.seconds(exact.work) if exact_fits and allowed is None else math.inf
         found, needed = _fastest(
             view, tolerance_db, exact, to_beat, device, costs, room, allowed or Allowed()
         )
@@ -324,8 +334,11 @@ def _fastest(
         others = other_errors(
             within, way.sides, roots, filters.aperture, crowding, beam_cycles, device
         )
+        besides_filters = ErrorBudget(
+            roots=others.roots, spacing=sum(others.nodes), leaves=others.leaves, beam_edges=trimmed
+        )
         found = forecast.factorized(
-            within, way, others.total + trimmed, tolerance_db, exact, device, costs, memory_bytes
+            within, way, besides_filters, tolerance_db, exact, device, costs, memory_bytes
         )
         if found.predicted_seconds >= seconds:
             break
@@ -393,7 +406,8 @@ def _nearest(
     filters = Filters(linear, Interpolator(1, 1.0, np.zeros((0, 2, 0)), 0.0, 0.0), linear)
     way = Way(tuple(sides[::-1]), filters, nearest=tuple(beams for beams, _ in stages))
     error, by_stage = nearest_errors(view, stages)
-    found = forecast.factorized(view, way, error, None, exact, device, costs, memory_bytes)
+    errors = ErrorBudget(nearest_beams=error)
+    found = forecast.factorized(view, way, errors, None, exact, device, costs, memory_bytes)
     *divided, last = found.stages
     divided = [
         replace(stage, error_db=in_db(power(stage.error_db) + of_beams))

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsas.core.decibels import in_db, power
+from clsas.factorized.estimates import Work, backprojecting_leaves, combining, upsampling
 from clsas.factorized.filters import ALIGN_TAPS, APERTURE_TAPS, UPSAMPLING_SHARE, Choice, choose
 from clsas.factorized.plan import LEAST_BATCH
 from clsas.opencl.device import Device
@@ -116,14 +117,14 @@ class _Within:
         Which these are.
     turns, of_leaf : float [n, n], [n]
         Cycles that a child of size i uses of a parent of size j; and those of leaves.
-    step_ns : float [n, n]
+    step_s : float [n, n]
         0 where a parent of size j may be divided into those of size i, else infinite.
     """
 
     sizes: NDArray[np.int64]
     turns: NDArray[np.float64]
     of_leaf: NDArray[np.float64]
-    step_ns: NDArray[np.float64]
+    step_s: NDArray[np.float64]
 
     @classmethod
     def of(cls, sizes: _Sizes, within: NDArray[np.int64], turns: NDArray[np.float64]) -> _Within:
@@ -160,69 +161,62 @@ def _sizes(
 
 @dataclass(frozen=True, eq=False)
 class _Option:
-    """Filters for a number of stages, and what they make things cost.
+    """Filters for a number of stages, and the time that things take with them.
 
     Attributes
     ----------
     choice : Choice
     stages : int
-    given_ns, channel_ns : float [sizes]
-        Of every channel of all subimages of a size, in the first stage and in others.
-    subimages_ns : float [sizes]
+    channel_s : float [sizes]
+        Of every channel of all subimages of a size, in stages after the first.
+    subimages_s : float [sizes]
         Of these subimages besides.
-    pixels_ns : float [sizes]
-        Of every virtual channel of all leaves of a size, in the last.
-    once_ns : float
-        What it takes however the grid is divided.
+    leaves_s : float [sizes]
+        Of every virtual channel of all leaves of a size; infinite where leaves may not have it.
+    roots_s : float [sizes]
+        Of the first stage with roots of a size, and of all that does not depend on the division.
     """
 
     choice: Choice
     stages: int
-    given_ns: NDArray[np.float64]
-    channel_ns: NDArray[np.float64]
-    subimages_ns: NDArray[np.float64]
-    pixels_ns: NDArray[np.float64]
-    once_ns: float
+    channel_s: NDArray[np.float64]
+    subimages_s: NDArray[np.float64]
+    leaves_s: NDArray[np.float64]
+    roots_s: NDArray[np.float64]
 
     def channels(self, view: View, turns: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the virtual channels of subimages whose phases turn by so many cycles."""
         return view.channels(self.choice.aperture_taps, 2 * self.choice.density, turns)
 
-    def roots_ns(self, sizes: _Sizes, costs: Costs) -> NDArray[np.float64]:
-        """Return the cost of the first stage, [sizes]."""
-        per_channel = sizes.share * self.given_ns + sizes.counts * costs.reference_ns
-        batches = np.maximum(sizes.counts / LEAST_BATCH, 1.0)
-        commands_ns = batches * self.stages * costs.batch_ns
-        besides_ns = self.subimages_ns + commands_ns + self.once_ns
-        return sizes.view.lines.channels * per_channel + besides_ns
-
 
 def _options(sizes: _Sizes, filters_db: float, costs: Costs, allowed: Allowed) -> list[_Option]:
-    """Return all ways to filter, and their costs."""
+    """Return all ways to filter, and what they take."""
     view, options = sizes.view, []
-    sample_ns = costs.filtered_sample_ns
+    counts, channels = sizes.counts, view.lines.channels
+    batches = np.maximum(counts / LEAST_BATCH, 1.0)
     most_db = filters_db + in_db(UPSAMPLING_SHARE)
-    if upsampler(view.spectrum, PHASES // 2, np.ones_like, most_db) is None:
-        sample_ns = costs.upsampled_sample_ns
+    filtered = upsampler(view.spectrum, PHASES // 2, np.ones_like, most_db) is not None
+    tiled, weighted = view.surface.is_plane, view.beam is not None
     for stages, *taps in product(allowed.stages, allowed.align_taps, allowed.aperture_taps):
         choice = choose(view.spectrum, *taps, stages, filters_db)
         if choice is None:
             continue
         samples = 2 * sizes.reach_m * choice.rate / view.lines.range_step_m
         samples += choice.final_taps + 16
-        beam = view.beam is not None
-        of_leaf = costs.leaf_line_ns(
-            sizes.slots, choice.final_taps, tiled=view.surface.is_plane, beam=beam
+        leaves = backprojecting_leaves(
+            counts, sizes.slots, choice.final_taps, tiled=tiled, weighted=weighted
         )
+        of_roots = combining(counts * sizes.share * channels, samples, sum(taps), given=True)
+        of_roots += Work(reference=counts * channels, subimage=counts, batch=batches * stages)
+        of_roots += upsampling(view.lines.samples.size * choice.rate, filtered=filtered)
         options.append(
             _Option(
                 choice,
                 stages,
-                given_ns=sizes.counts * costs.line_ns(samples, sum(taps), given=True),
-                channel_ns=sizes.counts * costs.line_ns(samples, sum(taps), given=False),
-                subimages_ns=sizes.counts * costs.subimage_ns,
-                pixels_ns=np.where(sizes.leaf, sizes.counts * of_leaf, np.inf),
-                once_ns=sample_ns * view.lines.samples.size * choice.rate,
+                channel_s=costs.seconds(combining(counts, samples, sum(taps), given=False)),
+                subimages_s=costs.seconds(Work(subimage=counts)),
+                leaves_s=np.where(sizes.leaf, costs.seconds(leaves), np.inf),
+                roots_s=costs.seconds(of_roots),
             )
         )
     return options
@@ -254,26 +248,26 @@ def search(
         return None
     # In a root phases turn no less than in the middle of it.
     anywhere = _Within.of(sizes, np.arange(len(sizes.sides)), sizes.cycles((0, 0)))
-    roots_ns = np.array([option.roots_ns(sizes, costs) for option in options])
-    least_ns = np.array([_onward(view, option, anywhere)[0] for option in options])
-    least_ns = (roots_ns + least_ns)[:, roots]
+    roots_s = np.array([option.roots_s for option in options])
+    least_s = np.array([_onward(view, option, anywhere)[0] for option in options])
+    least_s = (roots_s + least_s)[:, roots]
     in_root = functools.cache(sizes.in_root)
-    best_ns, best = math.inf, None
-    for place in np.argsort(least_ns, axis=None, kind="stable"):
-        if least_ns.flat[place] >= best_ns:
+    best_s, best = math.inf, None
+    for place in np.argsort(least_s, axis=None, kind="stable"):
+        if least_s.flat[place] >= best_s:
             break
         index, root = place // len(roots), int(roots[place % len(roots)])
         within = in_root(root)
-        onward_ns, children = _onward(view, options[index], within)
+        onward_s, children = _onward(view, options[index], within)
         size = int(np.searchsorted(within.sizes, root))
-        cost_ns = roots_ns[index, root] + onward_ns[size]
-        if cost_ns < best_ns:
+        cost_s = roots_s[index, root] + onward_s[size]
+        if cost_s < best_s:
             path = [size]
             for each in children:
                 path.append(int(each[path[-1]]))
             choice = options[index].choice
             sides = tuple(sizes.pairs[within.sizes[size]] for size in path)
-            best_ns, best = cost_ns, Tree(sides, choice.align_taps, choice.aperture_taps)
+            best_s, best = cost_s, Tree(sides, choice.align_taps, choice.aperture_taps)
     return best
 
 
@@ -285,17 +279,17 @@ def _onward(
     Beside it, stage by stage, the sizes (as places in `within`) that are best to go on to.
     """
     # To a child of size i from a parent of size j: the channels of the parent that it uses.
-    step_ns = option.channels(view, within.turns)
-    step_ns *= option.channel_ns[within.sizes, None]
-    step_ns += option.subimages_ns[within.sizes, None]
-    step_ns += within.step_ns
-    onward_ns = option.channels(view, within.of_leaf) * option.pixels_ns[within.sizes]
+    step_s = option.channels(view, within.turns)
+    step_s *= option.channel_s[within.sizes, None]
+    step_s += option.subimages_s[within.sizes, None]
+    step_s += within.step_s
+    onward_s = option.channels(view, within.of_leaf) * option.leaves_s[within.sizes]
     children = []
     for _ in range(option.stages - 1):
-        through_ns = step_ns + onward_ns[:, None]
-        children.append(best := through_ns.argmin(axis=0))
-        onward_ns = through_ns[best, np.arange(len(best))]
-    return onward_ns, children[::-1]
+        through_s = step_s + onward_s[:, None]
+        children.append(best := through_s.argmin(axis=0))
+        onward_s = through_s[best, np.arange(len(best))]
+    return onward_s, children[::-1]
 
 
 def root_limits(view: View, allowed: float) -> tuple[int, int] | None:

@@ -1,4 +1,5 @@
 import dataclasses
+import json
 import re
 
 import numpy as np
@@ -22,6 +23,7 @@ from factorizing import (
 )
 
 from clsas.core.grid import Grid
+from clsas.factorized.plan import Plan
 from clsas.planning import planner
 from clsas.planning.costs import Costs
 from clsas.planning.planner import plan
@@ -443,3 +445,39 @@ def test_the_highest_frequency_leaves_out_as_little_as_is_allowed():
         assert share[cycles_per_m > view.highest_cycles_per_m + bin_m].sum() <= outside
         highest.append(view.highest_cycles_per_m)
     assert highest[2] > highest[0]
+
+
+# Estimates
+
+
+@pytest.mark.parametrize("tolerance_db", [-30, -60])
+@pytest.mark.parametrize("case", ["plane", "beam", "exact"])
+def test_predictions_are_sums_over_work_and_causes(case, tolerance_db):
+    lines, grid = straight()[:2]
+    beam = BEAMS[0] if case == "beam" else None
+    costs = Costs(pixel_ns=0.0, part_ns=0.0) if case == "exact" else EXACT_IS_SLOW
+    chosen = plan(lines, grid, tolerance_db=tolerance_db, beam=beam, costs=costs)
+    assert chosen.is_exact == (case == "exact")
+    seconds = sum(
+        1e-9 * getattr(costs, f"{name}_ns") * amount for name, amount in vars(chosen.work).items()
+    )
+    assert chosen.predicted_seconds == pytest.approx(seconds)
+    causes = vars(chosen.errors)
+    assert chosen.predicted_error_db == pytest.approx(10 * np.log10(sum(causes.values())))
+    told = chosen.describe()
+    for name, power in causes.items():
+        line = f"\n{name.replace(chr(95), chr(32)):<16}"
+        assert (line in told) == (power > 1e-3 * sum(causes.values())), name
+    read = Plan.from_json(chosen.to_json())
+    assert (read.work, read.errors) == (chosen.work, chosen.errors)
+
+
+def test_plans_without_estimates_are_read():
+    """Older versions wrote none."""
+    lines, grid = straight()[:2]
+    values = json.loads(plan(lines, grid, tolerance_db=-40).to_json())
+    for name in ("work", "errors", "digest"):
+        del values[name]
+    read = Plan.from_json(json.dumps(values))
+    assert read.work is None
+    assert "by cause" not in read.describe()
