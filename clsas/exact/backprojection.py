@@ -2,37 +2,27 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from typing import Any
-
-import numpy as np
-from numpy.typing import NDArray
 
 from clsas.core import validate
 from clsas.core.grid import Grid
 from clsas.core.image import Image
-from clsas.core.lines import RangeLines, fastest, some_channels, wavelength_m
-from clsas.exact.checks import check_accumulate, check_distances, check_numbers
-from clsas.exact.lookup import most_upsampling
+from clsas.core.lines import RangeLines
+from clsas.exact.checks import check_accumulate, check_numbers
+from clsas.exact.decision import decide
 from clsas.exact.preparation import Preparation
 from clsas.exact.run import execute
-from clsas.exact.tiles import GEOMETRY_ERROR, allowed, lay_out
-from clsas.opencl import phases
 from clsas.opencl.device import Device, open_device
-from clsas.signal import interpolation
 from clsas.signal.ambiguity import ambiguity
-from clsas.signal.spectrum import Spectrum, cycles_per_m_at, measure_spectrum
-from clsas.sonar.beam import BeamWindow, sines
+from clsas.signal.spectrum import measure_spectrum
+from clsas.sonar.beam import BeamWindow
 from clsas.sonar.simplify import Model, simplify
 
 BEST_ACCURACY_DB = -85.0
 """The best accuracy that may be asked for: what float32 allows."""
 ACCURACY_DB = -60.0
 """What is taken where no accuracy is asked for."""
-
-
-_CHANNELS, _PLACES = 256, 16  # at which is looked how full of what is seen the beam is
 
 
 def backproject(
@@ -160,50 +150,29 @@ def prepare(
         model = simplify(lines, grid, beam, accuracy_db)
     lines, grid, beam = model.lines, model.grid, model.beam
     along = None if beam is None else beam.directions(lines)
-    fullness = 1.0 if beam is None else fullness_of(lines, grid, beam, along)
     device = open_device(device)
     spectrum = measure_spectrum(lines, grid)
     left_open = ambiguity(lines, grid, spectrum, beam, along)
-    antennas_m, cycles_per_m = antennas_and_phase(lines, spectrum, beam)
-    geometry_error = GEOMETRY_ERROR if fixed else allowed(accuracy_db)
-    layout = lay_out(
+    decision = decide(
+        lines,
         grid,
-        antennas_m,
-        cycles_per_m,
-        device.info.width,
-        error=geometry_error,
-        speed_ratio=fastest(lines),
+        device=device,
+        accuracy_db=accuracy_db,
+        spectrum=spectrum,
+        left_open=left_open,
         beam=beam,
-        fullness=fullness,
-    )
-    check_distances(antennas_m, layout)
-    terms = phases.TERMS[-1] if fixed else phases.terms_within(accuracy_db)
-    interpolator = interpolation.choose(
-        spectrum,
-        left_open.rest_db(accuracy_db, model.error),
+        along=along,
         taps=taps,
         upsampling=upsampling,
-        other_error=math.hypot(geometry_error, phases.error(terms)),
-        pixels_per_sample=grid.size / lines.length,
-        most_upsampling=most_upsampling(device, lines, layout.lookup_radius_m),
+        left_out_error=model.error,
     )
-    resampling = interpolation.resampling(lines.length, interpolator, spectrum)
-    one_cubic = False
-    if beam is not None:
-        nearest_m = max(layout.nearest_m(lines.phase_centres_m) - layout.radius_m, 1e-30)
-        error = layout.one_cubic_error(beam, nearest_m, wavelength_m(lines))
-        one_cubic = error <= geometry_error * fullness
     return Preparation(
         device,
         lines,
         grid,
-        layout,
-        interpolator,
-        resampling,
-        terms,
-        beam,
-        along,
-        one_cubic,
+        **vars(decision),
+        beam=beam,
+        along=along,
         wanted_db=0.0 if fixed else accuracy_db,
         ambiguity=left_open,
         given_grid=given_grid,
@@ -225,29 +194,3 @@ def form_exactly(
     `warned` is whether an image of zeros has been warned of too.
     """
     return execute(prepare(lines, grid, **wish), progress=progress, warned=warned)
-
-
-def antennas_and_phase(
-    lines: RangeLines, spectrum: Spectrum, beam: BeamWindow | None
-) -> tuple[NDArray[np.float64], float]:
-    """Return all places that ranges and aspects are from, [n, 3], and cycles per metre of range.
-
-    The latter are what rounding a range costs: phase, and place within the lines' band, 0.3 Nyquist
-    rms.
-    """
-    antennas_m = lines.tx_m
-    if not np.array_equal(lines.tx_m, lines.rx_m):
-        antennas_m = np.unique(np.concatenate([lines.tx_m, lines.rx_m]), axis=0)
-    if beam is not None:
-        antennas_m = np.concatenate([antennas_m, lines.phase_centres_m])
-    of_phase = cycles_per_m_at(lines, spectrum.centre)
-    return antennas_m, math.hypot(of_phase, 0.3 / lines.range_step_m)
-
-
-def fullness_of(
-    lines: RangeLines, grid: Grid, beam: BeamWindow, along: NDArray[np.float64]
-) -> float:
-    """Return `BeamWindow.fullness` of some channels at points all over a grid, its edges too."""
-    some = some_channels(lines.channels, _CHANNELS)
-    sine = sines(grid.spread(_PLACES), lines.phase_centres_m[some], along[some])
-    return beam.fullness(sine, wavelength_m(lines), len(some) / lines.channels)

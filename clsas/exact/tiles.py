@@ -245,6 +245,34 @@ class Groups:
         return image.reshape(self.grid.shape)
 
 
+@dataclass(frozen=True, eq=False)
+class GroupsEstimate:
+    """Groups before they are made: as if all were full, and as wide as float32 allows.
+
+    Attributes
+    ----------
+    grid : Grid
+        The points.
+    part_pixels : int
+        Slots of a group.
+    radius_m : float
+        Largest distance of a pixel from its group's centre.
+    lookup_radius_m : float
+        Unknown, and taken as none.
+    """
+
+    grid: Grid
+    part_pixels: int
+    radius_m: float
+    lookup_radius_m: float = 0.0
+    across: int = 1
+
+    @property
+    def parts(self) -> int:
+        """Number of groups."""
+        return -(-self.grid.size // self.part_pixels)
+
+
 def allowed(accuracy_db: float) -> float:
     """Return what the geometry may add to an image's error: 6 % of its power, -90 dB at least."""
     return max(GEOMETRY_ERROR, 10 ** ((accuracy_db - 12) / 20))
@@ -260,7 +288,8 @@ def lay_out(
     speed_ratio: float = 0.0,
     beam: BeamWindow | None = None,
     fullness: float = 1.0,
-) -> Tiles | Groups:
+    longest_m: float | None = None,
+) -> Tiles | Groups | GroupsEstimate:
     """Return how to divide a grid so that the geometry's share of the error stays small.
 
     That is below -90 dB in tiles, if there are such; else in tiles within `error`; else in groups.
@@ -284,6 +313,8 @@ def lay_out(
     fullness : float
         Of the beam, by what it sees of the pixels: `BeamWindow.fullness`. Errors of weights must be
         as much smaller.
+    longest_m : float, optional
+        Length of the lines. With it groups are estimated in place of made.
 
     Notes
     -----
@@ -308,7 +339,10 @@ def lay_out(
     )
     if found is not None:
         return found
-    return _group(grid, largest_radius_m(cycles_per_m, len(antennas_m)), width)
+    radius_m = largest_radius_m(cycles_per_m, len(antennas_m))
+    if longest_m is not None:
+        return GroupsEstimate(grid, STACK * width, min(radius_m, longest_m))
+    return _group(grid, radius_m, width)
 
 
 def tiles(

@@ -50,7 +50,7 @@ class Costs:
         """Return the time that work takes: amounts times costs, added up."""
         total_ns: ArrayLike = 0.0
         for name, amount in vars(work).items():
-            if np.ndim(amount) or amount:
+            if isinstance(amount, np.ndarray) or amount:
                 total_ns = total_ns + getattr(self, f"{name}_ns") * amount
         return 1e-9 * total_ns
 

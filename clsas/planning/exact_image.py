@@ -7,18 +7,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from clsas.core.lines import fastest
-from clsas.exact import tiles as layout
-from clsas.exact.backprojection import antennas_and_phase, fullness_of
-from clsas.exact.lookup import most_upsampling
+from clsas.exact.decision import decide
 from clsas.exact.run import Blocks, band_parts, blocks_of
-from clsas.exact.tiles import STACK, Tiles
+from clsas.exact.tiles import GroupsEstimate, Tiles
 from clsas.factorized.estimates import Work, backprojecting, upsampling
-from clsas.opencl import phases
 from clsas.opencl.buffers import VECTOR_ROOM, channel_pitch
 from clsas.opencl.device import Device
 from clsas.planning.view import View
-from clsas.signal import interpolation
 from clsas.sonar.beam import INTERVALS
 
 
@@ -69,44 +64,21 @@ class Exact:
 
 
 def expect(view: View, accuracy_db: float, device: Device) -> Exact:
-    """Return how an image would be backprojected plainly.
-
-    What `clsas.backproject` decides before it starts; off a plane, where groups are not made for
-    this, they are taken as full, and as wide as float32 allows.
-    """
-    lines, grid, beam, width = view.lines, view.grid, view.beam, device.info.width
-    antennas_m, cycles_per_m = antennas_and_phase(lines, view.spectrum, beam)
-    error = layout.allowed(accuracy_db)
-    tiles = layout.tiles(
-        grid,
-        antennas_m,
-        cycles_per_m,
-        width,
-        error=error,
-        speed_ratio=fastest(lines),
+    """Return how an image would be backprojected exactly, by the decision that forms it."""
+    lines, beam = view.lines, view.beam
+    decision = decide(
+        lines,
+        view.grid,
+        device=device,
+        accuracy_db=accuracy_db,
+        spectrum=view.spectrum,
+        left_open=view.ambiguity,
         beam=beam,
-        fullness=1.0 if beam is None else fullness_of(lines, grid, beam, view.channels_along),
+        along=view.channels_along,
+        estimate=True,
     )
-    if tiles is not None:
-        parts, part_pixels, across, radius_m = (
-            tiles.parts, tiles.part_pixels, tiles.across, tiles.radius_m,
-        )  # fmt: skip
-    else:
-        part_pixels, across = STACK * width, 1
-        parts = -(-grid.size // part_pixels)
-        radius_m = min(
-            layout.largest_radius_m(cycles_per_m, len(antennas_m)),
-            lines.length * lines.range_step_m,
-        )
-    block_m = Tiles(grid, 16, width).lookup_radius_m if grid.is_planar else 0.0
-    interpolator = interpolation.choose(
-        view.spectrum,
-        view.ambiguity.rest_db(accuracy_db),
-        other_error=math.hypot(error, phases.error(phases.terms_within(accuracy_db))),
-        pixels_per_sample=grid.size / lines.length,
-        most_upsampling=most_upsampling(device, lines, block_m),
-    )
-    resampling = interpolation.resampling(lines.length, interpolator, view.spectrum)
+    layout, interpolator, resampling = decision.layout, decision.interpolator, decision.resampling
+    tiled = isinstance(layout, Tiles)
     share = most = 1.0
     if beam is not None and view.track is not None:
         share, most = view.share_seen((16, 16)), view.share_seen((64, 64), most=True)
@@ -115,22 +87,22 @@ def expect(view: View, accuracy_db: float, device: Device) -> Exact:
         lines,
         resampling,
         interpolator.taps,
-        radius_m=radius_m,
-        part_pixels=part_pixels,
-        tiled=tiles is not None,
+        radius_m=layout.radius_m,
+        part_pixels=layout.part_pixels,
+        tiled=tiled,
         beam=beam,
     )
     return Exact(
         accuracy_db=accuracy_db,
-        tiled=tiles is not None,
+        tiled=tiled,
         weighted=beam is not None,
-        parts=parts,
-        part_pixels=part_pixels,
+        parts=layout.parts,
+        part_pixels=layout.part_pixels,
         channels=lines.channels,
         seen=share * lines.channels,
         taps=interpolator.taps,
         samples=resampling.length,
-        memory_bytes=_memory_bytes(view, device, blocks, parts, part_pixels, across, most),
+        memory_bytes=_memory_bytes(view, device, blocks, layout, most),
     )
 
 
@@ -138,9 +110,7 @@ def _memory_bytes(
     view: View,
     device: Device,
     blocks: Blocks,
-    parts: int,
-    part_pixels: int,
-    across: int,
+    layout: Tiles | GroupsEstimate,
     most: float,
 ) -> int:
     """Return the device memory that `backproject.execute` takes.
@@ -149,8 +119,9 @@ def _memory_bytes(
     the largest share of the channels that a part sees.
     """
     lines, beam = view.lines, view.beam
+    parts, part_pixels = layout.parts, layout.part_pixels
     normalise = beam is not None and beam.normalise
-    of_band = min(band_parts(device, part_pixels, across, normalise), parts)
+    of_band = min(band_parts(device, part_pixels, layout.across, normalise), parts)
     of_job = min(blocks.parts_at_once, of_band)
     bands, jobs_of_set = -(-parts // of_band), -(-of_band // of_job)
     # Channels of the first set, and of the other that there is room for.

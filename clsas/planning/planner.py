@@ -6,7 +6,6 @@ import math
 import weakref
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 
@@ -16,18 +15,18 @@ from clsas.core.grid import Grid
 from clsas.core.lines import RangeLines
 from clsas.exact.backprojection import ACCURACY_DB
 from clsas.factorized.estimates import ErrorBudget
-from clsas.factorized.filters import ALIGN_TAPS, Choice, Filters, steering_spectrum
+from clsas.factorized.filters import ALIGN_TAPS, Filters
 from clsas.factorized.plan import Plan, with_left_out
-from clsas.opencl import phases
 from clsas.opencl.device import Device, open_device
 from clsas.planning import forecast
 from clsas.planning.costs import Costs
 from clsas.planning.costs import defaults as default_costs
 from clsas.planning.costs import measured as measured_costs
-from clsas.planning.errors import excess_error, nearest_errors, other_errors, root_error
+from clsas.planning.errors import nearest_errors
 from clsas.planning.exact_image import Exact, expect
-from clsas.planning.forecast import MARGIN_DB, OUTSIDE, Way, margin_db
-from clsas.planning.search import MOST_STAGES, Allowed, Tree, root_limits, search
+from clsas.planning.fastest import fastest
+from clsas.planning.forecast import MARGIN_DB, OUTSIDE, Way
+from clsas.planning.search import MOST_STAGES, Allowed
 from clsas.planning.view import View
 from clsas.signal import interpolation
 from clsas.signal.interpolation import Interpolator
@@ -45,14 +44,10 @@ TOLERANCE_DB = -50.0
 NEAREST_UPSAMPLING = 8.0
 """By how much lines are upsampled before the linear interpolation of given stages."""
 
-_ROOTS_SHARE, _NODES_SHARE, _EDGES_SHARE = 0.25, 0.2, 0.03  # of the error allowed
 _WORTH = 0.95  # of the time of an exact image
-_LEAST_CROWDED, _MOST_CROWDING = 1.05, 2.0  # more nodes at a time, and altogether
-_CROWDING_POWER = 0.08  # of an error that more nodes are to mend
-_LEAST_STEP = 0.02  # of the error allowed
+_SEARCH_S = 0.1  # that a search takes, about: 0.05 to 0.12 s on a core of 2.5 GHz
 _LEAST_COVERED = 0.25  # of the sum of weights at the best covered pixel
 _LEAST_SHARE_COVERED, _LEAST_PARTIAL = 0.1, 0.25  # of an image
-_LEAST_BEAM_CYCLES, _MOST_BEAM_CYCLES = 0.5, 64.0
 
 
 def plan(
@@ -204,10 +199,10 @@ def _chosen(
         if found.memory_bytes <= room:
             return found
         exact_fits, least = False, found.memory_bytes
-    elif stages is None and _divisible(view):
+    elif stages is None and _worth_a_search(exact, costs, exact_fits, allowed) and _divisible(view):
         # What is gained must be worth an error, and more than predictions scatter.
         to_beat = _WORTH * costs.seconds(exact.work) if exact_fits and allowed is None else math.inf
-        found, needed = _fastest(
+        found, needed = fastest(
             view, tolerance_db, exact, to_beat, device, costs, room, allowed or Allowed()
         )
         if found is not None:
@@ -258,6 +253,11 @@ def _allowed(taps: tuple[int, int] | None, depth: int | None) -> Allowed | None:
     return Allowed(**fields)
 
 
+def _worth_a_search(exact: Exact, costs: Costs, exact_fits: bool, allowed: Allowed | None) -> bool:
+    """Return whether something faster than the exact image is needed, or worth a search."""
+    return not exact_fits or allowed is not None or costs.seconds(exact.work) > _SEARCH_S
+
+
 def _divisible(view: View) -> bool:
     """Return whether an image can be factorized at all."""
     if view.track is None or view.grid.size == 1 or not view.sweeps_once:
@@ -272,107 +272,6 @@ def _divisible(view: View) -> bool:
         return False
     # Where hardly any pixel sees anything there is as little to gain as is known about errors.
     return float(view.coverage(2).mean()) >= _LEAST_SHARE_COVERED
-
-
-def _fastest(
-    view: View,
-    tolerance_db: float,
-    exact: Exact,
-    seconds: float,
-    device: Device,
-    costs: Costs,
-    memory_bytes: int,
-    choices: Allowed,
-) -> tuple[Plan | None, float]:
-    """Return the fastest plan within a tolerance, if it takes less than some seconds.
-
-    Beside it, where there is none, the least memory of those that did not fit.
-    """
-    allowed = power(tolerance_db)
-    view, trimmed = view.trimmed(_EDGES_SHARE * allowed), 0.0
-    if view.beam is not None:
-        trimmed = _EDGES_SHARE * allowed
-    most = root_limits(view, _ROOTS_SHARE * allowed)
-    beam_cycles = 0.0 if view.beam is None else _LEAST_BEAM_CYCLES
-    needed = math.inf
-    # The errors of filters and roots, and of phases.
-    least = trimmed + 0.08 * allowed + phases.error(phases.terms_within(tolerance_db)) ** 2
-    besides = least
-    tree: Tree | None = None
-    designed: tuple[Choice, float] | None = None
-    leaf_pixels = 1
-    frequencies, share = view.frequencies
-    steering = steering_spectrum(frequencies / view.highest_cycles_per_m, share)
-    while most is not None:
-        # Roots are often smaller than they might be.
-        roots = root_error(view, most if tree is None else tree.sides[0])
-        spared = besides + roots
-        choice = None
-        if spared < 0.9 * allowed:
-            filters_db = in_db(allowed - spared) - margin_db(view)
-            choice = None if tree is None else tree.filters(view.spectrum, filters_db)
-        elif tree is None:
-            break
-        if tree is None:
-            tree = search(view, filters_db, most, leaf_pixels, beam_cycles, device, costs, choices)
-            if tree is None:
-                break
-            crowding = (1.0,) * len(tree.sides)
-            continue
-        if choice is None:
-            # Fewer stages are of larger subimages, with more nodes.
-            fewer = tuple(n for n in choices.stages if n < len(tree.sides))
-            if not fewer or _MOST_CROWDING not in crowding[:-1]:
-                break
-            choices, tree, besides = replace(choices, stages=fewer), None, least
-            continue
-        if (choice, filters_db) != designed:
-            designed = choice, filters_db
-            filters = choice.design(view.spectrum, steering, len(tree.sides), filters_db)
-        way = Way(tree.sides, filters, crowding=crowding, beam_cycles=beam_cycles)
-        within = view.within(tree.sides[0])
-        others = other_errors(
-            within, way.sides, roots, filters.aperture, crowding, beam_cycles, device
-        )
-        besides_filters = ErrorBudget(
-            roots=others.roots, spacing=sum(others.nodes), leaves=others.leaves, beam_edges=trimmed
-        )
-        found = forecast.factorized(
-            within, way, besides_filters, tolerance_db, exact, device, costs, memory_bytes
-        )
-        if found.predicted_seconds >= seconds:
-            break
-        if found.predicted_error_db <= tolerance_db:
-            if found.memory_bytes <= memory_bytes:
-                return found, needed
-            needed, tree = min(needed, found.memory_bytes), None
-            rows, columns = found.sides[0]
-            most = (rows // 2, columns) if rows > columns else (rows, columns // 2)
-            continue
-        # What uneven spacing and a beam add falls with the density of nodes; filters must make up
-        # for the rest.
-        share = _NODES_SHARE * allowed / len(found.sides)
-        excess = [max(of_stage - share, 0.0) for of_stage in others.nodes]
-        uneven = partial(excess_error, within, found.sides[-1], found.aperture, crowding[-1], None)
-        if excess[-1] and beam_cycles > 0 and 2 * uneven() < others.nodes[-1]:
-            if beam_cycles >= _MOST_BEAM_CYCLES:
-                break  # no nodes follow a step
-            beam_cycles, excess[-1] = 2 * beam_cycles, 0.0
-        elif excess[-1] and crowding[-1] == _MOST_CROWDING:
-            # Smaller leaves have fewer nodes, less evenly spaced.
-            leaf_pixels, tree = 2 * math.prod(found.sides[-1]), None
-            continue
-        elif not any(excess) or max(crowding) == _MOST_CROWDING:
-            margin = power(-margin_db(view))
-            too_much = margin * (power(found.predicted_error_db) - allowed)
-            besides += 1.3 * too_much + _LEAST_STEP * allowed
-            continue
-        more = (max((1 + each / share) ** _CROWDING_POWER, _LEAST_CROWDED) for each in excess)
-        crowding = tuple(
-            float(min(density * factor, _MOST_CROWDING)) if each else density
-            for density, factor, each in zip(crowding, more, excess, strict=True)
-        )
-    return None, needed
 
 
 def decibels(wavelengths: float) -> float:

@@ -24,7 +24,7 @@ from factorizing import (
 
 from clsas.core.grid import Grid
 from clsas.factorized.plan import Plan
-from clsas.planning import planner
+from clsas.planning import fastest, planner
 from clsas.planning.costs import Costs
 from clsas.planning.planner import plan
 from clsas.planning.view import View
@@ -190,13 +190,13 @@ def test_half_precision_is_for_tolerances_and_devices_that_allow_it(device):
 @pytest.mark.parametrize("width_deg", [20, 40])
 def test_planning_ends_soon_where_nodes_follow_no_step(monkeypatch, width_deg):
     """More of them do not help: once as many as are allowed were tried, others are not."""
-    tried, errors = [], planner.other_errors
+    tried, errors = [], fastest.other_errors
 
     def counted(*arguments):
         tried.append(arguments)
         return errors(*arguments)
 
-    monkeypatch.setattr(planner, "other_errors", counted)
+    monkeypatch.setattr(fastest, "other_errors", counted)
     grid = around(-2, 10.8, shape=(99, 164), pixel_m=(0.0016, 0.0036))
     lines, grid = over(grid, along_x(341, 0.0346), carrier_hz=300e3, band=0.05)
     beam = BeamWindow(width_deg)
@@ -207,13 +207,13 @@ def test_planning_ends_soon_where_nodes_follow_no_step(monkeypatch, width_deg):
 def test_planning_ends_whatever_is_tried_in_vain(monkeypatch):
     """A stage's nodes may not follow, however many there are."""
     lines, grid = over(around(0, 40))
-    measured = planner.other_errors
+    measured = fastest.other_errors
 
     def hopeless(*arguments):
         found = measured(*arguments)
         return dataclasses.replace(found, nodes=(1e-2, *found.nodes[1:]))
 
-    monkeypatch.setattr(planner, "other_errors", hopeless)
+    monkeypatch.setattr(fastest, "other_errors", hopeless)
     wish = {"tolerance_db": -40, "costs": EXACT_IS_SLOW}
     assert plan(lines, grid, **wish).is_exact
 
@@ -455,7 +455,11 @@ def test_the_highest_frequency_leaves_out_as_little_as_is_allowed():
 def test_predictions_are_sums_over_work_and_causes(case, tolerance_db):
     lines, grid = straight()[:2]
     beam = BEAMS[0] if case == "beam" else None
-    costs = Costs(pixel_ns=0.0, part_ns=0.0) if case == "exact" else EXACT_IS_SLOW
+    costs = (
+        Costs(upsampled_sample_ns=0.0, pixel_ns=0.0, part_ns=0.0)
+        if case == "exact"
+        else EXACT_IS_SLOW
+    )
     chosen = plan(lines, grid, tolerance_db=tolerance_db, beam=beam, costs=costs)
     assert chosen.is_exact == (case == "exact")
     seconds = sum(
@@ -481,3 +485,14 @@ def test_plans_without_estimates_are_read():
     read = Plan.from_json(json.dumps(values))
     assert read.work is None
     assert "by cause" not in read.describe()
+
+
+def test_no_search_where_the_exact_image_is_formed_sooner(monkeypatch):
+    def searched(*_):
+        pytest.fail("a search takes longer than the exact image")
+
+    monkeypatch.setattr(planner, "fastest", searched)
+    lines, grid = over(around(0, 40, shape=(40, 40)))
+    assert plan(lines, grid, tolerance_db=-40, costs=Costs()).is_exact
+    with pytest.raises(pytest.fail.Exception):  # but those who ask for a factorization get one
+        plan(lines, grid, tolerance_db=-40, costs=Costs(), taps=(4, 4))

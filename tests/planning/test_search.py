@@ -19,9 +19,9 @@ def everything_tried(view, filters_db, most, leaf_pixels, beam_cycles, device, c
     for option in search._options(sizes, filters_db, costs, allowed):
         for root in np.flatnonzero((sizes.sides <= most).all(axis=1)):
             within = sizes.in_root(root)
-            onward_ns, _ = search._onward(view, option, within)
+            onward_s, _ = search._onward(view, option, within)
             place = np.searchsorted(within.sizes, root)
-            best = min(best, option.roots_ns(sizes, costs)[root] + onward_ns[place])
+            best = min(best, option.roots_s[root] + onward_s[place])
     return best
 
 
@@ -40,13 +40,13 @@ def cost_of(tree, view, filters_db, most, leaf_pixels, beam_cycles, device, cost
     path = [sizes.pairs.index(side) for side in tree.sides]
     within = sizes.in_root(path[0])
     turns, place = within.turns, {int(size): index for index, size in enumerate(within.sizes)}
-    total = option.roots_ns(sizes, costs)[path[0]]
+    total = option.roots_s[path[0]]
     for parent, child in pairwise(path):
         used = option.channels(view, turns[place[child], place[parent]])
-        total += used * option.channel_ns[child] + option.subimages_ns[child]
+        total += used * option.channel_s[child] + option.subimages_s[child]
     leaf = path[-1]
     turned = turns[place[leaf], place[leaf]] + sizes.beam_turns[leaf]
-    return total + option.channels(view, turned) * option.pixels_ns[leaf]
+    return total + option.channels(view, turned) * option.leaves_s[leaf]
 
 
 @pytest.mark.parametrize("filters_db", [-20.0, -55.0])
