@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,26 +20,13 @@ from clsas.factorized.aperture import drift, stretches
 from clsas.factorized.thesis import stage_errors_m
 from clsas.factorized.tree import interpolated_directions, interpolated_nodes
 from clsas.opencl.device import Device
-from clsas.planning.view import View
+from clsas.planning.view import View, kept
 from clsas.signal.interpolation import Interpolator
 from clsas.sonar.beam import sines
 
 _FLOAT32 = 4.5e-8  # rms error of a phase in the stages over the phase across a root: measured
 _CHANNELS, _FURTHEST, _PLACES, _PIXELS = 128, 32, 160, 24  # at which errors are evaluated
 _SOME_SPOTS = (0, 7, 14, 16, 23)  # of 5 by 5, in every row and column one
-
-
-def _kept(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Return a function of a view that keeps with it what it returned."""
-
-    @functools.wraps(function)
-    def kept(view: View, *arguments: Hashable) -> Any:
-        key = function.__name__, *arguments
-        if key not in view.kept:
-            view.kept[key] = function(view, *arguments)
-        return view.kept[key]
-
-    return kept
 
 
 def leaf_error(view: View, sides: NDArray[np.int64], device: Device) -> NDArray[np.float64]:
@@ -122,7 +108,7 @@ def _over_relief(
     return plane + max(error(surface.extents(side, most_m)) - plane, 0.0) * float(share)
 
 
-@_kept
+@kept
 def root_error(view: View, side: tuple[int, int]) -> float:
     """Return the power of the error of roots: of rounding, and of channels put on the mean track.
 
@@ -206,7 +192,7 @@ def _some_off_track(
     return np.concatenate([some, furthest]), counts
 
 
-@_kept
+@kept
 def excess_error(
     view: View,
     side: tuple[int, int],
@@ -287,7 +273,7 @@ class _LookedAt:
     exact: NDArray[np.float32]
 
 
-@_kept
+@kept
 def _looked_at(
     view: View, side: tuple[int, int], weighted: bool, extents: tuple[float, ...]
 ) -> _LookedAt | None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import functools
 import math
-from collections.abc import Hashable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from typing import Any
 
 import numpy as np
@@ -28,11 +28,28 @@ _CHANNELS = 256  # of which it is looked at what they see
 _SPOTS = (0.02, 0.25, 0.5, 0.75, 0.98)  # of rows and columns, where the geometry is looked at
 _OF_SPOTS = np.array([0.135, 0.24, 0.25, 0.24, 0.135])  # what these stand for
 _SHARES = np.outer(_OF_SPOTS, _OF_SPOTS).ravel() / _OF_SPOTS.sum() ** 2
+_MIDDLE = np.arange(len(_SPOTS) ** 2).reshape(len(_SPOTS), -1)[1:-1, 1:-1].ravel()
 _EVERYWHERE = np.linspace(0, 1, 17)  # parts of rows and columns
 _BINS = 512  # of a beam
 _MOST_OUTSIDE = 1e-6  # of the lines' power, beyond what counts as their highest frequency
 _MOST_TURNED = 1 / 16  # of a beam, from one channel to the next
 _COARSER = 4  # of the track's samples: where roots are compared
+
+
+def kept(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Return a function, or method, of a view that is evaluated once per view and arguments.
+
+    Views that were derived from each other share what they keep.
+    """
+
+    @functools.wraps(function)
+    def from_before(view: View, *arguments: Hashable, **options: Hashable) -> Any:
+        key = (function.__qualname__, view.limits, view.root, arguments, *options.items())
+        if key not in view.kept:
+            view.kept[key] = function(view, *arguments, **options)
+        return view.kept[key]
+
+    return from_before
 
 
 class View:
@@ -52,10 +69,8 @@ class View:
         Sines of the aspect angle between which anything is seen.
     root : (rows, columns) or None
         Of the roots within which `rates` hold.
-    rates : float64 [axes, spots, samples]
-        Cycles per row, column and metre of relief, and per unit of the track's parameter.
     kept : dict
-        What was found out about this view before.
+        What was found out before about this view and those derived from it; see `kept`.
 
     It is made with the share of the lines' power that may lie `outside` of what counts as their
     band.
@@ -97,14 +112,28 @@ class View:
         between_m += self.surface.relief_m(LEAST_SIDE).max() / 2
         nearest_m = KDTree(dense_m).query(lines.phase_centres_m)[0].min() - between_m
         self.nearest_m = max(float(nearest_m), 1e-9)
-        self._seen: dict[tuple[int, int], NDArray[np.bool_]] = {}
-        self._within: dict[tuple[int, int], View] = {}
-        self._in_roots: dict[tuple[int, int], NDArray[np.float64]] = {}
-        self._while_seen: dict[tuple[int, int], NDArray[np.float64]] = {}
         if beam is not None:
             self.along = beam_directions(self.channels_along, self.track, self.track.samples)
             self.beam_rates = beam_rate(beam, self.track, self.along, self.spots_m)
-        self.rates = self._rates(np.zeros(len(self.surface.steps_m)), self.spots_m)
+
+    def _with(self, **changes: Any) -> View:
+        """Return this view with other limits, or within roots of a size."""
+        view = copy.copy(self)
+        vars(view).update(changes)
+        return view
+
+    @property
+    @kept
+    def rates(self) -> NDArray[np.float64]:
+        """Cycles per row, column and metre of relief, and per unit of the track's parameter.
+
+        float64 [axes, spots, samples]; within roots of the view's size if it has any.
+        """
+        if self.root is None:
+            extents = np.zeros(len(self.surface.steps_m))
+        else:
+            extents = self.extents(self.root, most=True)
+        return self._rates(extents, self.spots_m)
 
     @property
     def frequencies(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -175,14 +204,8 @@ class View:
         first, last = np.min(bounds, axis=0)[0], np.max(bounds, axis=0)[1]
         if not 0 < first <= last:
             return self
-        view = copy.copy(self)
-        view._seen, view._within, view._in_roots, view._while_seen, view.kept = {}, {}, {}, {}, {}
-        for name in ("ends_seen", "slopes_m"):  # these depend on what is seen
-            view.__dict__.pop(name, None)
         edges = np.linspace(low, high, _BINS + 1)
-        view.limits = float(edges[first]), float(edges[min(last + 1, _BINS)])
-        view.rates = view._rates(np.zeros(len(self.surface.steps_m)), self.spots_m)
-        return view
+        return self._with(limits=(float(edges[first]), float(edges[min(last + 1, _BINS)])))
 
     def coverage(self, power: int) -> NDArray[np.float64]:
         """Return sums over channels of a power of the beam's weights, over the largest, [points].
@@ -275,14 +298,13 @@ class View:
         size = STACK * width
         return -(-self.surface.counts(side) // size) * size
 
+    @kept
     def seen(self, side: tuple[int, int]) -> NDArray[np.bool_]:
         """Return from where channels see anything of subimages at the spots, [spots, samples]."""
         if self.limits is None:
             return np.broadcast_to(self.on_track, self.distance_m.shape)
-        if side not in self._seen:
-            half = self.extents(side, most=True) / 2
-            self._seen[side] = self.on_track & (self._boxes.inside_by(self.limits, half) > 0)
-        return self._seen[side]
+        half = self.extents(side, most=True) / 2
+        return self.on_track & (self._boxes.inside_by(self.limits, half) > 0)
 
     @functools.cached_property
     def _boxes(self) -> Sight:
@@ -329,7 +351,8 @@ class View:
         """
         return density * turns + 1 + self.ends_seen * (taps / 2 - 0.5)
 
-    @functools.cached_property
+    @property
+    @kept
     def ends_seen(self) -> float:
         """How many ends of the track the beam sees a spot from, on average."""
         ends = np.flatnonzero(self.on_track)[[0, -1]]
@@ -337,11 +360,7 @@ class View:
 
     def within(self, root: tuple[int, int]) -> View:
         """Return this view with the rates of subimages in roots of a size."""
-        if root not in self._within:
-            view = self._within[root] = copy.copy(self)
-            view.root, view.kept = root, {}
-            view.rates = self._rates(self.extents(root, most=True), self.spots_m)
-        return self._within[root]
+        return self._with(root=root)
 
     def cycles_in_root(
         self, root: tuple[int, int], sides: Sequence[tuple[int, int]]
@@ -350,18 +369,16 @@ class View:
 
         Roughly; [sides, axes].
         """
-        middle = np.arange(len(_SPOTS) ** 2).reshape(len(_SPOTS), -1)[1:-1, 1:-1].ravel()
-        if root not in self._in_roots:
-            extents = self.extents(root, most=True) if any(root) else self.surface.extents(root)
-            rates = self._rates(extents, self.spots_m[middle], _COARSER)
-            self._in_roots[root] = rates.reshape(len(rates), -1) / len(middle)
-        spacing = _spacing(self.track.samples[::_COARSER])
-        for side in sides:
-            if side not in self._while_seen:
-                seen = self.seen(side)[middle, ::_COARSER]
-                self._while_seen[side] = (seen * spacing).ravel()
-        while_seen = np.stack([self._while_seen[side] for side in sides])
-        return while_seen @ self._in_roots[root].T
+        extents = self.extents(root, most=True) if any(root) else self.surface.extents(root)
+        rates = self._rates(extents, self.spots_m[_MIDDLE], _COARSER)
+        while_seen = np.stack([self._while_seen(side) for side in sides])
+        return while_seen @ rates.reshape(len(rates), -1).T / len(_MIDDLE)
+
+    @kept
+    def _while_seen(self, side: tuple[int, int]) -> NDArray[np.float64]:
+        """Return what the samples stand for from which subimages in the middle are seen, flat."""
+        seen = self.seen(side)[_MIDDLE, ::_COARSER]
+        return (seen * _spacing(self.track.samples[::_COARSER])).ravel()
 
     def _rates(
         self, extents: NDArray[np.float64], centres_m: NDArray[np.float64], every: int = 1
@@ -378,7 +395,8 @@ class View:
             every,
         )
 
-    @functools.cached_property
+    @property
+    @kept
     def slopes_m(self) -> NDArray[np.float64]:
         """Largest change of range per row, column and metre of relief, [axes]."""
         seen = self.seen((16, 16))
