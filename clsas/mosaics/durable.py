@@ -7,7 +7,9 @@ temporary files of killed processes.
 from __future__ import annotations
 
 import asyncio
+from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import zarr
@@ -19,6 +21,7 @@ from zarr.storage import LocalStore
 
 from clsas.core.atomic import make_folders, replacing
 from clsas.core.grid import Grid
+from clsas.core.reading import check_ordinary
 
 
 class DurableStore(LocalStore):
@@ -35,6 +38,20 @@ class DurableStore(LocalStore):
         make_folders(path.parent)
         with replacing(path) as temporary:
             temporary.write_bytes(value.as_buffer_like())
+
+    async def get(self, key: str, *options: Any, **named: Any) -> Buffer | None:
+        """Read a chunk or document; a pipe or a device in its place is refused."""
+        self._check_ordinary(key)
+        return await super().get(key, *options, **named)
+
+    def get_sync(self, key: str, *options: Any, **named: Any) -> Buffer | None:
+        """Read a chunk or document; some versions of Zarr call this one."""
+        self._check_ordinary(key)
+        return super().get_sync(key, *options, **named)
+
+    def _check_ordinary(self, key: str) -> None:
+        with suppress(OSError):  # nothing there: a chunk of zeros
+            check_ordinary(Path(self.root) / key)
 
     # Zarr's own, by way of `set`.
     set_if_not_exists = Store.set_if_not_exists
@@ -70,6 +87,11 @@ def create_arrays(path: Path, grid: Grid, patch_shape: tuple[int, int]) -> None:
             dimension_names=dimensions,
             attributes={"units": "m"},
         )
+
+
+def open_array(path: Path, name: str) -> zarr.Array:
+    """Open an array of a mosaic for reading."""
+    return zarr.open_array(DurableStore(path, read_only=True), path=name, mode="r")
 
 
 def write_pixels(path: Path, rows: slice, columns: slice, pixels: NDArray[np.complex64]) -> None:

@@ -306,8 +306,11 @@ class Store:
         return reduced(self.grid, self.pixels.chunks, self.read, most)
 
     def _array(self, name: str) -> zarr.Array:
+        _zarr()
+        from clsas.mosaics.durable import open_array
+
         try:
-            return _zarr().open_array(self.path / name, mode="r")
+            return open_array(self.path, name)
         except (LookupError, OSError, ValueError, TypeError) as error:
             raise ValueError(f"{self.path} is damaged: {name} cannot be read: {error}") from error
 

@@ -279,3 +279,13 @@ def test_the_snippets_of_the_documentation_run_where_patches_are_unseen(tmp_path
     records = Store.opened("image.zarr").records().values()
     assert {record.has_pixels for record in records} == {True, False}
     assert names["worst"] <= -40
+
+
+@pytest.mark.parametrize("make", [os.mkfifo, lambda chunk: chunk.symlink_to("/dev/zero")])
+def test_a_pipe_or_device_in_place_of_a_chunk_is_refused(path, make):
+    """Reading it would never end."""
+    chunk = next(each for each in sorted((path / "pixels" / "c").rglob("*")) if each.is_file())
+    chunk.unlink()
+    make(chunk)
+    with pytest.raises(ValueError, match="must be an ordinary file, got a"):
+        _ = clsas.Store.opened(path).pixels[:]
