@@ -25,6 +25,7 @@ from clsas.core.atomic import creating, sync_folder
 from clsas.core.extras import install_command
 from clsas.core.grid import Grid
 from clsas.core.image import Image
+from clsas.core.reading import check_ordinary
 from clsas.factorized.plan import grid_digest
 from clsas.mosaics.overview import reduced
 from clsas.mosaics.provenance import differences
@@ -363,6 +364,7 @@ class Store:
     def _checksum(self, place: Place) -> str | None:
         """Return the checksum that a patch's pixels end with, or None where they are all zero."""
         try:
+            check_ordinary(self._chunk(place))
             with self._chunk(place).open("rb") as file:
                 file.seek(8 * math.prod(self.pixels.chunks))
                 return file.read().hex()
@@ -381,7 +383,11 @@ class Store:
         if found is None:
             return None
         record, expected = found
-        if self._checksum(place) != expected:
+        try:
+            matches = self._checksum(place) == expected
+        except ValueError as error:
+            raise DamageError(str(error)) from error
+        if not matches:
             gone = not self._chunk(place).exists()
             raise DamageError("its pixels are " + ("gone" if gone else "not those of its record"))
         return record

@@ -45,7 +45,7 @@ NEAREST_UPSAMPLING = 8.0
 """By how much lines are upsampled before the linear interpolation of given stages."""
 
 _WORTH = 0.95  # of the time of an exact image
-_SEARCH_S = 0.1  # that a search takes, about: 0.05 to 0.12 s on a core of 2.5 GHz
+_SEARCH_S = 0.05  # that a search takes at least: 0.05 to 0.12 s on a core of 2.5 GHz
 _LEAST_COVERED = 0.25  # of the sum of weights at the best covered pixel
 _LEAST_SHARE_COVERED, _LEAST_PARTIAL = 0.1, 0.25  # of an image
 

@@ -289,3 +289,6 @@ def test_a_pipe_or_device_in_place_of_a_chunk_is_refused(path, make):
     make(chunk)
     with pytest.raises(ValueError, match="must be an ordinary file, got a"):
         _ = clsas.Store.opened(path).pixels[:]
+    damaged = clsas.Store.opened(path).damage()
+    assert len(damaged) == 1
+    assert "must be an ordinary file" in next(iter(damaged.values()))
