@@ -1,4 +1,4 @@
-"""How an exact image is formed: one decision, for the image itself and for its prediction."""
+"""The decision how to form an exact image; its prediction uses the same."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _CHANNELS, _PLACES = 256, 16  # at which is looked how full of what is seen the 
 
 @dataclass(frozen=True, eq=False)
 class Decision:
-    """How an exact image is formed.
+    """The way an exact image is formed.
 
     Attributes
     ----------

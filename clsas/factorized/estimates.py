@@ -1,4 +1,4 @@
-"""What is predicted of an image before it is formed: work, and errors."""
+"""Predictions of an image before it is formed: its work and its errors."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from clsas.signal.interpolation import COST
 
 @dataclass(frozen=True)
 class Work:
-    """How often a device, or its host, does each thing that takes time.
+    """Amounts of each thing that takes time on a device or its host.
 
     `clsas.planning.costs.Costs` has the same fields, in nanoseconds each: `Costs.seconds`
     multiplies the two. Amounts are numbers, or arrays over sizes of subimages.

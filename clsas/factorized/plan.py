@@ -31,7 +31,7 @@ LEAST_BATCH = 2
 
 @dataclass(frozen=True)
 class Stage:
-    """What one stage is expected to do.
+    """The predicted work of one stage.
 
     Attributes
     ----------
@@ -274,7 +274,7 @@ class Plan:
 
     @functools.cached_property
     def kept(self) -> dict[str, Any]:
-        """What an image formed by this plan leaves for the next; see `factorize`."""
+        """Geometry that an image by this plan leaves for the next; see `factorize`."""
         return {}
 
     def __getstate__(self) -> dict[str, Any]:
@@ -290,7 +290,7 @@ class Plan:
 
     @property
     def is_exact(self) -> bool:
-        """Whether this is plain backprojection."""
+        """True for exact backprojection."""
         return not self.sides
 
     def describe(self) -> str:

@@ -79,7 +79,7 @@ class _Image:
 
     @property
     def scatter(self) -> float:
-        """By how much two halves of the runs differ: logarithm of the ratio of least times."""
+        """Logarithm of the ratio between the least times of two halves of the runs."""
         return math.log(min(self.seconds[::2]) / min(self.seconds[1::2]))
 
     def work(self, names: Sequence[str]) -> list[float]:

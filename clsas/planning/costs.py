@@ -1,4 +1,4 @@
-"""What the parts of imaging cost on a device: measured once, stored in the user's cache."""
+"""Costs of the things that imaging does on a device: measured once, stored in the cache."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from clsas.opencl.device import Device
 
 @dataclass(frozen=True)
 class Costs:
-    """What each thing that imaging does takes, nanoseconds; see `Work` for what these are.
+    """Time of each thing that imaging does, nanoseconds; `Work` says what these are.
 
     The defaults are of 2 AVX-512 cores with PoCL; `defaults` returns those for a device.
     """

@@ -1,4 +1,4 @@
-"""What a factorized image errs by besides its filters: its roots, nodes and leaves."""
+"""Errors of a factorized image beside those of its filters: of roots, spacing and leaves."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ from clsas.signal.interpolation import Interpolator
 from clsas.sonar.beam import sines
 
 _FLOAT32 = 4.5e-8  # rms error of a phase in the stages over the phase across a root: measured
-_CHANNELS, _FURTHEST, _PLACES, _PIXELS = 128, 32, 160, 24  # at which errors are evaluated
-_SOME_SPOTS = (0, 7, 14, 16, 23)  # of 5 by 5, in every row and column one
+_CHANNELS, _FURTHEST, _PLACES, _PIXELS = 128, 32, 160, 24  # sampled for errors
+_SOME_POINTS = (0, 7, 14, 16, 23)  # of 5 by 5 sample points, one in every row and column
 
 
 def leaf_error(view: View, sides: NDArray[np.int64], device: Device) -> NDArray[np.float64]:
@@ -55,8 +55,14 @@ def leaf_error(view: View, sides: NDArray[np.int64], device: Device) -> NDArray[
 class Errors:
     """Powers of the errors that filters do not account for.
 
-    Of rounding and of putting channels on the track, of uneven nodes and weights stage by stage,
-    and of expanding leaves.
+    Attributes
+    ----------
+    roots : float
+        Of rounding, and of channels put on the mean track.
+    nodes : tuple of float
+        Of unevenly spaced virtual channels, and of weights that change between them, by stage.
+    leaves : float
+        Of expanding the leaves.
     """
 
     roots: float
@@ -124,15 +130,14 @@ def root_error(view: View, side: tuple[int, int]) -> float:
 def _off_track(view: View, side: tuple[int, int], extents: NDArray[np.float64]) -> float:
     """Return the power of the error that channels put on the mean track make.
 
-    It is evaluated as it is: over some channels, roots and pixels of these, how a
-    range changes from a root's centre to a pixel for the channel, less the same for the place on
-    the track that stands for it, stretched as the first stage does. That holds what the track does
-    not follow, transmitters and receivers apart, and motion during flight; and with a beam by how
-    much the weights of the two differ.
+    It is evaluated for sampled channels, roots and pixels: the change in range from a root's centre
+    to a pixel for the channel, less the same change for its stand-in on the mean track, stretched
+    as the first stage does. This covers track errors, separate transmitters and receivers, and
+    motion during flight. With a beam it adds the difference between the weights of the two.
     """
     lines, track = view.lines, view.track
-    spots = np.array(_SOME_SPOTS)
-    seen = view.seen(side)[spots]
+    points = np.array(_SOME_POINTS)
+    seen = view.seen(side)[points]
     candidates = np.flatnonzero(np.interp(track.place, track.samples, seen.any(axis=0)))
     index, counts = _some_off_track(view, candidates)
     part = replace(track, place=track.place[index])
@@ -142,13 +147,13 @@ def _off_track(view: View, side: tuple[int, int], extents: NDArray[np.float64]) 
     own = view.own_drift if view.own_drift is None else view.own_drift[index]
     antennas = tx_m, rx_m, moving, lines.sound_speed_m_s
     seen = np.stack([np.interp(part.place, track.samples, each) for each in seen]) > 0
-    somewhere = seen.any(axis=1)
-    spots, seen = spots[somewhere], seen[somewhere]
-    if not spots.size:
+    sees_any = seen.any(axis=1)
+    points, seen = points[sees_any], seen[sees_any]
+    if not points.size:
         return 0.0
-    # [spots, pixels, channels]; the first pixel is the middle of a root.
-    pixels_m = np.stack([_pixels_m(view, extents, spot)[0] for spot in spots])
-    points_m = view.spots_m[spots, None] + pixels_m
+    # [points, pixels, channels]; the first pixel is the middle of a root.
+    pixels_m = np.stack([_pixels_m(view, extents, point)[0] for point in points])
+    points_m = view.points_m[points, None] + pixels_m
     centres_m, all_m = points_m[:, 0], points_m.reshape(-1, 3)
     range_m = pairwise_range_m(all_m, *antennas)
     range_m = range_m.reshape(*points_m.shape[:2], -1)
@@ -178,9 +183,9 @@ def _off_track(view: View, side: tuple[int, int], extents: NDArray[np.float64]) 
 def _some_off_track(
     view: View, candidates: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return some channels of these, those furthest off the track, and how many each is like.
+    """Sample channels, the furthest off the track among them; return their weights too.
 
-    Where a track turns sharply a few may be much further off than all others.
+    Where a track turns sharply, a few channels may be much further off than all others.
     """
     if len(candidates) <= _CHANNELS:
         return candidates, np.ones(len(candidates))
@@ -200,7 +205,7 @@ def excess_error(
     crowding: float,
     beam_cycles: float | None,
 ) -> float:
-    """Return the power of the error that a stage's nodes add to that of the aperture's filter.
+    """Return the power of the error that uneven spacing adds to that of the aperture's filter.
 
     See `_between_nodes`.
     """
@@ -216,57 +221,57 @@ def _between_nodes(
     beam_cycles: float | None,
     extents: NDArray[np.float64],
 ) -> float:
-    """Return the power of the error between nodes beside that of the aperture's filter.
+    """Return the error power between virtual channels beside that of the aperture's filter.
 
-    The filter takes nodes as equally spaced and weights as constant. Evaluated as it is, for some
-    subimages and pixels of them and where there are channels: steering functions between nodes
-    against what interpolation makes of them; unless `beam_cycles` is None, weighted by the beam
-    at places and nodes alike, since what nodes hold that it does not see is left out.
-    As large as the image where nothing is seen, of which nothing is known.
+    The filter takes virtual channels as equally spaced and weights as constant. Here steering
+    functions are interpolated and compared with the exact ones, for sampled subimages, pixels and
+    aperture coordinates. Unless `beam_cycles` is None, the beam weighs both: the image leaves out
+    what the beam does not see. Where nothing is seen nothing is known: the error is then as large
+    as the image.
     """
     weighted = view.beam is not None and beam_cycles is not None
-    looked = _looked_at(view, side, weighted, tuple(extents))
-    if looked is None:
+    samples = _samples(view, side, weighted, tuple(extents))
+    if samples is None:
         return 1.0
-    rates = crowding * np.tensordot(extents, view.rates[:, looked.spots], 1)
+    rates = crowding * np.tensordot(extents, view.rates[:, samples.points], 1)
     if weighted:
-        rates = rates + beam_cycles * view.beam_rates[looked.spots]
-    nodes = interpolated_nodes(view.track, rates, looked.place, aperture)
-    of_nodes = _steering(view, *looked.pixels, weighted, nodes.place)
-    # A matrix that interpolates at all places of a spot, spot after spot.
+        rates = rates + beam_cycles * view.beam_rates[samples.points]
+    nodes = interpolated_nodes(view.track, rates, samples.place, aperture)
+    of_nodes = _steering(view, *samples.pixels, weighted, nodes.place)
+    # A matrix that interpolates at all aperture coordinates of one subimage after the other.
     index = nodes.base[..., None] + np.arange(nodes.taps)
     index += nodes.place.shape[1] * np.arange(len(index))[:, None, None]
     weights = nodes.weights.astype(np.float32).ravel()
     rows = np.arange(0, weights.size + 1, nodes.taps)
     of_nodes = of_nodes.reshape(-1, of_nodes.shape[-1])
     interpolate = csr_array((weights, index.ravel(), rows), shape=(len(rows) - 1, len(of_nodes)))
-    away = (interpolate @ of_nodes).reshape(looked.exact.shape) - looked.exact
+    away = (interpolate @ of_nodes).reshape(samples.exact.shape) - samples.exact
     wrong, total = (
-        looked.count @ np.einsum("nsp,nsp->n", each, each, dtype=np.float64)
-        for each in (away, looked.exact)
+        samples.count @ np.einsum("nsp,nsp->n", each, each, dtype=np.float64)
+        for each in (away, samples.exact)
     )
     return float(max(wrong / max(total, 1e-30) - power(aperture.error_db), 0.0))
 
 
 @dataclass(frozen=True, eq=False)
-class _LookedAt:
-    """Some subimages of a size, and steering functions of pixels in them where there are channels.
+class _Samples:
+    """Sampled subimages of a size, and the steering functions of sampled pixels in them.
 
     Attributes
     ----------
-    spots : int64 [n]
-        Where they are.
+    points : int64 [n]
+        The sample points that they lie at.
     count : int64 [n]
-        How many channels see each.
+        Number of channels that see each.
     place : float64 [n, places]
-        Like those of channels, ascending.
+        Aperture coordinates, ascending, distributed as those of the channels.
     pixels : (centres_m, pixels_m, carriers)
-        What `_steering` takes.
+        Arguments of `_steering`.
     exact : float32 [n, places, 2 pixels]
         The steering functions.
     """
 
-    spots: NDArray[np.int64]
+    points: NDArray[np.int64]
     count: NDArray[np.int64]
     place: NDArray[np.float64]
     pixels: tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]
@@ -274,37 +279,38 @@ class _LookedAt:
 
 
 @kept
-def _looked_at(
+def _samples(
     view: View, side: tuple[int, int], weighted: bool, extents: tuple[float, ...]
-) -> _LookedAt | None:
-    """Return at what errors between nodes are evaluated, None where nothing is seen."""
+) -> _Samples | None:
+    """Return samples for errors between virtual channels, None where nothing is seen."""
     channels, first, count = _channels_seen(view, side)
     if not count.any():
         return None
-    everywhere = weighted and view.beam.jumps  # steps are seen from some spots only
-    spots = np.flatnonzero(count)
-    if not everywhere and np.isin(spots, _SOME_SPOTS).any():
-        spots = np.intersect1d(spots, _SOME_SPOTS)
-    first, count = first[spots], count[spots]
-    # One place beyond those that see anything: edges lie in between.
+    everywhere = weighted and view.beam.jumps  # only some points see a step
+    points = np.flatnonzero(count)
+    if not everywhere and np.isin(points, _SOME_POINTS).any():
+        points = np.intersect1d(points, _SOME_POINTS)
+    first, count = first[points], count[points]
+    # One channel beyond those that see anything: edges lie in between.
     number = np.linspace(first - 1, first + count, _PLACES, axis=1)
     number = np.clip(number, 0, len(channels) - 1)
     place = np.interp(number, np.arange(len(channels)), channels)
     frequencies = view.carriers(_PIXELS)
-    found = [_pixels_m(view, np.array(extents), spot) for spot in spots]
+    found = [_pixels_m(view, np.array(extents), point) for point in points]
     pixels_m = np.stack([each_m for each_m, _ in found])
     carriers = np.stack([frequencies[(share * _PIXELS).astype(int)] for _, share in found])
-    pixels = view.spots_m[spots], pixels_m, carriers
-    return _LookedAt(spots, count, place, pixels, _steering(view, *pixels, weighted, place))
+    pixels = view.points_m[points], pixels_m, carriers
+    return _Samples(points, count, place, pixels, _steering(view, *pixels, weighted, place))
 
 
 def _channels_seen(
     view: View, side: tuple[int, int]
 ) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.int64]]:
-    """Return places of channels, ascending, the first that sees a subimage and how many do.
+    """Return the channels' aperture coordinates, and the range of them that sees each subimage.
 
-    The latter of subimages at all spots. The track that sees one may have a gap there. Edges of
-    what is seen lie between the track's samples.
+    The coordinates ascend. Of subimages at all sample points follow the first channel that sees it,
+    and the number of channels that do: none where the track has a gap. The edges of visibility lie
+    between the track's samples.
     """
     places, samples = np.sort(view.track.place), view.track.samples
     seen = view.seen(side)
@@ -323,9 +329,9 @@ def _steering(
     weighted: bool,
     at: NDArray[np.float64],
 ) -> NDArray[np.float32]:
-    """Return steering functions at places on the track, float32 [n, places, 2 pixels].
+    """Return steering functions at aperture coordinates, float32 [n, places, 2 pixels].
 
-    Of all pixels the real parts, then the imaginary ones.
+    The real parts of all pixels come first, then the imaginary ones.
 
     Parameters
     ----------
@@ -357,18 +363,19 @@ def _steering(
 
 
 def _pixels_m(
-    view: View, extents: NDArray[np.float64], spot: int
+    view: View, extents: NDArray[np.float64], point: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return pixels of a subimage at a spot from its middle, and that before them, [n + 1, 3].
+    """Return sampled pixels of a subimage, relative to its middle, [n + 1, 3]; the middle is first.
 
-    Beside them one more number each, from 0 to 1. All are spread evenly by multiples of powers of
-    an irrational number (a Kronecker sequence), others at every spot.
+    A second array holds one more number for each, from 0 to 1. All numbers come from a Kronecker
+    sequence (multiples of powers of an irrational number), which spreads evenly; every sample point
+    has its own stretch of it.
     """
     dimensions = len(extents) + 1
     ratio = 1.0
     for _ in range(20):  # towards x^(dimensions + 1) = x + 1
         ratio = (1 + ratio) ** (1 / (dimensions + 1))
-    index = spot * _PIXELS + np.arange(_PIXELS)[:, None]
+    index = point * _PIXELS + np.arange(_PIXELS)[:, None]
     places = (0.5 + index * ratio ** -np.arange(1.0, dimensions + 1)) % 1
     pixels_m = ((places[:, :-1] - 0.5) * extents) @ view.surface.steps_m
     return np.concatenate([np.zeros((1, 3)), pixels_m]), places[:, -1]
@@ -377,7 +384,7 @@ def _pixels_m(
 def nearest_errors(view: View, stages: Sequence[tuple[int, int]]) -> tuple[float, list[float]]:
     """Return the power of the error of nearest beams, THESIS [45], spread evenly, and by stage.
 
-    Range errors of stages are added, not their powers.
+    Range errors of stages add, not their powers.
     """
     centres_m = view.lines.phase_centres_m[np.argsort(view.track.place)]
     spacing_m = np.linalg.norm(np.diff(centres_m, axis=0), axis=1).mean()

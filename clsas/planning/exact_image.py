@@ -1,4 +1,4 @@
-"""What plain backprojection takes: time and device memory."""
+"""The predicted time and device memory of exact images."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ from clsas.sonar.beam import INTERVALS
 
 @dataclass(frozen=True)
 class Exact:
-    """Plain backprojection, as `clsas.backproject` would prepare it.
+    """An exact image, as `clsas.backproject` forms it.
 
     Attributes
     ----------
     accuracy_db : float
         Its relative rms error.
     tiled, weighted : bool
-        Whether pixels lie in tiles of a plane, or in groups; whether a beam weighs them.
+        True where pixels lie in tiles of a plane, not in groups; where a beam weighs them.
     parts, part_pixels : int
-        How many tiles or groups, and pixels of each.
+        Number of tiles or groups, and of pixels in each.
     channels, seen : int, float
-        How many there are, and how many a part sees on average.
+        Number of channels, and mean number that sees a part.
     taps, samples : int
         Of the interpolator, and of an upsampled line.
     memory_bytes : int
@@ -50,7 +50,7 @@ class Exact:
 
     @property
     def work(self) -> Work:
-        """What it does."""
+        """Work of forming the image."""
         lines = upsampling(self.channels * self.samples, filtered=False)
         pixels = backprojecting(
             self.parts,
@@ -64,7 +64,7 @@ class Exact:
 
 
 def expect(view: View, accuracy_db: float, device: Device) -> Exact:
-    """Return how an image would be backprojected exactly, by the decision that forms it."""
+    """Predict an exact image, by the same decision that forms it."""
     lines, beam = view.lines, view.beam
     decision = decide(
         lines,

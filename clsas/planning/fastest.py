@@ -21,7 +21,7 @@ from clsas.planning import forecast
 from clsas.planning.costs import Costs
 from clsas.planning.errors import Errors, excess_error, other_errors, root_error
 from clsas.planning.exact_image import Exact
-from clsas.planning.forecast import Way, margin_db
+from clsas.planning.forecast import Candidate, margin_db
 from clsas.planning.search import Allowed, Tree, root_limits, search
 from clsas.planning.view import View
 
@@ -37,7 +37,7 @@ _LEAST_BEAM_CYCLES, _MOST_BEAM_CYCLES = 0.5, 64.0
 
 @dataclass(frozen=True, eq=False)
 class _Problem:
-    """What all candidates have in common.
+    """Conditions that all candidates share.
 
     Attributes
     ----------
@@ -86,7 +86,7 @@ class _Problem:
 
 @dataclass(frozen=True)
 class _Trial:
-    """What the next candidate keeps to.
+    """Limits that the next candidate keeps to.
 
     Attributes
     ----------
@@ -207,10 +207,10 @@ def _estimated(problem: _Problem, trial: _Trial, filters: Filters) -> tuple[Erro
         leaves=errors.leaves,
         beam_edges=problem.beam_edges,
     )
-    way = Way(sides, filters, crowding=trial.density, beam_cycles=trial.beam_cycles)
+    candidate = Candidate(sides, filters, crowding=trial.density, beam_cycles=trial.beam_cycles)
     found = forecast.factorized(
         within,
-        way,
+        candidate,
         budget,
         problem.tolerance_db,
         problem.exact,

@@ -1,4 +1,4 @@
-"""Plans with all that is expected of them: time, error and memory."""
+"""Plans of candidates, with their predicted time, error and memory."""
 
 from __future__ import annotations
 
@@ -39,23 +39,23 @@ from clsas.signal.interpolation import PHASES
 
 HALF_ROUNDING = 4e-8
 """Power of the error that rounding lines to half precision once adds: 2^-11/sqrt(6) rms."""
-_ROOM = 1.06  # for virtual channels, over the most expected
-_ROUNDING_SHARE = 0.1  # of an image's error
-_MOST_CHUNKS = 16  # that a sum in half precision is made of
-MARGIN_DB = 1.0  # between prediction and tolerance, for what measured errors scatter
-OUTSIDE = 0.1  # of the power of the error allowed: what may lie beyond the highest frequency
-_FEW_CHANNELS = 7.0, 30.0  # where no more see a pixel errors scatter much; with steps
+_ROOM = 1.06  # buffers hold so many times the largest predicted number of virtual channels
+_ROUNDING_SHARE = 0.1  # of an image's error power, for half precision
+_MOST_CHUNKS = 16  # in a sum that is rounded to half precision
+MARGIN_DB = 1.0  # of predictions, for the scatter of measured errors
+OUTSIDE = 0.1  # of the error power allowed may come from outside of the nominal band
+_FEW_CHANNELS = 7.0, 30.0  # see a pixel where errors scatter much; with stepped weights
 _CACHED_BYTES, _BATCH_BYTES = 16 << 20, 256 << 20  # of a batch, on CPUs and elsewhere
 _MOST_TABLE_BYTES = 64 << 20
-_ROOTS_PREPARED = 16  # enough for few and large arrays
+_ROOTS_PREPARED = 16  # together, so that arrays are few and large
 
 
 def margin_db(view: View) -> float:
-    """Margin between the expected and the predicted error, dB, for the scatter of measured ones.
+    """Return the margin of predicted errors, dB, which covers the scatter of measured ones.
 
-    It is larger where few channels see a pixel: then the error depends on how these happen to lie
-    between virtual channels, and on whether one lies at a step of the window. It is larger, too,
-    where the power of the lines lies at few frequencies.
+    Errors scatter more where few channels see a pixel: they depend on how these happen to lie
+    between virtual channels, and to a step of the beam. They also scatter more where the lines'
+    power lies at few frequencies.
     """
     channels = view.lines.channels * view.share_seen((16, 16))
     few = _FEW_CHANNELS[view.beam is not None and view.beam.jumps]
@@ -63,8 +63,8 @@ def margin_db(view: View) -> float:
 
 
 @dataclass(frozen=True)
-class Way:
-    """How an image is factorized; attributes as those of `Plan`."""
+class Candidate:
+    """A factorization that the planner considers; attributes as those of `Plan`."""
 
     sides: tuple[tuple[int, int], ...]
     filters: Filters
@@ -75,7 +75,7 @@ class Way:
 
 def factorized(
     view: View,
-    way: Way,
+    candidate: Candidate,
     other_errors: ErrorBudget,
     tolerance_db: float | None,
     exact: Exact,
@@ -83,14 +83,18 @@ def factorized(
     costs: Costs,
     memory_bytes: int,
 ) -> Plan:
-    """Return a plan with all that is expected of it.
+    """Return the plan of a candidate, with its predicted time, error and memory.
 
     `view` is that within its roots where the aperture is interpolated; `other_errors` are those
     that the filters do not account for.
     """
-    lines, sides, nearest = view.lines, way.sides, way.nearest
-    align, aperture, final = way.filters.align, way.filters.aperture, way.filters.final
-    errors = replace(other_errors, **_filter_errors(way))
+    lines, sides, nearest = view.lines, candidate.sides, candidate.nearest
+    align, aperture, final = (
+        candidate.filters.align,
+        candidate.filters.aperture,
+        candidate.filters.final,
+    )
+    errors = replace(other_errors, **_filter_errors(candidate))
     upsampler = None
     if not nearest:
         step = max(int(PHASES / align.upsampling), 1)
@@ -115,11 +119,11 @@ def factorized(
             used, channels = channels, math.ceil(channels / nearest[level])
         else:
             if level:
-                turns = way.crowding[level - 1] * view.turns(sides[level - 1], seen)
+                turns = candidate.crowding[level - 1] * view.turns(sides[level - 1], seen)
                 used = min(channels, view.channels(*of_aperture, turns))
-            turns = way.crowding[level] * view.turns(side, seen)
+            turns = candidate.crowding[level] * view.turns(side, seen)
             if view.beam is not None and level == len(sides) - 1:
-                turns += way.beam_cycles * view.cycles(view.beam_rates, seen)
+                turns += candidate.beam_cycles * view.cycles(view.beam_rates, seen)
             channels = view.channels(*of_aperture, turns)
             reach.append(aperture.taps * used / channels)
         taps = align.taps + aperture.taps
@@ -130,7 +134,7 @@ def factorized(
             upsampled = lines.channels * resampling.length
             of_stage += upsampling(upsampled, filtered=upsampler is not None)
         work += of_stage
-        operations, error_db = count * used * samples, in_db(_power_of_stage(way))
+        operations, error_db = count * used * samples, in_db(_power_of_stage(candidate))
         seconds = costs.seconds(of_stage)
         stages.append(Stage(*side, count, round(channels), samples, operations, error_db, seconds))
     tiled, pixels = view.surface.is_plane, view.slots(side, width)
@@ -155,9 +159,9 @@ def factorized(
     line_bytes = sample_bytes(half_precision) * lines.channels * padded_length(resampling)
     if upsampler is not None:
         line_bytes += min(lines.samples.nbytes, GIVEN_BYTES)
-    most_channels = _most_channels(view, way, stages)
+    most_channels = _most_channels(view, candidate, stages)
     root_bytes, table_bytes = _root_bytes(
-        view, way, tile, stages, most_channels, width, sample_bytes(half_precision)
+        view, candidate, tile, stages, most_channels, width, sample_bytes(half_precision)
     )
     room = memory_bytes - line_bytes
     batch_bytes = _CACHED_BYTES if device.info.kind == "cpu" else _BATCH_BYTES
@@ -198,8 +202,8 @@ def factorized(
         grid_digest=grid_digest(view.grid),
         beam=view.beam,
         limits=view.limits,
-        crowding=way.crowding,
-        beam_cycles=way.beam_cycles,
+        crowding=candidate.crowding,
+        beam_cycles=candidate.beam_cycles,
         most_channels=tuple(math.ceil(most) for _, most in most_channels),
         band=None if nearest else _band(view, OUTSIDE * power(tolerance_db)),
         work=work,
@@ -208,16 +212,16 @@ def factorized(
 
 
 def _band(view: View, outside: float) -> tuple[float, float]:
-    """Return centre and half the width of the band outside of which lies that share of power."""
+    """Return the centre and half width of the band that holds all but a share of the power."""
     spectrum = view.spectrum
     bins = np.searchsorted(np.cumsum(spectrum.share), 1 - outside)
     return spectrum.centre, float(min((bins + 1) / (2 * len(spectrum.power)), 0.5))
 
 
 def half_precision_error(stages: int) -> float:
-    """Return the power of the error of half precision through some stages, at least.
+    """Return the least error power that half precision adds through some stages.
 
-    Where virtual channels are sums of many it is more: see `_half_rounding`.
+    It is more where virtual channels are sums of many: see `_half_rounding`.
     """
     return HALF_ROUNDING * (1 + 1.5 * stages)
 
@@ -225,9 +229,9 @@ def half_precision_error(stages: int) -> float:
 def _half_rounding(view: View, reach: Sequence[float]) -> float:
     """Return the power of the error that rounding lines to half precision adds.
 
-    reach: the channels that a virtual one is the sum of, stage by stage. Upsampled lines are
-    rounded, and what a stage hands on: sums of incoherent lines so often that it counts as half of
-    their chunks, which grow. Where these are very many a sum no longer takes up what is added.
+    `reach` is the number of channels that a virtual one sums, stage by stage. Rounded are the
+    upsampled lines, and the lines that a stage hands on: the latter once per chunk of channels,
+    while the sum still grows, which counts as half. A sum of very many chunks loses what is added.
     """
     chunks = np.array(reach) / CHUNK
     chunks[0] *= view.densest
@@ -236,18 +240,22 @@ def _half_rounding(view: View, reach: Sequence[float]) -> float:
     return HALF_ROUNDING * (1 + float(np.sum(1 + chunks / 2)))
 
 
-def _power_of_stage(way: Way) -> float:
+def _power_of_stage(candidate: Candidate) -> float:
     """Return the power of the errors that the filters of one stage add."""
-    if way.nearest:
-        return power(way.filters.align.error_db)
-    return power(way.filters.align.scatter_db) + power(way.filters.aperture.error_db)
+    if candidate.nearest:
+        return power(candidate.filters.align.error_db)
+    return power(candidate.filters.align.scatter_db) + power(candidate.filters.aperture.error_db)
 
 
-def _filter_errors(way: Way) -> dict[str, float]:
+def _filter_errors(candidate: Candidate) -> dict[str, float]:
     """Return the errors that all filters add, by their names in the budget."""
-    align, aperture, final = way.filters.align, way.filters.aperture, way.filters.final
-    stages, last = len(way.sides), power(final.scatter_db)
-    if way.nearest:
+    align, aperture, final = (
+        candidate.filters.align,
+        candidate.filters.aperture,
+        candidate.filters.final,
+    )
+    stages, last = len(candidate.sides), power(final.scatter_db)
+    if candidate.nearest:
         return {"range_filters": stages * power(align.error_db) + last}
     return {
         "range_filters": stages * power(align.scatter_db) + last,
@@ -255,23 +263,31 @@ def _filter_errors(way: Way) -> dict[str, float]:
     }
 
 
-def _most_channels(view: View, way: Way, stages: Sequence[Stage]) -> list[tuple[float, float]]:
-    """Return how many virtual channels the whole aperture has by stage, and at most a subimage.
+def _most_channels(
+    view: View, candidate: Candidate, stages: Sequence[Stage]
+) -> list[tuple[float, float]]:
+    """Return the virtual channels of the whole aperture, and the most of a subimage, by stage.
 
-    The latter with some room, since buffers have it from the beginning.
+    The latter includes spare room, since buffers are allocated once.
     """
-    if way.nearest:
+    if candidate.nearest:
         return [(stage.channels, _ROOM * stage.channels) for stage in stages[:-1]]
-    taps, density, found = way.filters.aperture.taps, 2 * way.filters.aperture.upsampling, []
-    for level, side in enumerate(way.sides):
+    taps, density, found = (
+        candidate.filters.aperture.taps,
+        2 * candidate.filters.aperture.upsampling,
+        [],
+    )
+    for level, side in enumerate(candidate.sides):
         seen = view.seen(side)
         everywhere, most = (
-            density * way.crowding[level] * view.turns(side, where, most=True) + taps + 2
+            density * candidate.crowding[level] * view.turns(side, where, most=True) + taps + 2
             for where in (np.ones_like(seen), seen)
         )
         if view.beam is not None:
-            if level == len(way.sides) - 1:
-                most += density * way.beam_cycles * view.cycles(view.beam_rates, seen, most=True)
+            if level == len(candidate.sides) - 1:
+                most += (
+                    density * candidate.beam_cycles * view.cycles(view.beam_rates, seen, most=True)
+                )
             most *= 1 + OF_BEAM
         found.append((everywhere, _ROOM * most))
     return found
@@ -279,18 +295,18 @@ def _most_channels(view: View, way: Way, stages: Sequence[Stage]) -> list[tuple[
 
 def _root_bytes(
     view: View,
-    way: Way,
+    candidate: Candidate,
     tile: tuple[int, int],
     stages: Sequence[Stage],
     most_channels: Sequence[tuple[float, float]],
     width: int,
     of_sample: int,
 ) -> tuple[float, float]:
-    """Return the device memory that a root takes while it is worked on, and that of its tables.
+    """Return the device memory of a root at work, and of its tables, bytes.
 
     See `factorize` and `leaves`.
     """
-    channels, work, tables, sides = view.lines.channels, 0.0, 0.0, way.sides
+    channels, work, tables, sides = view.lines.channels, 0.0, 0.0, candidate.sides
     for level, (everywhere, most) in enumerate(most_channels):
         side = sides[level]
         subimages = _subimages(sides[0], side)
@@ -316,7 +332,7 @@ def _subimages(root: tuple[int, int], side: tuple[int, int]) -> int:
 
 
 def _tile(view: View, leaf: tuple[int, int], device: Device) -> tuple[int, int]:
-    """Return the largest parts of a leaf that may be expanded about their centres."""
+    """Return the largest tiles of a leaf that may be expanded about their centres."""
     parts = [
         (rows, columns)
         for rows in range(16, min(leaf[0], 64) + 1, 16)
@@ -330,7 +346,7 @@ def _tile(view: View, leaf: tuple[int, int], device: Device) -> tuple[int, int]:
 def plain(
     view: View, tolerance_db: float | None, exact: Exact, device: Device, costs: Costs
 ) -> Plan:
-    """Return plain backprojection as a plan."""
+    """Return the plan of an exact image."""
     seconds = float(costs.seconds(exact.work))
     return Plan(
         tolerance_db=tolerance_db,

@@ -1,4 +1,4 @@
-"""Choosing a plan: what every division costs and errs by, and the fastest within a tolerance."""
+"""Plans: the fastest factorization within a tolerance, or the exact image."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from clsas.planning.costs import measured as measured_costs
 from clsas.planning.errors import nearest_errors
 from clsas.planning.exact_image import Exact, expect
 from clsas.planning.fastest import fastest
-from clsas.planning.forecast import MARGIN_DB, OUTSIDE, Way
+from clsas.planning.forecast import MARGIN_DB, OUTSIDE, Candidate
 from clsas.planning.search import MOST_STAGES, Allowed
 from clsas.planning.view import View
 from clsas.signal import interpolation
@@ -183,7 +183,7 @@ def _chosen(
     memory_bytes: int | None,
     allowed: Allowed | None,
 ) -> Plan:
-    """Return the plan of checked wishes."""
+    """Return the plan of checked arguments."""
     beam = view.beam
     exact = expect(view, ACCURACY_DB if tolerance_db is None else tolerance_db - MARGIN_DB, device)
     # Backprojection keeps within a device by itself.
@@ -235,7 +235,7 @@ def tolerance_in_db(
 
 
 def _allowed(taps: tuple[int, int] | None, depth: int | None) -> Allowed | None:
-    """Return what was asked for, None where nothing was."""
+    """Return the filters and stages asked for, None where the search is free."""
     if taps is None and depth is None:
         return None
     fields = {}
@@ -303,10 +303,10 @@ def _nearest(
         leaf = leaf[0] * divisions, leaf[1] * divisions
     linear = interpolation.design(2, NEAREST_UPSAMPLING, view.spectrum)
     filters = Filters(linear, Interpolator(1, 1.0, np.zeros((0, 2, 0)), 0.0, 0.0), linear)
-    way = Way(tuple(sides[::-1]), filters, nearest=tuple(beams for beams, _ in stages))
+    candidate = Candidate(tuple(sides[::-1]), filters, nearest=tuple(beams for beams, _ in stages))
     error, by_stage = nearest_errors(view, stages)
     errors = ErrorBudget(nearest_beams=error)
-    found = forecast.factorized(view, way, errors, None, exact, device, costs, memory_bytes)
+    found = forecast.factorized(view, candidate, errors, None, exact, device, costs, memory_bytes)
     *divided, last = found.stages
     divided = [
         replace(stage, error_db=in_db(power(stage.error_db) + of_beams))

@@ -50,7 +50,7 @@ class Tree:
 
 @dataclass(frozen=True, eq=False)
 class _Sizes:
-    """What is known of subimages of every size, [sizes] each.
+    """Subimages of every size, [sizes] each.
 
     Attributes
     ----------
@@ -58,17 +58,17 @@ class _Sizes:
     sides : int [sizes, 2]
         Rows and columns.
     counts : int
-        How many of them hold anything.
-    slots : int
-        Pixels of these on average, with those that fill up what is computed together.
+        Number that hold a pixel.
+    slots : float
+        Mean number of pixels, padded to whole work-items.
     share : float
-        Which part of the channels sees anything of one.
+        Share of the channels that see any of one.
     reach_m : float
-        By how much a pixel's range may differ from that of its centre.
+        Largest difference in range between a pixel and the centre.
     beam_turns : float
-        Cycles that virtual channels of a leaf must be dense enough for, besides its phases'.
+        Cycles of the beam's weights that virtual channels of a leaf must follow.
     leaf : bool
-        Whether leaves may be of this size.
+        True where leaves may have this size.
     """
 
     view: View
@@ -87,38 +87,38 @@ class _Sizes:
 
     @functools.cached_property
     def inside(self) -> NDArray[np.bool_]:
-        """Whether subimages of one size, [sizes, sizes], are divided into those of another."""
+        """True where subimages of one size divide into those of another, [sizes, sizes]."""
         return (self.sides[:, None] % self.sides == 0).all(axis=-1)
 
     def cycles(
         self, root: tuple[int, int], within: NDArray[np.int64] | slice = slice(None)
     ) -> NDArray[np.float64]:
-        """Return the turns of phases of subimages of some sizes in a root.
+        """Return the cycles that phases turn by in a root.
 
-        [i, j]: while a subimage of size i is seen, of phases that turn as for size j.
+        Entry [i, j]: while a subimage of size i is seen, the phases of one of size j.
         """
         sides = [tuple(side) for side in self.sides[within].tolist()]
         extents = [self.view.extents(side, root=root if any(root) else None) for side in sides]
         return self.view.cycles_in_root(root, sides) @ np.stack(extents).T
 
     def in_root(self, root: int) -> _Within:
-        """Return what is known of the sizes inside a root's."""
+        """Return the sizes that divide a root."""
         within = np.flatnonzero(self.inside[root])
         return _Within.of(self, within, self.cycles(self.pairs[root], within))
 
 
 @dataclass(frozen=True, eq=False)
 class _Within:
-    """What is known of the sizes inside a root's.
+    """The sizes that divide a root.
 
     Attributes
     ----------
     sizes : int [n]
-        Which these are.
+        Their indices.
     turns, of_leaf : float [n, n], [n]
-        Cycles that a child of size i uses of a parent of size j; and those of leaves.
+        Cycles of a parent of size j that a child of size i uses; and those of leaves.
     step_s : float [n, n]
-        0 where a parent of size j may be divided into those of size i, else infinite.
+        0 where a parent of size j may divide into children of size i, else infinite.
     """
 
     sizes: NDArray[np.int64]
@@ -190,7 +190,7 @@ class _Option:
 
 
 def _options(sizes: _Sizes, filters_db: float, costs: Costs, allowed: Allowed) -> list[_Option]:
-    """Return all ways to filter, and what they take."""
+    """Return all choices of filters, and the time that things take with each."""
     view, options = sizes.view, []
     counts, channels = sizes.counts, view.lines.channels
     batches = np.maximum(counts / LEAST_BATCH, 1.0)
@@ -274,9 +274,9 @@ def search(
 def _onward(
     view: View, option: _Option, within: _Within
 ) -> tuple[NDArray[np.float64], list[NDArray[np.int64]]]:
-    """Return what it costs to come from subimages of some sizes to pixels, in the stages left.
+    """Return the seconds from subimages of each size to pixels, in the stages left.
 
-    Beside it, stage by stage, the sizes (as places in `within`) that are best to go on to.
+    Beside it, stage by stage, the best size of children (an index into `within.sizes`).
     """
     # To a child of size i from a parent of size j: the channels of the parent that it uses.
     step_s = option.channels(view, within.turns)

@@ -1,4 +1,8 @@
-"""How a track sees a grid: what the costs and errors of a factorized image depend on."""
+"""The model of a scene that costs and errors are evaluated on.
+
+It holds the lines' spectrum, the mean track, and what the track's samples see of some points of
+the grid.
+"""
 
 from __future__ import annotations
 
@@ -23,21 +27,21 @@ from clsas.signal.interpolation import Interpolator, Resampling
 from clsas.signal.spectrum import cycles_per_m_at, measure_spectrum
 from clsas.sonar.beam import BeamWindow, Sight, sines
 
-_NEIGHBOURS = 64  # channels whose density is looked at
-_CHANNELS = 256  # of which it is looked at what they see
-_SPOTS = (0.02, 0.25, 0.5, 0.75, 0.98)  # of rows and columns, where the geometry is looked at
-_OF_SPOTS = np.array([0.135, 0.24, 0.25, 0.24, 0.135])  # what these stand for
-_SHARES = np.outer(_OF_SPOTS, _OF_SPOTS).ravel() / _OF_SPOTS.sum() ** 2
-_MIDDLE = np.arange(len(_SPOTS) ** 2).reshape(len(_SPOTS), -1)[1:-1, 1:-1].ravel()
+_NEIGHBOURS = 64  # channels over which the density of channels is taken
+_CHANNELS = 256  # sampled for what they see
+_POINTS = (0.02, 0.25, 0.5, 0.75, 0.98)  # sample points, as parts of the rows and columns
+_WEIGHTS = np.array([0.135, 0.24, 0.25, 0.24, 0.135])  # of these in means over the grid
+_SHARES = np.outer(_WEIGHTS, _WEIGHTS).ravel() / _WEIGHTS.sum() ** 2
+_MIDDLE = np.arange(len(_POINTS) ** 2).reshape(len(_POINTS), -1)[1:-1, 1:-1].ravel()
 _EVERYWHERE = np.linspace(0, 1, 17)  # parts of rows and columns
 _BINS = 512  # of a beam
 _MOST_OUTSIDE = 1e-6  # of the lines' power, beyond what counts as their highest frequency
 _MOST_TURNED = 1 / 16  # of a beam, from one channel to the next
-_COARSER = 4  # of the track's samples: where roots are compared
+_COARSER = 4  # every so many samples of the track are enough to compare roots
 
 
 def kept(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Return a function, or method, of a view that is evaluated once per view and arguments.
+    """Cache a function, or method, of a view by the view's limits and root and by its arguments.
 
     Views that were derived from each other share what they keep.
     """
@@ -53,27 +57,26 @@ def kept(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 class View:
-    """How the track sees the grid at some spots: what costs and errors depend on.
+    """The track as seen from sample points of the grid: what costs and errors depend on.
 
     Attributes
     ----------
     surface : Surface
-        Where the grid's pixels lie.
-    spots_m : float64 [spots, 3]
-        Over the whole grid, its corners among them.
+        The positions of the grid's pixels.
+    points_m : float64 [points, 3]
+        Sample points all over the grid, near its corners too.
     track_m : float64 [samples, 3]
         Positions at `track.samples`.
     spacing : float64 [samples]
-        What each of these stands for, of the track's parameter.
+        Weight of each of these in integrals over the track's parameter.
     limits : (low, high) or None
-        Sines of the aspect angle between which anything is seen.
+        Sines of the aspect angle between which the beam weighs anything.
     root : (rows, columns) or None
-        Of the roots within which `rates` hold.
+        Pixels of the roots that `rates` hold for; None for the plane of the grid.
     kept : dict
-        What was found out before about this view and those derived from it; see `kept`.
+        Cached results of this view and those derived from it; see `kept`.
 
-    It is made with the share of the lines' power that may lie `outside` of what counts as their
-    band.
+    `outside` is the share of the lines' power that may lie outside of their nominal band.
     """
 
     def __init__(
@@ -98,14 +101,14 @@ class View:
         if self.track is None:
             return
         self.surface, self.root = surface_of(grid), None
-        self.spots_m = self._pixels_m(_SPOTS)
+        self.points_m = self._pixels_m(_POINTS)
         self.track_m, _ = self.track.sampled_m
         self.spacing = _spacing(self.track.samples)
-        sight = self.spots_m[:, None] - self.track_m
+        sight = self.points_m[:, None] - self.track_m
         self.distance_m = np.maximum(np.linalg.norm(sight, axis=-1), 1e-9)
         self.sight = sight / self.distance_m[..., None]
         self.on_track = np.abs(self.track.samples - 0.5) <= 0.5
-        # Between the places that are looked at a pixel may come nearer.
+        # A pixel may come nearer between these.
         dense_m = self._pixels_m(np.linspace(0, 1, 65))
         steps_m = np.linalg.norm(self.surface.steps_m[:2], axis=1)
         between_m = steps_m @ (np.array(self.surface.plane.shape) - 1) / 128
@@ -114,7 +117,7 @@ class View:
         self.nearest_m = max(float(nearest_m), 1e-9)
         if beam is not None:
             self.along = beam_directions(self.channels_along, self.track, self.track.samples)
-            self.beam_rates = beam_rate(beam, self.track, self.along, self.spots_m)
+            self.beam_rates = beam_rate(beam, self.track, self.along, self.points_m)
 
     def _with(self, **changes: Any) -> View:
         """Return this view with other limits, or within roots of a size."""
@@ -127,13 +130,13 @@ class View:
     def rates(self) -> NDArray[np.float64]:
         """Cycles per row, column and metre of relief, and per unit of the track's parameter.
 
-        float64 [axes, spots, samples]; within roots of the view's size if it has any.
+        float64 [axes, points, samples]; within roots of the view's size if it has any.
         """
         if self.root is None:
             extents = np.zeros(len(self.surface.steps_m))
         else:
             extents = self.extents(self.root, most=True)
-        return self._rates(extents, self.spots_m)
+        return self._rates(extents, self.points_m)
 
     @property
     def frequencies(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -148,33 +151,33 @@ class View:
         return np.maximum(cycles_per_m, 1e-3 * self.highest_cycles_per_m), share
 
     def carriers(self, count: int) -> NDArray[np.float64]:
-        """Return so many of these frequencies that all hold as much of the power."""
+        """Return so many of these frequencies, each of which stands for the same power."""
         cycles_per_m, share = self.frequencies
         place = np.interp((np.arange(count) + 0.5) / count, np.cumsum(share), np.arange(len(share)))
         return np.interp(place, np.arange(len(share)), cycles_per_m)
 
     @property
     def sweeps_once(self) -> bool:
-        """Whether the beam moves over every spot evenly, so that each is seen once.
+        """True where the beam sweeps once, at an even rate, over every sample point.
 
-        Nodes cannot follow a beam that swings with the track as fast as it passes by. As seen from
-        a spot, the aspect angle's sine changes along the track by (1 - sine^2)/distance where the
-        track is straight; half more or less than on average is followed.
+        Virtual channels cannot follow a beam that swings as fast as it sweeps. Seen from a point,
+        the sine of the aspect angle changes along a straight track by (1 - sine^2)/distance. Rates
+        between half and one and a half times the mean are followed.
         """
         if self.beam is None:
             return True
-        # Neighbours on the track must look much the same way: at a kink a beam may swing past a
-        # spot within a few channels, and one may lead back beside another.
+        # Neighbours on the track must look much the same way. At a kink the beam may swing past a
+        # point within a few channels, and a track may lead back beside itself.
         along = self.channels_along[np.argsort(self.track.place, kind="stable")]
         turned = np.linalg.norm(np.diff(along, axis=0), axis=1)
         if turned.max(initial=0.0) > _MOST_TURNED * np.ptp(np.clip(self.beam.limits, -1, 1)):
             return False
         on_track = self.on_track
         position = self.track_m[on_track]
-        way_m = np.concatenate([[0], np.linalg.norm(np.diff(position, axis=0), axis=1).cumsum()])
+        along_m = np.concatenate([[0], np.linalg.norm(np.diff(position, axis=0), axis=1).cumsum()])
         sine = np.einsum("psi,si->ps", self.sight[:, on_track], self.along[on_track])
-        way_m += 1e-9 * np.arange(len(way_m))  # a track may stand still
-        rate = -np.gradient(sine, way_m, axis=1)
+        along_m += 1e-9 * np.arange(len(along_m))  # a track may stand still
+        rate = -np.gradient(sine, along_m, axis=1)
         rate *= self.distance_m[:, on_track] / np.maximum(1 - sine**2, 1e-3)
         low, high = self.beam.limits
         for each in np.where((sine > low) & (sine < high), rate, np.nan):
@@ -184,17 +187,17 @@ class View:
         return True
 
     def trimmed(self, share: float) -> View:
-        """Return this view without the edges of the beam, where weights are next to nothing.
+        """Return this view without the outermost edges of the beam.
 
-        At both edges as much is left out as takes `share` of the power of an image of noise.
+        An image of noise loses `share` of its power.
         """
         if self.beam is None:
             return self
         low, high = np.clip(self.limits, -1, 1)
         on_track, bounds = self.on_track, []
         of_track = sines(self._everywhere_m, self.track_m[on_track], self.along[on_track])
-        # Of channels too, since the track may have gaps; filters reach into these. Everywhere: of
-        # a short aperture a pixel sees a small part of the beam only.
+        # Of channels and of the track: the track may have gaps, into which filters reach. Of points
+        # everywhere: a pixel sees but a small part of the beam from a short aperture.
         for sine in (self._sines_of_channels, of_track):
             sine = sine[(sine > low) & (sine < high)]
             power = self.beam.weights(sine, wavelength_m(self.lines)) ** 2
@@ -218,7 +221,7 @@ class View:
 
     @property
     def share_partial(self) -> float:
-        """Which part of the image's points sees the track through an edge of the beam."""
+        """Share of the image's points that see the track through an edge of the beam."""
         low, high = self.beam.limits
         seen = ((self._sines_of_channels > low) & (self._sines_of_channels < high)).mean(axis=0)
         return float(((seen > 0) & (seen < 1)).mean())
@@ -241,9 +244,9 @@ class View:
 
     @functools.cached_property
     def off_track_m(self) -> NDArray[np.float64]:
-        """How far channels are off the mean track, [channels]."""
-        away_m = self.lines.phase_centres_m - self.track.positions_m(self.track.place)
-        off_m = np.linalg.norm(away_m, axis=1)
+        """Track errors: distances of channels from the mean track, [channels]."""
+        aalong_m = self.lines.phase_centres_m - self.track.positions_m(self.track.place)
+        off_m = np.linalg.norm(aalong_m, axis=1)
         if self.own_drift is not None:
             off_m += np.linalg.norm(self.own_drift, axis=1) * np.median(self.distance_m)
         return off_m
@@ -255,7 +258,7 @@ class View:
 
     @functools.cached_property
     def densest(self) -> float:
-        """By how much denser than on average channels lie where they lie densest on the track."""
+        """Largest density of channels along the track, over the mean density."""
         place = np.sort(self.track.place)
         some = min(_NEIGHBOURS, len(place) - 1)
         closest = float((place[some:] - place[:-some]).min())
@@ -281,9 +284,9 @@ class View:
         return int((self.surface.counts(side) > 0).sum())
 
     def slots(self, side: tuple[int, int], width: int) -> float:
-        """Return the pixels of such a subimage, on average, filled up to what is computed together.
+        """Return the mean number of pixels of a subimage, padded to whole work-items.
 
-        On a plane that is all of it; elsewhere groups of blocks of `width` pixels.
+        On a plane these are all its pixels; elsewhere groups of blocks of `width` pixels.
         """
         if self.surface.is_plane:
             return float(math.prod(side))
@@ -291,7 +294,7 @@ class View:
         return float(slots.sum() / (slots > 0).sum())
 
     def most_slots(self, side: tuple[int, int], root: tuple[int, int], width: int) -> int:
-        """Return the most of these in a root."""
+        """Return the largest number of padded pixels of a root's leaves."""
         return int(within_roots(np.add, self._filled_up(side, width), side, root).max())
 
     def _filled_up(self, side: tuple[int, int], width: int) -> NDArray[np.int64]:
@@ -300,7 +303,7 @@ class View:
 
     @kept
     def seen(self, side: tuple[int, int]) -> NDArray[np.bool_]:
-        """Return from where channels see anything of subimages at the spots, [spots, samples]."""
+        """Return which samples of the track see any of a subimage, bool [points, samples]."""
         if self.limits is None:
             return np.broadcast_to(self.on_track, self.distance_m.shape)
         half = self.extents(side, most=True) / 2
@@ -308,22 +311,22 @@ class View:
 
     @functools.cached_property
     def _boxes(self) -> Sight:
-        """How the track sees boxes of cells at the spots."""
-        origin_m = self.spots_m[0]
+        """Boxes of cells at the sample points, as seen from the track."""
+        origin_m = self.points_m[0]
         return Sight.of(
-            self.spots_m - origin_m, self.surface.steps_m, self.track_m - origin_m, self.along
+            self.points_m - origin_m, self.surface.steps_m, self.track_m - origin_m, self.along
         )
 
     def share_seen(self, side: tuple[int, int], *, most: bool = False) -> float:
-        """Return which part of the channels sees anything of a subimage, on average or at most."""
+        """Return the share of the channels that see any of a subimage, its mean or its maximum."""
         count = np.count_nonzero(self.seen(side), axis=1)
-        return _over_spots(count / np.count_nonzero(self.on_track), most)
+        return _over_points(count / np.count_nonzero(self.on_track), most)
 
     def cycles(
         self, rates: NDArray[np.float64], seen: NDArray[np.bool_], *, most: bool = False
     ) -> float:
-        """Return how far a phase turns while it is seen, on average over the grid or at most."""
-        return _over_spots(np.where(seen, rates, 0.0) @ self.spacing, most)
+        """Return the cycles that a phase turns by while it is seen, their mean or their maximum."""
+        return _over_points(np.where(seen, rates, 0.0) @ self.spacing, most)
 
     def turns(self, side: tuple[int, int], seen: NDArray[np.bool_], *, most: bool = False) -> float:
         """Return `cycles` of the phases of subimages of a size."""
@@ -344,9 +347,9 @@ class View:
         return self.surface.extents(side, float(relief_m.max() if most else relief_m.mean()))
 
     def channels(self, taps: int, density: float, turns: ArrayLike) -> ArrayLike:
-        """Return the virtual channels of a subimage while whose phase turns by some cycles.
+        """Return the number of virtual channels of a subimage whose phase turns by some cycles.
 
-        `taps` and `density`, nodes per cycle, are those of the filter along the aperture, which
+        `taps` and `density`, virtual channels per cycle, are the aperture filter's. The filter
         reaches beyond the track's ends.
         """
         return density * turns + 1 + self.ends_seen * (taps / 2 - 0.5)
@@ -354,7 +357,7 @@ class View:
     @property
     @kept
     def ends_seen(self) -> float:
-        """How many ends of the track the beam sees a spot from, on average."""
+        """Mean number of the track's ends that see a sample point."""
         ends = np.flatnonzero(self.on_track)[[0, -1]]
         return float(self.seen((16, 16))[:, ends].sum(axis=1).mean())
 
@@ -370,13 +373,13 @@ class View:
         Roughly; [sides, axes].
         """
         extents = self.extents(root, most=True) if any(root) else self.surface.extents(root)
-        rates = self._rates(extents, self.spots_m[_MIDDLE], _COARSER)
+        rates = self._rates(extents, self.points_m[_MIDDLE], _COARSER)
         while_seen = np.stack([self._while_seen(side) for side in sides])
         return while_seen @ rates.reshape(len(rates), -1).T / len(_MIDDLE)
 
     @kept
     def _while_seen(self, side: tuple[int, int]) -> NDArray[np.float64]:
-        """Return what the samples stand for from which subimages in the middle are seen, flat."""
+        """Return the weights of the samples that see subimages in the middle, flat; 0 elsewhere."""
         seen = self.seen(side)[_MIDDLE, ::_COARSER]
         return (seen * _spacing(self.track.samples[::_COARSER])).ravel()
 
@@ -405,7 +408,7 @@ class View:
         return 1.02 * slopes.max(axis=0)
 
     def reach_m(self, side: tuple[int, int]) -> float:
-        """Return by how much a pixel's range may differ from that of its subimage's centre."""
+        """Return the largest difference in range between a pixel and its subimage's centre."""
         radius_m = self.surface.radius_m(side)
         bend_m = radius_m**2 / (2 * max(self.nearest_m, radius_m))
         extents = self.surface.extents(side, self.surface.relief_m(side).max())
@@ -418,7 +421,7 @@ class View:
         final: Interpolator,
         resampling: Resampling,
     ) -> tuple[int, ...]:
-        """Return the samples to either side of a centre that the lines of each stage must hold."""
+        """Return the samples that the lines of each stage hold to either side of a centre."""
         samples_per_m = resampling.samples_per_m(self.lines)
         return tuple(
             math.ceil(self.reach_m(side) * samples_per_m)
@@ -429,12 +432,12 @@ class View:
         )
 
 
-def _over_spots(values: NDArray[np.float64], most: bool) -> float:
-    """Return the largest of values at the spots, or their mean over the grid."""
+def _over_points(values: NDArray[np.float64], most: bool) -> float:
+    """Return the largest of values at the sample points, or their mean over the grid."""
     return float(values.max() if most else values @ _SHARES)
 
 
 def _spacing(samples: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return by what to multiply values at samples for the integral over them (trapezoids)."""
+    """Return the weights of samples in an integral over them (trapezoidal rule)."""
     halves = np.diff(samples) / 2
     return np.concatenate([halves, [0.0]]) + np.concatenate([[0.0], halves])
