@@ -62,13 +62,13 @@ def test_versions_agree():
     assert PROJECT["version"] == clsas.__version__
 
 
-def test_all_holds_every_extra_but_those_for_tests():
+def test_all_holds_every_extra_that_users_need():
     extras = PROJECT["optional-dependencies"]
     (everything,) = re.findall(r"clsas\[(.*)\]", *extras["all"])
-    assert set(everything.split(",")) == extras.keys() - {"all", "test"}
+    assert set(everything.split(",")) == extras.keys() - {"all", "test", "docs"}
 
 
-@pytest.mark.parametrize("script", ["scripts/demo", "scripts/test", ".ci/run"])
+@pytest.mark.parametrize("script", ["scripts/demo", "scripts/test", "scripts/docs", ".ci/run"])
 def test_scripts_without_a_python_say_so(script, tmp_path):
     """In a copy of the checkout, so that no environment is there."""
     checkout, tools = tmp_path / "checkout", tmp_path / "bin"

@@ -1,0 +1,97 @@
+"""The documentation's code runs, shows what it makes, and leaves no public name out."""
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import clsas
+
+pytest.importorskip("matplotlib")
+
+ROOT = Path(__file__).parents[1]
+DOCS = ROOT / "docs"
+PROGRAMS = sorted([*(DOCS / "tutorials").glob("*.md"), *(DOCS / "figures").glob("*.py")])
+
+
+@pytest.mark.parametrize("program", PROGRAMS, ids=lambda path: path.stem)
+def test_tutorials_and_figures_run(program):
+    if program.stem == "mosaic":
+        pytest.importorskip("zarr")
+    done = subprocess.run(
+        [sys.executable, ROOT / "scripts" / "pages", program], capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize(
+    ("said", "fault"),
+    [
+        ("5.2 cm of 300 channels", None),
+        ("... channels", None),
+        ("5.9 cm of 300 channels", None),
+        ("9.2 cm of 300 channels", "expected"),
+        ("5.4 m of 300 channels", "expected"),
+        ("5.4 cm", "expected"),
+    ],
+)
+def test_what_pages_say_is_printed_is_compared(said, fault, tmp_path):
+    page = tmp_path / "page.md"
+    page.write_text(f'```python\nprint("5.4 cm of 300 channels")\n```\n\n```text\n{said}\n```\n')
+    done = run_page(page)
+    assert (done.returncode != 0) == (fault is not None), done.stderr
+    assert (fault or "") in done.stderr
+
+
+def test_a_page_that_shows_a_picture_must_make_it(tmp_path):
+    page = tmp_path / "page.md"
+    page.write_text("![missing](../images/missing.png)\n")
+    done = run_page(page)
+    assert done.returncode != 0
+    assert "missing.png, which its code does not write" in done.stderr
+
+
+def run_page(page):
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    return subprocess.run(
+        [sys.executable, ROOT / "scripts" / "pages", page],
+        capture_output=True, text=True, env=environment,
+    )  # fmt: skip
+
+
+def test_the_reference_holds_every_public_name():
+    pages = "".join(page.read_text() for page in (DOCS / "reference").glob("*.md"))
+    shown = set(re.findall(r"^\.\. auto\w+:: clsas\.(\w+)$", pages, re.MULTILINE))
+    assert shown == set(clsas.__all__) - {"plot"}
+    assert ".. automodule:: clsas.products.plot" in pages
+
+
+def test_links_between_files_lead_somewhere():
+    """In the README too; anchors of pages are checked when the site is built."""
+    for page in (ROOT / "README.md", *DOCS.rglob("*.md")):
+        for link in re.findall(r"\]\(([^)#:]+)(?:#[^)]*)?\)", page.read_text()):
+            assert (page.parent / link).exists(), (page, link)
+
+
+def test_the_readme_lists_the_main_pages():
+    readme = (ROOT / "README.md").read_text()
+    for page in DOCS.glob("*.md"):
+        assert f"(docs/{page.name})" in readme
+    for page in (DOCS / "tutorials").glob("*.md"):
+        assert f"(docs/tutorials/{page.name})" in readme
+
+
+def test_every_page_is_in_a_table_of_contents():
+    pages = {path.relative_to(DOCS).with_suffix("").as_posix() for path in DOCS.rglob("*.md")}
+    listed = set()
+    for page in DOCS.rglob("*.md"):
+        for block in re.findall(r"```\{toctree\}\n(.*?)```", page.read_text(), re.DOTALL):
+            entries = [line for line in block.split() if not line.startswith(":")]
+            for entry in entries:
+                path = (page.parent / f"{entry}.md").resolve()
+                if path.is_file():
+                    listed.add(path.relative_to(DOCS).with_suffix("").as_posix())
+    assert pages == listed | {"index"}
