@@ -4,6 +4,7 @@ import os
 import re
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -14,7 +15,8 @@ pytest.importorskip("matplotlib")
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
-PROGRAMS = sorted([*(DOCS / "tutorials").glob("*.md"), *(DOCS / "figures").glob("*.py")])
+FIGURES = [path for path in (DOCS / "figures").glob("*.py") if path.stem != "drawing"]
+PROGRAMS = sorted([*(DOCS / "tutorials").glob("*.md"), *FIGURES])
 
 
 @pytest.mark.parametrize("program", PROGRAMS, ids=lambda path: path.stem)
@@ -95,3 +97,25 @@ def test_every_page_is_in_a_table_of_contents():
                 if path.is_file():
                     listed.add(path.relative_to(DOCS).with_suffix("").as_posix())
     assert pages == listed | {"index"}
+
+
+def test_architecture_names_every_room_and_only_modules_that_exist():
+    page = (DOCS / "architecture.md").read_text()
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())
+    (contract,) = project["tool"]["importlinter"]["contracts"]
+    rooms = {layer.removeprefix("clsas.") for layer in contract["layers"]}
+    assert set(re.findall(r"^\*\*`(\w+)`: ", page, re.MULTILINE)) == rooms
+    drawn = re.findall(
+        r'^\s+\(\(?\(?"(\w+)", "', (DOCS / "figures" / "house.py").read_text(), re.MULTILINE
+    )
+    assert set(drawn) == rooms
+    modules = re.findall(r"`(\w+/\w+\.(?:py|cl))`", page)
+    assert len(modules) > 20
+    for module in modules:
+        assert (ROOT / module).is_file() or (ROOT / "clsas" / module).is_file(), module
+
+
+def test_the_citation_is_of_this_version():
+    citation = (ROOT / "CITATION.cff").read_text()
+    assert f"\nversion: {clsas.__version__}\n" in citation
+    assert f"## {clsas.__version__}" in (DOCS / "changelog.md").read_text()

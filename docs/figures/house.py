@@ -1,0 +1,58 @@
+"""The rooms of the house, and what flows between them. Imports point up, data flow down."""
+
+from drawing import BLUE, INK, ORANGE, RED, TEAL, arrow, box, canvas, save
+
+FLOORS = (
+    ((("core", "what are the data?\nRangeLines, Grid, Image"),), INK),
+    (
+        (
+            ("sonar", "who looks, from where?\ntrack, beam, visibility"),
+            ("signal", "how are lines sampled?\nechoes, spectrum, filters"),
+            ("simulation", "what would be received?\nscenes, simulator"),
+            ("opencl", "how does a device see it?\ndevices, buffers, kernels"),
+        ),
+        TEAL,
+    ),
+    (
+        (
+            ("exact", "the image, whatever it takes\ntiles, backprojection"),
+            ("factorized", "the image, fast\naperture, tree, stages, leaves"),
+            ("planning", "which way is the fastest?\nwork, errors, search, plan"),
+        ),
+        RED,
+    ),
+    (
+        (
+            ("files", "in and out\nHDF5, scene files"),
+            ("mosaics", "larger than memory\nsurvey, patches, store"),
+            ("products", "what does it show?\nquality, tradeoff, pictures"),
+        ),
+        BLUE,
+    ),
+    (
+        (
+            ("trials", "is it right, is it fast?\noracle, selftest, benchmarks"),
+            ("cli", "the command line\none file per group of commands"),
+        ),
+        ORANGE,
+    ),
+)
+FLOWS = (
+    "samples, positions, pixels",
+    "directions, weights, spectra, buffers",
+    "plans, images",
+    "images from files, measured figures",
+)
+WIDTH, HEIGHT, STEP = 9.6, 0.92, 1.4
+
+figure, axes = canvas(WIDTH, STEP * len(FLOORS) + 0.05)
+for floor, (rooms, colour) in enumerate(FLOORS):
+    y = STEP * (len(FLOORS) - floor) - HEIGHT - 0.05
+    width = (WIDTH - 0.2) / len(rooms)
+    for number, (name, text) in enumerate(rooms):
+        corner = (0.1 + number * width + 0.06, y)
+        box(axes, corner, (width - 0.12, HEIGHT), name, text, colour=colour)
+    if floor < len(FLOWS):
+        arrow(axes, (WIDTH / 2, y - 0.03), (WIDTH / 2, y - STEP + HEIGHT + 0.03))
+        axes.text(WIDTH / 2 + 0.15, y - (STEP - HEIGHT) / 2, FLOWS[floor], va="center", size=9)
+save(figure, "house.svg")
