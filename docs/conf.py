@@ -26,6 +26,7 @@ autodoc_member_order = "bysource"
 autodoc_typehints = "none"  # docstrings tell types and shapes
 numpydoc_show_class_members = False  # autodoc shows them
 
+smartquotes = False  # options are --so
 html_theme = "furo"
 html_title = f"clsas {version}"
 html_static_path = ["static"]
