@@ -3,6 +3,8 @@
 The scene is that of the thesis: 640 channels over 5.28 m, 1 MHz, a subimage of 0.16 m at 42.5 m.
 """
 
+import functools
+
 import numpy as np
 from drawing import BLUE, INK, ORANGE, RED, TEAL, plt, save
 
@@ -31,8 +33,10 @@ def place(oversampling):
     return (cosine - cosine[0]) / spacing
 
 
-def weights(at, taps, oversampling):
+@functools.cache
+def weights(taps, oversampling):
     """Return the weights [channel, virtual channel] of windowed sincs; of the nearest for one."""
+    at = place(oversampling)
     nodes = np.arange(-taps, int(at[-1]) + taps + 1)
     away = at[:, None] - nodes
     if taps == 1:
@@ -43,8 +47,7 @@ def weights(at, taps, oversampling):
 
 
 def interpolated(point_m, taps, oversampling):
-    at = place(oversampling)
-    nodes, kernel = weights(at, taps, oversampling)
+    nodes, kernel = weights(taps, oversampling)
     # Virtual channels are channels themselves: their steering functions are known anywhere.
     cosine = x_m[0] / np.hypot(x_m[0], CENTRE_M[1]) + nodes * WAVELENGTH_M / (
         2 * SIDE_M * oversampling
@@ -85,7 +88,7 @@ aligned.set(xlabel="along the track (m)", ylim=(-1.2, 2.3))
 aligned.legend(loc="upper center", ncols=2, fontsize="small", frameon=False)
 
 random = np.random.default_rng(0)
-pixels_m = CENTRE_M + random.uniform(-SIDE_M / 2, SIDE_M / 2, (40, 2))
+pixels_m = CENTRE_M + random.uniform(-SIDE_M / 2, SIDE_M / 2, (15, 2))
 for taps, colour, name in (
     (1, RED, "nearest (the thesis)"),
     (4, ORANGE, "4 taps"),
