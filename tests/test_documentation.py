@@ -19,6 +19,7 @@ FIGURES = [path for path in (DOCS / "figures").glob("*.py") if path.stem != "dra
 PROGRAMS = sorted([*(DOCS / "tutorials").glob("*.md"), *FIGURES])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("program", PROGRAMS, ids=lambda path: path.stem)
 def test_tutorials_and_figures_run(program):
     if program.stem == "mosaic":
