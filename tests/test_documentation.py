@@ -1,5 +1,6 @@
 """The documentation's code runs, shows what it makes, and leaves no public name out."""
 
+import importlib
 import os
 import re
 import subprocess
@@ -122,3 +123,31 @@ def test_the_citation_is_of_this_version():
     citation = (ROOT / "CITATION.cff").read_text()
     assert f"\nversion: {clsas.__version__}\n" in citation
     assert f"## {clsas.__version__}" in (DOCS / "changelog.md").read_text()
+
+
+@pytest.mark.parametrize(
+    "page", [ROOT / "README.md", *sorted(DOCS.rglob("*.md"))], ids=lambda path: path.stem
+)
+def test_files_and_names_that_pages_mention_exist(page):
+    text = page.read_text()
+    for path in re.findall(r"`((?:tests|scripts|clsas|docs)/[\w./]+)`", text):
+        assert (ROOT / path).exists() or path == "clsas/cl", path  # which wheels hold
+    for name in re.findall(r"\bclsas(?:\.\w+)+", text):
+        assert is_there(name), name
+
+
+def is_there(name):
+    """Whether a dotted name is a module, or what a module holds."""
+    parts = name.split(".")
+    for count in range(len(parts), 0, -1):
+        try:
+            found = importlib.import_module(".".join(parts[:count]))
+        except ModuleNotFoundError:
+            continue
+        try:
+            for part in parts[count:]:
+                found = getattr(found, part)
+        except AttributeError:
+            return False
+        return True
+    return False
