@@ -204,3 +204,10 @@ def flat(occupied, centre=0.0):
 def burst(index, centre):
     """A Gaussian burst of 8 samples about sample 60, its energy about a frequency."""
     return np.exp(-(((index - 60) / 8) ** 2) + 2j * np.pi * centre * (index - 60))
+
+
+def track_lines(tx, rx=None):
+    """Lines of one sample from antennas [channels, 3]."""
+    return RangeLines(
+        np.ones((len(tx), 1), complex), 1.0, 1.0, tx, tx if rx is None else rx, 1e5, 1500.0
+    )

@@ -19,7 +19,8 @@ from clsas.signal import interpolation
 from clsas.signal.ambiguity import Ambiguity
 from clsas.signal.interpolation import Interpolator, Resampling
 from clsas.signal.spectrum import Spectrum, cycles_per_m_at
-from clsas.sonar.beam import BeamWindow, sines
+from clsas.sonar.beam import BeamWindow
+from clsas.sonar.visibility import sines
 
 _CHANNELS, _PLACES = 256, 16  # at which is looked how full of what is seen the beam is
 

@@ -17,7 +17,8 @@ from clsas.core.lines import RangeLines, wavelength_m
 from clsas.exact.preparation import Preparation
 from clsas.exact.run import normalising
 from clsas.signal.spectrum import measure_spectrum
-from clsas.sonar.beam import BeamWindow, sines
+from clsas.sonar.beam import BeamWindow
+from clsas.sonar.visibility import sines
 
 Progress = Callable[[int, int], None] | None
 Evaluate = Callable[[NDArray[np.complex128], NDArray[np.float64]], NDArray[np.complex128]]

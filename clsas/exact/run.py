@@ -32,8 +32,9 @@ from clsas.opencl.buffers import (
 )
 from clsas.opencl.device import Device, Slot
 from clsas.signal.interpolation import Resampling
-from clsas.sonar.beam import HARDLY_SEEN, INTERVALS, BeamWindow, channel_ranges
-from clsas.sonar.visibility import warn_unseen
+from clsas.sonar.beam import INTERVALS, LEAST_WEIGHT_SUM, BeamWindow
+from clsas.sonar.coverage import warn_unseen
+from clsas.sonar.visibility import channel_ranges
 
 _CHANNELS_AT_ONCE = 512  # bounds a float32 partial sum; lines that stay in a CPU's cache
 _PART_BYTES = 64 << 20  # device memory for one set of parts: a job of some tenths of a second
@@ -79,7 +80,7 @@ def execute(
 
 def normalising(sums: NDArray[np.floating], channels: int) -> NDArray[np.floating]:
     """Return what a normalising beam multiplies pixels by whose weights have these sums."""
-    return (channels / np.maximum(sums, HARDLY_SEEN)).astype(sums.dtype)
+    return (channels / np.maximum(sums, LEAST_WEIGHT_SUM)).astype(sums.dtype)
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ from clsas.core.threads import in_threads
 from clsas.exact.checks import check_numbers
 from clsas.signal.spectrum import measure_spectrum
 from clsas.sonar.beam import BeamWindow
-from clsas.sonar.visibility import warn_unseen
+from clsas.sonar.coverage import warn_unseen
 
 _SUM_ERROR = 1e-7  # of the non-uniform FFTs: what complex64 holds
 _UNUSED = 1e-12  # share of the energy that may be left out

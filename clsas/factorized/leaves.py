@@ -29,7 +29,8 @@ from clsas.opencl.buffers import (
     lookup_weights,
 )
 from clsas.opencl.device import Device, Slot
-from clsas.sonar.beam import INTERVALS, sines
+from clsas.sonar.beam import INTERVALS
+from clsas.sonar.visibility import sines
 
 _ALL = slice(None)
 _SHARE = 0.02  # of an image's error: what neighbours' weights may be off

@@ -34,7 +34,7 @@ from clsas.opencl.buffers import (
 )
 from clsas.opencl.device import Device, Slot, aligned
 from clsas.opencl.upsampling import upsample
-from clsas.sonar.visibility import warn_unseen
+from clsas.sonar.coverage import warn_unseen
 
 _GROUP = 64  # work-items that share a subimage where each has one lane
 _AHEAD_S = 0.1  # of work that is started: roots are prepared meanwhile, an interruption waits

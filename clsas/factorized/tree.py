@@ -12,7 +12,8 @@ from scipy.ndimage import gaussian_filter1d
 from clsas.factorized.aperture import MeanTrack, turned
 from clsas.factorized.surface import Surface
 from clsas.signal.interpolation import Interpolator
-from clsas.sonar.beam import BeamWindow, Sight, touches_boxes
+from clsas.sonar.beam import BeamWindow
+from clsas.sonar.visibility import Visibility, touches_boxes
 
 _EVEN_NODES = 2.5  # over how many nodes their spacing is smoothed, rms
 _LEAST_RATE = 0.3  # of the mean over the track
@@ -308,8 +309,8 @@ def seen_from(
             # With the places beside them; at the track's ends that is their first or last one.
             index = _RUN * at[some, None] + (inward if step > 0 else _RUN - 1 - inward)
             index = np.clip(index, 0, len(places) - 1)
-            sight = Sight.of(centres_m[some], half_m, position_m, along, index)
-            inside_by = sight.inside_by(limits, halves)
+            visibility = Visibility.of(centres_m[some], half_m, position_m, along, index)
+            inside_by = visibility.overlap(limits, halves)
             inside = inside_by[:, :-1] > 0
             whole = some[inside[:, 0]]
             edge[whole] = outermost[whole]

@@ -48,7 +48,9 @@ from clsas.opencl.device import (
 )
 from clsas.planning.factorize import factorize
 from clsas.planning.planner import TOLERANCE_DB, checked_pairs, plan, tolerance_in_db
-from clsas.sonar.beam import MOST_TRACK_PINGS, BeamWindow, touches_boxes
+from clsas.sonar.beam import BeamWindow
+from clsas.sonar.directions import MOST_TRACK_PINGS
+from clsas.sonar.visibility import touches_boxes
 
 if TYPE_CHECKING:
     from distributed import Client

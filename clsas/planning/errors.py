@@ -22,7 +22,7 @@ from clsas.factorized.tree import interpolated_directions, interpolated_nodes
 from clsas.opencl.device import Device
 from clsas.planning.view import View, kept
 from clsas.signal.interpolation import Interpolator
-from clsas.sonar.beam import sines
+from clsas.sonar.visibility import sines
 
 _FLOAT32 = 4.5e-8  # rms error of a phase in the stages over the phase across a root: measured
 _CHANNELS, _FURTHEST, _PLACES, _PIXELS = 128, 32, 160, 24  # sampled for errors

@@ -31,8 +31,8 @@ from clsas.planning.view import View
 from clsas.signal import interpolation
 from clsas.signal.interpolation import Interpolator
 from clsas.sonar.beam import BeamWindow
+from clsas.sonar.coverage import warn_unreached
 from clsas.sonar.simplify import Model, simplify
-from clsas.sonar.visibility import warn_unreached
 
 BEST_TOLERANCE_DB = -75.0
 """The tightest tolerance that may be asked for: what float32 leaves of a factorized image."""

@@ -25,7 +25,8 @@ from clsas.factorized.tree import beam_directions, beam_rate
 from clsas.signal.ambiguity import Ambiguity, ambiguity
 from clsas.signal.interpolation import Interpolator, Resampling
 from clsas.signal.spectrum import cycles_per_m_at, measure_spectrum
-from clsas.sonar.beam import BeamWindow, Sight, sines
+from clsas.sonar.beam import BeamWindow
+from clsas.sonar.visibility import Visibility, sines
 
 _NEIGHBOURS = 64  # channels over which the density of channels is taken
 _CHANNELS = 256  # sampled for what they see
@@ -307,13 +308,13 @@ class View:
         if self.limits is None:
             return np.broadcast_to(self.on_track, self.distance_m.shape)
         half = self.extents(side, most=True) / 2
-        return self.on_track & (self._boxes.inside_by(self.limits, half) > 0)
+        return self.on_track & (self._boxes.overlap(self.limits, half) > 0)
 
     @functools.cached_property
-    def _boxes(self) -> Sight:
+    def _boxes(self) -> Visibility:
         """Boxes of cells at the sample points, as seen from the track."""
         origin_m = self.points_m[0]
-        return Sight.of(
+        return Visibility.of(
             self.points_m - origin_m, self.surface.steps_m, self.track_m - origin_m, self.along
         )
 

@@ -14,10 +14,11 @@ from clsas.core.lines import RangeLines, some_channels, wavelength_m
 from clsas.factorized.surface import surface_of
 from clsas.signal.ambiguity import ends_error
 from clsas.signal.spectrum import cycles_per_m_at, measure_spectrum
-from clsas.sonar.beam import BeamWindow, sines
+from clsas.sonar.beam import BeamWindow
 from clsas.sonar.simplify import APART, MOTION, RELIEF
 from clsas.sonar.system import Sonar, element_pattern
 from clsas.sonar.track import Pointing, Track
+from clsas.sonar.visibility import sines
 
 SWAY = "sway and yaw beyond a straight track"
 PATTERN = "element pattern"

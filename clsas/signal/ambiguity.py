@@ -17,7 +17,8 @@ from clsas.core.geometry import pairwise_range_m
 from clsas.core.grid import Grid
 from clsas.core.lines import RangeLines, some_channels
 from clsas.signal.spectrum import NEEDED_OVERSAMPLING, Spectrum
-from clsas.sonar.beam import BeamWindow, sines
+from clsas.sonar.beam import BeamWindow
+from clsas.sonar.visibility import sines
 
 _AT_END, _END = 0.03, 4  # measured on noise that fills 40 to 90 % of the sampled band; samples
 _BESIDE = 5  # samples

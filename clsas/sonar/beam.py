@@ -1,4 +1,4 @@
-"""Beam windows: what a channel weighs in a pixel, by the angle at which it sees it."""
+"""Beam weights: how much a channel adds to a pixel, as a function of the aspect angle."""
 
 from __future__ import annotations
 
@@ -8,77 +8,70 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial.distance import cdist
 
 from clsas.core import validate
 from clsas.core.lines import RangeLines
+from clsas.sonar.directions import track_directions
 from clsas.sonar.system import element_pattern
 
 SHAPES = ("rectangular", "hann", "hamming", "taylor", "tukey", "inverse")
 
 INTERVALS = 1024
-"""Cubics of a table: enough for the kinks of a Tukey window."""
+"""Number of cubics in a table of weights: enough for the kinks of a Tukey window."""
 
-HARDLY_SEEN = 0.01
-"""A sum of weights below which normalised pixels fade to 0."""
+LEAST_WEIGHT_SUM = 0.01
+"""Normalised pixels whose weights sum to less than this fade to 0."""
 
-MOST_TRACK_PINGS = 101
-"""Pings over which a track's direction is smoothed at most, unless told otherwise."""
-
-_NARROWEST = 1e-3  # degrees: float32 holds a hundredth of it
-_BEYOND = 2.0  # for a limit at end-fire: a sine that rounding does not reach
+_NARROWEST = 1e-3  # degrees: float32 resolves a hundredth of this
+_END_FIRE = 2.0  # limit for beams that reach end-fire: rounding never makes a sine this large
 _HALF_POWER = 0.442946  # sinc^2 is 1/2 here
-_MOST_WEIGHT = 100.0
+_MOST_WEIGHT = 100.0  # 40 dB
 _TAYLOR_TERMS, _TAYLOR_SIDE_LOBES_DB = 4, 30.0  # SciPy's choice
-_TRACK_SHARE = 4  # the track's direction is that of cubics through this part of the pings
-_JUMP, _SHORTEST_LEG = 10.0, 5  # steps in usual ones between legs, and pings of a leg
-_ROUNDING = 1e-5  # of sines on the device, amply
-_CHANNELS_TOGETHER = 16
-_NEARLY_A_STEP = 0.1  # of the width of a window: what its edges take
+_STEEP_TAPER = 0.1  # with a taper up to this the errors of "tukey" are those of a step
 
 
 @dataclass(frozen=True, eq=False)
 class BeamWindow:
-    """Weights of the channels by aspect angle, so that an image uses a part of the beam only.
+    """Weights of the channels by aspect angle, which restrict an image to part of the beam.
 
-    A pixel x is seen by a channel at the aspect angle theta from broadside,
+    The weight of a channel in a pixel x is a function of theta - squint. The aspect angle theta
+    from broadside follows from the channel's phase centre p and the track's unit direction t,
 
-        sin(theta) = t . (x - p)/|x - p|,   p = (tx + rx)/2,
-
-    with t the unit direction of the track, and weighs a function of theta - squint.
+        sin(theta) = t . (x - p)/|x - p|,   p = (tx + rx)/2.
 
     Parameters
     ----------
     width_deg : float
-        Full width, 0.001 to 180 degrees; beyond half of it on either side the weight is 0.
+        Full width, 0.001 to 180 degrees. The weight is 0 beyond half the width on either side.
     shape : str
         "rectangular", "hann", "hamming", "taylor" (4 terms, side lobes at -30 dB), "tukey" or
-        "inverse"; all but the last are 1 in the middle, and functions of (theta - squint)/width.
+        "inverse". All but "inverse" depend on (theta - squint)/width and are 1 in the middle.
         "inverse" divides by the two-way pattern sinc^2(L/lambda sin(theta - squint)) of elements
         of length L at the lines' carrier.
     squint_deg : float
-        Middle of the window, degrees ahead of broadside; the whole window lies within +-90.
+        Squint angle of the beam's axis, positive forward. The whole beam lies within +-90 degrees.
     taper : float
-        For "tukey": which part of the width, 0 to 1, its two raised-cosine edges take together;
-        below 1/512 it has none.
+        For "tukey": fraction of the width, 0 to 1, that the two raised-cosine edges take together.
+        Below 1/512 there are no edges.
     element_length_m : float, optional
-        For "inverse": L. It may amplify by 40 dB at most.
+        For "inverse": L. The weights may amplify by 40 dB at most.
     along : array_like, [3] or [channels, 3], optional
-        Direction of the track, of any length. Unless given it is that of a smooth curve through
-        the lines' phase centres, see `directions`.
+        Direction of the track, a vector of any length. By default the direction of a smooth curve
+        through the lines' phase centres, see `directions`.
     track_pings : int, optional
-        Over how many pings the direction of the track is smoothed, from 5; a quarter of them, 101
-        at most, unless given.
+        Pings over which the track's direction is smoothed, at least 5. By default a quarter of
+        all pings, and at most 101.
     normalise : bool
-        Multiply every pixel by channels / sum_i w_i(x), w_i the weights: a point has the amplitude
-        it has without a window, also near the ends of the aperture, where fewer channels see it.
-        (Noise there grows, by the root of that.) Channels weigh in the sum whether or not the
-        pixel lies within their lines. Below a sum of 0.01 pixels fade to 0.
+        Multiply every pixel by channels / sum_i w_i(x), with w_i the weights. A point then has the
+        amplitude that it would have without a beam, also near the ends of the aperture, where
+        fewer channels receive from it. Noise grows there by the square root of that factor. The
+        sum includes channels whose lines do not reach the pixel. Pixels with a sum below 0.01
+        fade to 0.
 
     Raises
     ------
     TypeError, ValueError
-        If a value is of a wrong kind or outside its limits.
+        If a value has the wrong type or is outside its limits.
     """
 
     width_deg: float
@@ -128,7 +121,7 @@ class BeamWindow:
             largest = np.abs(along).max(axis=-1, keepdims=True)
             if not largest.all():
                 raise ValueError("along must hold directions of some length, got zeros")
-            along = along / largest  # so that no square overflows or vanishes
+            along = along / largest  # avoids overflow and underflow in the norm
             fields["along"] = along / np.linalg.norm(along, axis=-1, keepdims=True)
         if self.track_pings is not None:
             fields["track_pings"] = validate.count("track_pings", self.track_pings, least=5)
@@ -143,19 +136,19 @@ class BeamWindow:
     def of_element(
         cls, length_m: float, wavelength_m: float, shape: str = "rectangular", **others: object
     ) -> BeamWindow:
-        """Return the window as wide as an element's beam.
+        """Return weights as wide as an element's half-power beam.
 
-        Its edges are where one element's pattern is at -3 dB and the two-way one at -6 dB,
-        sin(width/2) = 0.443 wavelength/length: the half-power beamwidth of the textbooks, 0.886
-        wavelength/length, which resolves half an element. An element shorter than 0.443
-        wavelengths has no such edge: the window is 180 degrees wide.
+        Their edges lie where the pattern of one element is at -3 dB and the two-way pattern at
+        -6 dB, sin(width/2) = 0.443 wavelength/length. This is the textbook beamwidth of 0.886
+        wavelength/length, whose azimuth resolution is half an element. An element shorter than
+        0.443 wavelengths has no such edge: the beam is then 180 degrees wide.
 
         Parameters
         ----------
         length_m : float
-            Of the element along the track.
+            Length of the element along the track.
         wavelength_m : float
-            At the carrier.
+            Wavelength at the carrier.
         shape : str
             See `BeamWindow`.
         **others
@@ -173,7 +166,7 @@ class BeamWindow:
 
     @property
     def limits_rad(self) -> tuple[float, float]:
-        """Aspect angles at which the window begins and ends."""
+        """Aspect angles at which the beam begins and ends."""
         return (
             math.radians(self.squint_deg - self.width_deg / 2),
             math.radians(self.squint_deg + self.width_deg / 2),
@@ -181,31 +174,31 @@ class BeamWindow:
 
     @property
     def limits(self) -> tuple[float, float]:
-        """Sines between which a weight is not 0: of `limits_rad`, and -+2 at end-fire."""
+        """Sines of `limits_rad`, between which weights are not 0; -+2 for a limit at end-fire."""
         low, high = (math.sin(angle) for angle in self.limits_rad)
-        return (low if low > -1 + 1e-12 else -_BEYOND), (high if high < 1 - 1e-12 else _BEYOND)
+        return (low if low > -1 + 1e-12 else -_END_FIRE), (high if high < 1 - 1e-12 else _END_FIRE)
 
     @property
     def edge(self) -> float:
-        """Over which part of the sine it rises from nothing to all, roughly."""
+        """Approximate extent in sine over which the weights rise from 0 to 1."""
         low, high = np.clip(self.limits, -1, 1)
         return (high - low) / 2 * (max(self.taper, 0.02) if self.shape == "tukey" else 1.0)
 
     @property
     def jumps(self) -> bool:
-        """Whether its weights jump where it begins and ends, or nearly so."""
-        return self.shape != "hann" and not (self._has_taper and self.taper > _NEARLY_A_STEP)
+        """Whether the weights begin and end with a step, or nearly so."""
+        return self.shape != "hann" and not (self._has_taper and self.taper > _STEEP_TAPER)
 
     @property
     def _has_taper(self) -> bool:
-        """Whether it is "tukey" with edges: none are narrower than an interval of the table."""
+        """Whether the shape is "tukey" with edges at least as wide as a table interval."""
         return self.shape == "tukey" and self.taper * INTERVALS >= 2
 
     def block_error(self, reach: float) -> float:
-        """Return the relative rms error of taking the weights over a block as one cubic.
+        """Relative rms error of weights that are one cubic over a block of pixels.
 
-        `reach` is by how much the sine may change from the block's middle. The edges of "tukey"
-        begin with a kink, which no cubic follows; the other shapes are smooth between the limits.
+        `reach` is the largest change of the sine from the block's middle. The edges of "tukey"
+        begin with a kink that no cubic follows; the other shapes are smooth between the limits.
         """
         low, high = np.clip(self.limits, -1, 1)
         width = high - low
@@ -215,10 +208,11 @@ class BeamWindow:
         return 0.04 * x**2 * math.sqrt(min(8 * reach / width, 1.0))
 
     def plane_error(self, reach: float, wavelength_m: float = math.inf) -> float:
-        """Return the relative rms error of taking the sine as bilinear over a longer block.
+        """Relative rms error of a sine that is interpolated bilinearly over a longer block.
 
-        Along a block of half a length r at the distance R it bends by 0.6 (r/R)^2 at most. By as
-        much edges are displaced; where the weights jump there, channels come in or are lost.
+        Over a block of half length r at distance R the sine deviates from linear by at most
+        0.6 (r/R)^2 (`reach` is r/R). That shifts the beam's edges. Where the weights begin with a
+        step, the shift adds or drops channels.
         """
         square = self._all(wavelength_m) ** 2
         jump = (square[0] + square[-1]) / 2 / square.mean()
@@ -228,26 +222,36 @@ class BeamWindow:
     def fullness(
         self, sine: NDArray[np.float64], wavelength_m: float = math.inf, share: float = 1.0
     ) -> float:
-        """Return the rms of the weights at sines [channels, points] over that of all, 1 at most.
+        """Rms of the weights that an image uses over the rms of all weights, at most 1.
 
-        An image that sees an edge of the window only errs by as much more; and a normalised one by
-        as much as it amplifies what is seen less. Sines are of a `share` of the channels.
+        Relative errors grow by its inverse. It is small for an image that only the edge of the
+        beam covers. Normalising lowers it further, since it amplifies poorly covered pixels.
+
+        Parameters
+        ----------
+        sine : float64 [channels, points]
+            Sines of the aspect angles at which some channels receive from some points.
+        wavelength_m : float
+            For "inverse".
+        share : float
+            Fraction of all channels that `sine` has.
         """
         weights = self.weights(sine, wavelength_m)
-        seen = weights[weights > 0]
-        if not seen.size:
+        visible = weights[weights > 0]
+        if not visible.size:
             return 1.0
-        rms, of_all = (np.sqrt(np.mean(each**2)) for each in (seen, self._all(wavelength_m)))
+        rms, of_all = (np.sqrt(np.mean(each**2)) for each in (visible, self._all(wavelength_m)))
         result = float(min(rms / of_all, 1.0))
         if self.normalise:
             sums = weights.sum(axis=0) / share
-            least = [] if sums.all() else [HARDLY_SEEN]  # at the edge of what is seen
-            amplified = sums.max() / np.maximum(np.append(sums[sums > 0], least), HARDLY_SEEN)
+            # If any point is not covered at all, pixels on the way to it have every small sum.
+            least = [] if sums.all() else [LEAST_WEIGHT_SUM]
+            amplified = sums.max() / np.maximum(np.append(sums[sums > 0], least), LEAST_WEIGHT_SUM)
             result /= float(np.sqrt(np.mean(amplified**2)))
         return result
 
     def _all(self, wavelength_m: float) -> NDArray[np.float64]:
-        """Return weights all over the window."""
+        """Weights at 65 sines, evenly over the whole beam."""
         return self._inside(np.linspace(*np.clip(self.limits, -1, 1), 65), wavelength_m)
 
     def weights(self, q: ArrayLike, wavelength_m: float = math.inf) -> NDArray[np.float64]:
@@ -262,9 +266,9 @@ class BeamWindow:
     def table(self, wavelength_m: float = math.inf) -> NDArray[np.float32]:
         """Return the weights as cubics, float32 [INTERVALS, 4], constant terms first.
 
-        Their argument runs from 0 to 1 over each of equal intervals of the sine between `limits`,
-        or -1 and 1. Blocks of pixels take one beyond its interval, too: where a kink lies in an
-        interval, its cubic is that of the side on which its middle lies.
+        The cubics cover equal intervals of the sine between `limits` (or -1 and 1); the argument
+        of each runs from 0 to 1. Blocks of pixels also evaluate a cubic beyond its interval.
+        Therefore the cubic of an interval with a kink follows the side on which its middle lies.
 
         Raises
         ------
@@ -272,10 +276,10 @@ class BeamWindow:
             If "inverse" would have to amplify by more than 40 dB.
         """
         low, high = np.clip(self.limits, -1, 1)
-        place = np.array([0.0, 0.25, 0.75, 1.0])
+        nodes = np.array([0.0, 0.25, 0.75, 1.0])
         number = np.arange(INTERVALS)[:, None]
         q, middle = (
-            low + (high - low) * (number + each) / INTERVALS for each in (place, np.array([0.5]))
+            low + (high - low) * (number + each) / INTERVALS for each in (nodes, np.array([0.5]))
         )
         values = self._inside(q, wavelength_m, middle)
         if not values.max() <= _MOST_WEIGHT:
@@ -284,66 +288,42 @@ class BeamWindow:
                 f"{self.element_length_m:g} m at a wavelength of {wavelength_m:g} m, "
                 f"got {self.width_deg:g} degrees"
             )
-        cubics = np.linalg.solve(np.vander(place, increasing=True), values.T).T
+        cubics = np.linalg.solve(np.vander(nodes, increasing=True), values.T).T
         return cubics.astype(np.float32)
 
     def directions(self, lines: RangeLines) -> NDArray[np.float64]:
-        """Return the unit direction of the track for every channel, float64 [channels, 3].
+        """Return the unit direction of the track at every channel, float64 [channels, 3].
 
-        That is `along`, or from the lines the tangent, next to each phase centre, of local cubics:
-        least-squares fits to the phase centres of `track_pings` pings each. Successive channels of
-        one transmitter position are a ping. A step of ten usual ones begins another leg, which is
-        smoothed by itself.
+        This is `along` where it was given. Otherwise the lines' phase centres give it, smoothed
+        over `track_pings` pings; see `clsas.sonar.directions.track_directions`.
 
         Raises
         ------
         TypeError
-            If `lines` is of another type.
+            If `lines` is not a RangeLines.
         ValueError
-            If `along` is of another number of channels, or not given where there is one ping only
-            or a track stands still.
+            If `along` has another number of channels; or if `along` is missing and there is only
+            one ping, or the track stands still.
         """
         validate.instance("lines", lines, RangeLines)
-        if self.along is not None:
-            if self.along.ndim == 2 and len(self.along) != lines.channels:
-                raise ValueError(
-                    f"along must hold one direction or one for each of {lines.channels} channels, "
-                    f"got {len(self.along)}"
-                )
-            return np.broadcast_to(self.along, (lines.channels, 3))
-        first, channels_m = lines.ping_starts, lines.phase_centres_m
-        pings = len(first)
-        if pings < 2:
+        if self.along is None:
+            return track_directions(lines, self.track_pings)
+        if self.along.ndim == 2 and len(self.along) != lines.channels:
             raise ValueError(
-                f"along must be given: {lines.channels} channels of one transmitter position have "
-                f"no track"
+                f"along must hold one direction or one for each of {lines.channels} channels, "
+                f"got {len(self.along)}"
             )
-        counts = np.diff(np.append(first, lines.channels))
-        centres_m = np.add.reduceat(channels_m, first, axis=0) / counts[:, None]
-        wanted = self.track_pings or min(max(pings // _TRACK_SHARE, 5), MOST_TRACK_PINGS)
-        tangent = np.concatenate([_tangents(leg_m, wanted) for leg_m in _legs(centres_m)])
-        speed = np.linalg.norm(tangent, axis=1)
-        extent_m = np.linalg.norm(np.ptp(centres_m, axis=0))
-        if not speed.min() > 1e-3 * extent_m / pings:
-            raise ValueError("along must be given: the lines' phase centres stand still")
-        tangent /= speed[:, None]
-        # Of an array, a channel ahead of its ping's middle lies where later pings are.
-        ping = np.repeat(np.arange(pings), counts)
-        steps_m = np.linalg.norm(np.diff(centres_m, axis=0), axis=1)
-        covered_m = np.concatenate([[0.0], np.cumsum(steps_m)])
-        ahead_m = channels_m - centres_m[ping]
-        place_m = covered_m[ping] + np.einsum("ci,ci->c", ahead_m, tangent[ping])
-        found = np.stack([np.interp(place_m, covered_m, each) for each in tangent.T], axis=-1)
-        return found / np.linalg.norm(found, axis=1, keepdims=True)
+        return np.broadcast_to(self.along, (lines.channels, 3))
 
     def _inside(
         self, q: NDArray[np.float64], wavelength_m: float, around: NDArray[np.float64] | None = None
     ) -> NDArray[np.float64]:
-        """Return the weights as if the window had no end.
+        """Weights at sines `q`, continued smoothly beyond the limits.
 
-        Where it has kinks, those on the side of a kink where `around` lies go on beyond it.
+        With `around`, they are also continued beyond the kinks of "tukey", from the side of each
+        kink on which `around` lies.
         """
-        angle, u = self._place(q)
+        angle, u = self._from_axis(q)
         if self.shape == "hann":
             return np.cos(np.pi * u) ** 2
         if self.shape == "hamming":
@@ -355,7 +335,7 @@ class BeamWindow:
                 return np.ones_like(q)
             share, of_side = (
                 np.maximum((0.5 - np.abs(each)) / self.taper, 0.0)
-                for each in (u, u if around is None else self._place(around)[1])
+                for each in (u, u if around is None else self._from_axis(around)[1])
             )
             return np.sin(np.pi * np.where(of_side < 0.5, share, 0.5)) ** 2
         if self.shape == "inverse":
@@ -363,264 +343,17 @@ class BeamWindow:
             return 1 / np.maximum(one_way**2, 1e-30)
         return np.ones_like(q)
 
-    def _place(self, q: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return angles from the window's middle of some sines, in radians and in widths."""
+    def _from_axis(self, q: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Angles from the beam's axis at sines `q`, in radians and in widths of the beam."""
         angle = np.arcsin(np.clip(q, -1, 1)) - math.radians(self.squint_deg)
         return angle, angle / math.radians(self.width_deg)
 
 
-def sines(
-    points_m: NDArray[np.float64],
-    phase_centres_m: NDArray[np.float64],
-    along: NDArray[np.float64],
-) -> NDArray[np.float64]:
-    """Return the sine of the aspect angle of every point, float64 [channels, points].
-
-    Takes points [points, 3] and the phase centre and the direction of every channel, [channels, 3];
-    a phase centre's own sine is 0.
-    """
-    return _sines(points_m, phase_centres_m, along)[0].T
-
-
-def channel_ranges(
-    window: BeamWindow,
-    lines: RangeLines,
-    along: NDArray[np.float64],
-    centres_m: NDArray[np.float64],
-    radius_m: float,
-) -> NDArray[np.int32]:
-    """Return which channels may see balls of one radius about centres [parts, 3], int32 [parts, 2].
-
-    That is the first channel whose window touches a ball and the one after the last; both 0 where
-    there is none. Runs of channels are tried before single ones.
-    """
-    phase_centres_m = lines.phase_centres_m
-    count, run = lines.channels, _CHANNELS_TOGETHER
-    starts = np.arange(0, count, run)
-    run_of = np.arange(count) // run
-    # A run is one channel in its middle, less sharp by how far its channels lie and point apart.
-    middle_m = np.add.reduceat(phase_centres_m, starts, axis=0) / np.bincount(run_of)[:, None]
-    reach_m = np.linalg.norm(phase_centres_m - middle_m[run_of], axis=1)
-    direction = along[starts]
-    spread = np.linalg.norm(along - direction[run_of], axis=1)
-    sine, distance_m = _sines(centres_m, middle_m, direction)
-    seen = _touches(
-        window,
-        sine,
-        distance_m,
-        radius_m + np.maximum.reduceat(reach_m, starts),
-        np.maximum.reduceat(spread, starts),
-    )
-    some = np.flatnonzero(seen.any(axis=1))
-    ranges = np.zeros((len(centres_m), 2), np.int32)
-    if not some.size:
-        return ranges
-    seen = seen[some]
-
-    def touched(runs: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Return which channels of one run for each part touch it; the last stands for none."""
-        index = np.minimum(runs[:, None] * run + np.arange(run), count - 1)
-        square, sine = np.zeros(index.shape), np.zeros(index.shape)
-        for axis in range(3):
-            offset_m = centres_m[some, axis, None] - phase_centres_m[index, axis]
-            sine += offset_m * along[index, axis]
-            square += offset_m * offset_m
-        distance_m = np.sqrt(square)
-        return _touches(window, sine / np.maximum(distance_m, 1e-30), distance_m, radius_m)
-
-    first = seen.argmax(axis=1)
-    last = len(starts) - 1 - seen[:, ::-1].argmax(axis=1)
-    inside = touched(first)
-    begin = run * first + np.where(inside.any(axis=1), inside.argmax(axis=1), run)
-    inside = touched(last)
-    end = run * (last + 1) - np.where(inside.any(axis=1), inside[:, ::-1].argmax(axis=1), run)
-    end = np.minimum(end, count)
-    ranges[some, 0] = np.where(begin < end, begin, 0)
-    ranges[some, 1] = np.where(begin < end, end, 0)
-    return ranges
-
-
-@dataclass(frozen=True, eq=False)
-class Sight:
-    """How places on a track see points, and boxes about them.
-
-    Attributes
-    ----------
-    sine, inverse_m : float64 [points, places]
-        Of the aspect angle of a point, and one over its distance.
-    axes_m : float64 [axes, 3]
-        Along the sides of boxes.
-    slopes : float64 [axes, points, places]
-        By how much the sine changes along each, at most.
-    """
-
-    sine: NDArray[np.float64]
-    inverse_m: NDArray[np.float64]
-    axes_m: NDArray[np.float64]
-    slopes: NDArray[np.float64]
-
-    @classmethod
-    def of(
-        cls,
-        points_m: NDArray[np.float64],
-        axes_m: NDArray[np.float64],
-        track_m: NDArray[np.float64],
-        along: NDArray[np.float64],
-        index: NDArray[np.int64] | None = None,
-    ) -> Sight:
-        """Return how places [:, 3] on a track of some unit directions see points [n, 3].
-
-        All of them see all points; with `index` [n, places] those see a point that it names.
-        """
-        changes = along @ axes_m.T  # [:, axes]
-        if index is None:
-            sine, distance_m = _sines(points_m, track_m, along)
-            slopes = (axes_m @ points_m.T)[..., None] - (axes_m @ track_m.T)[:, None]
-            changes = changes.T
-        else:
-            sine, square = np.zeros(index.shape), np.zeros(index.shape)
-            for point_m, place_m, direction in zip(points_m.T, track_m.T, along.T, strict=True):
-                offset_m = point_m[:, None] - place_m[index]
-                sine += offset_m * direction[index]
-                square += offset_m * offset_m
-            distance_m = np.sqrt(square)
-            sine /= np.maximum(distance_m, 1e-9)
-            towards_m = axes_m @ points_m.T
-            slopes = [
-                each[:, None] - of_place[index]
-                for each, of_place in zip(towards_m, axes_m @ track_m.T, strict=True)
-            ]
-            changes = [each[index] for each in changes.T]
-        inverse_m = 1 / np.maximum(distance_m, 1e-9, out=distance_m)
-        for slope, change in zip(slopes, changes, strict=True):
-            slope *= inverse_m
-            slope *= sine
-            np.subtract(change, slope, out=slope)
-            slope *= inverse_m
-            np.abs(slope, out=slope)
-        return cls(sine, inverse_m, axes_m, slopes)
-
-    def inside_by(
-        self,
-        limits: tuple[float, float],
-        half: NDArray[np.float64],
-        around_m: float | NDArray[np.float64] = 0.0,
-        spread: float | NDArray[np.float64] = 0.0,
-    ) -> NDArray[np.float64]:
-        """Return how far into a window boxes about the points reach, [points, places].
-
-        That is in sines of the aspect angle, negative where a box lies outside.
-
-        Parameters
-        ----------
-        limits : (low, high)
-            Sines between which the window lies.
-        half : float64 [axes]
-            Half their sides, in lengths of the axes.
-        around_m, spread : float or float64 [places]
-            How far from the places other positions and directions may lie that they stand for.
-        """
-        radius_m = np.linalg.norm(np.abs(half[:, None] * self.axes_m).sum(axis=0))
-        reach = radius_m * self.inverse_m
-        reach *= reach
-        for each, slope in zip(half, self.slopes, strict=True):
-            reach += each * slope
-        low, high = limits
-        if np.any(around_m) or np.any(spread):
-            ratio = np.minimum(around_m * self.inverse_m, 0.5)
-            # From so much nearer the box reaches further; half way to it, anywhere.
-            reach = (reach + ratio + ratio**3) / (1 - ratio) + spread
-            reach[ratio == 0.5] = np.inf
-        # Beyond which of the limits: the one that is nearer.
-        reach -= np.abs(self.sine - (low + high) / 2)
-        reach += (high - low) / 2
-        return reach
-
-
-def touches_boxes(
-    limits: tuple[float, float],
-    centres_m: NDArray[np.float64],
-    half_m: NDArray[np.float64],
-    track_m: NDArray[np.float64],
-    along: NDArray[np.float64],
-    around_m: float | NDArray[np.float64] = 0.0,
-    spread: float | NDArray[np.float64] = 0.0,
-) -> NDArray[np.bool_]:
-    """Return whether a window may touch boxes, bool [boxes, places]; see `Sight`.
-
-    Parameters
-    ----------
-    limits : (low, high)
-        Sines of the aspect angle between which the window lies.
-    centres_m : float64 [boxes, 3]
-    half_m : float64 [axes, 3]
-        Half their sides, as vectors.
-    track_m, along : float64 [places, 3]
-        Positions on the track and its unit direction there.
-    around_m, spread : float or float64 [places]
-        How far from them other positions and directions may lie that these stand for.
-    """
-    sight = Sight.of(centres_m, half_m, track_m, along)
-    return sight.inside_by(limits, np.ones(len(half_m)), around_m, spread) > 0
-
-
-def _sines(
-    points_m: NDArray[np.float64], centres_m: NDArray[np.float64], along: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return sines of aspect angles, 0 at 0 m, and distances, [points, centres]."""
-    origin_m = centres_m[0]  # so that little cancels
-    distance_m = cdist(points_m, centres_m)
-    sine = (points_m - origin_m) @ along.T
-    sine -= np.einsum("ci,ci->c", centres_m - origin_m, along)
-    sine /= np.where(distance_m > 0, distance_m, np.inf)
-    return sine, distance_m
-
-
-def _touches(
-    window: BeamWindow,
-    sine: NDArray[np.float64],
-    distance_m: NDArray[np.float64],
-    radius_m: float | NDArray[np.float64],
-    spread: float | NDArray[np.float64] = 0.0,
-) -> NDArray[np.bool_]:
-    """Return whether a window may touch a ball, seen at a sine and a distance.
-
-    `spread` is by how much the direction may be another: the length of a unit vector's change.
-    """
-    low, high = window.limits
-    ratio = radius_m / np.maximum(distance_m, 1e-30)
-    # The way to a point of the ball turns by asin(ratio) at most, its unit vector by that chord.
-    wider = ratio * (1 + 0.42 * ratio * ratio) + (spread + _ROUNDING)
-    return (ratio >= 1) | ((sine + wider > low) & (sine - wider < high))
-
-
-def _legs(centres_m: NDArray[np.float64]) -> list[NDArray[np.float64]]:
-    """Return the phase centres of pings, [n, 3], leg by leg: where a track goes on elsewhere."""
-    steps_m = np.linalg.norm(np.diff(centres_m, axis=0), axis=1)
-    usual_m = np.median(steps_m)
-    starts = [0]
-    for start in np.flatnonzero(steps_m > _JUMP * usual_m) + 1 if usual_m else ():
-        if min(start - starts[-1], len(centres_m) - start) >= _SHORTEST_LEG:
-            starts.append(start)
-    return np.split(centres_m, starts[1:])
-
-
-def _tangents(centres_m: NDArray[np.float64], pings: int) -> NDArray[np.float64]:
-    """Return the tangents of local cubics through so many of a leg's pings, [n, 3]."""
-    count = len(centres_m)
-    # Odd, and four pings at least where there are as many.
-    window = min(2 * (pings // 2) + 1, count - 1 + count % 2)
-    if window < 2:
-        return np.diff(centres_m, axis=0).repeat(2, axis=0)
-    from scipy.signal import savgol_filter  # slow to import
-
-    return savgol_filter(centres_m, window, min(3, window - 1), deriv=1, axis=0, mode="interp")
-
-
 def _taylor(u: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the Taylor window at u from -0.5 to 0.5, 1 in its middle.
+    """Taylor window at u from -0.5 to 0.5, scaled to 1 in the middle.
 
-    1 + sum_m F_m cos(2 pi m u), with Taylor's factors for near side lobes of one height.
+    It is 1 + sum_m F_m cos(2 pi m u). Taylor's factors F_m give the nearest side lobes one height
+    (Carrara, Goodman and Majewski 1995, pages 512-513).
     """
     terms = np.arange(1, _TAYLOR_TERMS)
     a = math.acosh(10 ** (_TAYLOR_SIDE_LOBES_DB / 20)) / np.pi

@@ -23,7 +23,8 @@ from clsas.core.decibels import power
 from clsas.core.geometry import pairwise_range_m
 from clsas.core.grid import Grid
 from clsas.core.lines import RangeLines, some_channels
-from clsas.sonar.beam import BeamWindow, sines
+from clsas.sonar.beam import BeamWindow
+from clsas.sonar.visibility import sines
 
 MOTION = "motion during flight"
 APART = "transmitter and receiver apart"

@@ -1,140 +1,267 @@
-"""Whether any line reaches a grid, and the warning where none does."""
+"""Visibility: which channels see a point, a ball or a box through a beam."""
 
 from __future__ import annotations
 
-import itertools
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.distance import cdist
 
-from clsas.core import validate
-from clsas.core.geometry import pairwise_range_m
-from clsas.core.grid import Grid
-from clsas.core.lines import RangeLines, some_channels
-from clsas.sonar.beam import BeamWindow, sines, touches_boxes
+from clsas.core.lines import RangeLines
+from clsas.sonar.beam import BeamWindow
 
-_CHANNELS, _POINTS = 64, 16  # of a first look: channels, and pixels along either side of a grid
-_BLOCKS = 8  # along either side of a grid: smaller ones find smaller gaps
-_TAPS = 8  # samples beyond its ends that an interpolated line is not zero at
-_SPEED_RATIO = 0.05  # of receivers to sound, at most
+_ROUNDING = 1e-5  # more than the device's rounding error of a sine
+_RUN = 16  # channels tested together first
 
 
-def warn_unreached(
-    lines: RangeLines, grid: Grid, beam: BeamWindow | None, along: NDArray[np.float64] | None
-) -> bool:
-    """Warn where no pixel lies within the range of any line, or the beam; return whether it did.
+def sines(
+    points_m: NDArray[np.float64],
+    phase_centres_m: NDArray[np.float64],
+    along: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """Return the sine of every point's aspect angle at every channel, float64 [channels, points].
 
-    `along` are the track's directions for a beam, [channels, 3]. Nothing is said of lines of zeros.
+    The sine is 0 at the phase centre itself.
+
+    Parameters
+    ----------
+    points_m : float64 [points, 3]
+    phase_centres_m, along : float64 [channels, 3]
+        Phase centres and the track's unit directions.
     """
-    if _reached_at_points(lines, grid, beam, along):
-        return False
-    centres_m, half_m = _boxes(grid)
-    if _reached_in_boxes(lines, centres_m, half_m, beam, along) or not lines.samples.any():
-        return False
-    warn_unseen(lines, centres_m, beam, along)
-    return True
+    return _sines(points_m, phase_centres_m, along)[0].T
 
 
-def _reached_at_points(
-    lines: RangeLines, grid: Grid, beam: BeamWindow | None, along: NDArray[np.float64] | None
-) -> bool:
-    """Return whether some channels receive any of some pixels: true of nearly every grid."""
-    some = some_channels(lines.channels, _CHANNELS)
-    part, points_m = lines.select(some), grid.spread(_POINTS)
-    range_m = pairwise_range_m(
-        points_m, part.tx_m, part.rx_m, part.rx_velocity_m_s, part.sound_speed_m_s
-    )
-    inside = (range_m >= part.first_range_m) & (range_m <= part.last_range_m)
-    if beam is not None:
-        low, high = beam.limits
-        sine = sines(points_m, part.phase_centres_m, along[some]).T
-        inside &= (sine > low) & (sine < high)
-    return bool(inside.any())
-
-
-def _reached_in_boxes(
+def channel_ranges(
+    beam: BeamWindow,
     lines: RangeLines,
+    along: NDArray[np.float64],
+    centres_m: NDArray[np.float64],
+    radius_m: float,
+) -> NDArray[np.int32]:
+    """Return the range of channels whose beam touches each of some balls, int32 [balls, 2].
+
+    A range is the first of these channels and the one after the last, or 0, 0 if there is none.
+    Runs of 16 channels are tested first, then the single channels of the runs at both ends.
+
+    Parameters
+    ----------
+    beam : BeamWindow
+    lines : RangeLines
+    along : float64 [channels, 3]
+        The track's unit directions.
+    centres_m : float64 [balls, 3]
+    radius_m : float
+        Radius of every ball.
+    """
+    phase_centres_m = lines.phase_centres_m
+    count, run = lines.channels, _RUN
+    starts = np.arange(0, count, run)
+    run_of = np.arange(count) // run
+    # One channel in the middle stands for a run. The margins are how far the others lie from it
+    # and how much their directions differ.
+    middle_m = np.add.reduceat(phase_centres_m, starts, axis=0) / np.bincount(run_of)[:, None]
+    reach_m = np.linalg.norm(phase_centres_m - middle_m[run_of], axis=1)
+    direction = along[starts]
+    spread = np.linalg.norm(along - direction[run_of], axis=1)
+    sine, distance_m = _sines(centres_m, middle_m, direction)
+    visible = _touches(
+        beam,
+        sine,
+        distance_m,
+        radius_m + np.maximum.reduceat(reach_m, starts),
+        np.maximum.reduceat(spread, starts),
+    )
+    some = np.flatnonzero(visible.any(axis=1))
+    ranges = np.zeros((len(centres_m), 2), np.int32)
+    if not some.size:
+        return ranges
+    visible = visible[some]
+
+    def touched(runs: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Channels of one run per ball that touch it, [balls, 16]; the last channel is repeated."""
+        index = np.minimum(runs[:, None] * run + np.arange(run), count - 1)
+        square, sine = np.zeros(index.shape), np.zeros(index.shape)
+        for axis in range(3):
+            offset_m = centres_m[some, axis, None] - phase_centres_m[index, axis]
+            sine += offset_m * along[index, axis]
+            square += offset_m * offset_m
+        distance_m = np.sqrt(square)
+        return _touches(beam, sine / np.maximum(distance_m, 1e-30), distance_m, radius_m)
+
+    first = visible.argmax(axis=1)
+    last = len(starts) - 1 - visible[:, ::-1].argmax(axis=1)
+    inside = touched(first)
+    begin = run * first + np.where(inside.any(axis=1), inside.argmax(axis=1), run)
+    inside = touched(last)
+    end = run * (last + 1) - np.where(inside.any(axis=1), inside[:, ::-1].argmax(axis=1), run)
+    end = np.minimum(end, count)
+    ranges[some, 0] = np.where(begin < end, begin, 0)
+    ranges[some, 1] = np.where(begin < end, end, 0)
+    return ranges
+
+
+@dataclass(frozen=True, eq=False)
+class Visibility:
+    """Aspect angles of points, and of boxes around them, from positions on a track.
+
+    Attributes
+    ----------
+    sine, inverse_m : float64 [points, positions]
+        Sine of the aspect angle of a point, and one over its distance.
+    axes_m : float64 [axes, 3]
+        Directions of the boxes' sides.
+    slopes : float64 [axes, points, positions]
+        Magnitude of the sine's derivative along each axis.
+    """
+
+    sine: NDArray[np.float64]
+    inverse_m: NDArray[np.float64]
+    axes_m: NDArray[np.float64]
+    slopes: NDArray[np.float64]
+
+    @classmethod
+    def of(
+        cls,
+        points_m: NDArray[np.float64],
+        axes_m: NDArray[np.float64],
+        track_m: NDArray[np.float64],
+        along: NDArray[np.float64],
+        index: NDArray[np.int64] | None = None,
+    ) -> Visibility:
+        """Return the visibility of points from positions on a track.
+
+        Parameters
+        ----------
+        points_m : float64 [points, 3]
+        axes_m : float64 [axes, 3]
+        track_m, along : float64 [track positions, 3]
+            Positions on the track, and its unit direction there.
+        index : int64 [points, positions], optional
+            Track positions to evaluate for each point. All, unless given.
+        """
+        changes = along @ axes_m.T  # [:, axes]
+        if index is None:
+            sine, distance_m = _sines(points_m, track_m, along)
+            slopes = (axes_m @ points_m.T)[..., None] - (axes_m @ track_m.T)[:, None]
+            changes = changes.T
+        else:
+            sine, square = np.zeros(index.shape), np.zeros(index.shape)
+            for point_m, from_m, direction in zip(points_m.T, track_m.T, along.T, strict=True):
+                offset_m = point_m[:, None] - from_m[index]
+                sine += offset_m * direction[index]
+                square += offset_m * offset_m
+            distance_m = np.sqrt(square)
+            sine /= np.maximum(distance_m, 1e-9)
+            towards_m = axes_m @ points_m.T
+            slopes = [
+                each[:, None] - from_m[index]
+                for each, from_m in zip(towards_m, axes_m @ track_m.T, strict=True)
+            ]
+            changes = [each[index] for each in changes.T]
+        inverse_m = 1 / np.maximum(distance_m, 1e-9, out=distance_m)
+        for slope, change in zip(slopes, changes, strict=True):
+            slope *= inverse_m
+            slope *= sine
+            np.subtract(change, slope, out=slope)
+            slope *= inverse_m
+            np.abs(slope, out=slope)
+        return cls(sine, inverse_m, axes_m, slopes)
+
+    def overlap(
+        self,
+        limits: tuple[float, float],
+        half: NDArray[np.float64],
+        around_m: float | NDArray[np.float64] = 0.0,
+        spread: float | NDArray[np.float64] = 0.0,
+    ) -> NDArray[np.float64]:
+        """Depth by which boxes around the points may reach into a beam, [points, positions].
+
+        The depth is an upper bound in sine of the aspect angle. It is negative where no part of
+        the box lies in the beam.
+
+        Parameters
+        ----------
+        limits : (low, high)
+            Sines of the aspect angle at which the beam begins and ends.
+        half : float64 [axes]
+            Half the boxes' sides, in lengths of the axes.
+        around_m, spread : float or float64 [positions]
+            A position stands for others within this distance, whose directions differ from its
+            own by a vector of at most this length.
+        """
+        radius_m = np.linalg.norm(np.abs(half[:, None] * self.axes_m).sum(axis=0))
+        reach = radius_m * self.inverse_m
+        reach *= reach
+        for each, slope in zip(half, self.slopes, strict=True):
+            reach += each * slope
+        low, high = limits
+        if np.any(around_m) or np.any(spread):
+            ratio = np.minimum(around_m * self.inverse_m, 0.5)
+            # Seen from closer, the box fills a larger angle. From half the distance it may lie
+            # in any direction.
+            reach = (reach + ratio + ratio**3) / (1 - ratio) + spread
+            reach[ratio == 0.5] = np.inf
+        # The depth past the nearer limit, which is the smaller of the two depths.
+        reach -= np.abs(self.sine - (low + high) / 2)
+        reach += (high - low) / 2
+        return reach
+
+
+def touches_boxes(
+    limits: tuple[float, float],
     centres_m: NDArray[np.float64],
     half_m: NDArray[np.float64],
-    beam: BeamWindow | None,
-    along: NDArray[np.float64] | None,
-) -> bool:
-    """Return whether any channel may receive anything from boxes; it may not where this is false.
+    track_m: NDArray[np.float64],
+    along: NDArray[np.float64],
+    around_m: float | NDArray[np.float64] = 0.0,
+    spread: float | NDArray[np.float64] = 0.0,
+) -> NDArray[np.bool_]:
+    """Return which boxes a beam may touch from which positions, bool [boxes, positions].
 
-    Boxes have centres and half sides along x, y and z, both [boxes, 3].
+    Parameters
+    ----------
+    limits : (low, high)
+        Sines of the aspect angle at which the beam begins and ends.
+    centres_m : float64 [boxes, 3]
+    half_m : float64 [axes, 3]
+        Half the boxes' sides, as vectors.
+    track_m, along : float64 [positions, 3]
+        Positions on the track, and its unit direction there.
+    around_m, spread : float or float64 [positions]
+        What each position stands for; see `Visibility.overlap`.
     """
-    beyond_m = _TAPS * lines.range_step_m
-    for centre_m, sides_m in zip(centres_m, half_m, strict=True):
-        range_m = pairwise_range_m(
-            centre_m[None], lines.tx_m, lines.rx_m, lines.rx_velocity_m_s, lines.sound_speed_m_s
-        )[0]
-        radius_m = np.linalg.norm(sides_m) * (1 + 2 * _SPEED_RATIO) + beyond_m
-        reached = range_m + radius_m >= lines.first_range_m
-        reached &= range_m - radius_m <= lines.last_range_m
-        if beam is not None and reached.any():
-            track_m, direction = lines.phase_centres_m[reached], along[reached]
-            reached = touches_boxes(
-                beam.limits, centre_m[None], np.diag(sides_m), track_m, direction
-            )
-        if reached.any():
-            return True
-    return False
+    visibility = Visibility.of(centres_m, half_m, track_m, along)
+    return visibility.overlap(limits, np.ones(len(half_m)), around_m, spread) > 0
 
 
-def _boxes(grid: Grid) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return centres and half sides, [boxes, 3], of boxes that hold all pixels of a grid."""
-    parts = [
-        [slice(first, last) for first, last in itertools.pairwise(_cuts(count))]
-        for count in grid.shape[:2]
-    ]
-    ends_m = []
-    for part in itertools.product(*parts):
-        block = grid.window(*part)
-        if block.is_planar:
-            block = block.window(*(slice(None, None, max(n - 1, 1)) for n in block.shape))
-        positions_m = block.positions_m().reshape(-1, 3)
-        ends_m.append((positions_m.min(axis=0), positions_m.max(axis=0)))
-    low_m, high_m = np.array(ends_m).swapaxes(0, 1)
-    return (low_m + high_m) / 2, (high_m - low_m) / 2
+def _sines(
+    points_m: NDArray[np.float64], centres_m: NDArray[np.float64], along: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Sines of aspect angles (0 at distance 0) and distances, both [points, centres]."""
+    origin_m = centres_m[0]  # keeps coordinates small, which far from the origin would cancel
+    distance_m = cdist(points_m, centres_m)
+    sine = (points_m - origin_m) @ along.T
+    sine -= np.einsum("ci,ci->c", centres_m - origin_m, along)
+    sine /= np.where(distance_m > 0, distance_m, np.inf)
+    return sine, distance_m
 
 
-def _cuts(count: int) -> NDArray[np.int64]:
-    return np.unique(np.linspace(0, count, min(count, _BLOCKS) + 1).astype(np.int64))
+def _touches(
+    beam: BeamWindow,
+    sine: NDArray[np.float64],
+    distance_m: NDArray[np.float64],
+    radius_m: float | NDArray[np.float64],
+    spread: float | NDArray[np.float64] = 0.0,
+) -> NDArray[np.bool_]:
+    """Whether a beam may touch a ball whose centre lies at a sine and a distance.
 
-
-def warn_unseen(
-    lines: RangeLines,
-    centres_m: NDArray[np.float64],
-    beam: BeamWindow | None,
-    along: NDArray[np.float64] | None,
-) -> None:
-    """Warn that lines add nothing to parts of a grid with centres [parts, 3]."""
-    some = lines.select(slice(None, None, max(lines.channels // 64, 1)))
-    range_m = pairwise_range_m(
-        centres_m[:: max(len(centres_m) // 1024, 1)],
-        some.tx_m,
-        some.rx_m,
-        some.rx_velocity_m_s,
-        some.sound_speed_m_s,
-    )
-    spans = (
-        f"the lines span {lines.first_range_m.min():.6g} to {lines.last_range_m.max():.6g} m, the "
-        f"grid lies at {range_m.min():.6g} to {range_m.max():.6g} m"
-    )
-    if beam is None:
-        validate.warn(
-            f"no pixel of the grid lies within any line's range, so the image is zero: {spans}"
-        )
-        return
-    sine = sines(
-        centres_m[:: max(len(centres_m) // 1024, 1)],
-        some.phase_centres_m,
-        along[:: max(lines.channels // 64, 1)],
-    )
-    low, high = np.degrees(np.arcsin(np.clip([sine.min(), sine.max()], -1, 1)))
-    first, last = np.degrees(beam.limits_rad)
-    validate.warn(
-        f"no pixel of the grid lies within the beam and the range of any line, so the image is "
-        f"zero: the beam spans {first:.4g} to {last:.4g} degrees, the grid lies at {low:.4g} to "
-        f"{high:.4g} degrees; {spans}"
-    )
+    `spread` is the largest change of the track's unit direction, as the length of a vector.
+    """
+    low, high = beam.limits
+    ratio = radius_m / np.maximum(distance_m, 1e-30)
+    # The direction to a point of the ball differs from that to its centre by at most asin(ratio).
+    # The unit vectors then differ by the chord of that angle.
+    wider = ratio * (1 + 0.42 * ratio * ratio) + (spread + _ROUNDING)
+    return (ratio >= 1) | ((sine + wider > low) & (sine - wider < high))

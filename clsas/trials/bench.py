@@ -28,7 +28,8 @@ from clsas.planning.planner import plan
 from clsas.products.tradeoff import REFERENCE_DB
 from clsas.simulation.scenes import PointTargets
 from clsas.simulation.simulator import simulate_lines
-from clsas.sonar.beam import BeamWindow, sines
+from clsas.sonar.beam import BeamWindow
+from clsas.sonar.visibility import sines
 from clsas.trials import wreck
 
 _PIXELS = 300  # random pixels at which errors are measured

@@ -21,7 +21,7 @@ import clsas
 from clsas.factorized import thesis as nearest
 from clsas.opencl.device import Device, open_device
 from clsas.simulation import scenes as scene
-from clsas.sonar.beam import sines, touches_boxes
+from clsas.sonar.visibility import sines, touches_boxes
 from clsas.trials import wreck
 
 PIXELS = 1024

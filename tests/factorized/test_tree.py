@@ -16,7 +16,8 @@ from clsas.planning.factorize import factorize
 from clsas.planning.planner import plan
 from clsas.signal import interpolation
 from clsas.signal.spectrum import Spectrum
-from clsas.sonar.beam import BeamWindow, touches_boxes
+from clsas.sonar.beam import BeamWindow
+from clsas.sonar.visibility import touches_boxes
 
 FLAT = Spectrum(0.0, (np.arange(64) + 0.5) / 128, np.full(64, 1 / 64))
 

@@ -28,7 +28,8 @@ from clsas.planning import fastest, planner
 from clsas.planning.costs import Costs
 from clsas.planning.planner import plan
 from clsas.planning.view import View
-from clsas.sonar.beam import BeamWindow, sines
+from clsas.sonar.beam import BeamWindow
+from clsas.sonar.visibility import sines
 
 # What is chosen
 

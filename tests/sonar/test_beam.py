@@ -7,7 +7,6 @@ from cases import (
     CARRIER,
     STEP,
     along_x,
-    beside,
     bistatic,
     height_map,
     lines_over,
@@ -31,8 +30,9 @@ from clsas.exact.run import execute
 from clsas.exact.tiles import Groups, Tiles
 from clsas.simulation.scenes import PointTargets
 from clsas.simulation.simulator import simulate_lines
-from clsas.sonar.beam import INTERVALS, SHAPES, BeamWindow, channel_ranges, sines
+from clsas.sonar.beam import INTERVALS, SHAPES, BeamWindow
 from clsas.sonar.system import element_pattern
+from clsas.sonar.visibility import channel_ranges, sines
 
 FINE = {"taps": 8, "upsampling": 4}
 X = (1.0, 0, 0)
@@ -132,84 +132,13 @@ def test_an_elements_window_is_its_half_power_beam():
     assert inverse.weights(inverse.limits[1] - 1e-9, 0.012) == pytest.approx(2, abs=1e-4)
 
 
-# Direction of the track
-
-
-def track_lines(tx, rx=None):
-    return RangeLines(
-        np.ones((len(tx), 1), complex), 1.0, 1.0, tx, tx if rx is None else rx, 1e5, 1500.0
-    )
-
-
-def test_the_direction_is_that_of_the_phase_centres():
-    straight = along_x(50, 0.1) @ np.array([[0.6, 0.8, 0], [0, 1, 0], [0, 0, 1]])
-    np.testing.assert_allclose(
-        BeamWindow(10).directions(track_lines(straight)), [[0.6, 0.8, 0]] * 50, atol=1e-9
-    )
-    backwards = BeamWindow(10).directions(track_lines(straight[::-1]))
-    np.testing.assert_allclose(backwards, [[-0.6, -0.8, 0]] * 50, atol=1e-9)
-    few = BeamWindow(10).directions(track_lines(along_x(2, 1.0)))
-    np.testing.assert_allclose(few, [X, X], atol=1e-9)
-
-
-@pytest.mark.parametrize("pings", [2, 3, 4, 5, 6, 200])
-def test_receivers_of_one_ping_do_not_turn_it(pings):
-    tx = np.repeat(along_x(pings, 0.1), 6, axis=0)
-    rx = tx + np.tile(along_x(6, 0.2, y=0.05), (pings, 1))
-    np.testing.assert_allclose(
-        BeamWindow(10).directions(track_lines(tx, rx)), [X] * 6 * pings, atol=1e-9
-    )
-
-
-def test_sway_and_bends_are_followed_smoothly():
-    angle = np.linspace(0, 2 * np.pi, 400)
-    circle = 10 * np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
-    tangent = np.stack([-np.sin(angle), np.cos(angle), 0 * angle], axis=1)
-    rough = circle + np.random.default_rng(0).normal(0, 0.01, circle.shape)
-    found = BeamWindow(10).directions(track_lines(rough))
-    assert np.arccos(np.einsum("ci,ci->c", found, tangent)).max() < 3 * DEGREE
-    swaying = along_x(400, 0.05) + 0.02 * np.sin(np.arange(400) / 3)[:, None] * [0, 1, 1]
-    found = BeamWindow(10).directions(track_lines(swaying))
-    assert np.arccos(found[:, 0]).max() < 1 * DEGREE
-
-
-def test_a_direction_that_is_given_is_made_a_unit():
-    lines = track_lines(along_x(3, 1.0))
-    np.testing.assert_allclose(
-        BeamWindow(10, along=(0, 3, 4)).directions(lines), [[0, 0.6, 0.8]] * 3
-    )
-    each = BeamWindow(10, along=[[1, 0, 0], [0, 2, 0], [0, 0, 3]]).directions(lines)
-    np.testing.assert_allclose(each, np.eye(3))
-
-
-# Which channels are seen
+# Track's direction
 
 
 @pytest.mark.parametrize("length", [1e-300, 1e300])
 def test_a_direction_may_be_of_any_length(length):
     along = BeamWindow(20, along=(3 * length, 4 * length, 0)).along
     np.testing.assert_allclose(along, [0.6, 0.8, 0], rtol=1e-12)
-
-
-def test_ranges_hold_every_channel_that_sees_a_part_and_few_others():
-    rng = np.random.default_rng(1)
-    track = along_x(1000, 0.05) + rng.normal(0, 0.05, (1000, 3))
-    lines = track_lines(track, beside(track, 0.2, 0, 0.1))
-    beam = BeamWindow(6, "hann", squint_deg=10, along=X)
-    along = beam.directions(lines)
-    centres, radius = rng.uniform([-40, 5, -3], [40, 80, 3], (300, 3)), 0.5
-    ranges = channel_ranges(beam, lines, along, centres, radius)
-    way = rng.normal(size=(200, 3))
-    ball = radius * way / np.linalg.norm(way, axis=1)[:, None]
-    channel = np.arange(1000)
-    wasted = 0
-    for centre, (first, end) in zip(centres, ranges, strict=True):
-        seen = (beam.weights(sines(centre + ball, lines.phase_centres_m, along)) > 0).any(axis=1)
-        assert np.all(~seen | ((channel >= first) & (channel < end)))
-        if seen.any():
-            wasted += (end - first) - np.ptp(channel[seen]) - 1
-    assert 0 < (ranges[:, 1] - ranges[:, 0]).sum() < 0.2 * 300 * 1000
-    assert wasted < 0.15 * (ranges[:, 1] - ranges[:, 0]).sum()
 
 
 # Images
@@ -501,15 +430,3 @@ def test_what_does_not_fit_the_lines_is_refused():
     bare = dataclasses.replace(lines, carrier_hz=0.0)
     with pytest.raises(ValueError, match=r"carrier_hz must be above 0 .*'inverse'"):
         backproject(bare, grid, beam=BeamWindow(20, "inverse", element_length_m=0.015))
-
-
-def test_directions_of_legs():
-    """Each leg has its own, up to its ends."""
-    leg = np.zeros((60, 3))
-    leg[:, 0] = np.linspace(0, 30, 60)
-    across = leg[:, [1, 0, 2]] + [40, 5, 0]
-    tx_m = np.concatenate([leg, leg[::-1] + [0, 20, 0], across])
-    lines = RangeLines(np.ones((180, 1), complex), 0.0, 0.1, tx_m, tx_m, 1e5, 1500.0)
-    directions = BeamWindow(10).directions(lines)
-    expected = np.repeat([[1, 0, 0], [-1, 0, 0], [0, 1, 0]], 60, axis=0)
-    np.testing.assert_allclose(directions, expected, atol=1e-9)

@@ -18,8 +18,9 @@ from clsas.exact.backprojection import backproject, prepare
 from clsas.exact.reference import ideal
 from clsas.exact.run import execute
 from clsas.factorized.plan import Plan
-from clsas.sonar.beam import BeamWindow, sines
+from clsas.sonar.beam import BeamWindow
 from clsas.sonar.simplify import APART, MOTION, RELIEF, SHARE, leave_out, simplify
+from clsas.sonar.visibility import sines
 
 LEAST_PIXELS = 1 << 15
 CHANNELS, CARRIER, STEP = 96, 300e3, 0.012

@@ -1,78 +1,28 @@
-import re
-import warnings
-
 import numpy as np
-import pytest
-from cases import along_x, lines_over
-from factorizing import EXACT_IS_SLOW, around
+from cases import along_x, beside, track_lines
 
-from clsas.core.grid import Grid
-from clsas.core.validate import ClsasWarning
-from clsas.exact.backprojection import backproject
-from clsas.planning.costs import Costs
-from clsas.planning.factorize import factorize
-from clsas.planning.planner import plan
 from clsas.sonar.beam import BeamWindow
+from clsas.sonar.visibility import channel_ranges, sines
 
-NEAR = around(0, 40)
-LINES = lines_over(NEAR, along_x(200, 0.02), None, carrier_hz=120e3, step_m=0.02)
-FAR = around(0, 90)
-ASIDE = around(30, 25)
-"""At ranges of the lines, 50 degrees ahead."""
+X = (1.0, 0, 0)
 
 
-def heard(form):
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        form()
-    return [str(each.message) for each in caught if each.category is ClsasWarning]
-
-
-@pytest.mark.parametrize(
-    ("grid", "beam"),
-    [
-        (FAR, None),
-        (around(0, 10), None),
-        (Grid.points(FAR.positions_m()[::9, ::9].reshape(-1, 3)), None),
-        (FAR.with_height(np.full(FAR.shape, 3.0)), None),
-        (ASIDE, BeamWindow(20.0, "hann")),
-    ],
-    ids=["far", "near", "points", "heights", "beam"],
-)
-def test_whoever_is_asked_warns_once_of_a_grid_that_no_line_reaches(grid, beam):
-    ways = {
-        "plan": lambda: plan(LINES, grid, tolerance_db=-40, beam=beam),
-        "factorize": lambda: factorize(LINES, grid, -40, beam=beam),
-        "slow": lambda: factorize(
-            LINES, grid, plan(LINES, grid, tolerance_db=-40, beam=beam, costs=EXACT_IS_SLOW)
-        ),
-        "backproject": lambda: backproject(LINES, grid, beam=beam),
-    }
-    for name, form in ways.items():
-        (message,) = heard(form)
-        assert "so the image is zero: " in message, name
-        assert ("within the beam" in message) == (beam is not None)
-        assert re.search(r"the grid lies at [\d.]+ to [\d.]+ m$", message)
-
-
-@pytest.mark.parametrize("pixels", [(0, 0), (3, 77), (149, 159)])
-def test_nothing_is_said_where_one_pixel_of_many_is_reached(pixels):
-    """Between the points that are looked at first."""
-    points_m = np.tile(FAR.positions_m()[:1, :1], (150, 160, 1))
-    points_m[pixels] = 0, 40, 0
-    assert heard(lambda: plan(LINES, Grid.points(points_m), tolerance_db=-40)) == []
-
-
-def test_nothing_is_said_of_a_narrow_strip_of_a_large_plane():
-    """A beam of a degree from a track of centimetres, over pixels metres apart."""
-    short = LINES.select(slice(0, 2))
-    grid = Grid.plane(x=(-1000.3, 1000, 700), y=(30, 60, 300))
-    assert heard(lambda: plan(short, grid, tolerance_db=-40, beam=BeamWindow(1.0))) == []
-
-
-def test_nothing_is_said_of_lines_of_zeros():
-    silent = type(LINES)(
-        0 * LINES.samples, LINES.first_range_m, LINES.range_step_m,
-        LINES.tx_m, LINES.rx_m, LINES.carrier_hz, LINES.sound_speed_m_s,
-    )  # fmt: skip
-    assert heard(lambda: plan(silent, FAR, tolerance_db=-40, costs=Costs())) == []
+def test_ranges_hold_every_channel_that_sees_a_part_and_few_others():
+    rng = np.random.default_rng(1)
+    track = along_x(1000, 0.05) + rng.normal(0, 0.05, (1000, 3))
+    lines = track_lines(track, beside(track, 0.2, 0, 0.1))
+    beam = BeamWindow(6, "hann", squint_deg=10, along=X)
+    along = beam.directions(lines)
+    centres, radius = rng.uniform([-40, 5, -3], [40, 80, 3], (300, 3)), 0.5
+    ranges = channel_ranges(beam, lines, along, centres, radius)
+    way = rng.normal(size=(200, 3))
+    ball = radius * way / np.linalg.norm(way, axis=1)[:, None]
+    channel = np.arange(1000)
+    wasted = 0
+    for centre, (first, end) in zip(centres, ranges, strict=True):
+        seen = (beam.weights(sines(centre + ball, lines.phase_centres_m, along)) > 0).any(axis=1)
+        assert np.all(~seen | ((channel >= first) & (channel < end)))
+        if seen.any():
+            wasted += (end - first) - np.ptp(channel[seen]) - 1
+    assert 0 < (ranges[:, 1] - ranges[:, 0]).sum() < 0.2 * 300 * 1000
+    assert wasted < 0.15 * (ranges[:, 1] - ranges[:, 0]).sum()

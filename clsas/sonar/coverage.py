@@ -1,0 +1,144 @@
+"""Coverage: whether any line and the beam reach a grid, and the warning if none does."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsas.core import validate
+from clsas.core.geometry import pairwise_range_m
+from clsas.core.grid import Grid
+from clsas.core.lines import RangeLines, some_channels
+from clsas.sonar.beam import BeamWindow
+from clsas.sonar.visibility import sines, touches_boxes
+
+_SAMPLED_CHANNELS = 64  # a quick test that finds nearly every grid covered
+_SAMPLED_PIXELS = 16  # along either side of the grid, in the quick test
+_BLOCKS = 8  # along either side of the grid; smaller blocks would find smaller gaps
+_TAPS = 8  # an interpolated line extends this many samples beyond its ends
+_SPEED_RATIO = 0.05  # largest speed of a receiver over that of sound
+
+
+def warn_unreached(
+    lines: RangeLines, grid: Grid, beam: BeamWindow | None, along: NDArray[np.float64] | None
+) -> bool:
+    """Warn if no pixel lies within the range of any line and the beam; return whether it warned.
+
+    `along` holds the track's unit directions for a beam, [channels, 3]. Lines that are all zero
+    cause no warning.
+    """
+    if _reached_at_points(lines, grid, beam, along):
+        return False
+    centres_m, half_m = _boxes(grid)
+    if _reached_in_boxes(lines, centres_m, half_m, beam, along) or not lines.samples.any():
+        return False
+    warn_unseen(lines, centres_m, beam, along)
+    return True
+
+
+def _reached_at_points(
+    lines: RangeLines, grid: Grid, beam: BeamWindow | None, along: NDArray[np.float64] | None
+) -> bool:
+    """Whether any sampled channel receives from any sampled pixel, as for nearly every grid."""
+    some = some_channels(lines.channels, _SAMPLED_CHANNELS)
+    part, points_m = lines.select(some), grid.spread(_SAMPLED_PIXELS)
+    range_m = pairwise_range_m(
+        points_m, part.tx_m, part.rx_m, part.rx_velocity_m_s, part.sound_speed_m_s
+    )
+    inside = (range_m >= part.first_range_m) & (range_m <= part.last_range_m)
+    if beam is not None:
+        low, high = beam.limits
+        sine = sines(points_m, part.phase_centres_m, along[some]).T
+        inside &= (sine > low) & (sine < high)
+    return bool(inside.any())
+
+
+def _reached_in_boxes(
+    lines: RangeLines,
+    centres_m: NDArray[np.float64],
+    half_m: NDArray[np.float64],
+    beam: BeamWindow | None,
+    along: NDArray[np.float64] | None,
+) -> bool:
+    """Whether any channel may receive from any box; if False, certainly none does.
+
+    `centres_m` and `half_m` hold the boxes' centres and half sides along x, y and z, [boxes, 3].
+    """
+    beyond_m = _TAPS * lines.range_step_m
+    for centre_m, sides_m in zip(centres_m, half_m, strict=True):
+        range_m = pairwise_range_m(
+            centre_m[None], lines.tx_m, lines.rx_m, lines.rx_velocity_m_s, lines.sound_speed_m_s
+        )[0]
+        radius_m = np.linalg.norm(sides_m) * (1 + 2 * _SPEED_RATIO) + beyond_m
+        reached = range_m + radius_m >= lines.first_range_m
+        reached &= range_m - radius_m <= lines.last_range_m
+        if beam is not None and reached.any():
+            track_m, direction = lines.phase_centres_m[reached], along[reached]
+            reached = touches_boxes(
+                beam.limits, centre_m[None], np.diag(sides_m), track_m, direction
+            )
+        if reached.any():
+            return True
+    return False
+
+
+def _boxes(grid: Grid) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Centres and half sides, [boxes, 3], of boxes that together hold all pixels of a grid."""
+    parts = [
+        [slice(first, last) for first, last in itertools.pairwise(_cuts(count))]
+        for count in grid.shape[:2]
+    ]
+    ends_m = []
+    for part in itertools.product(*parts):
+        block = grid.window(*part)
+        if block.is_planar:
+            block = block.window(*(slice(None, None, max(n - 1, 1)) for n in block.shape))
+        positions_m = block.positions_m().reshape(-1, 3)
+        ends_m.append((positions_m.min(axis=0), positions_m.max(axis=0)))
+    low_m, high_m = np.array(ends_m).swapaxes(0, 1)
+    return (low_m + high_m) / 2, (high_m - low_m) / 2
+
+
+def _cuts(count: int) -> NDArray[np.int64]:
+    """Edges that divide a side of a grid into blocks."""
+    return np.unique(np.linspace(0, count, min(count, _BLOCKS) + 1).astype(np.int64))
+
+
+def warn_unseen(
+    lines: RangeLines,
+    centres_m: NDArray[np.float64],
+    beam: BeamWindow | None,
+    along: NDArray[np.float64] | None,
+) -> None:
+    """Warn that no line contributes to parts of a grid, whose centres are [parts, 3]."""
+    some = lines.select(slice(None, None, max(lines.channels // 64, 1)))
+    range_m = pairwise_range_m(
+        centres_m[:: max(len(centres_m) // 1024, 1)],
+        some.tx_m,
+        some.rx_m,
+        some.rx_velocity_m_s,
+        some.sound_speed_m_s,
+    )
+    spans = (
+        f"the lines span {lines.first_range_m.min():.6g} to {lines.last_range_m.max():.6g} m, the "
+        f"grid lies at {range_m.min():.6g} to {range_m.max():.6g} m"
+    )
+    if beam is None:
+        validate.warn(
+            f"no pixel of the grid lies within any line's range, so the image is zero: {spans}"
+        )
+        return
+    sine = sines(
+        centres_m[:: max(len(centres_m) // 1024, 1)],
+        some.phase_centres_m,
+        along[:: max(lines.channels // 64, 1)],
+    )
+    low, high = np.degrees(np.arcsin(np.clip([sine.min(), sine.max()], -1, 1)))
+    first, last = np.degrees(beam.limits_rad)
+    validate.warn(
+        f"no pixel of the grid lies within the beam and the range of any line, so the image is "
+        f"zero: the beam spans {first:.4g} to {last:.4g} degrees, the grid lies at {low:.4g} to "
+        f"{high:.4g} degrees; {spans}"
+    )

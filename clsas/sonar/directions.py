@@ -1,0 +1,82 @@
+"""Direction of the track at every channel, from the channels' phase centres."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsas.core.lines import RangeLines
+
+MOST_TRACK_PINGS = 101
+"""Most pings over which the track's direction is smoothed by default."""
+
+_SMOOTHED_SHARE = 4  # by default cubics are fitted to this part (a quarter) of the pings
+_NEW_LEG = 10.0  # a step between pings this many times the median one begins a new leg
+_SHORTEST_LEG = 5  # pings; a cubic and one to spare
+
+
+def track_directions(lines: RangeLines, pings: int | None = None) -> NDArray[np.float64]:
+    """Return the unit direction of the track at every channel, float64 [channels, 3].
+
+    Local cubics are fitted to the pings' mean phase centres by least squares (Savitzky-Golay).
+    Their tangents are interpolated to each channel. Consecutive channels with one transmitter
+    position are a ping. Legs of a track, which are far apart, are smoothed one by one.
+
+    Parameters
+    ----------
+    lines : RangeLines
+    pings : int, optional
+        Pings that each fit spans; by default a quarter of all, between 5 and 101.
+
+    Raises
+    ------
+    ValueError
+        If there is only one ping, or the track stands still.
+    """
+    first, channels_m = lines.ping_starts, lines.phase_centres_m
+    count = len(first)
+    if count < 2:
+        raise ValueError(
+            f"along must be given: {lines.channels} channels of one transmitter position have "
+            f"no track"
+        )
+    receivers = np.diff(np.append(first, lines.channels))
+    centres_m = np.add.reduceat(channels_m, first, axis=0) / receivers[:, None]
+    span = pings or min(max(count // _SMOOTHED_SHARE, 5), MOST_TRACK_PINGS)
+    tangent = np.concatenate([_tangents(leg_m, span) for leg_m in _legs(centres_m)])
+    speed = np.linalg.norm(tangent, axis=1)
+    extent_m = np.linalg.norm(np.ptp(centres_m, axis=0))
+    if not speed.min() > 1e-3 * extent_m / count:
+        raise ValueError("along must be given: the lines' phase centres stand still")
+    tangent /= speed[:, None]
+    # The front channels of a long array lie where the middles of later pings will be.
+    ping = np.repeat(np.arange(count), receivers)
+    steps_m = np.linalg.norm(np.diff(centres_m, axis=0), axis=1)
+    travelled_m = np.concatenate([[0.0], np.cumsum(steps_m)])
+    ahead_m = channels_m - centres_m[ping]
+    at_m = travelled_m[ping] + np.einsum("ci,ci->c", ahead_m, tangent[ping])
+    found = np.stack([np.interp(at_m, travelled_m, each) for each in tangent.T], axis=-1)
+    return found / np.linalg.norm(found, axis=1, keepdims=True)
+
+
+def _legs(centres_m: NDArray[np.float64]) -> list[NDArray[np.float64]]:
+    """Pings' phase centres, [n, 3], split where the track continues somewhere else."""
+    steps_m = np.linalg.norm(np.diff(centres_m, axis=0), axis=1)
+    median_m = np.median(steps_m)
+    starts = [0]
+    for start in np.flatnonzero(steps_m > _NEW_LEG * median_m) + 1 if median_m else ():
+        if min(start - starts[-1], len(centres_m) - start) >= _SHORTEST_LEG:
+            starts.append(start)
+    return np.split(centres_m, starts[1:])
+
+
+def _tangents(centres_m: NDArray[np.float64], pings: int) -> NDArray[np.float64]:
+    """Tangents of local cubics through `pings` pings of one leg, [n, 3]."""
+    count = len(centres_m)
+    # The filter needs an odd number of pings, and a cubic at least four.
+    window = min(2 * (pings // 2) + 1, count - 1 + count % 2)
+    if window < 2:
+        return np.diff(centres_m, axis=0).repeat(2, axis=0)
+    from scipy.signal import savgol_filter  # slow to import
+
+    return savgol_filter(centres_m, window, min(3, window - 1), deriv=1, axis=0, mode="interp")

@@ -1,0 +1,62 @@
+import numpy as np
+import pytest
+from cases import along_x, track_lines
+
+from clsas.core.lines import RangeLines
+from clsas.sonar.beam import BeamWindow
+
+X = (1.0, 0, 0)
+DEGREE = np.pi / 180
+
+
+def test_the_direction_is_that_of_the_phase_centres():
+    straight = along_x(50, 0.1) @ np.array([[0.6, 0.8, 0], [0, 1, 0], [0, 0, 1]])
+    np.testing.assert_allclose(
+        BeamWindow(10).directions(track_lines(straight)), [[0.6, 0.8, 0]] * 50, atol=1e-9
+    )
+    backwards = BeamWindow(10).directions(track_lines(straight[::-1]))
+    np.testing.assert_allclose(backwards, [[-0.6, -0.8, 0]] * 50, atol=1e-9)
+    few = BeamWindow(10).directions(track_lines(along_x(2, 1.0)))
+    np.testing.assert_allclose(few, [X, X], atol=1e-9)
+
+
+@pytest.mark.parametrize("pings", [2, 3, 4, 5, 6, 200])
+def test_receivers_of_one_ping_do_not_turn_it(pings):
+    tx = np.repeat(along_x(pings, 0.1), 6, axis=0)
+    rx = tx + np.tile(along_x(6, 0.2, y=0.05), (pings, 1))
+    np.testing.assert_allclose(
+        BeamWindow(10).directions(track_lines(tx, rx)), [X] * 6 * pings, atol=1e-9
+    )
+
+
+def test_sway_and_bends_are_followed_smoothly():
+    angle = np.linspace(0, 2 * np.pi, 400)
+    circle = 10 * np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
+    tangent = np.stack([-np.sin(angle), np.cos(angle), 0 * angle], axis=1)
+    rough = circle + np.random.default_rng(0).normal(0, 0.01, circle.shape)
+    found = BeamWindow(10).directions(track_lines(rough))
+    assert np.arccos(np.einsum("ci,ci->c", found, tangent)).max() < 3 * DEGREE
+    swaying = along_x(400, 0.05) + 0.02 * np.sin(np.arange(400) / 3)[:, None] * [0, 1, 1]
+    found = BeamWindow(10).directions(track_lines(swaying))
+    assert np.arccos(found[:, 0]).max() < 1 * DEGREE
+
+
+def test_a_direction_that_is_given_is_made_a_unit():
+    lines = track_lines(along_x(3, 1.0))
+    np.testing.assert_allclose(
+        BeamWindow(10, along=(0, 3, 4)).directions(lines), [[0, 0.6, 0.8]] * 3
+    )
+    each = BeamWindow(10, along=[[1, 0, 0], [0, 2, 0], [0, 0, 3]]).directions(lines)
+    np.testing.assert_allclose(each, np.eye(3))
+
+
+def test_directions_of_legs():
+    """Each leg has its own, up to its ends."""
+    leg = np.zeros((60, 3))
+    leg[:, 0] = np.linspace(0, 30, 60)
+    across = leg[:, [1, 0, 2]] + [40, 5, 0]
+    tx_m = np.concatenate([leg, leg[::-1] + [0, 20, 0], across])
+    lines = RangeLines(np.ones((180, 1), complex), 0.0, 0.1, tx_m, tx_m, 1e5, 1500.0)
+    directions = BeamWindow(10).directions(lines)
+    expected = np.repeat([[1, 0, 0], [-1, 0, 0], [0, 1, 0]], 60, axis=0)
+    np.testing.assert_allclose(directions, expected, atol=1e-9)
