@@ -211,3 +211,10 @@ def track_lines(tx, rx=None):
     return RangeLines(
         np.ones((len(tx), 1), complex), 1.0, 1.0, tx, tx if rx is None else rx, 1e5, 1500.0
     )
+
+
+def lattice(seabed):
+    """Points of a seabed's lattice on its surface, [rows, columns, 3]."""
+    rows, columns = seabed.heights_m.shape
+    x, y = np.meshgrid(np.linspace(*seabed.x_m, columns), np.linspace(*seabed.y_m, rows))
+    return np.stack([x, y, seabed.heights_m], axis=-1)

@@ -32,8 +32,8 @@ from clsas.exact.backprojection import BEST_ACCURACY_DB
 from clsas.planning.planner import checked_pairs, tolerance_in_db
 from clsas.signal.compression import check_options as check_compression
 from clsas.signal.interpolation import MOST_UPSAMPLING, TAPS
-from clsas.simulation.scenes import PointTargets, Seabed, pipeline, rocks, wreck
-from clsas.simulation.simulator import Scene
+from clsas.simulation.scenes import PointTargets, Scene, Seabed
+from clsas.simulation.seabeds import pipeline, rocks, wreck
 from clsas.simulation.simulator import check_options as check_simulation
 from clsas.sonar.beam import BeamWindow
 from clsas.sonar.system import Pulse, Sonar, line_array

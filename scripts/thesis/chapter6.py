@@ -20,7 +20,7 @@ from scipy.spatial.distance import cdist
 import clsas
 from clsas.factorized import thesis as nearest
 from clsas.opencl.device import Device, open_device
-from clsas.simulation import scenes as scene
+from clsas.simulation import seabeds
 from clsas.sonar.visibility import sines, touches_boxes
 from clsas.trials import wreck
 
@@ -144,7 +144,7 @@ class Scene:
 def mast_shadow(grid: clsas.Grid) -> tuple[np.ndarray, np.ndarray]:
     """Return which pixels' sand the mast alone hides from broadside, and lit ones beside them."""
     seabed, track = wreck.scene().need("targets", "track")
-    without = scene.wreck(wreck.X_M, wreck.Y_M, mast_m=0.0)
+    without = seabeds.wreck(wreck.X_M, wreck.Y_M, mast_m=0.0)
     eye_m = track.positions_m.mean(axis=0)
     x_m, y_m = grid.axes_m
     hidden, light = np.zeros(grid.shape, bool), np.zeros(grid.shape, bool)

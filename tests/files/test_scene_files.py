@@ -7,7 +7,8 @@ import pytest
 from pydantic_core import PydanticUndefined
 
 from clsas.files import scene_files as config
-from clsas.simulation.scenes import PointTargets, Seabed, rocks
+from clsas.simulation.scenes import PointTargets, Seabed
+from clsas.simulation.seabeds import rocks
 from clsas.sonar.beam import BeamWindow
 from clsas.sonar.sampling import check_sampling
 from clsas.sonar.system import BARKER_13

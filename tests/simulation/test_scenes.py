@@ -1,21 +1,14 @@
 import numpy as np
 import pytest
+from cases import lattice
 
-from clsas.simulation import scenes as scene
-from clsas.simulation.scenes import PointTargets, Seabed, View
+from clsas.simulation.scenes import Observer, PointTargets, Seabed
 
 EYE = np.array([0.0, 0.0, 10.0])
 
 
 def flat(**others):
     return Seabed((-5, 5), (20, 30), np.zeros((101, 101)), **others)
-
-
-def lattice(seabed):
-    """The lattice's points on the surface, [rows, columns, 3]."""
-    rows, columns = seabed.heights_m.shape
-    x, y = np.meshgrid(np.linspace(*seabed.x_m, columns), np.linspace(*seabed.y_m, rows))
-    return np.stack([x, y, seabed.heights_m], axis=-1)
 
 
 def with_box(height=2.0, offset=(0.0, 0.0, 0.0)):
@@ -106,10 +99,10 @@ def test_flat_ground_is_lit_and_slopes_that_face_away_are_not():
     assert not flat().lit([[0, 25, 0]], [0, 0, -1.0]).any()
     y = np.linspace(20, 30, 101)[:, None]
     ridge = Seabed((-5, 5), (20, 30), np.broadcast_to(2 - 0.8 * np.abs(y - 25), (101, 101)))
-    positions, _ = ridge.seen(View(EYE))
+    positions, _ = ridge.visible(Observer(EYE))
     assert positions[:, 1].max() < 25 + 0.2
     # From straight above both sides are seen.
-    positions, _ = ridge.seen(View(np.array([0, 25, 20.0])))
+    positions, _ = ridge.visible(Observer(np.array([0, 25, 20.0])))
     assert positions[:, 1].max() > 29.9
 
 
@@ -126,9 +119,9 @@ def test_what_is_between_sonar_and_patch_does_not_matter():
 
 def test_scatterers_are_those_of_the_seed():
     first, again, other = flat(seed=4), flat(seed=4), flat(seed=5)
-    for one, two in zip(first.seen(View(EYE)), again.seen(View(EYE)), strict=True):
+    for one, two in zip(first.visible(Observer(EYE)), again.visible(Observer(EYE)), strict=True):
         np.testing.assert_array_equal(one, two)
-    assert first.seen(View(EYE))[1].tobytes() != other.seen(View(EYE))[1].tobytes()
+    assert first.visible(Observer(EYE))[1].tobytes() != other.visible(Observer(EYE))[1].tobytes()
 
 
 def test_density_is_per_surface_and_positions_lie_on_it():
@@ -136,7 +129,7 @@ def test_density_is_per_surface_and_positions_lie_on_it():
     slope = np.broadcast_to(np.sqrt(3) * np.linspace(0, 10, 101)[:, None], (101, 101))
     seabed = Seabed((-5, 5), (20, 30), slope, density_m2=300)
     assert seabed.points == pytest.approx(2 * 300 * 100, rel=0.02)
-    positions, _ = seabed.seen(View(EYE))
+    positions, _ = seabed.visible(Observer(EYE))
     np.testing.assert_allclose(positions[:, 2], np.sqrt(3) * (positions[:, 1] - 20), atol=1e-9)
     np.testing.assert_allclose(seabed.height_m(*positions.T[:2]), positions[:, 2], atol=1e-9)
 
@@ -145,7 +138,7 @@ def test_density_is_per_surface_and_positions_lie_on_it():
 def test_intensity_is_lambert_whatever_the_density(density):
     texture = np.full((101, 101), 2.0)
     texture[:, 51:] = 0.5
-    positions, amplitudes = flat(texture=texture, density_m2=density).seen(View(EYE))
+    positions, amplitudes = flat(texture=texture, density_m2=density).visible(Observer(EYE))
     sine = 10 / np.linalg.norm(positions - EYE, axis=1)
     intensity = np.abs(amplitudes) ** 2 / sine**2 * density
     left, right = positions[:, 0] < 0, positions[:, 0] > 0.1
@@ -162,33 +155,33 @@ def test_spheres_hold_what_is_seen():
     def gain(directions, slack):
         return np.where(np.abs(directions[:, 0]) - slack > 0.05, 1e-4, 1.0)
 
-    for view in (View(EYE), View(EYE, 0.3, gain)):
-        centres, radii = seabed.spheres(view)
-        positions, _ = seabed.seen(view)
+    for observer in (Observer(EYE), Observer(EYE, 0.3, gain)):
+        centres, radii = seabed.spheres(observer)
+        positions, _ = seabed.visible(observer)
         away = np.linalg.norm(positions[:, None] - centres, axis=-1) - radii
         assert away.min(axis=1).max() < 1e-9
     # Of what is left out nothing is in the beam; of what is kept most is not far from it.
-    everything, _ = seabed.seen(View(EYE))
+    everything, _ = seabed.visible(Observer(EYE))
     assert len(positions) < 0.8 * len(everything)
     in_beam = np.abs(everything[:, 0]) < 0.05 * np.linalg.norm(everything - EYE, axis=1)
     kept = {tuple(p) for p in positions}
     assert all(tuple(p) in kept for p in everything[in_beam])
     # Nothing in the beam: nothing is seen, but there is still somewhere to listen to.
-    blind = View(EYE, 0.0, lambda directions, slack: np.zeros(len(directions)))
-    assert len(seabed.seen(blind)[0]) == len(seabed.seen(blind)[1]) == 0
+    blind = Observer(EYE, 0.0, lambda directions, slack: np.zeros(len(directions)))
+    assert len(seabed.visible(blind)[0]) == len(seabed.visible(blind)[1]) == 0
     assert len(seabed.spheres(blind)[0]) > 0
 
 
-def test_point_targets_are_always_seen():
+def test_point_targets_are_always_visible():
     targets = PointTargets([[0, 30, 0], [0, -30, 0]], [1, 2])
-    for view in (View(EYE), View(EYE, 0.1, lambda directions, slack: np.zeros(len(directions)))):
-        positions, amplitudes = targets.seen(view)
+    for observer in (
+        Observer(EYE),
+        Observer(EYE, 0.1, lambda directions, slack: np.zeros(len(directions))),
+    ):
+        positions, amplitudes = targets.visible(observer)
         np.testing.assert_array_equal(positions, targets.positions_m)
         np.testing.assert_array_equal(amplitudes, [1, 2])
-        assert not targets.spheres(view)[1].any()
-
-
-# Built-in seabeds
+        assert not targets.spheres(observer)[1].any()
 
 
 def test_points_too_far_for_a_phase_are_refused():
@@ -196,50 +189,6 @@ def test_points_too_far_for_a_phase_are_refused():
         ValueError, match=r"farthest of positions_m must be .* <= 1e\+09 m, got 1e\+300"
     ):
         PointTargets([[0, 1e300, 0]])
-
-
-def test_the_wreck_has_hull_wheelhouse_and_mast_with_their_shadows():
-    wreck = scene.wreck(cell_m=0.2, density_m2=1)
-    assert wreck.steps_m == pytest.approx((0.2, 0.2))
-    points = lattice(wreck)
-    hull = points[wreck.heights_m > 0.5]
-    assert np.ptp(hull[:, 0]) == pytest.approx(25 * np.cos(np.radians(14)), abs=2)
-    assert wreck.heights_m.max() == 6.5
-    lit = wreck.lit(points.reshape(-1, 3), [0, 0, 20]).reshape(points.shape[:2])
-    y = points[:, 0, 1]
-
-    def end(x):
-        return y[~lit[:, np.argmin(np.abs(points[0, :, 0] - x))]].max()
-
-    # THESIS chapter 6: the mast's shadow reaches far beyond the hull's.
-    assert end(0.3) == pytest.approx(60 * 20 / 13.5, abs=1)
-    assert 70 < end(5) < 76
-    assert 74 < end(-6) < 80
-    assert lit[:, np.abs(points[0, :, 0]) > 20].mean() > 0.99
-    # Brighter than sand.
-    assert wreck.texture[wreck.heights_m > 0.5].min() > 2 * wreck.texture[0].max()
-
-
-def test_without_a_mast_there_is_still_a_deck():
-    bare = scene.wreck(cell_m=0.5, density_m2=1, mast_m=0)
-    assert bare.heights_m.max() == pytest.approx(4.4)
-    assert bare.height_m(0, 60) > 1.5
-
-
-def test_the_pipeline_and_rocks():
-    pipe = scene.pipeline(density_m2=1, position_m=(3, 50), heading_deg=0)
-    assert pipe.heights_m.max() == pytest.approx(0.6, abs=0.02)
-    assert pipe.height_m(3, 50) == pytest.approx(0.6, abs=0.02)
-    assert (pipe.heights_m > 0.3).any(axis=0).all()
-    boulders = scene.rocks(density_m2=1, seed=3)
-    assert 1 < boulders.heights_m.max() < 2.5
-    assert np.any(boulders.heights_m != scene.rocks(density_m2=1, seed=4).heights_m)
-    fewer = scene.rocks(density_m2=1, seed=3, count=5)
-    assert (fewer.heights_m > 0.3).sum() < (boulders.heights_m > 0.3).sum()
-    # Sand casts no shadow of its own.
-    sand = Seabed(pipe.x_m, pipe.y_m, np.where(pipe.texture > 2, 0, pipe.heights_m))
-    points = lattice(sand)
-    assert sand.lit(points.reshape(-1, 3), [0, 0, 20]).mean() > 0.995
 
 
 # Bad input
@@ -284,39 +233,3 @@ def test_a_seabed_without_scatterers():
 def test_bad_eyes(arguments, message):
     with pytest.raises(ValueError, match=message):
         flat().lit(**{"points_m": [[0, 25, 0]], "eye_m": EYE, **arguments})
-
-
-@pytest.mark.parametrize("make", [scene.wreck, scene.pipeline, scene.rocks])
-@pytest.mark.parametrize(
-    ("arguments", "error", "message"),
-    [
-        ({"x_m": (5, 5)}, ValueError, r"x_m must be first < last in m, got \(5, 5\)"),
-        ({"cell_m": 0}, ValueError, "cell_m must be finite and > 0 and <= 1 m, got 0"),
-        ({"cell_m": 1e-9}, ValueError, "cell_m must ask for at most .* GiB"),
-        ({"position_m": (0, 300)}, ValueError, "position_m must lie on the patch, x .*, got .*300"),
-        ({"position_m": 3}, ValueError, r"position_m must have shape \(2\)"),
-        ({"seed": -1}, ValueError, "seed must be at least 0, got -1"),
-        ({"density_m2": np.inf}, ValueError, "density_m2 must be finite"),
-    ],
-)
-def test_bad_built_ins(make, arguments, error, message):
-    with pytest.raises(error, match=message):
-        make(**arguments)
-
-
-@pytest.mark.parametrize(
-    ("make", "arguments", "message"),
-    [
-        (scene.wreck, {"mast_m": -1}, "mast_m must be finite and >= 0 and <= 100 m, got -1"),
-        (scene.wreck, {"heading_deg": np.nan}, "heading_deg must be finite degrees, got nan"),
-        (scene.rocks, {"count": 0}, "count must be at least 1, got 0"),
-    ],
-)
-def test_bad_details(make, arguments, message):
-    with pytest.raises(ValueError, match=message):
-        make(**arguments)
-
-
-def test_boulders_are_as_many_as_a_field_holds():
-    with pytest.raises(ValueError, match="count must be at most 100000, got 1000000000"):
-        scene.rocks(count=10**9)

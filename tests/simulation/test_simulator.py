@@ -1,4 +1,3 @@
-import importlib
 import math
 from dataclasses import replace
 
@@ -9,8 +8,9 @@ from scipy.special import erfc, fresnel
 from clsas.core.geometry import bistatic_range_m
 from clsas.core.validate import ClsasWarning
 from clsas.signal.echoes import Echoes
-from clsas.simulation.scenes import PointTargets, Seabed, View
-from clsas.simulation.simulator import _terms, simulate, simulate_lines
+from clsas.simulation.patterns import needed_terms
+from clsas.simulation.scenes import Observer, PointTargets, Seabed
+from clsas.simulation.simulator import simulate, simulate_lines
 from clsas.sonar.system import Pulse, Sonar, line_array
 from clsas.sonar.track import Pointing, Track, channels
 
@@ -138,9 +138,8 @@ def test_result_does_not_depend_on_blocks_or_threads(monkeypatch):
     scene = PointTargets(rng.uniform([-2, 38, -1], [2, 42, 1], (50, 3)))
     sonar = replace(SMOOTH, tx_length_m=0.1, rx_length_m=0.05)
     whole = simulate(sonar, TRACK, scene)
-    module = importlib.import_module("clsas.simulation.simulator")
-    monkeypatch.setattr(module, "_BLOCK", 7)
-    monkeypatch.setattr(module, "_BEAM_BLOCK", 3)
+    monkeypatch.setattr("clsas.simulation.paths._BLOCK", 7)
+    monkeypatch.setattr("clsas.simulation.paths._PATTERN_BLOCK", 3)
     parts = simulate(sonar, TRACK, scene, workers=1)
     assert db(whole.samples - parts.samples, whole.samples) < -110
 
@@ -369,7 +368,7 @@ def test_a_seabed_sounds_like_its_points_that_are_seen(sonar, options):
     for ping in range(SWATH.pings):
         alone = Track(SWATH.positions_m[[ping]], [0.0], velocity_m_s=SWATH.velocity_m_s[[ping]])
         tx, rx, _ = channels(sonar, alone)
-        positions, amplitudes = seabed.seen(View((tx[0] + rx.mean(axis=0)) / 2))
+        positions, amplitudes = seabed.visible(Observer((tx[0] + rx.mean(axis=0)) / 2))
         points = PointTargets(positions, amplitudes.astype(complex))
         exact = simulate(sonar, alone, points, **{**options, "range_m": (25, 48)})
         for channel in range(3):
@@ -435,15 +434,14 @@ def test_window_of_a_seabed_holds_its_echoes():
     assert tight.length < 0.3 * wide.length
 
 
-def test_result_does_not_depend_on_threads_or_looks(monkeypatch):
+def test_result_does_not_depend_on_threads_or_groups(monkeypatch):
     seabed = box_on_sand()
     one = simulate(NARROW, SWATH, seabed, workers=1).samples
     np.testing.assert_array_equal(one, simulate(NARROW, SWATH, seabed, workers=3).samples)
-    module = importlib.import_module("clsas.simulation.simulator")
-    monkeypatch.setattr(module, "_LOOK", 1)
-    # Each channel looks for itself: only edges of shadows and of the beam change.
+    monkeypatch.setattr("clsas.simulation.paths._GROUP", 1)
+    # Visibility is found for every channel: only edges of shadows and of the beam change.
     apart = simulate(NARROW, SWATH, seabed, range_m=(30, 46)).samples
-    monkeypatch.setattr(module, "_LOOK", 8)
+    monkeypatch.setattr("clsas.simulation.paths._GROUP", 8)
     together = simulate(NARROW, SWATH, seabed, range_m=(30, 46)).samples
     assert 0 < np.linalg.norm(apart - together) < 0.15 * np.linalg.norm(together)
 
@@ -688,14 +686,13 @@ def test_elements_too_long_for_memory_are_an_error_at_once(name, length_m):
 def test_the_terms_of_long_elements_pass_what_floats_hold():
     """Powers overflow from about 700 on, before Q! catches up."""
     reach = np.array([5000.0])
-    terms = _terms(reach, 2.0, 1e-6)
+    terms = needed_terms(reach, 2.0, 1e-6)
     assert terms == pytest.approx(np.e * 5000, rel=0.01)
     assert terms * np.log(reach[0]) - math.lgamma(terms + 1) + np.log(2 / (terms + 1)) < -13.8
 
 
 def test_a_survey_too_large_for_memory_is_an_error_before_its_channels_are_laid_out(monkeypatch):
-    module = importlib.import_module("clsas.simulation.simulator")  # hidden by the function
-    monkeypatch.setattr(module, "channels", None)
+    monkeypatch.setattr("clsas.simulation.simulator.channels", None)
     track = Track.straight((0, 0, 0), (1, 0, 0), pings=10**6, ping_interval_s=0.1)
     sonar = replace(SMOOTH, rx_m=np.zeros((1000, 3)))
     with pytest.raises(ValueError, match=r"sonar and track must ask for at most .* GiB"):

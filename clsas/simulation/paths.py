@@ -1,0 +1,184 @@
+"""Acoustic paths: for every channel the visible points of a scene, block by block.
+
+Visibility is found once for a group of neighbouring channels of a ping. Point targets are always
+visible; of a seabed only what is lit and within the beam.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsas.core import validate
+from clsas.core.geometry import legs_m
+from clsas.core.threads import in_threads
+from clsas.simulation.patterns import ElementPatterns
+from clsas.simulation.scenes import Observer, PointTargets, Scene, Seabed
+from clsas.sonar.track import Channels
+
+# Points of a block without and with element patterns. Blocks fit into a processor's caches, and are
+# large enough that summing them costs more than the FFT.
+_BLOCK = 1 << 17
+_PATTERN_BLOCK = 1 << 15
+# Channels of a ping for which visibility is found together. The Notes of `simulate` give the error.
+_GROUP = 8
+
+
+class PointBlock(NamedTuple):
+    """Some of the points that a group of channels receives from.
+
+    Attributes
+    ----------
+    points_m : float64 [points, 3]
+        Positions relative to the observer, along the elements' axes; each coordinate contiguous.
+    amplitudes : [points]
+    error : float
+        Relative error that the sum over these points may have.
+    """
+
+    points_m: NDArray[np.float64]
+    amplitudes: NDArray
+    error: float
+
+
+@dataclass(frozen=True)
+class Paths:
+    """A scene and the positions of all channels.
+
+    Attributes
+    ----------
+    parts : tuple of PointTargets or Seabed
+        From `scene_parts`.
+    geometry : Channels
+    sound_speed_m_s : float
+    spreading : bool
+        Whether amplitudes fall as 1/(R_tx R_rx).
+    patterns : ElementPatterns or None
+        None: every element is omnidirectional.
+    receivers : int
+        Channels of a ping.
+    """
+
+    parts: tuple[PointTargets | Seabed, ...]
+    geometry: Channels
+    sound_speed_m_s: float
+    spreading: bool = False
+    patterns: ElementPatterns | None = None
+    receivers: int = 1
+
+    @property
+    def channels(self) -> int:
+        """Number of channels."""
+        return len(self.geometry.tx_m)
+
+    @property
+    def groups(self) -> list[range]:
+        """Channels for which visibility is found together."""
+        return [
+            range(first, min(first + _GROUP, ping + self.receivers))
+            for ping in range(0, self.channels, self.receivers)
+            for first in range(ping, ping + self.receivers, _GROUP)
+        ]
+
+    def elements(self, channel: int) -> Channels:
+        """Return the positions of one channel, [3] each."""
+        tx, rx, velocity = self.geometry
+        return Channels(tx[channel], rx[channel], None if velocity is None else velocity[channel])
+
+    def observer(self, group: range) -> Observer:
+        """Return the observer that stands for a group of channels."""
+        tx, rx, velocity = self.geometry
+        tx, rx = tx[group], rx[group]
+        middle = (tx.mean(axis=0) + rx.mean(axis=0)) / 2
+        patterns = self.patterns
+        if patterns is None:
+            return Observer(middle)
+        radius = max(np.linalg.norm(end - middle, axis=1).max() for end in (tx, rx))
+        ping = group[0] // self.receivers
+        # The receivers move while the sound travels, which turns the direction of the return path.
+        turn = 0.0
+        if velocity is not None:
+            turn = 2 * float(np.linalg.norm(velocity[group[0]])) / self.sound_speed_m_s
+
+        def gain(directions: NDArray, slack: NDArray | float) -> NDArray:
+            return patterns.bound(ping, directions, slack + turn)
+
+        return Observer(middle, radius, gain)
+
+    def visible(self, group: range) -> tuple[list[Channels], Iterator[PointBlock]]:
+        """Return the positions of a group's channels, and the visible points block by block.
+
+        Both are relative to the observer and along the elements' axes.
+        """
+        observer, patterns = self.observer(group), self.patterns
+        axes = np.eye(3) if patterns is None else patterns.axes[group[0] // self.receivers]
+        size = _BLOCK if patterns is None else _PATTERN_BLOCK
+        origin_m = observer.position_m
+
+        def local(channel: int) -> Channels:
+            tx, rx, velocity = self.elements(channel)
+            velocity = None if velocity is None else axes @ velocity
+            return Channels(axes @ (tx - origin_m), axes @ (rx - origin_m), velocity)
+
+        def blocks() -> Iterator[PointBlock]:
+            for part in self.parts:
+                positions, amplitudes = part.visible(observer)
+                for first in range(0, len(positions), size):
+                    block = slice(first, first + size)
+                    offsets = np.ascontiguousarray((positions[block] - origin_m).T)
+                    yield PointBlock((axes @ offsets).T, amplitudes[block], part.error)
+
+        return [local(channel) for channel in group], blocks()
+
+    def delay_limits_s(self, workers: int | None) -> NDArray:
+        """Return the shortest and the longest delay of every channel, float64 [2, channels]."""
+        velocity = self.geometry.rx_velocity_m_s
+        speed = 0.0 if velocity is None else float(np.linalg.norm(velocity, axis=1).max())
+        # A point one metre farther away lengthens the path by two metres, and by what the receiver
+        # moves in the meantime.
+        per_metre = 2 / max(1 - speed / self.sound_speed_m_s, 1e-3)
+
+        def limits(group: range) -> list[tuple[float, float]]:
+            observer = self.observer(group)
+            spheres = [part.spheres(observer) for part in self.parts]
+
+            def lengths(channel: int) -> Iterator[tuple[float, float]]:
+                for centres, radii in spheres:
+                    out, back = legs_m(centres, *self.elements(channel), self.sound_speed_m_s)
+                    margin = per_metre * radii
+                    yield np.min(out + back - margin), np.max(out + back + margin)
+
+            both = [zip(*lengths(channel), strict=True) for channel in group]
+            return [(min(nearest), max(farthest)) for nearest, farthest in both]
+
+        found = np.array(
+            [ends for group in in_threads(limits, self.groups, workers) for ends in group]
+        )
+        return np.maximum(found.T, 0.0) / self.sound_speed_m_s
+
+
+def scene_parts(scene: Scene) -> tuple[PointTargets | Seabed, ...]:
+    """Return the parts of a scene, point targets in blocks.
+
+    Raises
+    ------
+    TypeError
+        If the scene is neither PointTargets nor Seabed nor a tuple of them.
+    """
+    given: Any = scene if isinstance(scene, tuple) and scene else (scene,)
+    parts: list[PointTargets | Seabed] = []
+    for part in given:
+        validate.instance("scene", part, PointTargets, Seabed)
+    for part in given:
+        # `points` makes a seabed draw its scatterers: here once, instead of in every thread.
+        if part.points <= _BLOCK or isinstance(part, Seabed):
+            parts.append(part)
+            continue
+        for first in range(0, part.points, _BLOCK):
+            block = slice(first, first + _BLOCK)
+            parts.append(PointTargets(part.positions_m[block], part.amplitudes[block]))
+    return tuple(parts)

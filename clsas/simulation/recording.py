@@ -1,0 +1,196 @@
+"""What every channel records: the sum over visible points of delayed pulses, in frequency.
+
+A channel records the pulse P, delayed, through the receiver's anti-alias filter G. The filter
+passes |f| <= 0.4 sample rates unchanged and falls as an integrated Gaussian to nothing at half the
+rate:
+
+    X_i(f) = P(f) G(f) sum_s a_is(f) exp(-j 2 pi (f + fc) tau_is).
+
+a_is is the amplitude times, if asked for, 1/(R_tx R_rx) and the element patterns at frequency
+f + fc (Ødegaard 2004, the thesis, eqs. [8]-[12]). No delay is rounded. G rings for only 90 samples
+(to -145 dB), so an echo has an end, and a receive window that cuts it keeps exactly the part
+inside. A pulse without energy beyond 0.4 sample rates passes G unchanged.
+
+The sum is one type-1 non-uniform FFT per channel (finufft). Scenes that allow their echoes an error
+are summed only to that accuracy, in single precision where that is enough.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import finufft
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft
+
+from clsas.core import validate
+from clsas.core.fourier import EDGE_PRODUCT, smooth_edge
+from clsas.core.geometry import legs_m
+from clsas.core.threads import in_threads
+from clsas.simulation.paths import Paths, PointBlock
+from clsas.simulation.patterns import interpolation_matrix
+from clsas.sonar.system import PASSBAND
+from clsas.sonar.track import Channels
+
+Progress = Callable[[int, int], None] | None
+
+RINGING = math.ceil(EDGE_PRODUCT / ((1 - PASSBAND) / 2))
+"""Samples for which the receiver's filter rings before and after an echo."""
+
+NO_ECHO = "no echo falls within the receive window, from where elements look: every sample is zero"
+
+_SUM_ERROR = 1e-9  # relative, of the non-uniform FFT
+_PATTERN_ERROR = 1e-6  # of interpolated element patterns
+_TOUCHING_M = 1e-9  # a point closer to an element than this has no direction
+
+
+@dataclass(frozen=True)
+class ReceiveWindows:
+    """When every channel records.
+
+    Attributes
+    ----------
+    rate_hz : float
+        Sample rate.
+    start_s : float64 [channels]
+        Time of the first sample.
+    length : int
+        Samples per channel.
+    kept_s : (float64 [channels], float64 [channels])
+        Shortest and longest delay of the points that are summed.
+    tail : int
+        Zeros behind the window, so that echoes that end later do not wrap around into it.
+    """
+
+    rate_hz: float
+    start_s: NDArray[np.float64]
+    length: int
+    kept_s: tuple[NDArray[np.float64], NDArray[np.float64]]
+    tail: int
+
+
+def record(
+    paths: Paths,
+    spectrum: Callable[[NDArray], NDArray],
+    carrier_hz: float,
+    windows: ReceiveWindows,
+    *,
+    workers: int | None,
+    progress: Progress,
+) -> NDArray[np.complex64]:
+    """Return the samples in the receive windows, complex64 [channels, length].
+
+    Parameters
+    ----------
+    paths : Paths
+    spectrum : callable
+        The pulse's spectrum at frequencies relative to the carrier, in seconds.
+    carrier_hz : float
+    windows : ReceiveWindows
+    workers, progress
+        As for `clsas.simulate`.
+
+    Raises
+    ------
+    ValueError
+        If a point lies on an element while spreading or patterns are asked for.
+
+    Warns
+    -----
+    ClsasWarning
+        If every sample is zero.
+    """
+    modes = fft.next_fast_len(windows.length + windows.tail)
+    frequency = fft.fftfreq(modes, 1 / windows.rate_hz)
+    beyond = (2 * np.abs(frequency) / windows.rate_hz - PASSBAND) / (1 - PASSBAND)
+    # The FFT's sum stands for an integral over frequency, hence the factor of the sample rate.
+    transfer = windows.rate_hz * spectrum(frequency) * smooth_edge(beyond)
+
+    def echoes(group: range) -> list[NDArray[np.complex64]]:
+        totals = np.zeros((len(group), modes), np.complex128)
+        elements, blocks = paths.visible(group)
+        for block in blocks:
+            for total, channel, ends in zip(totals, group, elements, strict=True):
+                _add(total, paths, carrier_hz, windows, channel, ends, block)
+        return [
+            fft.ifft(total * transfer)[: windows.length].astype(np.complex64) for total in totals
+        ]
+
+    samples = np.empty((paths.channels, windows.length), np.complex64)
+    groups = paths.groups
+    for group, lines in zip(groups, in_threads(echoes, groups, workers), strict=True):
+        for channel, line in zip(group, lines, strict=True):
+            samples[channel] = line
+            if progress is not None:
+                progress(channel + 1, paths.channels)
+    if not samples.any():
+        validate.warn(NO_ECHO)
+    return samples
+
+
+def _add(
+    total: NDArray[np.complex128],
+    paths: Paths,
+    carrier_hz: float,
+    windows: ReceiveWindows,
+    channel: int,
+    elements: Channels,
+    block: PointBlock,
+) -> None:
+    """Add the transfer functions of a block of points to those of one channel, [modes]."""
+    modes, patterns = len(total), paths.patterns
+    points, amplitudes = block.points_m, block.amplitudes
+    out, back = legs_m(points, *elements, paths.sound_speed_m_s)
+    delay = (out + back) / paths.sound_speed_m_s
+    kept = (delay >= windows.kept_s[0][channel]) & (delay <= windows.kept_s[1][channel])
+    if not kept.any():
+        return
+    if not kept.all():
+        points, amplitudes, out, back, delay = (
+            part[kept] for part in (points, amplitudes, out, back, delay)
+        )
+    if (paths.spreading or patterns) and min(out.min(), back.min()) < _TOUCHING_M:
+        raise ValueError(
+            f"scene must have no point on an element with spreading or element patterns, "
+            f"got one on an element of channel {channel}"
+        )
+    sines: list[NDArray] = []
+    if patterns is not None:
+        in_front, sines = patterns.sines(points, elements, out, back)
+        if not in_front.any():
+            return
+        if not in_front.all():
+            amplitudes, out, back, delay, *sines = (
+                part[in_front] for part in (amplitudes, out, back, delay, *sines)
+            )
+    # float32 rounds an angle by up to 2^-25 of it, which is a phase error at frequency modes/2.
+    single = block.error >= 1e-7 * modes
+    real = np.float32 if single else np.float64
+    cycles = carrier_hz * delay
+    phase = (-2 * np.pi * (cycles - np.rint(cycles))).astype(real)
+    strengths: NDArray = np.empty(len(phase), np.complex64 if single else np.complex128)
+    strengths.real, strengths.imag = np.cos(phase), np.sin(phase)
+    strengths *= amplitudes
+    if paths.spreading:
+        strengths /= out * back
+    turns = windows.rate_hz / modes * (delay - windows.start_s[channel])
+    angles = (2 * np.pi * (turns - np.rint(turns))).astype(real)
+    accuracy = max(_SUM_ERROR, block.error / 10)
+    if patterns is None:
+        total += _point_sum(angles, strengths, modes, accuracy)
+        return
+    sines = [sine.astype(real) for sine in sines]
+    gains = patterns.gains(sines, max(_PATTERN_ERROR, block.error), real, modes)
+    sums = _point_sum(angles, strengths * gains, modes, accuracy).reshape(len(gains), modes)
+    total += np.sum(interpolation_matrix(len(gains), modes) * sums, axis=0)
+
+
+def _point_sum(angles: NDArray, strengths: NDArray, modes: int, error: float) -> NDArray:
+    """Return sum_s strengths_s exp(-j k angle_s) for the FFT's frequencies k."""
+    # The frequency grid fits into caches, so sorting the points would not pay.
+    return finufft.nufft1d1(
+        angles, strengths, modes, eps=error, isign=-1, modeord=1, nthreads=1, spread_sort=0
+    )
