@@ -18,7 +18,7 @@ from clsas.cli.parameters import INPUT
 from clsas.core import validate
 from clsas.exact.backprojection import prepare
 from clsas.exact.run import execute
-from clsas.files.scene_files import DIAL
+from clsas.files.scene_tables import PLAN_KEYS
 from clsas.opencl.device import open_device
 from clsas.planning.planner import WORST_TOLERANCE_DB
 from clsas.products.tradeoff import summary
@@ -88,7 +88,7 @@ def image(
     opened = open_device(device)
     results: dict[str, Any] = {"method": "exact"}
     chosen, why, warned = None, "", False
-    if wish.keys() & set(DIAL):
+    if wish.keys() & set(PLAN_KEYS):
         start = time.perf_counter()
         chosen = clsas.plan(lines, grid, **wish, beam=beam, device=opened)
         results["plan_seconds"] = time.perf_counter() - start
@@ -186,7 +186,7 @@ def plan(
     wish = read_wish(described, given)
     beam = read_beam(described, given)
     lines = load(lines_file, clsas.RangeLines)
-    if not wish.keys() & set(DIAL):
+    if not wish.keys() & set(PLAN_KEYS):
         wish = DEFAULT_WISH
     chosen = clsas.plan(lines, grid, **wish, beam=beam, device=device)
     _warn_of_error(chosen)

@@ -12,7 +12,8 @@ import clsas
 from clsas.cli.parameters import keep_apart, written_to
 from clsas.core import validate
 from clsas.files import scene_files as config
-from clsas.files.scene_files import DIAL, EXACT, SceneFile
+from clsas.files.scene_files import SceneFile
+from clsas.files.scene_tables import EXACT_KEYS, PLAN_KEYS
 from clsas.planning.planner import TOLERANCE_DB
 
 DEFAULT_WISH = {"tolerance_db": TOLERANCE_DB}
@@ -62,10 +63,10 @@ def read_grid(
 
 
 def read_wish(described: SceneFile, given: dict[str, Any], exact: bool = False) -> dict[str, Any]:
-    """Return how an image is wanted: one of `DIAL`, or else what the exact image takes."""
+    """Return how an image is wanted: one of `PLAN_KEYS`, or else what the exact image takes."""
     dial, exactly = (
         {name: given[name] for name in names if given.get(name) is not None}
-        for names in (DIAL, EXACT)
+        for names in (PLAN_KEYS, EXACT_KEYS)
     )
     if len(dial) + exact > 1:
         raise click.UsageError(
@@ -76,16 +77,16 @@ def read_wish(described: SceneFile, given: dict[str, Any], exact: bool = False) 
             "--accuracy-db, --taps and --upsampling are of the exact image, and play no part with "
             f"--{next(iter(dial)).replace('_', '-')}"
         )
-    if len(exactly) == len(EXACT):
+    if len(exactly) == len(EXACT_KEYS):
         raise click.UsageError(
             "--accuracy-db plays no part where --taps and --upsampling are given"
         )
     if dial:
         return dial
-    described_exactly = {key: value for key, value in described.image.items() if key in EXACT}
+    described_exactly = {key: value for key, value in described.image.items() if key in EXACT_KEYS}
     if exact or exactly:
         return described_exactly | exactly
-    described_dial = {key: value for key, value in described.image.items() if key in DIAL}
+    described_dial = {key: value for key, value in described.image.items() if key in PLAN_KEYS}
     return described_dial or described_exactly or DEFAULT_WISH
 
 

@@ -20,7 +20,8 @@ from clsas.cli.outputs import progress_bar, report
 from clsas.cli.parameters import COUNTS, INPUT, File, Store, keep_apart
 from clsas.core.extras import install_command
 from clsas.core.threads import uninterrupted
-from clsas.files.scene_files import DIAL, SceneFile, simulation_digest
+from clsas.files.scene_files import SceneFile, simulation_digest
+from clsas.files.scene_tables import PLAN_KEYS
 from clsas.mosaics.mosaic import patch_shape_of
 from clsas.opencl.device import open_device
 
@@ -101,7 +102,7 @@ def mosaic(
         return
     described, grid = read_grid(scene, given, memory=False)
     wish = read_wish(described, given)
-    if set(wish) - {*DIAL, "accuracy_db"}:
+    if set(wish) - {*PLAN_KEYS, "accuracy_db"}:
         raise ValueError(f"{scene}: [image] taps and upsampling play no part in a mosaic")
     beam = read_beam(described, given)
     warn_of_sampling(described, grid)

@@ -1,7 +1,7 @@
-"""Files: one HDF5 schema for grids, range lines, echoes and images; and xarray.
+"""Grids, range lines, echoes and images in HDF5 files, and as xarray objects.
 
-The schema is in docs/format.md. It follows the dataclasses: an array is a dataset, a number or
-string is an attribute, a nested object is a group, None is left out.
+docs/format.md describes the schema. It follows the dataclasses: arrays are datasets, numbers and
+strings are attributes, nested objects are groups, and fields that are None are left out.
 """
 
 from __future__ import annotations
@@ -42,45 +42,45 @@ _KINDS = {
 _SAVED = (Grid, RangeLines, Image, Echoes)
 
 SUFFIXES = (".h5", ".hdf5", ".he5")
-"""What names of files may end in."""
+"""Suffixes that HDF5 files may have."""
 
 Saved = Grid | RangeLines | Image | Echoes
 
 
 class FileFormatError(ValueError):
-    """A file that is not a whole clsas file of a version this library reads."""
+    """The file is not a complete clsas file of a version that this library reads."""
 
 
 def save(path: str | os.PathLike, obj: Saved) -> None:
-    """Write an object to an HDF5 file, replacing a file of that name at once or not at all.
+    """Write an object to an HDF5 file. An existing file is replaced in one step.
 
     Parameters
     ----------
     path : path-like
-        The file: its name ends in one of `SUFFIXES` or has none. Its folder must exist.
+        The file. Its name has one of the `SUFFIXES` or none. Its folder must exist.
     obj : Grid, RangeLines, Image or Echoes
-        What to write; `load` returns it bit for bit.
+        The object; `load` returns it bit for bit.
 
     Raises
     ------
     TypeError
         If `obj` is of another type.
     ValueError
-        If the file's name ends as one of another format, such as .tif.
+        If the file's name has the suffix of another format, such as .tif.
     OSError
         If the folder does not exist or the file cannot be written, as on a full disk.
 
     Notes
     -----
-    The file is put together in memory, which thus holds the object once more: HDF5 does not
-    recover from a disk that turns out to be full.
+    The file is assembled in memory first, since HDF5 does not recover from a full disk. This takes
+    as much memory again as the object.
     """
     path = validate.path("path", path)
     validate.suffix("path", path, *SUFFIXES)
     validate.instance("obj", obj, *_SAVED)
     with replacing(path) as temporary:
         memory = BytesIO()
-        # The metadata of HDF5 1.10 carry checksums; those of earlier versions do not all.
+        # From format 1.10 on, all of HDF5's metadata have checksums.
         with h5py.File(memory, "w", libver=("v110", "v110")) as content:
             _set(content, "format", FORMAT)
             content.attrs["version"] = VERSION
@@ -99,15 +99,15 @@ def load(path: str | os.PathLike) -> Saved:
     Returns
     -------
     Grid, RangeLines, Image or Echoes
-        Equal to what was saved, bit for bit.
+        The object that was saved, bit for bit.
 
     Raises
     ------
     FileFormatError
-        If the file is not HDF5, not of clsas, of a newer version, incomplete, damaged, larger
-        than memory when unpacked, or refers to other files or places.
+        If the file is not HDF5, was not written by clsas, has a newer version, is incomplete or
+        damaged, is larger than memory when unpacked, or contains links.
     OSError
-        If it does not exist (FileNotFoundError) or cannot be read.
+        If the file does not exist (FileNotFoundError) or cannot be read.
     """
     with _opened(validate.path("path", path)) as file:
         obj = _read(file)
@@ -117,19 +117,19 @@ def load(path: str | os.PathLike) -> Saved:
 
 
 def read_geometry(path: str | os.PathLike) -> tuple[RangeLines, int]:
-    """Read everything of range lines but their samples.
+    """Read range lines without their samples.
 
     Returns
     -------
     lines : RangeLines
-        With one sample per channel, zero.
+        Lines with one sample per channel, which is zero.
     length : int
         Samples per channel in the file.
 
     Raises
     ------
     FileFormatError, OSError
-        As `load` does, and if the file holds something else.
+        As `load` does, and if the file holds another kind of object.
     """
     with _opened(path) as file:
         dataset = _samples_of(file)
@@ -138,7 +138,7 @@ def read_geometry(path: str | os.PathLike) -> tuple[RangeLines, int]:
 
 
 def read_samples(path: str | os.PathLike, rows: slice, columns: slice) -> np.ndarray:
-    """Read some samples of range lines, [channels, samples], and nothing else.
+    """Read some samples of range lines, [channels, samples].
 
     Raises
     ------
@@ -156,14 +156,14 @@ def read_samples(path: str | os.PathLike, rows: slice, columns: slice) -> np.nda
 
 @contextmanager
 def _opened(path: str | os.PathLike) -> Iterator[h5py.File]:
-    """Open a file of clsas to read; whatever is wrong with it is said by one exception."""
+    """Open a clsas file for reading; every defect raises FileFormatError."""
     path = Path(path)
     try:
         reading.check_ordinary(path)
     except ValueError as error:
         raise FileFormatError(str(error)) from None
     with path.open("rb"):
-        pass  # Whatever keeps it from being opened is said by Python, better than by HDF5.
+        pass  # Python's messages about files that cannot be opened are clearer than HDF5's.
     if not h5py.is_hdf5(path):
         raise FileFormatError(f"{path} is not an HDF5 file")
     try:
@@ -172,22 +172,22 @@ def _opened(path: str | os.PathLike) -> Iterator[h5py.File]:
             yield file
     except FileFormatError as error:
         raise FileFormatError(f"{path} {error}") from None
-    # HDF5 reports damage by any of these, depending on what it met first.
+    # HDF5 reports damage by any of these exceptions.
     except (OSError, RuntimeError, LookupError, ValueError, TypeError) as error:
         raise FileFormatError(f"{path} is damaged: {error}") from error
 
 
 def to_xarray(obj: Saved) -> xarray.DataArray | xarray.Dataset:
-    """Return an object as an xarray one, with coordinates in metres.
+    """Return an object as an xarray object, with coordinates in metres.
 
-    An image is a DataArray; a grid is a Dataset of coordinates only; range lines and echoes are
-    Datasets over (channel, sample). A coordinate has its unit in `attrs["units"]`; numbers that
-    belong to no axis are attributes, with the unit in their name.
+    An image becomes a DataArray, and a grid a Dataset that has only coordinates. Range lines and
+    echoes become Datasets over (channel, sample). `attrs["units"]` of a coordinate is its unit.
+    Numbers that belong to no axis are attributes with the unit in their name.
 
     Parameters
     ----------
     obj : Grid, RangeLines, Image or Echoes
-        What to convert. The arrays are shared, not copied.
+        The object. Its arrays are shared, not copied.
 
     Raises
     ------
@@ -216,7 +216,7 @@ def _write(group: h5py.Group, obj: Any) -> None:
         if value is None:
             continue
         if isinstance(value, np.ndarray):
-            # Checksummed, so that damage does not become data.
+            # With a checksum, so that damage is found.
             group.create_dataset(field.name, data=value, fletcher32=True)
         elif type(value) in _KINDS.values():
             _write(group.create_group(field.name), value)
@@ -240,7 +240,7 @@ def _samples_of(file: h5py.File) -> h5py.Dataset:
 
 
 def _read(group: h5py.Group, **instead: Any) -> Any:
-    """Return the object in a group, some of whose fields may be given `instead` of being read."""
+    """Return the object in a group. Fields in `instead` are not read."""
     name = _attribute(group, "kind")
     if not isinstance(name, str) or name not in _KINDS:
         where = f"{validate.shown(name)} at {validate.shown(group.name)}"
@@ -254,7 +254,7 @@ def _read(group: h5py.Group, **instead: Any) -> Any:
             values[field.name] = _attribute(group, field.name)
         elif (item := _item(group, field.name)) is not None:
             is_group = isinstance(item, h5py.Group)
-            # A group may be linked as a part of itself.
+            # A group may contain a link to itself.
             if is_group and _kind_of_field(field.type) != _attribute(item, "kind"):
                 raise FileFormatError(f"holds another object as {field.name} of the {name}")
             values[field.name] = _read(item) if is_group else _values(item)
@@ -266,15 +266,15 @@ def _read(group: h5py.Group, **instead: Any) -> Any:
 
 
 def _kind_of_field(annotation: object) -> str | None:
-    """Return the kind of object that a field such as `pulse: Pulse | None` holds, if of any."""
+    """Return the kind of object in a field such as `pulse: Pulse | None`; None for other fields."""
     classes = str(annotation).split(" | ")
     return next((name for name, kind in _KINDS.items() if kind.__name__ in classes), None)
 
 
 def _item(group: h5py.Group, name: str) -> h5py.Group | h5py.Dataset | None:
-    """Return a group or dataset that lies in this file itself, or None where there is none.
+    """Return a group or dataset of this file, or None if there is none of that name.
 
-    A file from elsewhere must not decide which other files are read.
+    Links are refused: a file must not decide which other files are read.
     """
     link = group.get(name, getlink=True)
     if link is None:
@@ -293,7 +293,7 @@ def _item(group: h5py.Group, name: str) -> h5py.Group | h5py.Dataset | None:
 
 
 def _values(dataset: h5py.Dataset) -> np.ndarray:
-    # HDF5 reads what was never written as zeros, however many.
+    # HDF5 returns zeros for chunks that were never written.
     if dataset.chunks is None:
         whole = dataset.id.get_storage_size() >= dataset.nbytes
     else:
@@ -306,8 +306,8 @@ def _values(dataset: h5py.Dataset) -> np.ndarray:
 
 
 def _check_memory(dataset: h5py.Dataset, size_bytes: int) -> None:
-    """Raise FileFormatError unless so much of a dataset fits into memory when it is read."""
-    # HDF5 unpacks chunks whole, from one buffer into another.
+    """Raise FileFormatError unless `size_bytes` of a dataset can be read into memory."""
+    # HDF5 unpacks whole chunks, from one buffer into another.
     chunk = math.prod(dataset.chunks or (0,)) * dataset.dtype.itemsize
     try:
         validate.memory(f"reading {dataset.name}", size_bytes + 2 * chunk)
@@ -316,12 +316,12 @@ def _check_memory(dataset: h5py.Dataset, size_bytes: int) -> None:
 
 
 def _set(group: h5py.Group, name: str, value: Any) -> None:
-    # Of fixed length, a string is inside the checksummed metadata; of variable length it is not.
+    # Checksums cover strings of fixed length, not those of variable length.
     group.attrs[name] = np.bytes_(value.encode()) if isinstance(value, str) else value
 
 
 def _attribute(group: h5py.Group, name: str) -> Any:
-    """Return an attribute as Python's own number, string or list, or None where there is none."""
+    """Return an attribute as a Python number, string or list, or None if it is missing."""
     value = group.attrs.get(name)
     value = value.tolist() if isinstance(value, np.generic | np.ndarray) else value
     return value.decode() if isinstance(value, bytes) else value

@@ -7,6 +7,10 @@ import pytest
 from pydantic_core import PydanticUndefined
 
 from clsas.files import scene_files as config
+from clsas.files.mistakes import models_in
+from clsas.files.scene_tables import SceneTables
+from clsas.files.survey_tables import PRESETS
+from clsas.files.track_files import read_track
 from clsas.simulation.scenes import PointTargets, Seabed
 from clsas.simulation.seabeds import rocks
 from clsas.sonar.beam import BeamWindow
@@ -95,14 +99,14 @@ def documented_keys():
 
 def tables(model, path=()):
     for name, info in model.model_fields.items():
-        for table in config._models(info.annotation):
+        for table in models_in(info.annotation):
             yield ".".join((*path, name)), table
             yield from tables(table, (*path, name))
 
 
 def test_every_key_is_documented_with_its_default():
     documented = documented_keys()
-    models = dict(tables(config._Scene))
+    models = dict(tables(SceneTables))
     assert documented.keys() == models.keys()
     for path, model in models.items():
         shared = path in {f"track.{motion}" for motion in ("surge", "sway", "heave")}
@@ -117,7 +121,7 @@ def test_every_key_is_documented_with_its_default():
 
 
 def test_presets_and_built_in_scenes():
-    for preset in config.PRESETS:
+    for preset in PRESETS:
         assert parse(f"[sonar]\npreset = '{preset}'").sonar.receivers > 1
     scene = config.parse_scene(
         config.built_in_scene("thesis_wide_beam"), name="built in", folder=Path()
@@ -472,5 +476,5 @@ def test_a_damaged_track_is_one_short_message(tmp_path):
     for text in ("x" * 10**6, "time_s,x_m,y_m,z_m\n" + "1" * 200_000, 'time_s,"x_m\n\0'):
         path.write_text(text)
         with pytest.raises(ValueError, match=r"track\.csv") as error:
-            config.read_track(path)
+            read_track(path)
         assert len(str(error.value)) < 500

@@ -1,0 +1,259 @@
+"""Tables of scene files: one pydantic model per table, which checks its keys.
+
+`build` turns a table into an object of the library. The library's own checks then apply; their
+messages get the table's name.
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+from pydantic import Field
+
+from clsas.core import validate
+from clsas.core.grid import Grid
+from clsas.exact.backprojection import BEST_ACCURACY_DB
+from clsas.files.survey_tables import SonarTable, TrackTable
+from clsas.files.tables import Table, Vector, located
+from clsas.planning.planner import checked_pairs, tolerance_in_db
+from clsas.signal.compression import check_options as check_compression
+from clsas.signal.interpolation import MOST_UPSAMPLING, TAPS
+from clsas.simulation.scenes import PointTargets, Seabed
+from clsas.simulation.seabeds import pipeline, rocks, wreck
+from clsas.simulation.simulator import check_options as check_simulation
+from clsas.sonar.beam import BeamWindow
+from clsas.sonar.track import Pointing
+
+SEABEDS: dict[str, Callable[..., Seabed]] = {"wreck": wreck, "pipeline": pipeline, "rocks": rocks}
+PLAN_KEYS = ("tolerance_db", "tolerance_wavelengths", "stages")
+"""Keys of `[image]` for `clsas.plan`, which takes one of them."""
+EXACT_KEYS = ("accuracy_db", "taps", "upsampling")
+"""Keys of `[image]` for `clsas.backproject`."""
+
+
+class _Target(Table):
+    position_m: Vector
+    amplitude: float = 1.0
+
+
+class _Seabed(Table):
+    scene: str
+    x_m: Annotated[list[float], Field(min_length=2, max_length=2)] | None = None
+    y_m: Annotated[list[float], Field(min_length=2, max_length=2)] | None = None
+    position_m: Annotated[list[float], Field(min_length=2, max_length=2)] | None = None
+    heading_deg: float | None = None
+    mast_m: float | None = None
+    count: int | None = None
+    cell_m: float = 0.1
+    density_m2: float = 600.0
+    seed: int = 0
+    floor_db: float = -50.0
+
+    def build(self) -> Seabed:
+        with located("[seabed]"):
+            make = SEABEDS[validate.one_of("scene", self.scene, tuple(SEABEDS))]
+            options = self.given()
+            del options["scene"]
+            known = inspect.signature(make).parameters
+            for name in options:
+                if name not in known:
+                    raise ValueError(
+                        f"{name} must be left out with the scene {validate.shown(self.scene)}"
+                    )
+            return make(**options)
+
+
+class _Axis(Table):
+    start_m: float
+    stop_m: float
+    count: int
+
+    def build(self) -> tuple[float, float, int]:
+        return self.start_m, self.stop_m, self.count
+
+
+class _Grid(Table):
+    x: _Axis
+    y: _Axis
+    z_m: float = 0.0
+
+    def build(self) -> Grid:
+        with located("[grid]"):
+            return Grid.plane(self.x.build(), self.y.build(), self.z_m)
+
+
+class _Pointing(Table):
+    squint_deg: float | list[float] = 0.0
+    depression_deg: float = 0.0
+    spot_m: Vector | None = None
+
+    def build(self) -> Pointing:
+        with located("[simulate.pointing]"):
+            if self.spot_m is None:
+                squint = np.atleast_1d(self.squint_deg)
+                squint = validate.array("squint_deg", squint, np.float64, (None,))
+                depression = validate.number("depression_deg", self.depression_deg, "degrees")
+                return Pointing.scan(np.radians(squint), depression_rad=np.radians(depression))
+            if len(self.model_fields_set) > 1:
+                raise ValueError("spot_m must stand alone: it sets the angles")
+            return Pointing.spot(self.spot_m)
+
+
+class _Simulate(Table):
+    spreading: bool = False
+    motion_in_flight: bool = False
+    element_pattern: bool = True
+    phase_centres: bool = False
+    range_m: Annotated[list[float], Field(min_length=2, max_length=2)] | None = None
+    snr_db: float | None = None
+    seed: int = 0
+    pointing: _Pointing | None = None
+
+    def build(self) -> dict[str, Any]:
+        options = self.given()
+        if self.pointing is not None:
+            options["pointing"] = self.pointing.build()
+        with located("[simulate]"):
+            check_simulation(**options)
+        return options
+
+
+class _Compress(Table):
+    window: str | list[str | float] = "none"
+    oversampling: float = 2.0
+
+    def build(self) -> dict[str, Any]:
+        options = self.given()
+        if isinstance(self.window, list):
+            options["window"] = tuple(self.window)
+        with located("[compress]"):
+            check_compression(**options)
+        return options
+
+
+class _Beam(Table):
+    width_deg: float
+    shape: str = "rectangular"
+    squint_deg: float = 0.0
+    taper: float = 0.5
+    element_length_m: float | None = None
+    normalise: bool = False
+    track_pings: int | None = None
+
+    def build(self) -> BeamWindow:
+        with located("[image.beam]"):
+            return BeamWindow(**self.given())
+
+
+class _Image(Table):
+    tolerance_db: float | None = None
+    tolerance_wavelengths: float | None = None
+    stages: list[Annotated[list[int], Field(min_length=2, max_length=2)]] | None = None
+    accuracy_db: float | None = None
+    taps: int | None = None
+    upsampling: float | None = None
+    beam: _Beam | None = None
+
+    def build(self) -> dict[str, Any]:
+        options = self.given()
+        with located("[image]"):
+            requests = [name for name in PLAN_KEYS if name in options]
+            if len(requests) > 1 or (requests and options.keys() & set(EXACT_KEYS)):
+                others = [
+                    name
+                    for name in (*PLAN_KEYS, *EXACT_KEYS)
+                    if name in options and name != requests[0]
+                ]
+                raise ValueError(f"{requests[0]} must stand alone, got also {', '.join(others)}")
+            tolerance_in_db(self.tolerance_db, self.tolerance_wavelengths)
+            checked_pairs(self.stages or [])
+            if self.accuracy_db is not None:
+                validate.number(
+                    "accuracy_db", self.accuracy_db, "dB", least=BEST_ACCURACY_DB, below=0.0
+                )
+            if self.taps is not None and self.taps not in TAPS:
+                raise ValueError(f"taps must be one of {TAPS}, got {self.taps}")
+            if self.upsampling is not None:
+                validate.number("upsampling", self.upsampling, least=1.0, most=MOST_UPSAMPLING)
+        if self.stages is not None:
+            options["stages"] = [tuple(stage) for stage in self.stages]
+        if self.beam is not None:
+            options["beam"] = self.beam.build()
+        return options
+
+
+class _Mosaic(Table):
+    lines: str | None = None
+    store: str | None = None
+    patches: Annotated[list[int], Field(min_length=2, max_length=2)] | None = None
+    memory_mib: int | None = None
+
+    def build(self, folder: Path) -> dict[str, Any]:
+        options = self.given()
+        with located("[mosaic]"):
+            for name in ("lines", "store"):
+                if name in options:
+                    if not options[name]:
+                        raise ValueError(f"{name} must be a path, got an empty one")
+                    options[name] = folder / options[name]
+            if "lines" in options and not options["lines"].exists():
+                raise ValueError(f"lines must be a file or folder, there is no {options['lines']}")
+            if self.patches is not None:
+                rows, columns = (validate.count("every entry of patches", n) for n in self.patches)
+                options["patches"] = rows, columns
+            if self.memory_mib is not None:
+                validate.count("memory_mib", self.memory_mib)
+        return options
+
+
+class SceneTables(Table):
+    """A whole scene file."""
+
+    sonar: SonarTable | None = None
+    track: TrackTable | None = None
+    targets: list[_Target] | None = None
+    seabed: _Seabed | None = None
+    grid: _Grid | None = None
+    simulate: _Simulate = _Simulate()
+    compress: _Compress = _Compress()
+    image: _Image = _Image()
+    mosaic: _Mosaic = _Mosaic()
+
+    def build(self, folder: Path) -> dict[str, Any]:
+        """Return the fields of `clsas.files.scene_files.SceneFile` but for its name.
+
+        Parameters
+        ----------
+        folder : Path
+            Where relative paths in the file begin.
+        """
+        parts: list[PointTargets | Seabed] = []
+        if self.targets is not None:
+            with located("[[targets]]"):
+                parts.append(
+                    PointTargets(
+                        np.reshape([target.position_m for target in self.targets], (-1, 3)),
+                        np.array([target.amplitude for target in self.targets], complex),
+                    )
+                )
+        if self.seabed is not None:
+            parts.append(self.seabed.build())
+        paths = {
+            "track.file": self.track and self.track.file,
+            "mosaic.lines": self.mosaic.lines,
+        }
+        return dict(
+            sonar=self.sonar.build() if self.sonar else None,
+            track=self.track.build(folder) if self.track else None,
+            targets=tuple(parts) if len(parts) > 1 else parts[0] if parts else None,
+            grid=self.grid.build() if self.grid else None,
+            simulate=self.simulate.build(),
+            compress=self.compress.build(),
+            image=self.image.build(),
+            mosaic=self.mosaic.build(folder),
+            files={key: folder / file for key, file in paths.items() if file},
+        )

@@ -1,0 +1,177 @@
+"""Tables of scene files that describe the sonar and its track."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from clsas.core import validate
+from clsas.files.tables import Table, Vector, located
+from clsas.files.track_files import read_track
+from clsas.sonar.system import Pulse, Sonar, line_array
+from clsas.sonar.track import Motion, Track
+
+PRESETS = ("thesis_wide_beam", "edgetech", "sensotek")
+
+
+class PulseTable(Table):
+    """`[sonar.pulse]`."""
+
+    carrier_hz: float
+    duration_s: float
+    bandwidth_hz: float | None = None
+    code: str | list[int] = "up"
+    taper: float = 0.0
+
+    def build(self) -> Pulse:
+        """Return the pulse; raises ValueError if a value is outside its limits."""
+        if self.bandwidth_hz is not None:
+            code = self.code if isinstance(self.code, str) else tuple(self.code)
+            return Pulse(self.carrier_hz, self.bandwidth_hz, self.duration_s, code, self.taper)
+        if isinstance(self.code, str):
+            raise ValueError("missing key 'bandwidth_hz' (only a phase code sets its own)")
+        return Pulse.phase_code(
+            self.carrier_hz, self.duration_s, tuple(self.code), taper=self.taper
+        )
+
+
+class SonarTable(Table):
+    """`[sonar]`."""
+
+    preset: str | None = None
+    pulse: PulseTable | None = None
+    receivers: int | None = None
+    spacing_m: float | None = None
+    rx_m: list[Vector] | None = None
+    tx_m: Vector = Field(default=[0.0, 0.0, 0.0])
+    sample_rate_hz: float | None = None
+    sound_speed_m_s: float = 1500.0
+    tx_length_m: float | None = None
+    rx_length_m: float | None = None
+    tx_height_m: float | None = None
+    rx_height_m: float | None = None
+
+    def build(self) -> Sonar:
+        """Return the sonar; raises ValueError if a value is outside its limits."""
+        with located("[sonar]"):
+            if self.preset is not None:
+                others = sorted(self.model_fields_set - {"preset"})
+                if others:
+                    raise ValueError(f"preset must stand alone, got also {', '.join(others)}")
+                validate.one_of("preset", self.preset, PRESETS)
+                return getattr(Sonar, self.preset)()
+            if self.pulse is None:
+                raise ValueError("missing table [sonar.pulse], or key 'preset'")
+            match self.rx_m, self.receivers, self.spacing_m:
+                case list(), None, None:
+                    rx = np.array(self.rx_m)
+                case None, int(count), float(spacing):
+                    rx = line_array(count, spacing)
+                case _:
+                    raise ValueError("receivers must be given by receivers and spacing_m, or rx_m")
+        with located("[sonar.pulse]"):
+            pulse = self.pulse.build()
+        skipped = {"preset", "pulse", "receivers", "spacing_m", "rx_m"}
+        with located("[sonar]"):
+            return Sonar(pulse, rx, **self.model_dump(exclude=skipped))
+
+
+class MotionTable(Table):
+    """Sinusoid in time, or with `random_seed` random motion of the same power."""
+
+    period_s: float
+    phase_deg: float = 0.0
+    random_seed: int | None = None
+
+    def _motion(self, name: str, unit: str, scale: float = 1.0) -> Motion:
+        amplitude = scale * validate.number(name, getattr(self, name), unit)
+        period = validate.positive("period_s", self.period_s, "s")
+        phase = validate.number("phase_deg", self.phase_deg, "degrees")
+        phases, frequencies = np.radians([phase]), np.array([1 / period])
+        if self.random_seed is not None:
+            if "phase_deg" in self.model_fields_set:
+                raise ValueError("phase_deg must be left out with random_seed")
+            # Sinusoids of random frequency and phase, none with a shorter period than given.
+            random = np.random.default_rng(validate.count("random_seed", self.random_seed, least=0))
+            frequencies = random.uniform(0.1, 1.0, 32) / period
+            phases = random.uniform(0, 2 * np.pi, 32)
+        amplitude /= np.sqrt(len(phases))
+
+        def motion(time_s: NDArray[np.float64]) -> NDArray[np.float64]:
+            cycles = np.multiply.outer(time_s, frequencies)
+            return amplitude * np.sin(2 * np.pi * cycles + phases).sum(axis=-1)
+
+        return motion
+
+
+class DisplacementTable(MotionTable):
+    """`[track.surge]`, `[track.sway]` or `[track.heave]`."""
+
+    amplitude_m: float
+
+    def build(self) -> Motion:
+        """Return the displacement as a function of time, metres."""
+        return self._motion("amplitude_m", "m")
+
+
+class RotationTable(MotionTable):
+    """`[track.yaw]`, `[track.pitch]` or `[track.roll]`."""
+
+    amplitude_deg: float
+
+    def build(self) -> Motion:
+        """Return the angle as a function of time, radians."""
+        return self._motion("amplitude_deg", "degrees", np.pi / 180)
+
+
+class TrackTable(Table):
+    """`[track]`."""
+
+    file: str | None = None
+    start_m: Vector | None = None
+    velocity_m_s: Vector | None = None
+    pings: int | None = None
+    ping_interval_s: float | None = None
+    surge: DisplacementTable | None = None
+    sway: DisplacementTable | None = None
+    heave: DisplacementTable | None = None
+    yaw: RotationTable | None = None
+    pitch: RotationTable | None = None
+    roll: RotationTable | None = None
+
+    def build(self, folder: Path) -> Track:
+        """Return the track; a relative `file` begins at `folder`.
+
+        Raises
+        ------
+        ValueError
+            If a value is outside its limits or the file cannot be read.
+        """
+        if self.file is not None:
+            others = sorted(self.model_fields_set - {"file"})
+            if others:
+                raise ValueError(f"[track] file must stand alone, got also {', '.join(others)}")
+            with located("[track] file"):
+                try:
+                    return read_track(folder / self.file)
+                except OSError as error:
+                    raise ValueError(
+                        f"must be readable: {error.strerror}: {folder / self.file}"
+                    ) from None
+                except UnicodeDecodeError as error:
+                    raise ValueError(f"must be text: {folder / self.file}: {error}") from None
+        course = ("start_m", "velocity_m_s", "pings", "ping_interval_s")
+        for name in course:
+            if getattr(self, name) is None:
+                raise ValueError(f"[track] missing key {name!r} (or 'file')")
+        motions = {}
+        for argument in ("surge_m", "sway_m", "heave_m", "yaw_rad", "pitch_rad", "roll_rad"):
+            table = argument.split("_")[0]
+            if (motion := getattr(self, table)) is not None:
+                with located(f"[track.{table}]"):
+                    motions[argument] = motion.build()
+        with located("[track]"):
+            return Track.straight(*(getattr(self, name) for name in course), **motions)

@@ -1,0 +1,30 @@
+"""Base of the tables in scene files."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Annotated, Any
+
+from pydantic import BaseModel, ConfigDict, Field
+
+Vector = Annotated[list[float], Field(min_length=3, max_length=3)]
+
+
+class Table(BaseModel):
+    """A table that refuses unknown keys and values of other types."""
+
+    model_config = ConfigDict(extra="forbid", strict=True)
+
+    def given(self) -> dict[str, Any]:
+        """Return the keys that the file sets."""
+        return {name: getattr(self, name) for name in self.model_fields_set}
+
+
+@contextmanager
+def located(where: str) -> Iterator[None]:
+    """Prefix the library's own messages with the table of the file, such as "[sonar]"."""
+    try:
+        yield
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{where} {error}") from None
