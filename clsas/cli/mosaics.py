@@ -22,7 +22,7 @@ from clsas.core.extras import install_command
 from clsas.core.threads import uninterrupted
 from clsas.files.scene_files import SceneFile, simulation_digest
 from clsas.files.scene_tables import PLAN_KEYS
-from clsas.mosaics.mosaic import patch_shape_of
+from clsas.mosaics.patches import patch_shape_of
 from clsas.opencl.device import open_device
 
 _SCHEDULER_S = 10  # to answer

@@ -11,7 +11,7 @@ from clsas.factorized.plan import grid_digest
 from clsas.mosaics.survey import Survey
 from clsas.sonar.beam import BeamWindow
 
-WISHES = ("tolerance_db", "tolerance_wavelengths", "stages", "accuracy_db")
+REQUESTS = ("tolerance_db", "tolerance_wavelengths", "stages", "accuracy_db")
 """How a mosaic may be wished for: at most one of these."""
 
 
@@ -24,7 +24,7 @@ def inputs_of(
         "grid": grid_digest(grid),
         "pixels": list(grid.shape),
         "beam": None if beam is None else json.loads(beam_json(beam)),
-        **{name: wish.get(name) for name in WISHES},
+        **{name: wish.get(name) for name in REQUESTS},
     }
     return json.loads(json.dumps(inputs))
 

@@ -22,7 +22,7 @@ PIXELS_CHECKSUM = "pixels_crc32c"
 """Attribute that holds the checksum of a patch's pixels."""
 
 
-Place = tuple[int, int]
+PatchIndex = tuple[int, int]
 """Row and column of a patch."""
 
 _LISTED = 3  # damaged patches that a message names
@@ -160,7 +160,7 @@ def is_intact(attributes: dict[str, Any]) -> bool:
     return attributes == with_checksum(attributes)
 
 
-def describe_damage(found: dict[Place, str]) -> str:
+def describe_damage(found: dict[PatchIndex, str]) -> str:
     """Return damaged patches in words: how many, and the first of them with the reason."""
     named = [f"patch {row},{column}: {reason}" for (row, column), reason in found.items()]
     more = f" and {len(named) - _LISTED} more" if len(named) > _LISTED else ""

@@ -31,7 +31,7 @@ from clsas.mosaics.overview import reduced
 from clsas.mosaics.provenance import differences
 from clsas.mosaics.record import (
     DamageError,
-    Place,
+    PatchIndex,
     Record,
     describe_damage,
     is_intact,
@@ -182,7 +182,7 @@ class Store:
             write_attributes(temporary / "patches", {})
             write_attributes(temporary, with_checksum(attributes))
 
-    def records(self) -> dict[Place, Record]:
+    def records(self) -> dict[PatchIndex, Record]:
         """Return the records of all finished patches, by row and column.
 
         Damaged patches are left out as far as their records and the sizes of their pixels tell;
@@ -198,7 +198,7 @@ class Store:
                 found[place] = record
         return found
 
-    def damage(self, tell: Callable[[int, int], object] | None = None) -> dict[Place, str]:
+    def damage(self, tell: Callable[[int, int], object] | None = None) -> dict[PatchIndex, str]:
         """Read every finished patch; return what is wrong with each that is damaged.
 
         Parameters
@@ -323,7 +323,7 @@ class Store:
         except ValueError as error:
             raise ValueError(f"{self.path} is damaged: {name} cannot be read: {error}") from error
 
-    def _places(self) -> list[Place]:
+    def _places(self) -> list[PatchIndex]:
         """Return the patches that have a folder for their record, in order."""
         shape = self._shape
         folders = self.path / "patches"
@@ -342,7 +342,7 @@ class Store:
         rows, columns = (math.ceil(n / m) for n, m in zip(pixels.shape, pixels.chunks, strict=True))
         return rows, columns
 
-    def _touched(self, rows: slice, columns: slice) -> list[Place]:
+    def _touched(self, rows: slice, columns: slice) -> list[PatchIndex]:
         """Return the patches that some pixels belong to."""
         indices = []
         for part, count, side in zip(
@@ -355,13 +355,13 @@ class Store:
             indices.append(range(ends[0] // side, ends[1] // side + 1))
         return list(itertools.product(*indices))
 
-    def _folder(self, place: Place) -> Path:
+    def _folder(self, place: PatchIndex) -> Path:
         return self.path / "patches" / "{}.{}".format(*place)
 
-    def _chunk(self, place: Place) -> Path:
+    def _chunk(self, place: PatchIndex) -> Path:
         return self.path.joinpath("pixels", "c", *map(str, place))
 
-    def _checksum(self, place: Place) -> str | None:
+    def _checksum(self, place: PatchIndex) -> str | None:
         """Return the checksum that a patch's pixels end with, or None where they are all zero."""
         try:
             check_ordinary(self._chunk(place))
@@ -371,7 +371,7 @@ class Store:
         except FileNotFoundError:
             return None  # Zarr leaves out a chunk that is all zero
 
-    def _record(self, place: Place) -> Record | None:
+    def _record(self, place: PatchIndex) -> Record | None:
         """Return the record of a patch, or None if it is not finished.
 
         Raises
@@ -392,7 +392,7 @@ class Store:
             raise DamageError("its pixels are " + ("gone" if gone else "not those of its record"))
         return record
 
-    def _verify(self, place: Place) -> None:
+    def _verify(self, place: PatchIndex) -> None:
         """Read a patch; raise DamageError if it is finished and not what was written."""
         if self._record(place) is None:
             return

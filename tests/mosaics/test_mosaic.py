@@ -22,8 +22,11 @@ import clsas
 from clsas.core.grid import Grid
 from clsas.core.image_error import relative_error_db
 from clsas.core.validate import ClsasWarning
+from clsas.mosaics.devices import claim_device
+from clsas.mosaics.forming import open_visibility, stamped_files
 from clsas.mosaics.store import Store
-from clsas.mosaics.survey import END
+from clsas.mosaics.survey import END, open_survey
+from clsas.mosaics.visibility import SurveyVisibility
 from clsas.opencl.device import list_devices
 from clsas.planning import planner
 from clsas.sonar.beam import BeamWindow
@@ -31,7 +34,7 @@ from clsas.sonar.beam import BeamWindow
 GRID = Grid.plane((-4, 4, 80), (30, 40, 60))
 LINES = lines_over(GRID, along_x(160, 0.05), carrier_hz=100e3, step_m=0.03)
 BEAM = BeamWindow(8.0, "hann")
-WISH = {"accuracy_db": -70, "beam": BEAM, "patches": (2, 4)}
+REQUEST = {"accuracy_db": -70, "beam": BEAM, "patches": (2, 4)}
 
 
 @pytest.fixture(scope="module")
@@ -46,14 +49,14 @@ def file(tmp_path):
 
 
 def test_patches_make_the_image(platform, exact):
-    image = clsas.mosaic(LINES, GRID, **WISH, device=platform).image()
+    image = clsas.mosaic(LINES, GRID, **REQUEST, device=platform).image()
     assert image.grid is GRID
     assert relative_error_db(image, exact) < -65
 
 
 def test_every_patch_has_its_own_pixels(exact):
     seen = []
-    for patch in clsas.mosaic(LINES, GRID, **WISH):
+    for patch in clsas.mosaic(LINES, GRID, **REQUEST):
         seen.append((patch.row, patch.column))
         expected = GRID.positions_m(patch.rows, patch.columns)
         np.testing.assert_allclose(patch.grid.positions_m(), expected, atol=1e-9)
@@ -63,7 +66,7 @@ def test_every_patch_has_its_own_pixels(exact):
 
 
 def test_a_store_holds_pixels_and_records(file, tmp_path, exact):
-    mosaic = clsas.mosaic(file, GRID, tmp_path / "image.zarr", **WISH)
+    mosaic = clsas.mosaic(file, GRID, tmp_path / "image.zarr", **REQUEST)
     assert len(mosaic) == 8
     assert not mosaic.finished
     for patch in mosaic:
@@ -80,7 +83,7 @@ def test_a_store_holds_pixels_and_records(file, tmp_path, exact):
 
 def test_a_store_opens_in_xarray(file, tmp_path, exact):
     xarray = pytest.importorskip("xarray")
-    for _ in clsas.mosaic(file, GRID, tmp_path / "image.zarr", **WISH):
+    for _ in clsas.mosaic(file, GRID, tmp_path / "image.zarr", **REQUEST):
         pass
     data = xarray.open_zarr(tmp_path / "image.zarr", consolidated=False)
     assert data.pixels.dims == ("y", "x")
@@ -89,7 +92,7 @@ def test_a_store_opens_in_xarray(file, tmp_path, exact):
 
 
 def test_the_overview_keeps_power_and_place(file, tmp_path, exact):
-    for _ in clsas.mosaic(file, GRID, tmp_path / "image.zarr", **WISH):
+    for _ in clsas.mosaic(file, GRID, tmp_path / "image.zarr", **REQUEST):
         pass
     overview = Store.opened(tmp_path / "image.zarr").overview(20)
     assert overview.grid.shape == (15, 20)
@@ -106,7 +109,7 @@ def test_the_directions_are_those_of_the_whole_track():
     lines = lines_over(GRID, track, carrier_hz=100e3, step_m=0.03)
     beam = BeamWindow(8.0, "rectangular")
     reference = clsas.backproject(lines, GRID, beam=beam, accuracy_db=-80)
-    image = clsas.mosaic(lines, GRID, **(WISH | {"beam": beam})).image()
+    image = clsas.mosaic(lines, GRID, **(REQUEST | {"beam": beam})).image()
     assert relative_error_db(image, reference) < -65
 
 
@@ -166,11 +169,11 @@ def test_a_normalising_beam(tmp_path):
     """What it multiplies by is that of all channels, not of those that a patch sees."""
     beam = BeamWindow(8.0, "hann", normalise=True)
     exact = clsas.backproject(LINES, GRID, beam=beam, accuracy_db=-80)
-    image = clsas.mosaic(LINES, GRID, **(WISH | {"beam": beam})).image()
+    image = clsas.mosaic(LINES, GRID, **(REQUEST | {"beam": beam})).image()
     assert relative_error_db(image, exact) < -65
     clsas.save(tmp_path / "lines.h5", LINES)
     with pytest.raises(ValueError, match="beam must not normalise with a folder"):
-        clsas.mosaic(tmp_path, GRID, **(WISH | {"beam": beam}))
+        clsas.mosaic(tmp_path, GRID, **(REQUEST | {"beam": beam}))
 
 
 def test_height_maps_and_points():
@@ -178,7 +181,7 @@ def test_height_maps_and_points():
     hill = 0.3 * np.exp(-(np.add.outer((y - 35) ** 2, x**2)))
     for grid in (GRID.with_height(hill), Grid.points(GRID.with_height(hill).positions_m())):
         exact = clsas.backproject(LINES, grid, beam=BEAM, accuracy_db=-80)
-        image = clsas.mosaic(LINES, grid, **WISH).image()
+        image = clsas.mosaic(LINES, grid, **REQUEST).image()
         assert relative_error_db(image, exact) < -65
 
 
@@ -196,7 +199,7 @@ def test_the_thesis_stages_work_in_patches():
 
 def test_patches_that_do_not_divide_the_grid(exact):
     patches = []
-    image = clsas.mosaic(LINES, GRID, **(WISH | {"patches": (7, 3)})).image(patches.append)
+    image = clsas.mosaic(LINES, GRID, **(REQUEST | {"patches": (7, 3)})).image(patches.append)
     assert {patch.image.grid.shape for patch in patches} == {(9, 27), (9, 26), (6, 27), (6, 26)}
     assert relative_error_db(image, exact) < -65
 
@@ -220,7 +223,7 @@ def test_patches_that_do_not_divide_the_grid(exact):
 )
 def test_bad_arguments(wrong, message):
     with pytest.raises((TypeError, ValueError), match=message):
-        clsas.mosaic(LINES, GRID, **(WISH | wrong))
+        clsas.mosaic(LINES, GRID, **(REQUEST | wrong))
 
 
 def test_bad_grids():
@@ -230,7 +233,7 @@ def test_bad_grids():
         clsas.mosaic(LINES, (3, 4))
 
 
-def test_a_wish_is_checked_before_any_patch():
+def test_a_request_is_checked_before_any_patch():
     with pytest.raises(ValueError, match=r"tolerance_db must be .* got -200"):
         clsas.mosaic(LINES, GRID, tolerance_db=-200)
     with pytest.raises(ValueError, match="tolerance_wavelengths must be"):
@@ -242,7 +245,7 @@ def test_a_wish_is_checked_before_any_patch():
 def test_a_patch_that_no_channel_sees_is_empty_and_flagged(tmp_path):
     """Half of the scene lies behind the beams, and some beyond the lines' end."""
     grid = Grid.plane((-4, 120, 64), (30, 40, 20))
-    mosaic = clsas.mosaic(LINES, grid, tmp_path / "a.zarr", **(WISH | {"patches": (1, 4)}))
+    mosaic = clsas.mosaic(LINES, grid, tmp_path / "a.zarr", **(REQUEST | {"patches": (1, 4)}))
     patches = []
     image = mosaic.image(patches.append)
     assert image.pixels[:, :16].any()
@@ -263,7 +266,7 @@ def test_missing_samples_are_flagged(file, tmp_path):
         LINES.select(kept), GRID, beam=dataclasses.replace(BEAM, along=along[kept])
     )
     patches = []
-    image = clsas.mosaic(file, GRID, tmp_path / "a.zarr", **WISH).image(patches.append)
+    image = clsas.mosaic(file, GRID, tmp_path / "a.zarr", **REQUEST).image(patches.append)
     assert relative_error_db(image, reference) < -58
     flagged = [patch for patch in patches if patch.record.flags]
     assert 0 < len(flagged) < len(patches)
@@ -276,7 +279,7 @@ def test_missing_samples_are_flagged(file, tmp_path):
 @pytest.mark.parametrize("wish", [{}, {"accuracy_db": None, "tolerance_db": -65}])
 def test_missing_channels_weigh_nothing(file, wish, monkeypatch):
     """Neither with a beam that divides by what channels weigh, nor in a plan."""
-    monkeypatch.setattr(sys.modules["clsas.mosaics.mosaic"], "_WORTH_A_PLAN", 0)
+    monkeypatch.setattr("clsas.mosaics.forming._WORTH_A_PLAN", 0)
     beam = BeamWindow(8.0, "hann", normalise=True)
     kept = np.random.default_rng(1).random(160) > 0.2
     with h5py.File(file, "r+") as lines:
@@ -286,7 +289,7 @@ def test_missing_channels_weigh_nothing(file, wish, monkeypatch):
     reference = clsas.backproject(
         LINES.select(kept), GRID, beam=dataclasses.replace(beam, along=along), accuracy_db=-80
     )
-    image = clsas.mosaic(file, GRID, **(WISH | {"beam": beam} | wish)).image()
+    image = clsas.mosaic(file, GRID, **(REQUEST | {"beam": beam} | wish)).image()
     # It is a mean times the number of all channels.
     of_all = 160 / np.count_nonzero(kept)
     assert relative_error_db(image.pixels, of_all * reference.pixels) < -65
@@ -310,18 +313,18 @@ def test_lines_without_complex_samples_are_refused(file, samples, says):
         elif samples is not None:
             lines["samples"] = samples
     with pytest.raises(clsas.FileFormatError, match=says):
-        clsas.mosaic(file, GRID, **WISH)
+        clsas.mosaic(file, GRID, **REQUEST)
 
 
 def test_lost_pings_are_flagged():
     lines = LINES.select(np.delete(np.arange(160), slice(70, 80)))
-    flags = {patch.record.flags for patch in clsas.mosaic(lines, GRID, **WISH)}
+    flags = {patch.record.flags for patch in clsas.mosaic(lines, GRID, **REQUEST)}
     assert ("a gap of 0.55 m between pings",) in flags
 
 
 class TestOnceMore:
     def test_what_the_store_has_is_not_formed_again(self, file, tmp_path, exact):
-        mosaic = clsas.mosaic(file, GRID, tmp_path / "a.zarr", **WISH)
+        mosaic = clsas.mosaic(file, GRID, tmp_path / "a.zarr", **REQUEST)
         running = iter(mosaic)
         first = next(running)
         running.close()
@@ -335,41 +338,41 @@ class TestOnceMore:
         assert relative_error_db(mosaic.image(), exact) < -65
 
     def test_without_a_store_everything_is(self):
-        mosaic = clsas.mosaic(LINES, GRID, **WISH)
+        mosaic = clsas.mosaic(LINES, GRID, **REQUEST)
         assert len(list(mosaic)) == len(list(mosaic)) == 8
 
 
 class TestResuming:
     def test_what_is_finished_is_kept(self, file, tmp_path, exact):
         path = tmp_path / "image.zarr"
-        running = iter(clsas.mosaic(file, GRID, path, **WISH))
+        running = iter(clsas.mosaic(file, GRID, path, **REQUEST))
         for _ in range(3):
             next(running)
         running.close()
         kept = {place: (path / "patches" / "{}.{}".format(*place)) for place in np.ndindex(2, 4)}
         times = {p: f.stat().st_mtime_ns for p, f in kept.items() if f.exists()}
         assert 3 <= len(times) < 8
-        mosaic = clsas.mosaic(file, GRID, path, **WISH)
+        mosaic = clsas.mosaic(file, GRID, path, **REQUEST)
         assert set(mosaic.finished) == set(times)
         assert {(patch.row, patch.column) for patch in mosaic} == set(kept) - set(times)
         assert all(kept[place].stat().st_mtime_ns == then for place, then in times.items())
         assert relative_error_db(Store.opened(path).image(), exact) < -65
-        assert not list(clsas.mosaic(file, GRID, path, **WISH))
+        assert not list(clsas.mosaic(file, GRID, path, **REQUEST))
 
     def test_the_image_has_what_was_there_and_what_was_not(self, tmp_path):
         path = tmp_path / "a.zarr"
-        before = clsas.mosaic(LINES, GRID, path, **WISH).image()
+        before = clsas.mosaic(LINES, GRID, path, **REQUEST).image()
         chunk = path / "pixels" / "c" / "1" / "2"
         chunk.write_bytes(chunk.read_bytes()[:100])
         patches = []
         with pytest.warns(ClsasWarning, match="patch 1,2: its pixels are not those"):
-            mosaic = clsas.mosaic(LINES, GRID, path, **WISH)
+            mosaic = clsas.mosaic(LINES, GRID, path, **REQUEST)
         again = mosaic.image(patches.append)
         np.testing.assert_array_equal(again.pixels, before.pixels)
         told = [(patch.row, patch.column) for patch in patches]
         assert told[-1] == (1, 2)  # after those that were there
         assert sorted(told) == list(np.ndindex(2, 4))
-        there = clsas.mosaic(LINES, GRID, path, **WISH)
+        there = clsas.mosaic(LINES, GRID, path, **REQUEST)
         assert len(there.finished) == 8
         np.testing.assert_array_equal(there.image().pixels, before.pixels)
 
@@ -383,7 +386,7 @@ class TestResuming:
         """
         import pickle
 
-        wish = WISH | {"patches": (6, 8)}
+        wish = REQUEST | {"patches": (6, 8)}
         (tmp_path / "wish").write_bytes(pickle.dumps((GRID, wish)))
         formed = []
         for kills in range(4):
@@ -415,9 +418,9 @@ class TestResuming:
         ],
     )
     def test_other_inputs_are_refused(self, tmp_path, change, message):
-        next(iter(clsas.mosaic(LINES, GRID, tmp_path / "a.zarr", **WISH)))
+        next(iter(clsas.mosaic(LINES, GRID, tmp_path / "a.zarr", **REQUEST)))
         before = len(Store.opened(tmp_path / "a.zarr").records())
-        change = {"lines": LINES, "grid": GRID} | WISH | change
+        change = {"lines": LINES, "grid": GRID} | REQUEST | change
         with pytest.raises(ValueError, match=f"made with other inputs: .*{message}"):
             clsas.mosaic(change.pop("lines"), change.pop("grid"), tmp_path / "a.zarr", **change)
         assert len(Store.opened(tmp_path / "a.zarr").records()) == before
@@ -428,7 +431,7 @@ class TestResuming:
         wrong = clsas.mosaic(LINES, GRID, path, stages=[(64, 64)], patches=(2, 4))
         with pytest.raises(ValueError, match="patch 0,0: stages must leave a line and a pixel"):
             list(wrong)
-        other = WISH | {"patches": (3, 4)}
+        other = REQUEST | {"patches": (3, 4)}
         with pytest.raises(ValueError, match="or delete it: no patch of it was finished"):
             clsas.mosaic(LINES, GRID, path, **other)
         assert path.exists()
@@ -447,35 +450,35 @@ class TestResuming:
     )
     def test_a_patch_with_a_damaged_record_is_formed_again(self, tmp_path, name, value):
         path = tmp_path / "a.zarr"
-        assert len(list(clsas.mosaic(LINES, GRID, path, **WISH))) == 8
+        assert len(list(clsas.mosaic(LINES, GRID, path, **REQUEST))) == 8
         record = path / "patches" / "1.2" / "zarr.json"
         stored = json.loads(record.read_text())
         stored["attributes"][name] = value
         record.write_text(json.dumps(stored))
         with pytest.warns(ClsasWarning, match="patch 1,2: its record does not match its checksum"):
-            again = list(clsas.mosaic(LINES, GRID, path, **WISH))
+            again = list(clsas.mosaic(LINES, GRID, path, **REQUEST))
         assert [(patch.row, patch.column) for patch in again] == [(1, 2)]
 
     def test_a_store_of_an_older_schema_is_refused(self, tmp_path):
-        next(iter(clsas.mosaic(LINES, GRID, tmp_path / "a.zarr", **WISH)))
+        next(iter(clsas.mosaic(LINES, GRID, tmp_path / "a.zarr", **REQUEST)))
         header = tmp_path / "a.zarr" / "zarr.json"
         text = json.loads(header.read_text())
         text["attributes"]["version"] = 0
         header.write_text(json.dumps(text))
         with pytest.raises(ValueError, match="is a mosaic of version 0, this clsas works with"):
-            clsas.mosaic(LINES, GRID, tmp_path / "a.zarr", **WISH)
+            clsas.mosaic(LINES, GRID, tmp_path / "a.zarr", **REQUEST)
 
     def test_lines_with_other_samples_are_refused(self, tmp_path):
-        next(iter(clsas.mosaic(LINES, GRID, tmp_path / "a.zarr", **WISH)))
+        next(iter(clsas.mosaic(LINES, GRID, tmp_path / "a.zarr", **REQUEST)))
         samples = LINES.samples.copy()
         samples[77] *= 5
         changed = dataclasses.replace(LINES, samples=samples)
         with pytest.raises(ValueError, match="the range lines are others"):
-            clsas.mosaic(changed, GRID, tmp_path / "a.zarr", **WISH)
+            clsas.mosaic(changed, GRID, tmp_path / "a.zarr", **REQUEST)
 
     @pytest.mark.parametrize("damage", ["removed", "cut"])
     def test_pixels_that_are_not_there_are_formed_again(self, tmp_path, damage):
-        list(clsas.mosaic(LINES, GRID, tmp_path / "a.zarr", **WISH))
+        list(clsas.mosaic(LINES, GRID, tmp_path / "a.zarr", **REQUEST))
         before = Store.opened(tmp_path / "a.zarr").image().pixels
         chunk = tmp_path / "a.zarr" / "pixels" / "c" / "1" / "2"
         if damage == "cut":
@@ -483,38 +486,38 @@ class TestResuming:
         else:
             chunk.unlink()
         with pytest.warns(ClsasWarning, match="patch 1,2: its pixels are"):
-            again = list(clsas.mosaic(LINES, GRID, tmp_path / "a.zarr", **WISH))
+            again = list(clsas.mosaic(LINES, GRID, tmp_path / "a.zarr", **REQUEST))
         assert [(patch.row, patch.column) for patch in again] == [(1, 2)]
         np.testing.assert_array_equal(Store.opened(tmp_path / "a.zarr").image().pixels, before)
 
     @pytest.mark.parametrize("name", ["pixels/zarr.json", "zarr.json"])
     @pytest.mark.parametrize("text", ["", "{}", '{"attributes": {"format": "clsas mosaic"}}'])
     def test_a_damaged_store_is_told(self, tmp_path, name, text):
-        next(iter(clsas.mosaic(LINES, GRID, tmp_path / "a.zarr", **WISH)))
+        next(iter(clsas.mosaic(LINES, GRID, tmp_path / "a.zarr", **REQUEST)))
         (tmp_path / "a.zarr" / name).write_text(text)
         with pytest.raises(ValueError, match=r"a.zarr (is damaged|exists and is not|is a mosaic)"):
-            clsas.mosaic(LINES, GRID, tmp_path / "a.zarr", **WISH)
+            clsas.mosaic(LINES, GRID, tmp_path / "a.zarr", **REQUEST)
 
     def test_a_file_written_anew_is_read_anew(self, file, tmp_path):
-        clsas.mosaic(file, GRID, **WISH).image()
+        clsas.mosaic(file, GRID, **REQUEST).image()
         moved = dataclasses.replace(LINES, tx_m=LINES.tx_m + 0.3, rx_m=LINES.rx_m + 0.3)
         clsas.save(file, moved)
-        image = clsas.mosaic(file, GRID, **WISH).image()
+        image = clsas.mosaic(file, GRID, **REQUEST).image()
         exact = clsas.backproject(moved, GRID, beam=BEAM, accuracy_db=-80)
         assert relative_error_db(image, exact) < -65
 
     def test_a_folder_of_something_else_is_left_alone(self, tmp_path):
         (tmp_path / "letter.txt").write_text("dear")
         with pytest.raises(ValueError, match="exists and is not a mosaic of clsas"):
-            clsas.mosaic(LINES, GRID, tmp_path, **WISH)
+            clsas.mosaic(LINES, GRID, tmp_path, **REQUEST)
         assert [path.name for path in tmp_path.iterdir()] == ["letter.txt"]
 
     def test_a_record_cut_off_is_formed_again(self, tmp_path):
-        list(clsas.mosaic(LINES, GRID, tmp_path / "a.zarr", **WISH))
+        list(clsas.mosaic(LINES, GRID, tmp_path / "a.zarr", **REQUEST))
         record = tmp_path / "a.zarr" / "patches" / "1.2" / "zarr.json"
         record.write_text(record.read_text()[:50])
         with pytest.warns(ClsasWarning, match="patch 1,2: its record cannot be read"):
-            again = list(clsas.mosaic(LINES, GRID, tmp_path / "a.zarr", **WISH))
+            again = list(clsas.mosaic(LINES, GRID, tmp_path / "a.zarr", **REQUEST))
         assert [(patch.row, patch.column) for patch in again] == [(1, 2)]
 
 
@@ -536,7 +539,7 @@ def test_a_full_disk_keeps_what_is_finished(file, tmp_path):
     """
     import pickle
 
-    (tmp_path / "wish").write_bytes(pickle.dumps((GRID, WISH)))
+    (tmp_path / "wish").write_bytes(pickle.dumps((GRID, REQUEST)))
     done = subprocess.run(
         [sys.executable, "-c", textwrap.dedent(program)], cwd=tmp_path, text=True,
         capture_output=True, check=True,
@@ -545,30 +548,30 @@ def test_a_full_disk_keeps_what_is_finished(file, tmp_path):
     assert re.search(r"a\.zarr/pixels/c/\d/\d'$", done.stdout.strip())  # not a temporary file
     kept = Store.opened(tmp_path / "a.zarr").records()
     assert 3 <= len(kept) < 8
-    assert len(list(clsas.mosaic(file, GRID, tmp_path / "a.zarr", **WISH))) == 8 - len(kept)
+    assert len(list(clsas.mosaic(file, GRID, tmp_path / "a.zarr", **REQUEST))) == 8 - len(kept)
 
 
 def test_a_store_that_cannot_be_made(tmp_path):
     with pytest.raises(OSError, match="no such folder"):
-        clsas.mosaic(LINES, GRID, tmp_path / "none" / "a.zarr", **WISH)
+        clsas.mosaic(LINES, GRID, tmp_path / "none" / "a.zarr", **REQUEST)
     (tmp_path / "file").write_text("")
     with pytest.raises((OSError, ValueError), match="file"):
-        clsas.mosaic(LINES, GRID, tmp_path / "file", **WISH)
+        clsas.mosaic(LINES, GRID, tmp_path / "file", **REQUEST)
 
 
 @pytest.mark.skipif(not os.geteuid(), reason="nothing is read-only to root")
 def test_a_store_that_is_read_only(tmp_path):
-    list(clsas.mosaic(LINES, GRID, tmp_path / "a.zarr", **WISH))
+    list(clsas.mosaic(LINES, GRID, tmp_path / "a.zarr", **REQUEST))
     (tmp_path / "a.zarr").chmod(0o500)
     with pytest.raises(PermissionError):
-        clsas.mosaic(LINES, GRID, tmp_path / "a.zarr", **WISH)
+        clsas.mosaic(LINES, GRID, tmp_path / "a.zarr", **REQUEST)
 
 
 @pytest.mark.skipif(len(list_devices()) < 2, reason="one OpenCL device only")
 def test_devices_side_by_side(exact):
     infos = list_devices()[:2]
     mosaic = clsas.mosaic(
-        LINES, GRID, **(WISH | {"patches": (6, 8)}), device=[info.index for info in infos]
+        LINES, GRID, **(REQUEST | {"patches": (6, 8)}), device=[info.index for info in infos]
     )
     patches = []
     assert relative_error_db(mosaic.image(patches.append), exact) < -65
@@ -578,7 +581,7 @@ def test_devices_side_by_side(exact):
 class TestDistributed:
     def test_a_worker_that_dies_is_made_up_for(self, file, tmp_path):
         distributed = pytest.importorskip("distributed")
-        for _ in clsas.mosaic(file, GRID, tmp_path / "local.zarr", **WISH):
+        for _ in clsas.mosaic(file, GRID, tmp_path / "local.zarr", **REQUEST):
             pass
         with (
             distributed.LocalCluster(
@@ -589,7 +592,7 @@ class TestDistributed:
             first = next(iter(client.run(os.getpid).values()))
             places = []
             path = tmp_path / "distributed.zarr"
-            for patch in clsas.mosaic(file, GRID, path, client=client, **WISH):
+            for patch in clsas.mosaic(file, GRID, path, client=client, **REQUEST):
                 places.append((patch.row, patch.column))
                 if len(places) == 2:
                     os.kill(first, signal.SIGKILL)
@@ -602,7 +605,7 @@ class TestDistributed:
     def test_only_workers_need_a_device(self, file, tmp_path, monkeypatch):
         monkeypatch.setattr("clsas.opencl.device._raw_devices", list)
         client = SimpleNamespace(get_executor=None)
-        mosaic = clsas.mosaic(file, GRID, tmp_path / "a.zarr", client=client, **WISH)
+        mosaic = clsas.mosaic(file, GRID, tmp_path / "a.zarr", client=client, **REQUEST)
         assert len(mosaic) == 8
 
     @pytest.mark.parametrize(
@@ -622,7 +625,7 @@ class TestDistributed:
 class TestFollowing:
     GRID = Grid.plane((-30, 10, 200), (30, 33, 12))
     TRACK = along_x(1200, 0.05)
-    WISH = MappingProxyType({"accuracy_db": -70, "beam": BEAM, "patches": (1, 10)})
+    REQUEST = MappingProxyType({"accuracy_db": -70, "beam": BEAM, "patches": (1, 10)})
 
     @pytest.fixture(scope="class")
     @classmethod
@@ -659,7 +662,7 @@ class TestFollowing:
         recorder = threading.Thread(target=more)
         recorder.start()
         path = tmp_path / "a.zarr"
-        for patch in clsas.mosaic(folder, self.GRID, path, **self.WISH, follow_s=60):
+        for patch in clsas.mosaic(folder, self.GRID, path, **self.REQUEST, follow_s=60):
             formed.append((patch.column, patch.record.survey_channels))
             late.set()
         recorder.join()
@@ -671,7 +674,7 @@ class TestFollowing:
         folder, add = record
         add(range(3))
         patches = list(
-            clsas.mosaic(folder, self.GRID, tmp_path / "a.zarr", **self.WISH, follow_s=1)
+            clsas.mosaic(folder, self.GRID, tmp_path / "a.zarr", **self.REQUEST, follow_s=1)
         )
         assert len(patches) == 10
         assert not (folder / END).exists()
@@ -679,15 +682,12 @@ class TestFollowing:
     @pytest.mark.parametrize(("squint_deg", "column"), [(0.0, 160), (40.0, 160), (-40.0, 0)])
     def test_no_patch_is_formed_too_early(self, lines, squint_deg, column):
         """Not either with a beam that looks ahead, or back."""
-        module = sys.modules["clsas.mosaics.mosaic"]
         beam = BeamWindow(8.0, "hann", squint_deg=squint_deg, along=(1.0, 0.0, 0.0))
         patch = self.GRID.window(slice(0, 12), slice(column, column + 10))
         counts = np.arange(20, 1201, 20)
-        sights = [
-            module._Sight.of(module.open_survey(lines.select(slice(0, n))), beam) for n in counts
-        ]
-        last = np.flatnonzero(sights[-1].sees(patch))[-1]
-        passed = [sight.has_passed(patch, sight.settled) for sight in sights]
+        known = [SurveyVisibility.of(open_survey(lines.select(slice(0, n))), beam) for n in counts]
+        last = np.flatnonzero(known[-1].channels(patch))[-1]
+        passed = [each.has_passed(patch, each.settled) for each in known]
         assert not any(passed[: np.searchsorted(counts, last + 1)])
         assert last < 1000
         assert passed[np.searchsorted(counts, last + 200)]  # and soon
@@ -696,13 +696,13 @@ class TestFollowing:
         """Files are in the store's inputs once, whoever looked when they came."""
         folder, add = record
         add(range(2))
-        mosaic = clsas.mosaic(folder, self.GRID, tmp_path / "a.zarr", **self.WISH, follow_s=1)
+        mosaic = clsas.mosaic(folder, self.GRID, tmp_path / "a.zarr", **self.REQUEST, follow_s=1)
         add(range(2, 4))
         (folder / END).touch()
         formed = list(mosaic)
         assert len(formed) == 10
         assert not list(mosaic)
-        again = clsas.mosaic(folder, self.GRID, tmp_path / "a.zarr", **self.WISH, follow_s=1)
+        again = clsas.mosaic(folder, self.GRID, tmp_path / "a.zarr", **self.REQUEST, follow_s=1)
         assert len(again.finished) == 10
 
     def test_a_survey_that_grew_twice_goes_on(self, record, tmp_path):
@@ -710,22 +710,22 @@ class TestFollowing:
         folder, add = record
         add(range(2))
         path = tmp_path / "a.zarr"
-        mosaic = clsas.mosaic(folder, self.GRID, path, **self.WISH, follow_s=3)
+        mosaic = clsas.mosaic(folder, self.GRID, path, **self.REQUEST, follow_s=3)
         add([2])
         later = threading.Timer(1.5, add, ([3],))
         later.start()
         list(mosaic)
         later.join()
         assert len(Store.opened(path)._attributes()["inputs"]["parts"]) == 4
-        assert len(clsas.mosaic(folder, self.GRID, path, **self.WISH).finished) == 10
+        assert len(clsas.mosaic(folder, self.GRID, path, **self.REQUEST).finished) == 10
 
     def test_later_channels_make_a_patch_anew(self, lines, record, tmp_path):
         folder, add = record
         add(range(4))
         path = tmp_path / "a.zarr"
-        assert len(list(clsas.mosaic(folder, self.GRID, path, **self.WISH))) == 10
+        assert len(list(clsas.mosaic(folder, self.GRID, path, **self.REQUEST))) == 10
         add(range(4, 6))
-        again = {patch.column for patch in clsas.mosaic(folder, self.GRID, path, **self.WISH)}
+        again = {patch.column for patch in clsas.mosaic(folder, self.GRID, path, **self.REQUEST)}
         assert 9 in again
         assert 0 not in again
         beam = dataclasses.replace(BEAM, track_pings=101)
@@ -737,11 +737,11 @@ class TestFollowing:
         folder, add = record
         add(range(6))
         path = tmp_path / "a.zarr"
-        running = iter(clsas.mosaic(folder, self.GRID, path, **self.WISH, follow_s=5))
+        running = iter(clsas.mosaic(folder, self.GRID, path, **self.REQUEST, follow_s=5))
         for _ in range(5):
             next(running)
         running.close()
-        mosaic = clsas.mosaic(folder, self.GRID, path, **self.WISH, follow_s=5)
+        mosaic = clsas.mosaic(folder, self.GRID, path, **self.REQUEST, follow_s=5)
         assert len(mosaic.finished) >= 5
         # The way back, beside the first.
         back = lines.select(np.arange(1199, -1, -1))
@@ -753,11 +753,11 @@ class TestFollowing:
         store = Store.opened(path)
         assert {record.survey_channels for record in store.records().values()} == {2400}
         np.testing.assert_array_equal(image.pixels, store.image().pixels)
-        assert not list(clsas.mosaic(folder, self.GRID, path, **self.WISH))
+        assert not list(clsas.mosaic(folder, self.GRID, path, **self.REQUEST))
 
     def test_a_worker_opens_every_file_once(self, lines, record, monkeypatch):
         """But again should it be another one meanwhile."""
-        mosaic, survey = sys.modules["clsas.mosaics.mosaic"], sys.modules["clsas.mosaics.survey"]
+        survey = sys.modules["clsas.mosaics.survey"]
         read, opened = survey.read_geometry, []
         monkeypatch.setattr(
             survey, "read_geometry", lambda path: opened.append(path.name) or read(path)
@@ -766,9 +766,9 @@ class TestFollowing:
 
         def seen():
             """Return the channels that a worker knows, and the files that it opened for it."""
-            files = mosaic._files(survey.open_survey(folder))
+            files = stamped_files(survey.open_survey(folder))
             opened.clear()
-            return mosaic._opened(files, None).survey.channels, list(opened)
+            return open_visibility(files, None).survey.channels, list(opened)
 
         add(range(2))
         assert seen() == (400, ["0.h5", "1.h5"])
@@ -781,7 +781,7 @@ class TestFollowing:
     def test_a_folder_that_stays_empty(self, tmp_path):
         (tmp_path / "none").mkdir()
         with pytest.raises(ValueError, match="has no file"):
-            clsas.mosaic(tmp_path / "none", self.GRID, **self.WISH, follow_s=0.1)
+            clsas.mosaic(tmp_path / "none", self.GRID, **self.REQUEST, follow_s=0.1)
 
 
 @pytest.mark.skipif(not os.path.exists("/proc/self/status"), reason="Linux tells the most memory")
@@ -840,10 +840,9 @@ def test_lines_larger_than_memory_are_read_in_parts(tmp_path):
 
 def test_workers_of_a_machine_take_a_device_each(tmp_path, monkeypatch):
     """And share them where there are more; what one leaves the next takes."""
-    module = sys.modules["clsas.mosaics.mosaic"]
-    monkeypatch.setattr(module, "_side_by_side", lambda: ("first", "second"))
-    monkeypatch.setattr(module.tempfile, "gettempdir", lambda: str(tmp_path))
-    claim = module._claimed.__wrapped__  # as every process calls it, once
+    monkeypatch.setattr("clsas.mosaics.devices.default_devices", lambda: ("first", "second"))
+    monkeypatch.setattr("tempfile.gettempdir", lambda: str(tmp_path))
+    claim = claim_device.__wrapped__  # as every process calls it, once
     workers = [claim() for _ in range(5)]
     assert [device for device, _ in workers] == ["first", "second", "first", "second", "first"]
     os.close(workers[1][1])

@@ -1,0 +1,226 @@
+"""Form one patch of a mosaic: read its lines, plan, image, and write it to the store."""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsas.core.grid import Grid
+from clsas.core.image import Image, holds_any
+from clsas.core.lines import RangeLines
+from clsas.exact.backprojection import prepare
+from clsas.exact.run import execute
+from clsas.factorized.plan import Plan
+from clsas.mosaics.devices import process_device, thread_device
+from clsas.mosaics.patches import PatchWindow, host_bytes
+from clsas.mosaics.provenance import REQUESTS, beam_json
+from clsas.mosaics.record import Record
+from clsas.mosaics.store import Store
+from clsas.mosaics.survey import Survey, largest_gap_m, open_files
+from clsas.mosaics.visibility import SurveyVisibility
+from clsas.opencl.device import Device
+from clsas.planning.factorize import factorize
+from clsas.planning.planner import plan, tolerance_in_db
+from clsas.sonar.beam import BeamWindow
+
+_WORTH_A_PLAN = 5e7  # pixels times channels; smaller patches are backprojected in less time
+_OPENING = threading.Lock()
+_LATEST: list[Survey] = []  # the survey that this process opened last
+
+StampedFiles = tuple[tuple[Path, tuple[int, int]], ...]
+"""Files of a survey, with their sizes and times of change."""
+
+
+@dataclass(frozen=True, eq=False)
+class Job:
+    """Settings shared by all patches. Pickled with every task, so it holds no samples.
+
+    Attributes
+    ----------
+    files : tuple of (Path, (int, int))
+        Files from which a worker process opens the survey.
+    local : SurveyVisibility or None
+        The survey, where patches are formed in this process.
+    request : dict
+        One of `REQUESTS`.
+    beam : BeamWindow or None
+    memory_bytes : int
+        Memory of one patch.
+    store : Path or None
+    """
+
+    files: StampedFiles
+    local: SurveyVisibility | None
+    request: dict[str, Any]
+    beam: BeamWindow | None
+    memory_bytes: int
+    store: Path | None
+
+    def accuracy_db(self, pairs: int) -> float | None:
+        """Accuracy of exact imaging, dB, or None if the patch is to be planned.
+
+        `pairs` is the number of pixels times the number of channels.
+        """
+        if "accuracy_db" in self.request:
+            return self.request["accuracy_db"]
+        if "stages" in self.request or pairs > _WORTH_A_PLAN:
+            return None
+        return tolerance_in_db(*(self.request.get(name) for name in REQUESTS[:2]))
+
+    def visibility(self) -> SurveyVisibility:
+        """Return the survey. A worker process opens its files when their number changes.
+
+        Raises
+        ------
+        ValueError
+            If a file has changed.
+        """
+        if self.local is not None:
+            return self.local
+        with _OPENING:
+            found = open_visibility(self.files, beam_json(self.beam))
+        if found.survey.stamps != tuple(stamp for _, stamp in self.files):
+            raise ValueError("source must not change while a mosaic is formed: a file of it did")
+        return found
+
+    def opened_store(self) -> Store | None:
+        """Return the store, or None if there is none."""
+        return None if self.store is None else Store.at(self.store)
+
+
+def stamped_files(survey: Survey) -> StampedFiles:
+    """Return the files of a survey for `Job.files`."""
+    pairs = zip(survey.parts, survey.stamps, strict=True)
+    return tuple((part, stamp) for part, stamp in pairs if isinstance(part, Path))
+
+
+@lru_cache(maxsize=2)
+def open_visibility(files: StampedFiles, beam: str | None) -> SurveyVisibility:
+    """Open a survey's files in a worker process; `beam` is JSON."""
+    # If the survey has grown, only the new files are opened.
+    before = next((s for s in _LATEST if files[: len(s.parts)] == stamped_files(s)), None)
+    survey = open_files(tuple(path for path, _ in files), before)
+    _LATEST[:] = [survey]
+    return SurveyVisibility.of(survey, None if beam is None else BeamWindow(**json.loads(beam)))
+
+
+def form_patch(job: Job, window: PatchWindow) -> tuple[Record, Image | None]:
+    """Form one patch and write it to the store.
+
+    Returns
+    -------
+    record : Record
+    image : Image or None
+        None if another process runs this: it reads the pixels from the store.
+
+    Raises
+    ------
+    ValueError
+        As imaging does, with the patch's row and column.
+    """
+    try:
+        device = process_device() if job.local is None else thread_device()
+        record, image = _image(job, job.visibility(), window.grid, device)
+    except ValueError as error:
+        raise ValueError(f"patch {window.row},{window.column}: {error}") from error
+    store = job.opened_store()
+    if store is not None:
+        place = (window.row, window.column, window.rows, window.columns)
+        store.write(*place, image.pixels, record)
+    return record, None if job.local is None else image
+
+
+def _image(
+    job: Job, visibility: SurveyVisibility, grid: Grid, device: Device
+) -> tuple[Record, Image]:
+    """Image one patch, and record how."""
+    start = time.perf_counter()
+    survey, visible = visibility.survey, visibility.channels(grid)
+    known: dict[str, Any] = {
+        "survey_channels": survey.channels,
+        "device": device.info.label,
+        "driver": device.info.driver,
+        "channels": int(np.count_nonzero(visible)),
+    }
+    if not visible.any():
+        return Record(**known, seconds=time.perf_counter() - start), _empty(grid)
+    lines, missing = survey.read(visible, *visibility.ranges_m(grid))
+    known |= {
+        "missing_channels": int(np.count_nonzero(missing)),
+        "gap_m": largest_gap_m(lines, missing),
+        "read_seconds": time.perf_counter() - start,
+    }
+    if missing.all():
+        return Record(**known, seconds=time.perf_counter() - start), _empty(grid)
+    beam = None
+    if job.beam is not None:
+        beam = replace(job.beam, along=visibility.along[visible][~missing])
+    if missing.any():
+        lines = lines.select(~missing)
+    _check_memory(job, lines, grid)
+    image, how = _formed(job, lines, grid, beam, device)
+    if beam is not None and beam.normalise:
+        # The beam normalised by the channels of this patch instead of all.
+        scale = np.float32(survey.channels / lines.channels)
+        image = Image(scale * image.pixels, grid) if scale != 1 else image
+    known |= how | {
+        "has_pixels": holds_any(image.pixels),
+        "seconds": time.perf_counter() - start,
+    }
+    return Record(**known), image
+
+
+def _formed(
+    job: Job, lines: RangeLines, grid: Grid, beam: BeamWindow | None, device: Device
+) -> tuple[Image, dict[str, Any]]:
+    """Return the image of some lines, and what its record says about the method."""
+    patch_bytes = host_bytes(lines.channels, lines.length, grid.size)
+    accuracy_db = job.accuracy_db(lines.channels * grid.size)
+    if accuracy_db is not None:
+        preparation = prepare(lines, grid, accuracy_db=accuracy_db, beam=beam, device=device)
+        preparation.warn_of_ambiguity()
+        error_db = max(accuracy_db, preparation.predicted_error_db)
+        how = {"predicted_error_db": error_db, "memory_bytes": patch_bytes}
+        return execute(preparation), how
+    before = time.perf_counter()
+    available = min(job.memory_bytes - patch_bytes, device.info.memory_bytes // 2)
+    chosen = plan(lines, grid, **job.request, beam=beam, device=device, memory_bytes=available)
+    how = {
+        "plan_seconds": time.perf_counter() - before,
+        "predicted_error_db": chosen.predicted_error_db,
+        "predicted_seconds": chosen.predicted_seconds,
+        "memory_bytes": patch_bytes + int(chosen.memory_bytes),
+        "plan": json.loads(_without_directions(chosen).to_json()),
+    }
+    return factorize(lines, grid, chosen, device=device), how
+
+
+def _check_memory(job: Job, lines: RangeLines, grid: Grid) -> None:
+    """Raise ValueError if lines and pixels of a patch alone take all of its memory."""
+    patch_bytes = host_bytes(lines.channels, lines.length, grid.size)
+    if patch_bytes >= job.memory_bytes:
+        raise ValueError(
+            f"memory_bytes must be more than {patch_bytes / 2**20:.1f} MiB for "
+            f"{grid.shape[0]} x {grid.shape[1]} pixels from {lines.channels} lines of "
+            f"{lines.length} samples, got {job.memory_bytes / 2**20:.1f} MiB: use smaller patches"
+        )
+
+
+def _empty(grid: Grid) -> Image:
+    pixels: NDArray[np.complex64] = np.zeros(grid.shape, np.complex64)
+    return Image(pixels, grid)
+
+
+def _without_directions(chosen: Plan) -> Plan:
+    """Return a plan without the beam's directions, which would take most of a record."""
+    if chosen.beam is None:
+        return chosen
+    return replace(chosen, beam=replace(chosen.beam, along=None))

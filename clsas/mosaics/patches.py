@@ -1,0 +1,127 @@
+"""Division of a mosaic into patches, and how large a patch may be."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from clsas.core import validate
+from clsas.core.grid import Grid
+from clsas.mosaics.record import PatchIndex
+from clsas.mosaics.visibility import SurveyVisibility
+
+_LARGEST_SIDE = 4096  # pixels; such a patch takes seconds, so larger ones would gain nothing
+_SMALLEST_SIDE = 128  # pixels; smaller patches would be read and planned more than imaged
+
+
+class PatchWindow(NamedTuple):
+    """Which pixels of a mosaic a patch has."""
+
+    grid: Grid
+    row: int
+    column: int
+    rows: slice
+    columns: slice
+
+
+@dataclass(frozen=True, eq=False)
+class Layout:
+    """A grid divided into patches.
+
+    Attributes
+    ----------
+    grid : Grid
+        Grid of the whole mosaic.
+    patch_shape : (rows, columns)
+        Pixels of a patch; patches at the end may be smaller.
+    """
+
+    grid: Grid
+    patch_shape: tuple[int, int]
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Number of patches along rows and columns."""
+        rows, columns = (
+            math.ceil(n / m) for n, m in zip(self.grid.shape, self.patch_shape, strict=True)
+        )
+        return rows, columns
+
+    def __len__(self) -> int:
+        """Return the number of all patches."""
+        return math.prod(self.shape)
+
+    def window(self, index: PatchIndex) -> PatchWindow:
+        """Return the pixels of a patch."""
+        rows, columns = (
+            slice(i * side, min((i + 1) * side, most))
+            for i, side, most in zip(index, self.patch_shape, self.grid.shape, strict=True)
+        )
+        return PatchWindow(self.grid.window(rows, columns), *index, rows, columns)
+
+
+def host_bytes(channels: int, length: int, pixels: int) -> int:
+    """Return the memory for lines and pixels of a patch, each with one working copy."""
+    return 2 * 8 * (channels * length + pixels)
+
+
+def choose_patch_shape(
+    visibility: SurveyVisibility, grid: Grid, memory_bytes: int
+) -> tuple[int, int]:
+    """Return the pixels of the largest patches that are predicted to fit into memory.
+
+    Raises
+    ------
+    ValueError
+        If not even the smallest patches fit.
+    """
+    side = _LARGEST_SIDE
+    needed = 0
+    while side >= _SMALLEST_SIDE:
+        # Patches as even as possible.
+        shape = tuple(math.ceil(n / math.ceil(n / side)) for n in grid.shape)
+        most = 0
+        for row in (0, grid.shape[0] - 1):
+            start = [row // shape[0] * shape[0], grid.shape[1] // 2 // shape[1] * shape[1]]
+            window = grid.window(*(slice(a, a + n) for a, n in zip(start, shape, strict=True)))
+            visible = visibility.channels(window)
+            if visible.any():
+                count, length = visibility.survey.extent(visible, *visibility.ranges_m(window))
+                most = max(most, count * length)
+        # The device holds upsampled lines and stages: about one and a half times the lines.
+        needed = host_bytes(1, most, shape[0] * shape[1]) + 12 * most + (64 << 20)
+        if needed <= memory_bytes:
+            return shape
+        side //= 2
+    raise ValueError(
+        f"memory_bytes must be at least {needed / 2**20:.0f} MiB to choose patches by it, of "
+        f"{shape[0]} x {shape[1]} pixels, got {memory_bytes / 2**20:.3g} MiB: give patches"
+    )
+
+
+def patch_shape_of(patches: tuple[int, int], grid: Grid) -> tuple[int, int]:
+    """Return the pixels of a patch for a number of patches along rows and columns.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If `patches` is not two whole numbers, or some patches would be empty.
+    """
+    try:
+        counts = tuple(validate.count("every entry of patches", n) for n in patches)
+    except TypeError:
+        raise TypeError(f"patches must be (rows, columns) of patches, got {patches!r}") from None
+    if len(counts) != 2:
+        raise ValueError(f"patches must be (rows, columns) of patches, got {patches!r}")
+    shape = []
+    for count, pixels in zip(counts, grid.shape, strict=True):
+        side = math.ceil(pixels / count)
+        if math.ceil(pixels / side) != count:
+            fewer = math.ceil(pixels / side)
+            raise ValueError(
+                f"patches must leave each some of {pixels} pixels: {count} patches of {side} are "
+                f"too many, {fewer} are enough"
+            )
+        shape.append(side)
+    return shape[0], shape[1]

@@ -1,0 +1,202 @@
+"""Order in which patches are formed, also while the survey grows."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Sequence
+from concurrent.futures import Executor, Future
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from clsas.core.image import Image
+from clsas.core.lines import RangeLines
+from clsas.core.threads import uninterrupted, wait
+from clsas.mosaics.devices import device_threads
+from clsas.mosaics.forming import Job, form_patch, stamped_files
+from clsas.mosaics.patches import Layout
+from clsas.mosaics.record import PatchIndex, Record
+from clsas.mosaics.survey import files_of, has_ended, open_files
+from clsas.mosaics.visibility import SurveyVisibility
+from clsas.opencl.device import Device
+
+if TYPE_CHECKING:
+    from distributed import Client
+
+POLL_S = 0.5
+"""Seconds between looks for new files of a survey."""
+
+Formed = tuple[PatchIndex, Record, Image | None]
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """All that forming a mosaic needs.
+
+    Attributes
+    ----------
+    layout : Layout
+    job : Job
+        Settings of the patches; the survey is added to it.
+    inputs : dict
+        What the store says the mosaic was made with.
+    visibility : SurveyVisibility
+        The survey when the mosaic was requested.
+    source : RangeLines or Path
+    devices : tuple of Device
+        Devices of this process; empty with a client.
+    client : distributed.Client or None
+    idle_s : float or None
+        Seconds without a new file after which a survey has ended; None if it does not grow.
+    """
+
+    layout: Layout
+    job: Job
+    inputs: dict[str, Any]
+    visibility: SurveyVisibility
+    source: RangeLines | Path
+    devices: tuple[Device, ...]
+    client: Client | None
+    idle_s: float | None
+
+    @property
+    def workers(self) -> int:
+        """Number of threads in this process."""
+        return max(min(len(self.devices), len(self.layout)), 1)
+
+    @property
+    def most_running(self) -> int:
+        """Number of patches that are submitted at once.
+
+        One more than there are workers: finished patches wait in memory. A cluster returns only
+        records.
+        """
+        return len(self.layout) if self.client is not None else self.workers + 1
+
+    def executor(self) -> Executor:
+        """Return the threads of this process, or the workers of the cluster."""
+        if self.client is not None:
+            return self.client.get_executor(pure=False)
+        return device_threads(self.workers, self.devices)
+
+    def job_on(self, visibility: SurveyVisibility) -> Job:
+        """Return the settings of patches that are formed from the present survey."""
+        if self.client is None:
+            return replace(self.job, local=visibility)
+        return replace(self.job, files=stamped_files(visibility.survey))
+
+
+class _GrowingSurvey:
+    """A survey to which files may be added.
+
+    Attributes
+    ----------
+    visibility : SurveyVisibility
+        The survey at present.
+    has_ended : bool
+        Whether no more files will come.
+    """
+
+    def __init__(self, run: Run) -> None:
+        self._run = run
+        self._inputs = run.inputs
+        self._latest_s = time.monotonic()
+        self.visibility = run.visibility
+        self.has_ended = run.idle_s is None
+
+    @property
+    def channels(self) -> int:
+        return self.visibility.survey.channels
+
+    def update(self) -> bool:
+        """Look for new files; return whether any came or the survey has ended."""
+        if self.has_ended:
+            return False
+        # Asked before the files are listed, since nothing comes after the end.
+        ended = has_ended(self._run.source)
+        paths, survey = files_of(self._run.source), self.visibility.survey
+        grown = paths != survey.parts
+        if grown:
+            first = len(survey.parts)
+            survey = open_files(paths, survey)
+            self.visibility = SurveyVisibility.of(survey, self._run.job.beam)
+            self._latest_s = time.monotonic()
+            store = self._run.job.opened_store()
+            if store is not None:
+                parts = [*self._inputs["parts"], *survey.digests(first)]
+                self._inputs = self._inputs | {"parts": parts}
+                store.grow(self._inputs)
+        self.has_ended = ended or time.monotonic() - self._latest_s > self._run.idle_s
+        return grown or self.has_ended
+
+    def ready(self, todo: Sequence[PatchIndex]) -> list[PatchIndex]:
+        """Return the patches whose channels have all been recorded."""
+        if self.has_ended:
+            return list(todo)
+        settled = self.visibility.settled
+        if settled < 1:
+            return []
+        layout = self._run.layout
+        return [i for i in todo if self.visibility.has_passed(layout.window(i).grid, settled)]
+
+
+def form_patches(run: Run, finished: dict[PatchIndex, Record]) -> Iterator[Formed]:
+    """Form the patches that are not finished, and yield each with its record and image.
+
+    The image is None where another process formed it. With a store, `finished` is kept up to date.
+    When the caller stops early, patches that have begun are completed in the store.
+    """
+    survey, layout, store = _GrowingSurvey(run), run.layout, run.job.store
+    todo = [index for index in _all(layout) if index not in finished]
+    # Number of the survey's channels that a patch was formed from, or checked against, so far.
+    known = {index: record.survey_channels for index, record in finished.items()}
+    executor = run.executor()
+    running: dict[Future, PatchIndex] = {}
+    try:
+        ready = survey.ready(todo)
+        while True:
+            for index in ready[: max(run.most_running - len(running), 0)]:
+                ready.remove(index)
+                todo.remove(index)
+                with uninterrupted():
+                    job = run.job_on(survey.visibility)
+                    running[executor.submit(form_patch, job, layout.window(index))] = index
+                known[index] = survey.channels
+            if not running and not todo and survey.has_ended:
+                return
+            timeout_s = None if survey.has_ended and running else POLL_S
+            for future in wait(running or [Future()], timeout_s):
+                with uninterrupted():
+                    index = running.pop(future)
+                    record, image = future.result()
+                if store is not None:
+                    finished[index] = record
+                yield index, record, image
+            news = survey.update()
+            # Form patches again that channels contribute to which came later.
+            for index in set(known) - set(running.values()) - set(todo):
+                grid = layout.window(index).grid
+                if survey.visibility.any_channel_from(known[index], grid):
+                    todo.append(index)
+                    news = True
+                known[index] = survey.channels
+            if news:
+                ready = survey.ready(todo)
+    finally:
+        with uninterrupted():
+            begun = {future for future in running if not future.cancel()}
+        # Threads of this process finish what they have begun; workers of a cluster may be gone.
+        left = begun if run.client is None else set()
+        while left:
+            left = left - wait(left)
+        with uninterrupted():
+            executor.shutdown(wait=run.client is None)
+            if run.client is None and store is not None:
+                for future in begun:
+                    if future.exception() is None:
+                        finished[running[future]] = future.result()[0]
+
+
+def _all(layout: Layout) -> Iterator[PatchIndex]:
+    rows, columns = layout.shape
+    return ((row, column) for row in range(rows) for column in range(columns))

@@ -1,0 +1,106 @@
+"""Which channels of a survey contribute to a patch: those whose beam and ranges reach it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsas.core.geometry import bistatic_range_m
+from clsas.core.grid import Grid
+from clsas.mosaics.survey import Survey
+from clsas.sonar.beam import BeamWindow
+from clsas.sonar.visibility import touches_boxes
+
+
+@dataclass(frozen=True, eq=False)
+class SurveyVisibility:
+    """A survey with a beam.
+
+    Attributes
+    ----------
+    survey : Survey
+    beam : BeamWindow or None
+    along : float64 [channels, 3] or None
+        The track's unit directions; None without a beam.
+    phase_centres_m : float64 [channels, 3]
+    """
+
+    survey: Survey
+    beam: BeamWindow | None
+    along: NDArray[np.float64] | None
+    phase_centres_m: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, survey: Survey, beam: BeamWindow | None) -> SurveyVisibility:
+        """Return a survey with the directions that a beam takes from its track."""
+        geometry = survey.geometry
+        along = None if beam is None else beam.directions(geometry)
+        return cls(survey, beam, along, geometry.phase_centres_m)
+
+    @property
+    def settled(self) -> int:
+        """Number of channels, from the first, whose direction later channels will not change."""
+        if self.beam is None:
+            return 0  # every channel may receive from every patch
+        if self.beam.along is not None:
+            return self.survey.channels
+        pings = self.survey.geometry.ping_starts
+        later = self.beam.track_pings // 2 + 1
+        return int(pings[-later]) if len(pings) > 2 * later else 0
+
+    def ranges_m(self, grid: Grid) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return bounds of the nearest and farthest range of a grid from every channel."""
+        centre_m, half_m = bounding_box(grid)
+        geometry = self.survey.geometry
+        middle_m = bistatic_range_m(centre_m, geometry.tx_m, geometry.rx_m)
+        radius_m = np.linalg.norm(np.abs(half_m).sum(axis=0))
+        extent_m = np.full(len(middle_m), radius_m + 2 * geometry.range_step_m)
+        if geometry.rx_velocity_m_s is not None:
+            speed = np.linalg.norm(geometry.rx_velocity_m_s, axis=1) / geometry.sound_speed_m_s
+            extent_m += 1.1 * speed * (middle_m + radius_m)
+        return middle_m - extent_m, middle_m + extent_m
+
+    def channels(self, grid: Grid) -> NDArray[np.bool_]:
+        """Return which channels may contribute to a grid, [channels]."""
+        found = self.survey.within(*self.ranges_m(grid))
+        if self.beam is not None:
+            centre_m, half_m = bounding_box(grid)
+            found &= touches_boxes(
+                self.beam.limits, centre_m[None], half_m, self.phase_centres_m, self.along
+            )[0]
+        return found
+
+    def any_channel_from(self, first: int, grid: Grid) -> bool:
+        """Return whether any channel from number `first` on may contribute to a grid."""
+        return first < self.survey.channels and bool(self.channels(grid)[first:].any())
+
+    def has_passed(self, grid: Grid, settled: int) -> bool:
+        """Return whether the beam of the latest settled channels is ahead of a grid."""
+        if self.any_channel_from(settled, grid):
+            return False
+        centre_m, half_m = bounding_box(grid)
+        offset_m = centre_m - self.phase_centres_m[settled - 1]
+        direction = self.along[settled - 1]
+        extent_m = np.abs(half_m @ direction).sum()
+        low, away_m = max(self.beam.limits[0], -1.0), np.linalg.norm(offset_m)
+        radius_m = np.linalg.norm(np.abs(half_m).sum(axis=0))
+        # The beam leaves the farthest point of the box last, or the nearest if it looks ahead.
+        distance_m = away_m + radius_m if low < 0 else max(away_m - radius_m, 0.0)
+        return bool(direction @ offset_m + extent_m < low * distance_m)
+
+
+def bounding_box(grid: Grid) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the centre of a box around a grid, and half its sides as vectors [n, 3]."""
+    if grid.points_m is not None:
+        low, high = (edge(grid.points_m, axis=(0, 1)) for edge in (np.min, np.max))
+        return (low + high) / 2, np.diag((high - low) / 2)
+    rows, columns = grid.shape
+    half_m = np.array([grid.row_step_m * (rows - 1), grid.column_step_m * (columns - 1)]) / 2
+    centre_m = grid.origin_m + half_m.sum(axis=0)
+    if grid.height_m is None:
+        return centre_m, half_m
+    low, high = grid.height_m.min(), grid.height_m.max()
+    up = np.array([0.0, 0.0, 1.0])
+    return centre_m + up * (low + high) / 2, np.concatenate([half_m, [up * (high - low) / 2]])
