@@ -1,4 +1,4 @@
-"""Overviews: large images at fewer pixels, read in parts."""
+"""Overviews: large images at fewer pixels, which are read part by part."""
 
 from __future__ import annotations
 
@@ -18,25 +18,25 @@ def reduced(
     read: Callable[[slice, slice], NDArray[np.complex64]],
     most: int,
 ) -> Image:
-    """Return an image at fewer pixels, each the root of the mean power of those it covers.
+    """Return an image at fewer pixels, each with the mean power of those it covers.
 
     Parameters
     ----------
     grid : Grid
         Grid of the image.
     patch_shape : (rows, columns)
-        Pixels that are read together, about.
+        Approximate number of pixels that are read together.
     read : callable
-        Returns pixels of some rows and columns, complex64 [rows, columns].
+        Called with slices of rows and columns; returns their pixels, complex64 [rows, columns].
     most : int
-        Pixels of the overview along its longer side, at most.
+        Largest number of pixels along the longer side of the overview.
     """
     height, width = patch_shape
     step = math.ceil(max(grid.shape) / most)
     shape = tuple(n // step or 1 for n in grid.shape)
     step = [min(step, n) for n in grid.shape]
     power = np.zeros(shape)
-    # Bands of whole patches and whole pixels of the overview.
+    # Read whole pixels of the overview, and about whole patches, at a time.
     band, run = max(height // step[0], 1), max(width // step[1], 1)
     for first in range(0, shape[0], band):
         last = min(first + band, shape[0])

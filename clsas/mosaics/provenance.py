@@ -1,4 +1,4 @@
-"""What a mosaic was made with: a description to keep with it, and how two of them differ."""
+"""Inputs of a mosaic: a description that is stored with it, and differences between two of them."""
 
 from __future__ import annotations
 
@@ -12,27 +12,27 @@ from clsas.mosaics.survey import Survey
 from clsas.sonar.beam import BeamWindow
 
 REQUESTS = ("tolerance_db", "tolerance_wavelengths", "stages", "accuracy_db")
-"""How a mosaic may be wished for: at most one of these."""
+"""Requests for accuracy or a method, of which a mosaic takes at most one."""
 
 
 def inputs_of(
-    survey: Survey, grid: Grid, wish: dict[str, Any], beam: BeamWindow | None
+    survey: Survey, grid: Grid, request: dict[str, Any], beam: BeamWindow | None
 ) -> dict[str, Any]:
-    """Return what a mosaic is made with, as JSON holds it."""
+    """Return the inputs of a mosaic in types of JSON."""
     inputs = {
         "parts": survey.digests(),
         "grid": grid_digest(grid),
         "pixels": list(grid.shape),
         "beam": None if beam is None else json.loads(beam_json(beam)),
-        **{name: wish.get(name) for name in REQUESTS},
+        **{name: request.get(name) for name in REQUESTS},
     }
     return json.loads(json.dumps(inputs))
 
 
 def differences(stored: dict[str, Any], given: dict[str, Any]) -> list[str]:
-    """Return how given inputs differ from stored ones, one message each.
+    """Return one message for every difference between stored and given inputs.
 
-    A survey may have grown: the stored parts need only be the first of those given.
+    The survey may have grown: the given parts only have to begin with the stored ones.
     """
     found = []
     for name in given:

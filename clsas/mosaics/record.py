@@ -1,56 +1,45 @@
-"""Records of finished patches: what is known about a patch, and checksums of it.
+"""Records of finished patches: how each was formed, and checksums of it.
 
-A record is the attributes of an empty Zarr group. It holds the checksum of its patch's pixels and
-one of itself, so a changed bit in either is found.
+A record is stored as the attributes of an empty Zarr group. It has a checksum of the patch's pixels
+and one of itself, so that a changed bit in either is found.
 """
 
 from __future__ import annotations
 
-import json
-import zlib
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
-from clsas.core.atomic import make_folders, replacing
-from clsas.core.reading import parse_json, read_bytes
-
-CHECKSUM = "crc32"
-"""Attribute that holds the checksum of the other attributes."""
+from clsas.mosaics.documents import DamageError, is_intact, read_attributes, with_checksum
 
 PIXELS_CHECKSUM = "pixels_crc32c"
-"""Attribute that holds the checksum of a patch's pixels."""
-
+"""Attribute with the checksum of a patch's pixels."""
 
 PatchIndex = tuple[int, int]
 """Row and column of a patch."""
 
-_LISTED = 3  # damaged patches that a message names
-
-
-class DamageError(ValueError):
-    """A patch or a document of a store that is not what was written."""
+_LISTED = 3  # damaged patches that a message names; it counts the others
 
 
 @dataclass(frozen=True)
 class Record:
-    """How a finished patch was formed, and what a user should know of it.
+    """How a finished patch was formed, and defects of its data.
 
     Attributes
     ----------
     channels : int
-        Channels whose beam and recorded ranges touch the patch. With 0 its pixels are all zero.
+        Channels whose beam and recorded ranges touch the patch. If 0, all pixels are zero.
     survey_channels : int
         Channels of the survey at that time.
     missing_channels : int
-        Number of `channels` that have no samples.
+        Number of `channels` without samples.
     gap_m : float
-        Longest distance between successive pings that see the patch if it exceeds three median
-        steps, else 0.
+        Longest distance between consecutive pings that contribute to the patch, if it exceeds
+        three median steps; else 0.
     predicted_error_db : float or None
         Predicted relative rms error against the exact image, dB; None for an empty patch.
     predicted_seconds, plan_seconds, read_seconds, seconds : float
-        Predicted imaging time; time for planning, for reading lines, and in total.
+        Predicted time of imaging; measured times of planning, of reading lines, and in total.
     memory_bytes : int
         Planned memory.
     device, driver : str
@@ -84,7 +73,7 @@ class Record:
 
     @property
     def flags(self) -> tuple[str, ...]:
-        """What a user should know, in words; nothing if all is well."""
+        """Defects of the data in words; empty if there are none."""
         found = []
         if not self.channels:
             found.append("empty: in no channel's beam and range")
@@ -95,17 +84,17 @@ class Record:
         return tuple(found)
 
     def attributes(self, pixels_checksum: str | None) -> dict[str, Any]:
-        """Return what a store keeps of a record; the checksum is None for pixels that are all 0."""
+        """Return the record for a store; the checksum of pixels that are all zero is None."""
         return with_checksum(asdict(self) | {PIXELS_CHECKSUM: pixels_checksum})
 
     @classmethod
     def read(cls, folder: Path) -> tuple[Record, str | None] | None:
-        """Return the record in a folder and its pixels' checksum, or None if there is none.
+        """Return the record in a folder and the checksum of its pixels, or None if there is none.
 
         Raises
         ------
         DamageError
-            If it is not what was written.
+            If the record is damaged.
         """
         if not (folder / "zarr.json").exists():
             return None
@@ -121,47 +110,8 @@ class Record:
         return record, checksum
 
 
-def read_attributes(folder: Path) -> dict[str, Any]:
-    """Return the attributes of a Zarr group.
-
-    Raises
-    ------
-    DamageError
-        If the group's document is not one.
-    OSError
-        If it cannot be read.
-    """
-    try:
-        attributes = parse_json(read_bytes(folder / "zarr.json"))["attributes"]
-    except (ValueError, LookupError, TypeError) as error:
-        raise DamageError("its record cannot be read") from error
-    if not isinstance(attributes, dict):
-        raise DamageError("its record cannot be read")
-    return attributes
-
-
-def write_attributes(folder: Path, attributes: dict[str, Any]) -> None:
-    """Write a Zarr group of these attributes; it is on the disk when this returns."""
-    make_folders(folder)
-    document = {"zarr_format": 3, "node_type": "group", "attributes": attributes}
-    with replacing(folder / "zarr.json") as temporary:
-        temporary.write_text(json.dumps(document, indent=1))
-
-
-def with_checksum(attributes: dict[str, Any]) -> dict[str, Any]:
-    """Return attributes with the checksum of all the others."""
-    others = {name: value for name, value in attributes.items() if name != CHECKSUM}
-    text = json.dumps(others, sort_keys=True, separators=(",", ":"))
-    return others | {CHECKSUM: f"{zlib.crc32(text.encode()):08x}"}
-
-
-def is_intact(attributes: dict[str, Any]) -> bool:
-    """Return whether attributes match the checksum among them."""
-    return attributes == with_checksum(attributes)
-
-
 def describe_damage(found: dict[PatchIndex, str]) -> str:
-    """Return damaged patches in words: how many, and the first of them with the reason."""
+    """Return the first damaged patches with their reasons, and the number of the others."""
     named = [f"patch {row},{column}: {reason}" for (row, column), reason in found.items()]
     more = f" and {len(named) - _LISTED} more" if len(named) > _LISTED else ""
     return "; ".join(named[:_LISTED]) + more

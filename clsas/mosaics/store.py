@@ -1,7 +1,8 @@
-"""The Zarr store of a mosaic: its pixels in one array, one chunk and one record per patch.
+"""Mosaics in Zarr stores: one array of pixels, and for every patch one chunk and one record.
 
-docs/mosaic.md describes the layout. A patch is finished once its record is there, which is written
-after its pixels. Both carry checksums, and both are on the disk before `Store.write` returns.
+docs/mosaic.md describes the layout. A patch is finished once it has a record, which is written
+after its pixels. Pixels and records have checksums. Both are on the disk when `Store.write`
+returns.
 """
 
 from __future__ import annotations
@@ -21,32 +22,26 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsas.core import validate
-from clsas.core.atomic import creating, sync_folder
+from clsas.core.atomic import sync_folder
 from clsas.core.extras import install_command
 from clsas.core.grid import Grid
 from clsas.core.image import Image
 from clsas.core.reading import check_ordinary
 from clsas.factorized.plan import grid_digest
-from clsas.mosaics.overview import reduced
-from clsas.mosaics.provenance import differences
-from clsas.mosaics.record import (
+from clsas.mosaics.documents import (
     DamageError,
-    PatchIndex,
-    Record,
-    describe_damage,
-    is_intact,
-    read_attributes,
+    read_document,
     with_checksum,
     write_attributes,
 )
+from clsas.mosaics.overview import reduced
+from clsas.mosaics.provenance import differences
+from clsas.mosaics.record import PatchIndex, Record, describe_damage
 
 if TYPE_CHECKING:
     import zarr
 
-FORMAT = "clsas mosaic"
-VERSION = 2  # 1 had no checksums
-
-_OVERVIEW = 1024  # pixels along the longer side, at most
+_OVERVIEW = 1024  # pixels along the longer side
 
 
 @dataclass(frozen=True)
@@ -62,7 +57,7 @@ class Store:
 
     @classmethod
     def at(cls, path: str | os.PathLike) -> Store:
-        """Return the store at a path, which need not exist yet.
+        """Return the store at a path where a mosaic may or may not exist.
 
         Raises
         ------
@@ -74,33 +69,33 @@ class Store:
 
     @classmethod
     def opened(cls, path: str | os.PathLike) -> Store:
-        """Return the store at a path.
+        """Return the mosaic at a path.
 
         Raises
         ------
         OSError
             If there is none.
         ValueError
-            If it is not of this library, or of another version.
+            If the path holds something else, or a mosaic of another version.
         """
         store = cls.at(path)
         if not store.path.exists():
             raise FileNotFoundError(2, "there is no mosaic", str(path))
-        store._attributes()
+        read_document(store.path)
         return store
 
     @property
     def patch_shape(self) -> tuple[int, int] | None:
-        """Pixels of a patch, or None where there is no mosaic yet."""
+        """Pixels of a patch, or None if there is no mosaic yet."""
         if not self._is_there():
             return None
-        rows, columns = self._attributes()["patch_shape"]
+        rows, columns = read_document(self.path)["patch_shape"]
         return rows, columns
 
     @cached_property
     def pixels(self) -> zarr.Array:
-        """The pixels, complex64 [rows, columns], on disk; Zarr verifies their checksums."""
-        pixels, attributes = self._array("pixels"), self._attributes()
+        """Pixels on disk, complex64 [rows, columns]. Zarr verifies their checksums."""
+        pixels, attributes = self._array("pixels"), read_document(self.path)
         described = list(pixels.shape), list(pixels.chunks), pixels.dtype, pixels.fill_value
         expected = attributes["inputs"].get("pixels"), attributes["patch_shape"], np.complex64, 0
         if described != expected:
@@ -109,14 +104,14 @@ class Store:
 
     @property
     def grid(self) -> Grid:
-        """Where the pixels lie.
+        """Grid of the pixels.
 
         Raises
         ------
         ValueError
-            If the mosaic is of points, whose grid is not stored, or the grid is damaged.
+            If the mosaic has arbitrary points, which are not stored, or the grid is damaged.
         """
-        attributes = self._attributes()
+        attributes = read_document(self.path)
         stored = attributes["grid"]
         if stored is None:
             raise ValueError(f"{self.path} is a mosaic of points, whose grid it does not hold")
@@ -128,18 +123,21 @@ class Store:
         return grid
 
     def begin(self, inputs: dict[str, Any], grid: Grid, patch_shape: tuple[int, int]) -> None:
-        """Create the store, or check that it was made with these inputs.
+        """Create the store, or check that it was made with the same inputs.
 
         Raises
         ------
         ValueError
-            If the path holds something else, or a mosaic of other inputs; the message names them.
+            If the path holds something else, or a mosaic with other inputs; the message names the
+            differences.
         OSError
-            If it cannot be written.
+            If the store cannot be written.
         """
         if not self._is_there():
-            self._create(inputs, grid, patch_shape)
-        stored = self._attributes()
+            from clsas.mosaics.durable import create_store
+
+            create_store(self.path, inputs, grid, patch_shape)
+        stored = read_document(self.path)
         found = differences(stored["inputs"], inputs)
         if stored["patch_shape"] != list(patch_shape):
             mine, theirs = ("{} x {}".format(*s) for s in (stored["patch_shape"], patch_shape))
@@ -155,56 +153,34 @@ class Store:
         self.grow(inputs)
 
     def grow(self, inputs: dict[str, Any]) -> None:
-        """Keep the inputs of a survey that has grown."""
-        attributes = self._attributes()
+        """Store the inputs of a survey that has grown."""
+        attributes = read_document(self.path)
         if attributes["inputs"] != inputs:
             write_attributes(self.path, with_checksum(attributes | {"inputs": inputs}))
-
-    def _create(self, inputs: dict[str, Any], grid: Grid, patch_shape: tuple[int, int]) -> None:
-        """Create the store, whole or not at all."""
-        if not self.path.parent.is_dir():
-            raise FileNotFoundError(2, "there is no such folder", str(self.path.parent))
-        from clsas.mosaics.durable import create_arrays
-
-        plane = None
-        if grid.points_m is None:
-            steps = ("origin_m", "row_step_m", "column_step_m")
-            plane = {name: getattr(grid, name).tolist() for name in steps}
-        attributes = {
-            "format": FORMAT,
-            "version": VERSION,
-            "patch_shape": list(patch_shape),
-            "grid": plane,
-            "inputs": inputs,
-        }
-        with creating(self.path) as temporary:
-            create_arrays(temporary, grid, patch_shape)
-            write_attributes(temporary / "patches", {})
-            write_attributes(temporary, with_checksum(attributes))
 
     def records(self) -> dict[PatchIndex, Record]:
         """Return the records of all finished patches, by row and column.
 
-        Damaged patches are left out as far as their records and the sizes of their pixels tell;
+        Patches are left out if their records or the checksums behind their pixels are damaged.
         `damage` also reads the pixels.
         """
         found = {}
-        for place in self._places():
+        for index in self._indices():
             try:
-                record = self._record(place)
+                record = self._record(index)
             except DamageError:
                 continue
             if record is not None:
-                found[place] = record
+                found[index] = record
         return found
 
     def damage(self, tell: Callable[[int, int], object] | None = None) -> dict[PatchIndex, str]:
-        """Read every finished patch; return what is wrong with each that is damaged.
+        """Read every finished patch, and return the reason for each that is damaged.
 
         Parameters
         ----------
         tell : callable, optional
-            Called with the number of patches that were read and of all.
+            Called with the number of patches read so far and the number of all.
 
         Returns
         -------
@@ -216,14 +192,14 @@ class Store:
         OSError
             If a file cannot be read.
         """
-        found, places = {}, self._places()
-        for done, place in enumerate(places, 1):
+        found, indices = {}, self._indices()
+        for done, index in enumerate(indices, 1):
             try:
-                self._verify(place)
+                self._verify(index)
             except DamageError as error:
-                found[place] = str(error)
+                found[index] = str(error)
             if tell is not None:
-                tell(done, len(places))
+                tell(done, len(indices))
         return found
 
     def write(
@@ -235,17 +211,17 @@ class Store:
         pixels: NDArray[np.complex64],
         record: Record,
     ) -> None:
-        """Write a patch and then its record; both are on the disk when this returns.
+        """Write a patch and then its record, and wait until both are on the disk.
 
         Raises
         ------
         OSError
-            If the disk is full or the store not writable.
+            If the disk is full or the store is not writable.
         """
         from clsas.mosaics.durable import write_pixels
 
         folder = self._folder((row, column))
-        # A record is of the pixels it was written for: it goes before they are replaced.
+        # Remove the old record before the pixels that it belongs to are replaced.
         if (folder / "zarr.json").exists():
             (folder / "zarr.json").unlink()
             sync_folder(folder)
@@ -255,7 +231,7 @@ class Store:
     def read(
         self, rows: slice = slice(None), columns: slice = slice(None)
     ) -> NDArray[np.complex64]:
-        """Return some of the pixels, all by default, complex64 [rows, columns].
+        """Return pixels, by default all, complex64 [rows, columns].
 
         Raises
         ------
@@ -264,25 +240,25 @@ class Store:
         OSError
             If a file cannot be read.
         """
-        places = self._touched(rows, columns)
+        indices = self._touched(rows, columns)
         try:
-            for place in places:
-                self._record(place)
+            for index in indices:
+                self._record(index)
             return self.pixels[rows, columns]
         except ValueError as error:
             found = {}
-            for place in places:
+            for index in indices:
                 try:
-                    self._verify(place)
+                    self._verify(index)
                 except DamageError as damage:
-                    found[place] = str(damage)
-            told = describe_damage(found) if found else str(error)
+                    found[index] = str(damage)
+            reason = describe_damage(found) if found else str(error)
             raise ValueError(
-                f"{self.path} is damaged: {told}; clsas mosaic with the same inputs mends it"
+                f"{self.path} is damaged: {reason}; clsas mosaic with the same inputs mends it"
             ) from error
 
     def image(self, rows: slice = slice(None), columns: slice = slice(None)) -> Image:
-        """Return some of the pixels, all by default, as an image.
+        """Return pixels, by default all, as an image.
 
         Raises
         ------
@@ -296,7 +272,7 @@ class Store:
         return Image(self.read(rows, columns), window)
 
     def overview(self, most: int = _OVERVIEW) -> Image:
-        """Return the mosaic at fewer pixels, each the root of the mean power of those it covers.
+        """Return the mosaic at fewer pixels, each with the mean power of those it covers.
 
         Raises
         ------
@@ -323,16 +299,16 @@ class Store:
         except ValueError as error:
             raise ValueError(f"{self.path} is damaged: {name} cannot be read: {error}") from error
 
-    def _places(self) -> list[PatchIndex]:
-        """Return the patches that have a folder for their record, in order."""
+    def _indices(self) -> list[PatchIndex]:
+        """Patches that have a folder for their record, in order."""
         shape = self._shape
         folders = self.path / "patches"
         found = []
         for folder in folders.iterdir() if folders.is_dir() else ():
             if name := re.fullmatch(r"(\d+)\.(\d+)", folder.name):
-                place = int(name[1]), int(name[2])
-                if place[0] < shape[0] and place[1] < shape[1]:
-                    found.append(place)
+                index = int(name[1]), int(name[2])
+                if index[0] < shape[0] and index[1] < shape[1]:
+                    found.append(index)
         return sorted(found)
 
     @property
@@ -343,8 +319,8 @@ class Store:
         return rows, columns
 
     def _touched(self, rows: slice, columns: slice) -> list[PatchIndex]:
-        """Return the patches that some pixels belong to."""
-        indices = []
+        """Patches to which some pixels belong."""
+        touched = []
         for part, count, side in zip(
             (rows, columns), self.pixels.shape, self.pixels.chunks, strict=True
         ):
@@ -352,89 +328,61 @@ class Store:
             if not pixels:
                 return []
             ends = sorted((pixels[0], pixels[-1]))
-            indices.append(range(ends[0] // side, ends[1] // side + 1))
-        return list(itertools.product(*indices))
+            touched.append(range(ends[0] // side, ends[1] // side + 1))
+        return list(itertools.product(*touched))
 
-    def _folder(self, place: PatchIndex) -> Path:
-        return self.path / "patches" / "{}.{}".format(*place)
+    def _folder(self, index: PatchIndex) -> Path:
+        return self.path / "patches" / "{}.{}".format(*index)
 
-    def _chunk(self, place: PatchIndex) -> Path:
-        return self.path.joinpath("pixels", "c", *map(str, place))
+    def _chunk(self, index: PatchIndex) -> Path:
+        return self.path.joinpath("pixels", "c", *map(str, index))
 
-    def _checksum(self, place: PatchIndex) -> str | None:
-        """Return the checksum that a patch's pixels end with, or None where they are all zero."""
+    def _checksum(self, index: PatchIndex) -> str | None:
+        """Return the checksum behind a patch's pixels, or None if the pixels are all zero."""
         try:
-            check_ordinary(self._chunk(place))
-            with self._chunk(place).open("rb") as file:
+            check_ordinary(self._chunk(index))
+            with self._chunk(index).open("rb") as file:
                 file.seek(8 * math.prod(self.pixels.chunks))
                 return file.read().hex()
         except FileNotFoundError:
-            return None  # Zarr leaves out a chunk that is all zero
+            return None  # Zarr writes no chunk of zeros
 
-    def _record(self, place: PatchIndex) -> Record | None:
-        """Return the record of a patch, or None if it is not finished.
+    def _record(self, index: PatchIndex) -> Record | None:
+        """Return the record of a patch, or None if the patch is not finished.
 
         Raises
         ------
         DamageError
-            If the record is damaged, or the pixels on disk end with another checksum.
+            If the record is damaged, or the checksum behind the pixels is another one.
         """
-        found = Record.read(self._folder(place))
+        found = Record.read(self._folder(index))
         if found is None:
             return None
         record, expected = found
         try:
-            matches = self._checksum(place) == expected
+            matches = self._checksum(index) == expected
         except ValueError as error:
             raise DamageError(str(error)) from error
         if not matches:
-            gone = not self._chunk(place).exists()
+            gone = not self._chunk(index).exists()
             raise DamageError("its pixels are " + ("gone" if gone else "not those of its record"))
         return record
 
-    def _verify(self, place: PatchIndex) -> None:
-        """Read a patch; raise DamageError if it is finished and not what was written."""
-        if self._record(place) is None:
+    def _verify(self, index: PatchIndex) -> None:
+        """Read a patch; raise DamageError if it is finished and differs from what was written."""
+        if self._record(index) is None:
             return
         row, column = (
-            slice(i * n, (i + 1) * n) for i, n in zip(place, self.pixels.chunks, strict=True)
+            slice(i * n, (i + 1) * n) for i, n in zip(index, self.pixels.chunks, strict=True)
         )
         try:
             _ = self.pixels[row, column]
-        except ValueError as error:  # Zarr's, of a checksum
+        except ValueError as error:  # Zarr's message about a checksum
             raise DamageError("its pixels do not match their checksum") from error
 
     def _is_there(self) -> bool:
-        """Return whether the path holds anything."""
+        """Return whether there is anything at the path."""
         return self.path.exists() and not (self.path.is_dir() and not any(self.path.iterdir()))
-
-    def _attributes(self) -> dict[str, Any]:
-        """Return what is known about the mosaic as a whole.
-
-        Raises
-        ------
-        ValueError
-            If the path holds something else, a mosaic of another version, or a damaged one.
-        """
-        try:
-            attributes = read_attributes(self.path)
-        except (OSError, DamageError) as error:
-            raise ValueError(f"{self.path} exists and is not a mosaic of clsas") from error
-        if attributes.get("format") != FORMAT:
-            raise ValueError(f"{self.path} exists and is not a mosaic of clsas")
-        if attributes.get("version") != VERSION:
-            raise ValueError(
-                f"{self.path} is a mosaic of version {attributes.get('version')}, this clsas works "
-                f"with version {VERSION}: give it another path"
-            )
-        if not is_intact(attributes):
-            raise ValueError(f"{self.path} is damaged: its attributes do not match their checksum")
-        shape, inputs = attributes.get("patch_shape"), attributes.get("inputs")
-        whole = isinstance(inputs, dict) and isinstance(inputs.get("parts"), list)
-        whole = whole and isinstance(shape, list) and [type(n) for n in shape] == [int, int]
-        if not whole:
-            raise ValueError(f"{self.path} is damaged: its attributes are not those of a mosaic")
-        return attributes
 
 
 def _zarr() -> Any:

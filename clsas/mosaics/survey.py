@@ -1,7 +1,7 @@
-"""Surveys: range lines in files, of which only what a part of an image needs is read.
+"""Surveys: range lines in files, read in the parts that a patch needs.
 
-A survey is one file of range lines, or a folder of such files in the order of their names, to which
-more may be added while it is recorded. Its geometry is in memory, its samples are not.
+A survey is one file of range lines, or a folder of such files in the order of their names. Files
+may be added while the survey is recorded. Its geometry is in memory, its samples are not.
 """
 
 from __future__ import annotations
@@ -21,31 +21,31 @@ from clsas.factorized.plan import lines_digest
 from clsas.files.hdf5 import FileFormatError, read_geometry, read_samples
 
 END = "end"
-"""Name of the file that says of a folder that no more files will be added."""
+"""Name of the file that marks a folder as complete."""
 
 _TAPER = 64  # samples over which a line that is cut fades
-_BEYOND = 32  # further samples, untouched: what interpolation reaches, and the fading's ringing
-_DIGESTED = 16  # lines of a part whose samples its digest sees
-_APART = 64  # unseen channels that are rather read than skipped
-_HOLE = 3.0  # steps between pings, in median ones, that make a gap
+_MARGIN = 32  # untouched samples between pixels and taper, for interpolation and ringing
+_DIGESTED = 16  # lines of a file whose samples enter its digest; all would have to be read
+_SKIPPED = 64  # up to this many channels between two others are read too, rather than skipped
+_GAP = 3.0  # a distance between pings of more than this many median ones is a gap
 
 
 @dataclass(frozen=True, eq=False)
 class Survey:
-    """Range lines of which only the geometry is in memory.
+    """Range lines with only their geometry in memory.
 
     Attributes
     ----------
     geometry : RangeLines
-        Every channel's, with one sample each, zero.
+        Geometry of all channels, with one sample each, which is zero.
     parts : tuple of RangeLines or Path
-        Where the samples are, in the order of the channels.
+        Sources of the samples, in the order of the channels.
     begins : tuple of int
-        First channel of every part, and the number of channels.
+        First channel of every part, and at the end the number of channels.
     lengths : tuple of int
         Samples per channel of every part.
     stamps : tuple of (int, int)
-        Size and time of change, ns, of every file when it was opened; 0, 0 for lines in memory.
+        Size and time of change (ns) of every file when it was opened; 0, 0 for lines in memory.
     """
 
     geometry: RangeLines
@@ -65,9 +65,9 @@ class Survey:
         return np.repeat(self.lengths, np.diff(self.begins))
 
     def digests(self, first: int = 0) -> list[str]:
-        """Return a digest of every part from the first on.
+        """Return a digest of geometry and samples of every part from number `first` on.
 
-        It is of geometry and samples; of a file's samples it sees 16 lines.
+        The digest of a file covers the samples of 16 lines.
         """
         found = []
         for index, part in enumerate(self.parts[first:], first):
@@ -83,67 +83,68 @@ class Survey:
         return found
 
     def within(self, near_m: NDArray[np.float64], far_m: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Return which channels recorded anything of ranges from near to far, [channels]."""
+        """Return which channels recorded any range between two bounds, bool [channels]."""
         first_m = self.geometry.first_range_m
         last_m = first_m + (self.length - 1) * self.geometry.range_step_m
         return (far_m >= first_m) & (near_m <= last_m)
 
     def extent(
-        self, seen: NDArray[np.bool_], near_m: NDArray[np.float64], far_m: NDArray[np.float64]
+        self, visible: NDArray[np.bool_], near_m: NDArray[np.float64], far_m: NDArray[np.float64]
     ) -> tuple[int, int]:
-        """Return how many lines, and samples of each, `read` would return."""
-        blocks = list(self._blocks(seen, near_m, far_m))
+        """Return the number of lines that `read` returns, and of samples of each."""
+        blocks = list(self._blocks(visible, near_m, far_m))
         longest = max(columns.stop - columns.start for _, _, columns in blocks)
-        return int(np.count_nonzero(seen)), longest
+        return int(np.count_nonzero(visible)), longest
 
     def read(
-        self, seen: NDArray[np.bool_], near_m: NDArray[np.float64], far_m: NDArray[np.float64]
+        self, visible: NDArray[np.bool_], near_m: NDArray[np.float64], far_m: NDArray[np.float64]
     ) -> tuple[RangeLines, NDArray[np.bool_]]:
-        """Return some channels' lines between ranges, and which of them have no samples.
+        """Return the lines of some channels between two ranges, and which have no samples.
 
         Parameters
         ----------
-        seen : bool [channels]
-            Which channels; at least one.
+        visible : bool [channels]
+            Channels to read; at least one.
         near_m, far_m : float64 [channels]
-            Ranges that must be there as they were recorded. Where more was recorded, lines go on
-            for 32 samples and then fade over 64, so that they can be interpolated; beyond what was
-            recorded they are zero.
+            Ranges between which the samples are unchanged. If more was recorded, lines continue
+            for 32 samples and then fade over 64, so that they can be interpolated. Outside the
+            recording they are zero.
 
         Returns
         -------
         lines : RangeLines
         missing : bool [lines.channels]
-            Channels whose samples are not finite or all zero; they are zero in `lines`.
+            Channels whose samples are not finite or all zero. They are zero in `lines`.
 
         Raises
         ------
         FileFormatError, OSError
-            If a file cannot be read, or is not what it was when the survey was opened.
+            If a file cannot be read, or has changed since the survey was opened.
         """
-        geometry, index = self.geometry, np.flatnonzero(seen)
-        blocks = list(self._blocks(seen, near_m, far_m))
+        geometry, index = self.geometry, np.flatnonzero(visible)
+        blocks = list(self._blocks(visible, near_m, far_m))
         longest = max(columns.stop - columns.start for _, _, columns in blocks)
         validate.memory("lines of a patch", 8 * len(index) * longest)
         samples = np.zeros((len(index), longest), np.complex64)
         first_m = np.empty(len(index))
-        place = 0
+        filled = 0
         for part, rows, columns in blocks:
             begin = self.begins[part]
-            wanted = seen[rows]
+            chosen = visible[rows]
             block = self._samples(part, slice(rows.start - begin, rows.stop - begin), columns)
-            here = slice(place, place + np.count_nonzero(wanted))
+            here = slice(filled, filled + np.count_nonzero(chosen))
             lines = samples[here, : block.shape[1]]
-            lines[:] = block if wanted.all() else block[wanted]
+            lines[:] = block if chosen.all() else block[chosen]
             fade = np.sin(np.pi / 2 * (np.arange(_TAPER) + 0.5) / _TAPER) ** 2
             if columns.start > 0:
                 lines[:, :_TAPER] *= fade.astype(np.float32)
             if columns.stop < self.lengths[part]:
                 lines[:, -_TAPER:] *= fade[::-1].astype(np.float32)
-            first_m[here] = geometry.first_range_m[rows][wanted]
+            first_m[here] = geometry.first_range_m[rows][chosen]
             first_m[here] += columns.start * geometry.range_step_m
-            place = here.stop
-        # Sums tell of most: they may also be too large, or cancel.
+            filled = here.stop
+        # The sum of a line shows defects quickly. It may also overflow or cancel, so suspected
+        # lines are checked sample by sample.
         with np.errstate(over="ignore", invalid="ignore"):
             sums = np.add.reduce(samples, axis=1)
         missing, silent = ~np.isfinite(sums), sums == 0
@@ -163,23 +164,23 @@ class Survey:
         return lines, missing
 
     def _blocks(
-        self, seen: NDArray[np.bool_], near_m: NDArray[np.float64], far_m: NDArray[np.float64]
+        self, visible: NDArray[np.bool_], near_m: NDArray[np.float64], far_m: NDArray[np.float64]
     ) -> Iterator[tuple[int, slice, slice]]:
-        """Yield part, channels and samples of every run of channels that is read at once."""
+        """Yield part, channels and samples of every run of channels that is read together."""
         step_m = self.geometry.range_step_m
-        reach = _TAPER + _BEYOND
+        margin = _TAPER + _MARGIN
         for part, length in enumerate(self.lengths):
             begin, end = self.begins[part : part + 2]
-            index = begin + np.flatnonzero(seen[begin:end])
+            index = begin + np.flatnonzero(visible[begin:end])
             if not index.size:
                 continue
-            for run in np.split(index, np.flatnonzero(np.diff(index) > _APART) + 1):
+            for run in np.split(index, np.flatnonzero(np.diff(index) > _SKIPPED) + 1):
                 first_m = self.geometry.first_range_m[run]
-                start = int(np.floor(((near_m[run] - first_m) / step_m).min())) - reach
-                stop = int(np.ceil(((far_m[run] - first_m) / step_m).max())) + reach + 1
+                start = int(np.floor(((near_m[run] - first_m) / step_m).min())) - margin
+                stop = int(np.ceil(((far_m[run] - first_m) / step_m).max())) + margin + 1
                 start = min(max(start, 0), length - 1)
                 stop = max(min(stop, length), start + 1)
-                # A fade needs its room: what is nearly all of a line is read whole.
+                # Near the ends of a line there is no room for a taper, so read up to the end.
                 start = 0 if start < 2 * _TAPER else start
                 stop = length if stop > length - 2 * _TAPER else stop
                 yield part, slice(int(run[0]), int(run[-1]) + 1), slice(start, stop)
@@ -189,7 +190,7 @@ class Survey:
         if isinstance(part, RangeLines):
             return part.samples[rows, columns]
         if _stamp(part) != self.stamps[index]:
-            raise FileFormatError(f"{part} is not what it was when the survey was opened")
+            raise FileFormatError(f"{part} has changed since the survey was opened")
         return read_samples(part, rows, columns)
 
     def _part_geometry(self, index: int) -> RangeLines:
@@ -198,7 +199,7 @@ class Survey:
 
 
 def open_survey(source: RangeLines | str | os.PathLike) -> Survey:
-    """Return the survey in a file, in a folder of files (*.h5), or of lines in memory.
+    """Return a survey from a file, a folder of files (*.h5), or lines in memory.
 
     Raises
     ------
@@ -207,8 +208,8 @@ def open_survey(source: RangeLines | str | os.PathLike) -> Survey:
     FileFormatError
         If a file does not hold range lines.
     ValueError
-        If the files of a folder differ in carrier, sound speed, range step or in having
-        velocities, or there is none.
+        If there is no file, or the files of a folder differ in carrier, sound speed, range step,
+        or in whether they have velocities.
     OSError
         If a file cannot be read.
     """
@@ -222,7 +223,7 @@ def open_survey(source: RangeLines | str | os.PathLike) -> Survey:
 
 
 def files_of(source: str | os.PathLike) -> tuple[Path, ...]:
-    """Return the files that a survey is made of, by name."""
+    """Return the files of a survey, sorted by name."""
     path = validate.path("source", source)
     if not path.is_dir():
         return (path,)
@@ -230,15 +231,24 @@ def files_of(source: str | os.PathLike) -> tuple[Path, ...]:
 
 
 def has_ended(source: str | os.PathLike) -> bool:
-    """Return whether a survey will not grow: it is a file, or its folder holds a file `end`."""
+    """Return whether a survey is complete: it is a file, or its folder holds a file `end`."""
     path = Path(source)
     return not path.is_dir() or (path / END).exists()
 
 
 def open_files(paths: tuple[Path, ...], before: Survey | None = None) -> Survey:
-    """Return the survey of these files; `before` is of the first of them, already open.
+    """Return the survey in some files.
 
-    Raises ValueError also if these are not the first of them any more.
+    Parameters
+    ----------
+    paths : tuple of Path
+    before : Survey, optional
+        Survey of the first of these files, already open.
+
+    Raises
+    ------
+    ValueError
+        As `open_survey` does, and if `paths` do not begin with the files of `before`.
     """
     known = 0 if before is None else len(before.parts)
     if before is not None and paths[:known] != before.parts:
@@ -276,9 +286,9 @@ def open_files(paths: tuple[Path, ...], before: Survey | None = None) -> Survey:
 
 
 def largest_gap_m(lines: RangeLines, missing: NDArray[np.bool_]) -> float:
-    """Return the longest way between successive pings if it is a gap, else 0, metres.
+    """Return the longest distance between consecutive pings if it is a gap, else 0, metres.
 
-    A gap is three times the median step. Channels that are `missing` make gaps too.
+    A gap is longer than three median steps. Channels that are `missing` cause gaps, too.
     """
     there = ~missing
     if np.count_nonzero(there) < 2:
@@ -288,9 +298,9 @@ def largest_gap_m(lines: RangeLines, missing: NDArray[np.bool_]) -> float:
     )
     axis = np.ptp(every_m, axis=0).argmax()
     steps_m = np.diff(np.sort(every_m[:, axis]))
-    usual_m = float(np.median(steps_m[steps_m > 0])) if steps_m.any() else 0.0
+    median_m = float(np.median(steps_m[steps_m > 0])) if steps_m.any() else 0.0
     longest_m = float(np.diff(np.sort(some_m[:, axis])).max(initial=0.0))
-    return longest_m if longest_m > _HOLE * usual_m else 0.0
+    return longest_m if longest_m > _GAP * median_m else 0.0
 
 
 def _stamp(path: Path) -> tuple[int, int]:

@@ -1,8 +1,8 @@
-"""Worker processes of this machine, which nobody else can use: a Dask cluster behind TLS.
+"""Worker processes on this machine that only this user can reach: a Dask cluster behind TLS.
 
-A Dask scheduler runs whatever code a client sends it, and other users of the machine can connect
-to its port. So every connection needs a certificate that exists only in the memory of this run's
-processes, and the HTTP pages that Dask serves besides are not served.
+A Dask scheduler runs any code that a client sends, and other users of the machine can connect to
+its port. Therefore every connection needs a certificate, which exists only in the memory of this
+run's processes. Dask's HTTP pages are switched off.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from clsas.core.threads import uninterrupted
 
 class _NoPages:
     def start_http_server(self, *_: Any, **__: Any) -> None:
-        """Start none: Dask's own listens even where the dashboard is off."""
+        """Do nothing. Dask's own server listens even if the dashboard is off."""
 
 
 class _Scheduler(_NoPages, Scheduler):
@@ -35,19 +35,19 @@ class _Worker(_NoPages, Worker):
 
 @contextmanager
 def local_client(workers: int) -> Iterator[Client]:
-    """Give a client of worker processes with one thread each; end them afterwards.
+    """Start worker processes with one thread each, yield a client, and end them afterwards.
 
     Raises
     ------
     ImportError
-        If `cryptography` is not installed, which makes the certificate.
+        If `cryptography`, which makes the certificate, is not installed.
     ChildProcessError
-        If a worker ends while it starts.
+        If a worker ends during its start.
     OSError
         If the cache folder cannot be written.
     """
     security = _certificate()
-    # Workers import modules from their folder: it must be this user's, not one shared in /tmp.
+    # Workers import modules from their folder, so it must not be shared with others as /tmp is.
     folder = cache_folder() / "workers"
     folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     shared = {
@@ -65,8 +65,8 @@ def local_client(workers: int) -> Iterator[Client]:
         "local_directory": str(folder),
         "silence_logs": logging.CRITICAL,
     }
-    # Ctrl-C at a terminal is for this process, which then ends the others.
-    heeded = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    # A terminal sends Ctrl-C to all processes. Only this one heeds it, and ends the others.
+    previous = signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
         cluster = SpecCluster(
             scheduler={"cls": _Scheduler, "options": {**shared, "port": 0}},
@@ -79,7 +79,7 @@ def local_client(workers: int) -> Iterator[Client]:
             f"a worker process ended while it started: {_cause(error)}"
         ) from error
     finally:
-        signal.signal(signal.SIGINT, heeded)
+        signal.signal(signal.SIGINT, previous)
     opened = ExitStack()
     try:
         with uninterrupted():
@@ -102,11 +102,11 @@ def _certificate() -> Security:
 
 
 def _cause(error: BaseException) -> str:
-    """Return the first of a chain of exceptions, on one line."""
+    """Return the first cause of an exception, on one line."""
     while error.__cause__ is not None:
         error = error.__cause__
     text = " ".join(str(error).split())
-    # Dask says no more of a process that died without a word.
+    # This is all that Dask reports about a process that was killed.
     if text == "Nanny failed to start worker process":
         return "it was killed or exited by itself (out of memory?)"
     return f"{type(error).__name__}: {text}"

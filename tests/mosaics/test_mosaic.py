@@ -23,6 +23,7 @@ from clsas.core.grid import Grid
 from clsas.core.image_error import relative_error_db
 from clsas.core.validate import ClsasWarning
 from clsas.mosaics.devices import claim_device
+from clsas.mosaics.documents import read_document
 from clsas.mosaics.forming import open_visibility, stamped_files
 from clsas.mosaics.store import Store
 from clsas.mosaics.survey import END, open_survey
@@ -716,7 +717,7 @@ class TestFollowing:
         later.start()
         list(mosaic)
         later.join()
-        assert len(Store.opened(path)._attributes()["inputs"]["parts"]) == 4
+        assert len(read_document(path)["inputs"]["parts"]) == 4
         assert len(clsas.mosaic(folder, self.GRID, path, **self.REQUEST).finished) == 10
 
     def test_later_channels_make_a_patch_anew(self, lines, record, tmp_path):

@@ -13,7 +13,7 @@ from click.testing import CliRunner
 import clsas
 from clsas.cli import main
 from clsas.core.grid import Grid
-from clsas.mosaics.record import is_intact, read_attributes
+from clsas.mosaics.documents import is_intact, read_attributes
 from clsas.mosaics.store import Store
 
 GRID = Grid.plane((-4, 4, 40), (30, 40, 30))

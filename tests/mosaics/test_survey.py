@@ -129,7 +129,7 @@ def test_a_survey_grows_by_files_that_follow(folder):
 def test_a_file_that_changed_is_not_read(folder):
     survey = open_survey(folder)
     save(folder / "0.h5", LINES.select(slice(0, 49)))
-    with pytest.raises(FileFormatError, match=r"0\.h5 is not what it was"):
+    with pytest.raises(FileFormatError, match=r"0\.h5 has changed since"):
         survey.read(np.ones(120, bool), *ranges_of(PATCH))
 
 
