@@ -5,7 +5,7 @@ from functools import cache
 import pytest
 
 from clsas.opencl.device import Device, list_devices, open_device
-from clsas.trials.selftest import driven, forced_ways
+from clsas.trials.selftest import driven, other_builds
 
 
 def _named(ways, infos):
@@ -27,7 +27,7 @@ def _variants():
     # Of the CPUs' compilers PoCL's is the fastest.
     cpus = sorted((info for info in first if info.kind == "cpu"), key=lambda i: i.platform)[-1:]
     forced = _named(
-        [(info.index, *way) for info in cpus for way in forced_ways(info)],
+        [(info.index, *build) for info in cpus for build in other_builds(info)],
         infos,
     )
     # Without any device the tests fail, with the message that says how to get one.

@@ -197,16 +197,17 @@ def bench(
     Example:  clsas bench ffbp-2k --tolerance-db -40 --json
     """
     from clsas.trials import bench as benchmark
+    from clsas.trials import cases
 
-    measures = dict.fromkeys(benchmark.CASES, benchmark.run)
-    measures |= dict.fromkeys(benchmark.FACTORIZED, benchmark.run_factorized)
-    measures |= dict.fromkeys(benchmark.MOSAICS, benchmark.run_mosaic)
+    measures = dict.fromkeys(cases.EXACT_CASES, benchmark.run)
+    measures |= dict.fromkeys(cases.FACTORIZED_CASES, benchmark.run_factorized)
+    measures |= dict.fromkeys(cases.MOSAIC_CASES, benchmark.run_mosaic)
     if case is not None:
         _one_of(case, measures)
-        if (tolerance_db if case in benchmark.CASES else accuracy_db) is not None:
+        if (tolerance_db if case in cases.EXACT_CASES else accuracy_db) is not None:
             raise click.UsageError("--accuracy-db goes with bp-..., --tolerance-db with others")
     for name in [case] if case else measures:
-        exact, measure = name in benchmark.CASES, measures[name]
+        exact, measure = name in cases.EXACT_CASES, measures[name]
         option, value = ("accuracy_db", accuracy_db) if exact else ("tolerance_db", tolerance_db)
         wish = {} if value is None else {option: value}
         with progress_bar(name) as progress:
@@ -221,11 +222,11 @@ def bench(
 
 
 def _case(name: str) -> Any:
-    from clsas.trials import bench
+    from clsas.trials import cases
 
-    cases = bench.CASES | bench.FACTORIZED
-    _one_of(name, cases)
-    return cases[name]
+    known = cases.EXACT_CASES | cases.FACTORIZED_CASES
+    _one_of(name, known)
+    return known[name]
 
 
 def _one_of(name: str, cases: Collection[str]) -> None:

@@ -1,4 +1,4 @@
-"""The thesis's wide-beam case (chapter 5), from simulation to picture and measured figures."""
+"""Wide-beam case of the thesis (Ødegaard 2004, chapter 5), from simulation to measured image."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from clsas.sonar.track import Track, channels
 
 Progress = Callable[[int, int], None] | None
 
-_CLOSE_UP_M = 0.25  # to each side of the measured point
+_CLOSE_UP_M = 0.25  # half the side of the close-up around the measured point
 _CLOSE_UP_PIXELS = 501
 _FILES = (
     "scene.toml", "echoes.h5", "echoes.png", "lines.h5", "lines.png", "image.h5", "image.png",
@@ -50,27 +50,27 @@ def run(
     Parameters
     ----------
     out : Path
-        Folder for the files, made if need be.
+        Folder for the files; it is made if it does not exist.
     device : str or int, optional
         See `clsas.opencl.device.choose`.
     say : callable
-        Gets what was done, line by line.
+        Called with every line of the report.
     progress : callable
-        Called with the name of a step; returns a context that gives the step's progress callback
-        or None.
+        Called with the name of a step. Returns a context manager that yields the progress callback
+        of the step, or None.
 
     Returns
     -------
     dict
-        "seconds" per step, "device", "point" (the PointResponse of the scene's first target),
-        "expected" (its resolutions in theory) and "files".
+        "seconds" of every step, "device", "driver", "point" (the PointResponse of the scene's first
+        target), "expected" (its theoretical resolutions) and "files".
 
     Raises
     ------
     DeviceError
         If there is no such device.
     FileExistsError
-        If the folder holds files of the demo's names that are not of a demo.
+        If the folder holds files with the demo's names that another program made.
     ImportError
         If matplotlib is not installed.
     OSError
@@ -180,11 +180,11 @@ def run(
 def expected_resolution_m(
     sonar: Sonar, track: Track, point_m: NDArray[np.float64]
 ) -> tuple[float, float]:
-    """Return a point's -3 dB widths in azimuth and range, in theory.
+    """Return the theoretical -3 dB widths of a point in azimuth and range.
 
-    The response along an axis is the Fourier transform of what its spectrum holds. Along track that
-    is the two-way element pattern at the spatial frequency (sin theta_tx + sin theta_rx)/lambda
-    of every channel; in range the matched pulse's |P(f)|^2 at 2 f/c.
+    The response along an axis is the Fourier transform of the spectrum along it. In azimuth this is
+    the two-way element pattern at the spatial frequency (sin theta_tx + sin theta_rx)/lambda of
+    every channel; in range it is |P(f)|^2 of the matched pulse at 2 f/c.
     """
     tx, rx, _ = channels(sonar, track)
     sines = [(point_m - end)[:, 0] / np.linalg.norm(point_m - end, axis=1) for end in (tx, rx)]
@@ -201,7 +201,7 @@ def expected_resolution_m(
 
 
 def _width(cycles_per_m: NDArray[np.float64], weight: NDArray[np.float64]) -> float:
-    """Return the full width at half power of |sum weight exp(j 2 pi cycles u)| around u = 0."""
+    """Full width at half power of |sum weight exp(j 2 pi cycles_per_m u)| around u = 0."""
     offset = np.linspace(0, 1 / np.ptp(cycles_per_m), 2001)
     response = np.abs(np.exp(2j * np.pi * np.multiply.outer(offset, cycles_per_m)) @ weight)
     return 2 * float(np.interp(-0.5, -((response / response[0]) ** 2), offset))

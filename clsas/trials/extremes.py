@@ -1,7 +1,7 @@
-"""Scenes whose ideal image is known, at the extremes of what clsas images.
+"""Scenes with a known ideal image, at the extremes of what clsas images.
 
-Lines and images come from `clsas.trials.oracle` alone; of the library a scene takes only
-the containers, `RangeLines`, `Grid` and `BeamWindow`.
+Lines and images are those of `clsas.trials.oracle`. From the library a scene uses only the
+containers `RangeLines`, `Grid` and `BeamWindow`.
 """
 
 from __future__ import annotations
@@ -20,10 +20,11 @@ from clsas.trials import oracle
 from clsas.trials.oracle import Band, Echo
 
 LIGHT_M_S = 299_792_458.0
-_FILLED, _EDGE = 0.94, 0.01  # of the bandwidth: a pulse's flat part, and its edges' deviation
-_FADED = 6.0  # standard deviations of a Gaussian: 1.5e-8
-_TONES = 24  # per channel, of a noise floor
-_QUANTUM_M = 2.0**-29  # float64 holds sums of multiples of it up to 1.6e7 m
+_FLAT = 0.94  # share of the bandwidth in which a pulse's spectrum is flat
+_EDGE = 0.01  # standard deviation of the spectrum's edges over the bandwidth
+_FADED = 6.0  # standard deviations after which a Gaussian is 1.5e-8
+_TONES = 24  # per channel in a noise floor
+_QUANTUM_M = 2.0**-29  # float64 adds multiples of this without rounding up to 1.6e7 m
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,18 +35,19 @@ class Known:
     ----------
     lines : RangeLines
     grid : Grid
-    wanted : complex128 [rows, columns]
+    ideal : complex128 [rows, columns]
+        Ideal image.
     beam : BeamWindow or None
     """
 
     lines: RangeLines
     grid: Grid
-    wanted: NDArray[np.complex128]
+    ideal: NDArray[np.complex128]
     beam: BeamWindow | None = None
 
     def error_db(self, pixels: ArrayLike) -> float:
         """Return the relative rms error of an image of this scene, dB."""
-        return oracle.error_db(pixels, self.wanted)
+        return oracle.error_db(pixels, self.ideal)
 
 
 def along_x(channels: int, spacing_m: float, sway_m: float = 0.0) -> NDArray[np.float64]:
@@ -88,19 +90,21 @@ def scene(
     relief_m: float = 0.0,
     seed: int = 0,
 ) -> Known:
-    """Return points at random in a horizontal grid, as one sonar receives them.
+    """Return random points on a horizontal grid, as one sonar receives them.
 
     Parameters
     ----------
     tx_m, rx_m : float64 [channels, 3]
-        Antennas; receivers are the transmitters unless given.
+        Antennas; by default monostatic.
     centre_m : (x, y, z)
-        Of the grid.
+        Centre of the grid.
     carrier_hz, bandwidth_hz, speed_m_s : float
     pixel_m : (dx, dy)
+        Pixel spacing.
     shape : (rows, columns)
+        Pixels of the grid.
     rx_velocity_m_s : array_like, optional
-        Receivers' velocity in flight.
+        Velocity of the receivers during flight.
     beam : BeamWindow, optional
         Shape "hann" or "rectangular", with `along` of one direction.
     targets : int
@@ -108,22 +112,22 @@ def scene(
     oversampling : float
         Sample rate over bandwidth.
     colour : callable, optional
-        Returns a pulse's bands from centre and width, cycles per metre. Without one the
-        pulse is flat, or tilted by `tilt_db`.
+        Called with centre and width in cycles per metre; returns the bands of the pulse. By
+        default the pulse's spectrum is flat, or tilted by `tilt_db`.
     on_carrier : bool
-        Whether lines keep their carrier; `oversampling` must then have room for it.
+        Whether lines keep their carrier. The sampled band must then include it.
     offset : float
-        Constant in every line over the rms of its echoes.
+        Constant in every line, relative to the rms of its echoes.
     tail : float
-        Noise from 0 Hz up to the band, over the rms of the echoes.
+        Noise from 0 Hz up to the band, relative to the rms of the echoes.
     noise : float
-        Noise all over nine tenths of what is sampled, over the rms of the echoes.
+        Noise in nine tenths of the sampled band, relative to the rms of the echoes.
     origin_m : (x, y, z)
-        What is added to all coordinates.
+        Offset of all coordinates.
     own_starts : bool
-        Whether every line begins at another range.
+        Whether lines begin at different ranges.
     relief_m : float
-        Standard deviation of the pixels' heights over the grid's plane, each another.
+        Standard deviation of the pixels' heights, which are independent of each other.
     seed : int
 
     Returns
@@ -144,7 +148,7 @@ def scene(
     )
     height_m = relief_m * np.random.default_rng(seed).normal(size=shape)
     pixels[..., 2] += height_m
-    # Points keep off the border, so that the image holds their main lobes.
+    # No points near the border, so that the image holds their main lobes.
     points = corner + rng.uniform(0.1, 0.9, (targets, 3)) * [np.ptp(x_m), np.ptp(y_m), 0]
     amplitude = rng.normal(size=(targets, 2)) @ [1, 1j]
 
@@ -152,7 +156,7 @@ def scene(
     centre, width = per_m * carrier_hz, per_m * bandwidth_hz
     step_m = 1 / (width * oversampling)
     if colour is None:
-        bands = [Band(centre, _FILLED * width, _EDGE * width, tilt_db=tilt_db)]
+        bands = [Band(centre, _FLAT * width, _EDGE * width, tilt_db=tilt_db)]
     else:
         bands = colour(centre, width)
     at_m = oracle.ranges_m(points, tx, rx, speed_m_s, velocity)
@@ -161,7 +165,7 @@ def scene(
 
     fade_m = _FADED / (2 * np.pi * min(band.edge for band in bands))
     if offset or tail or noise:
-        # What has no range of its own fades with a Gaussian over the whole line.
+        # Offsets and noise extend over the whole line, and fade with a Gaussian.
         fade_m = max(fade_m, np.ptp(of_pixels_m, axis=1).max())
     nearest = np.minimum(at_m.min(axis=1), of_pixels_m.min(axis=1))
     farthest = np.maximum(at_m.max(axis=1), of_pixels_m.max(axis=1))
@@ -169,13 +173,15 @@ def scene(
     length = int(np.ceil(((farthest - nearest).max() + 2 * fade_m) / step_m)) + 1
     if own_starts:
         first_m = first_m - rng.uniform(0, step_m, len(tx))
-    elif np.ptp(first_m) < length * step_m:  # else lines would hold little but zeros
+    elif np.ptp(first_m) < length * step_m:  # otherwise lines would be mostly zeros
         length += int(np.ceil(np.ptp(first_m) / step_m))
         first_m = np.full(len(tx), first_m.min())
     carrier = 0.0 if on_carrier else centre
     values = oracle.samples(echoes, first_m, step_m, length, carrier)
     rms = np.sqrt(np.mean(np.abs(values) ** 2))
-    other = _other(rng, first_m, step_m, length, offset * rms, tail * rms, noise * rms, centre)
+    other = _disturbances(
+        rng, first_m, step_m, length, offset * rms, tail * rms, noise * rms, centre
+    )
     if other:
         values += oracle.samples(other, first_m, step_m, length, carrier)
         echoes = [*echoes, *other]
@@ -273,7 +279,7 @@ def _quantised(positions_m: ArrayLike) -> NDArray[np.float64]:
     return np.round(np.asarray(positions_m, np.float64) / _QUANTUM_M) * _QUANTUM_M
 
 
-def _other(
+def _disturbances(
     rng: np.random.Generator,
     first_m: NDArray[np.float64],
     step_m: float,
@@ -283,14 +289,14 @@ def _other(
     noise: float,
     centre: float,
 ) -> list[Echo]:
-    """Return what lines hold besides echoes: a constant, a tail below the band, and noise.
+    """Return a constant, a tail below the band, and noise as echoes.
 
     Amplitudes are rms values over a line.
     """
     channels = len(first_m)
     middle_m = (first_m + (length - 1) / 2 * step_m)[:, None]
     edge = _FADED / (np.pi * length * step_m)  # fades at both ends
-    # Mean square of the envelope over the line.
+    # Rms of the envelope over the line.
     fullness = np.sqrt(np.sqrt(np.pi) / (2 * _FADED))
     found = []
     if offset:
@@ -301,13 +307,13 @@ def _other(
         (noise, centre - floor, centre + floor),
     ):
         for tone in range(_TONES if level else 0):
-            place = (tone + rng.uniform(0, 1, (channels, 1))) / _TONES
+            position = (tone + rng.uniform(0, 1, (channels, 1))) / _TONES
             value = rng.normal(size=(channels, 1, 2)) @ [1, 1j] / np.sqrt(2 * _TONES)
             found.append(
                 Echo(
                     middle_m,
                     level / fullness * value,
-                    [Band(low + (high - low) * place, 0.0, edge)],
+                    [Band(low + (high - low) * position, 0.0, edge)],
                 )
             )
     return found
@@ -316,7 +322,7 @@ def _other(
 def _weights(
     beam: BeamWindow, pixels_m: NDArray[np.float64], centres_m: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return the weights of a beam by its definition, [channels, pixels]."""
+    """Return a beam's weights, [channels, pixels], from their definition."""
     towards = pixels_m.reshape(1, -1, 3) - centres_m[:, None]
     sine = towards @ beam.along / np.linalg.norm(towards, axis=-1)
     u = (np.degrees(np.arcsin(sine)) - beam.squint_deg) / beam.width_deg

@@ -1,8 +1,8 @@
-"""Analytic echoes and their ideal image in float64: what every imager is held to.
+"""Oracle: analytic echoes and their ideal image in float64, against which imagers are tested.
 
-This module shares nothing with the library that it judges: it imports NumPy and nothing else. An
-echo is a function known at every range. Sampling it gives range lines; evaluating it at the range
-of a pixel gives the ideal image. No sample is interpolated and no spectrum is measured.
+This module shares no code with the library; it imports only NumPy. An echo is a function known at
+every range. Its samples are range lines; its value at the range of a pixel contributes to the ideal
+image. No sample is interpolated and no spectrum is measured.
 
 Frequencies are cycles per metre of range: f hertz are 2 f / c, because range is half the path.
 """
@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-_ITERATIONS = 16  # of a delay: each gains a factor speed / |velocity|, 20 or more
+_ITERATIONS = 16  # of a delay; each reduces the error by |velocity| / speed, 1/20 or less
 
 
 @dataclass(frozen=True)

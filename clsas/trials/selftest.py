@@ -1,4 +1,4 @@
-"""A test of accuracy on the user's own device, against the oracle."""
+"""Test of accuracy on the user's own device, against the oracle."""
 
 from __future__ import annotations
 
@@ -22,29 +22,29 @@ from clsas.sonar.beam import BeamWindow
 from clsas.trials import extremes
 from clsas.trials.extremes import Known, along_x
 
-_WAYS = ((1, False), (4, False), (8, False), (8, True), (16, False))
+_BUILDS = ((1, False), (4, False), (8, False), (8, True), (16, False))  # width, permuted lookup
 _WIDEST = 16
 
 _DIVIDED = Costs(pixel_ns=1e3, point_ns=1e3)
-"""Plans of small images divide them only if nothing else is fast."""
+"""Costs with which even small images are divided, since exact imaging is predicted to be slow."""
 _FAR_M = (1e7, -1e7, 1e7)
-_WAVENUMBER_DB = -60.0  # what the wavenumber image of these scenes may err by; it takes no request
+_WAVENUMBER_DB = -60.0  # error bound of the wavenumber image, which takes no accuracy
 
 
 @dataclass(frozen=True)
 class Result:
-    """One image against its ideal.
+    """Error of one image against the ideal image.
 
     Attributes
     ----------
     case : str
         Scene and imager.
     asked_db : float or None
-        Relative rms error asked for, dB; None where the imager takes none.
+        Requested relative rms error, dB; None for an imager that takes no request.
     measured_db : float
-        Relative rms error found.
+        Measured relative rms error.
     bound_db : float
-        What it may be.
+        Largest error with which the test is passed.
     """
 
     case: str
@@ -63,11 +63,12 @@ def run(
     *,
     progress: Callable[[int, int], None] | None = None,
 ) -> tuple[Result, ...]:
-    """Form images at the extremes and measure their errors against the oracle.
+    """Form images at the extremes, and measure their errors against the oracle.
 
-    Scenes reach from 1 kHz to 10 GHz, from one channel to 1000, to a guard band of a tenth and to
-    coordinates of 10 000 km. Every imager takes part: exact, factorized (in single and in half
-    precision), mosaic and wavenumber. A CPU's kernels are built in every way that it is fit for.
+    The scenes cover 1 kHz to 10 GHz, one to 1000 channels, guard bands down to a tenth, and
+    coordinates up to 10 000 km. Every imager is tested: exact, factorized (in single and in half
+    precision), mosaic and wavenumber. On a CPU the kernels are built for every vector width that
+    the CPU supports.
 
     Parameters
     ----------
@@ -100,7 +101,7 @@ def run(
             progress(done, len(checks))
         known = made(scene)
         with warnings.catch_warnings():
-            # What counts is the error found, whether or not the library warned of it.
+            # Warnings do not matter here, only the measured error.
             warnings.simplefilter("ignore", validate.ClsasWarning)
             image = form(imager, known, asked_db, used)
         bound_db = _WAVENUMBER_DB if asked_db is None else asked_db
@@ -116,23 +117,23 @@ def form(imager: str, known: Known, asked_db: float | None, device: Device) -> I
     return IMAGERS[imager](known, asked_db, device)
 
 
-def forced_ways(info: DeviceInfo) -> list[tuple[int, bool]]:
-    """Return the other ways to drive a device: floats of a vector, and whether to permute them.
+def other_builds(info: DeviceInfo) -> list[tuple[int, bool]]:
+    """Return the other builds of kernels: floats of a vector, and whether lookups are permuted.
 
-    Only CPUs have more than one. A compiler that is driven with more lanes than it has may break.
+    Only CPUs have more than one. Compilers may fail with more lanes than the CPU has.
     """
     if info.kind != "cpu":
         return []
     most = info.width if info.width > 1 else _WIDEST
     own = (info.width, info.permute)
-    return [way for way in _WAYS if way[0] <= most and way != own]
+    return [build for build in _BUILDS if build[0] <= most and build != own]
 
 
 def variants(device: Device) -> dict[str, Device]:
-    """Return a device driven in every other way that it is fit for, by name."""
+    """Return the device with every other build of kernels that it supports, by name."""
     return {
         f"width {width}{', permuted' if permute else ''}": driven(device, width, permute)
-        for width, permute in forced_ways(device.info)
+        for width, permute in other_builds(device.info)
     }
 
 
@@ -155,7 +156,7 @@ def _factorized(known: Known, asked_db: float, device: Device) -> Image:
 
 
 def _in_half_precision(known: Known, asked_db: float, device: Device) -> Image:
-    # Every device computes in half precision, but plans take it only where that is fast.
+    # Every device can compute in half precision, but plans use it only where it is fast.
     able = driven(device, device.info.width, True)
     chosen = divided_plan(known, asked_db, able)
     if not chosen.half_precision:
@@ -164,7 +165,7 @@ def _in_half_precision(known: Known, asked_db: float, device: Device) -> Image:
 
 
 def divided_plan(known: Known, asked_db: float, device: Device) -> Plan:
-    """Return a plan that divides a scene's image, although it is small."""
+    """Return a plan that divides a scene's image even though it is small."""
     return plan(
         known.lines, known.grid, tolerance_db=asked_db, beam=known.beam, device=device,
         costs=_DIVIDED,
@@ -227,5 +228,5 @@ _CHECKS = (
     ("Hann beam", "mosaic", -50.0),
     ("Hann beam", "wavenumber", None),
 )
-# Requests whose kernels compilers build soonest: at -80 and -50 dB these take half as long again.
+# Requests whose kernels compile fast: those for -80 and -50 dB take half as long again.
 _OF_VARIANTS = (("exact", -60.0), ("factorized", -35.0))

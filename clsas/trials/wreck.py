@@ -1,7 +1,7 @@
-"""The narrow-beam case: a wreck and its shadow, after THESIS chapter 6.
+"""Narrow-beam case: a wreck and its shadow, after chapter 6 of the thesis (Ødegaard 2004).
 
-The scene is `scenes/wreck.toml`. What benchmarks and the scripts in scripts/thesis share is here:
-its range lines, which take minutes to simulate and are kept, and the contrast of its shadow.
+The scene is `scenes/wreck.toml`. Its range lines take minutes to simulate and are cached. The
+benchmarks and scripts/thesis use them and the contrast of the shadow.
 """
 
 from __future__ import annotations
@@ -25,26 +25,26 @@ from clsas.simulation.simulator import simulate
 
 X_M, Y_M = (-32.0, 32.0), (36.0, 92.0)
 
-_FOOTPRINT_M = 2.5  # half the way from which a pixel of the wreck is seen, amply
-_SPACING_M = 0.25  # between places where light and shadow are told
-_FLAT_M = 0.3  # height of what counts as sand
-_SURROUNDINGS_M = (12.0, 30.0)  # of the wreck along and across: sand that the shadow is compared to
+_FOOTPRINT_M = 2.5  # more than half the length of track that a pixel of the wreck is visible from
+_SPACING_M = 0.25  # of the points that are classified as lit or in shadow
+_FLAT_M = 0.3  # largest height that counts as sand
+_SURROUNDINGS_M = (12.0, 30.0)  # distance along and across up to which lit sand is compared
 
 
 def grid(pixels: int) -> Grid:
-    """Return the whole scene, 64 m x 56 m, in so many pixels along either side."""
+    """Return a grid of the whole scene, 64 m x 56 m, with `pixels` along either side."""
     return Grid.plane((*X_M, pixels), (*Y_M, pixels))
 
 
 def scene() -> SceneFile:
-    """Return the built-in scene."""
+    """Return the built-in scene of the wreck."""
     return parse_scene(built_in_scene("wreck"), name="wreck.toml", folder=Path())
 
 
 def lines(progress: Callable[[int, int], None] | None = None) -> RangeLines:
-    """Return the scene's range lines: simulated once, which takes minutes, and kept in the cache.
+    """Return the scene's range lines. The first call simulates them, which takes minutes.
 
-    See `clsas.core.cache.cache_folder` for where.
+    Later calls read them from the cache (`clsas.core.cache.cache_folder`).
     """
     digest = simulation_digest(built_in_scene("wreck"), Path())
     path = cache_folder() / f"wreck-{digest}.h5"
@@ -53,7 +53,7 @@ def lines(progress: Callable[[int, int], None] | None = None) -> RangeLines:
         if isinstance(kept, RangeLines):
             return kept
     except (FileFormatError, OSError):
-        pass  # not there, or not whole
+        pass  # missing or incomplete
     described = scene()
     sonar, track, targets = described.need("sonar", "track", "targets")
     echoes = simulate(sonar, track, targets, **described.simulate, progress=progress)
@@ -65,7 +65,7 @@ def lines(progress: Callable[[int, int], None] | None = None) -> RangeLines:
 
 @dataclass(frozen=True, eq=False)
 class Shadow:
-    """Which places of the seabed are lit and which in the wreck's shadow.
+    """Sand around the wreck, classified as lit or in shadow.
 
     Attributes
     ----------
@@ -76,9 +76,9 @@ class Shadow:
 
     @cached_property
     def masks(self) -> tuple[NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_]]:
-        """Positions [n, 2] of sand on and round the wreck, which are in shadow, and which lit.
+        """Positions [n, 2] of sand around the wreck, which are in shadow and which are lit, [n].
 
-        In shadow, and lit, from everywhere along the track from where they are seen.
+        Both hold from everywhere along the part of the track where the positions are visible.
         """
         seabed, track = self.scene.need("targets", "track")
         x_m, y_m = (

@@ -21,7 +21,7 @@ from clsas import cli
 from clsas.core import validate
 from clsas.files.scene_files import built_in_scene, read_scene
 from clsas.planning import costs
-from clsas.trials import bench, demo
+from clsas.trials import cases, demo
 
 pytest.importorskip("matplotlib")
 
@@ -30,7 +30,7 @@ README = (ROOT / "README.md").read_text()
 (EXAMPLE,) = re.findall(
     r"```toml\n(.*?)```", (ROOT / "docs" / "scene-files.md").read_text(), re.DOTALL
 )
-SMALL = bench.Case(48, 8.25e-3, 1e6, 100e3, (-0.2, 0.2), (40.0, 40.4), 64)
+SMALL = cases.Case(48, 8.25e-3, 1e6, 100e3, (-0.2, 0.2), (40.0, 40.4), 64)
 
 
 def run(*args, code=0):
@@ -258,7 +258,7 @@ def test_tradeoff(made, tmp_path):
 
 def test_tradeoff_of_a_built_in_case(monkeypatch):
     beam = clsas.BeamWindow(1.0)
-    monkeypatch.setattr(bench, "FACTORIZED", {"small": dataclasses.replace(SMALL, beam=beam)})
+    monkeypatch.setattr(cases, "FACTORIZED_CASES", {"small": dataclasses.replace(SMALL, beam=beam)})
     seen = []
 
     def measured(lines, grid, **options):
@@ -601,9 +601,9 @@ def test_help_shows_an_example_that_parses(monkeypatch):
 
 
 def test_bench(monkeypatch):
-    monkeypatch.setattr(bench, "CASES", {"one": SMALL, "two": SMALL})
-    monkeypatch.setattr(bench, "FACTORIZED", {"fast": SMALL})
-    monkeypatch.setattr(bench, "MOSAICS", {})
+    monkeypatch.setattr(cases, "EXACT_CASES", {"one": SMALL, "two": SMALL})
+    monkeypatch.setattr(cases, "FACTORIZED_CASES", {"fast": SMALL})
+    monkeypatch.setattr(cases, "MOSAIC_CASES", {})
     result = run_json("bench", "one", "--repeats", 2)
     assert result["case"] == "one"
     assert result.keys() >= {"device", "driver", "gbp_per_s", "rounding_error_db"}
@@ -708,7 +708,7 @@ def test_readme_tour(tmp_path, monkeypatch):
     commands, program = (
         "\n".join(re.findall(rf"```{kind}\n(.*?)```", tour, re.DOTALL)) for kind in ("sh", "python")
     )
-    monkeypatch.setattr(bench, "FACTORIZED", {"ffbp-thesis": SMALL})
+    monkeypatch.setattr(cases, "FACTORIZED_CASES", {"ffbp-thesis": SMALL})
     shown = {}
     for line in filter(None, commands.splitlines()):
         name, *args = shlex.split(line)

@@ -8,7 +8,7 @@ from clsas.factorized.sector import Geometry
 from clsas.factorized.surface import surface_of
 from clsas.planning.planner import plan
 from clsas.sonar.beam import BeamWindow
-from clsas.trials import bench
+from clsas.trials import cases
 
 HANN = BEAMS[0]
 
@@ -16,7 +16,7 @@ HANN = BEAMS[0]
 @pytest.fixture(scope="module")
 def wide():
     """A beam that leaves most of the track unseen, over a scene beyond both ends of it."""
-    case = bench.scaled(512)
+    case = cases.scaled(512)
     lines, grid = case.lines(), case.grid
     chosen = plan(lines, grid, tolerance_db=-40, beam=case.beam, costs=EXACT_IS_SLOW)
     return Geometry(lines, surface_of(grid), chosen)
@@ -33,7 +33,7 @@ def any_track(request, wide):
     """The same, and with pings missing over more than a root and its beam."""
     if request.param == "whole":
         return wide
-    case = bench.scaled(512)
+    case = cases.scaled(512)
     lines = case.lines()
     lines = lines.select(np.flatnonzero(np.abs(lines.tx_m[:, 0] - 2) > 8))
     beam = BeamWindow(3.0, "hann")

@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 
 from clsas.sonar.beam import BeamWindow
-from clsas.trials import bench
+from clsas.trials import bench, cases, tables
 
 SCRIPT = Path(__file__).parents[2] / "scripts" / "bench"
-SMALL = bench.Case(200, 8.25e-3, 1e6, 100e3, (-0.3, 0.3), (40.0, 40.6), 128)
+SMALL = cases.Case(200, 8.25e-3, 1e6, 100e3, (-0.3, 0.3), (40.0, 40.6), 128)
 
 
 def test_cases_are_sampled():
     """Channels and pixels are close enough for the beam, the grid and the band."""
-    for name, case in bench.FACTORIZED.items():
+    for name, case in cases.FACTORIZED_CASES.items():
         wavelength_m = 1500 / case.carrier_hz
         grid = case.grid
         assert grid.shape == (case.pixels, case.pixels)
@@ -30,7 +30,7 @@ def test_cases_are_sampled():
 
 
 def test_scaled_cases_keep_what_they_look_like_in_wavelengths():
-    base, scaled = bench.scaled(2048), bench.scaled(512)
+    base, scaled = cases.scaled(2048), cases.scaled(512)
     assert (base.channels, base.pixels, scaled.channels, scaled.pixels) == (2048, 2048, 512, 512)
     assert base.carrier_hz == 120e3
     assert scaled.spacing_m == pytest.approx(4 * base.spacing_m)
@@ -42,7 +42,7 @@ def test_scaled_cases_keep_what_they_look_like_in_wavelengths():
 @pytest.mark.parametrize("beam", [None, BeamWindow(1.5, "hann")])
 def test_factorized_against_exact(beam, monkeypatch):
     case = dataclasses.replace(SMALL, beam=beam)
-    monkeypatch.setitem(bench.FACTORIZED, "small", case)
+    monkeypatch.setitem(cases.FACTORIZED_CASES, "small", case)
     seen = []
     result = bench.run_factorized(
         "small", tolerance_db=-40, repeats=2, progress=lambda *done: seen.append(done)
@@ -76,16 +76,7 @@ def test_unknown_cases_are_refused():
         bench.run_factorized("bp-2k")
 
 
-@pytest.fixture
-def script():
-    """scripts/bench as a module."""
-    loader = SourceFileLoader("bench_script", str(SCRIPT))
-    module = module_from_spec(spec_from_loader("bench_script", loader))
-    loader.exec_module(module)
-    return module
-
-
-def test_scaling_fits_exponents_and_writes_them(script, monkeypatch, tmp_path, capsys):
+def test_scaling_fits_exponents_and_writes_them(monkeypatch, tmp_path, capsys):
     pytest.importorskip("matplotlib")
 
     def measured(case, **_):
@@ -96,7 +87,7 @@ def test_scaling_fits_exponents_and_writes_them(script, monkeypatch, tmp_path, c
         return {"device": "abacus", "driver": "1.0", "speedup": 10 * n, **times, **figures}
 
     monkeypatch.setattr(bench, "run_factorized", measured)
-    script.scaling(None, 1024, tmp_path / "s.csv", tmp_path / "s.png")
+    tables.scaling(None, 1024, tmp_path / "s.csv", tmp_path / "s.png")
     told = capsys.readouterr().out
     assert "N^2.00 (factorized), N^3.00 (exact)" in told
     assert "| 1024 | 1.6 | 64 |" in told
@@ -107,10 +98,20 @@ def test_scaling_fits_exponents_and_writes_them(script, monkeypatch, tmp_path, c
     assert (tmp_path / "s.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_the_table_of_factorized_cases(script, monkeypatch, capsys):
-    monkeypatch.setattr(bench, "FACTORIZED", {"small": SMALL})
-    script.factorized([None])
+def test_the_table_of_factorized_cases(monkeypatch, capsys):
+    monkeypatch.setattr(cases, "FACTORIZED_CASES", {"small": SMALL})
+    tables.factorized([None])
     header, _, row = capsys.readouterr().out.splitlines()
     assert "speedup" in header
     assert row.startswith("| small | ")
     assert header.count("|") == row.count("|")
+
+
+def test_the_script_prints_the_table_that_is_named(monkeypatch, capsys):
+    monkeypatch.setattr(tables, "factorized", lambda devices, names: print(devices, names))
+    loader = SourceFileLoader("bench_script", str(SCRIPT))
+    script = module_from_spec(spec_from_loader("bench_script", loader))
+    loader.exec_module(script)
+    monkeypatch.setattr("sys.argv", ["bench", "factorized", "--device", "0", "--case", "ffbp-2k"])
+    script.main()
+    assert capsys.readouterr().out == "['0'] ['ffbp-2k']\n"

@@ -13,7 +13,7 @@ from clsas.trials import selftest
 @pytest.fixture
 def small(monkeypatch):
     """One exact and one factorized image on the device as it is."""
-    monkeypatch.setattr(selftest, "forced_ways", lambda info: [])
+    monkeypatch.setattr(selftest, "other_builds", lambda info: [])
     monkeypatch.setattr(
         selftest, "_CHECKS", (("flat", "exact", -60.0), ("flat", "factorized", -40.0))
     )
@@ -21,7 +21,7 @@ def small(monkeypatch):
 
 def test_every_image_is_within_its_bound(platform, monkeypatch):
     """Other ways to drive a CPU are tested elsewhere."""
-    monkeypatch.setattr(selftest, "forced_ways", lambda info: [])
+    monkeypatch.setattr(selftest, "other_builds", lambda info: [])
     told = []
     results = selftest.run(platform, progress=lambda *done: told.append(done))
     assert [result for result in results if not result.passed] == []
@@ -30,9 +30,9 @@ def test_every_image_is_within_its_bound(platform, monkeypatch):
     assert imagers == {"exact", "factorized", "half precision", "mosaic", "wavenumber"}
 
 
-def test_other_ways_to_drive_a_device_are_tested_too(platform, monkeypatch):
+def test_other_builds_for_a_device_are_tested_too(platform, monkeypatch):
     monkeypatch.setattr(selftest, "_CHECKS", ())
-    monkeypatch.setattr(selftest, "_WAYS", ((1, False), (4, False)))
+    monkeypatch.setattr(selftest, "_BUILDS", ((1, False), (4, False)))
     own = (platform.info.width, platform.info.permute)
     results = selftest.run(platform)
     assert len(results) == 2 * len({(1, False), (4, False)} - {own})

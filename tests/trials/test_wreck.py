@@ -6,7 +6,7 @@ import pytest
 from clsas.core.image import Image
 from clsas.core.lines import RangeLines
 from clsas.sonar.beam import BeamWindow
-from clsas.trials import bench, wreck
+from clsas.trials import bench, cases, wreck
 
 
 @pytest.fixture(scope="module")
@@ -63,7 +63,7 @@ def test_lines_are_simulated_once(monkeypatch, tmp_path):
 
 def test_benchmark(monkeypatch):
     monkeypatch.setattr(wreck, "lines", lambda progress=None: few_lines())
-    monkeypatch.setitem(bench.MOSAICS, "small", (128, BeamWindow(5.0, "hann")))
+    monkeypatch.setitem(cases.MOSAIC_CASES, "small", (128, BeamWindow(5.0, "hann")))
     result = bench.run_mosaic("small", repeats=1)
     assert result["case"] == "small"
     assert result["pixels"] == [128, 128]

@@ -1,0 +1,377 @@
+"""Tables of docs/benchmarks.md and docs/accuracy.md, printed as Markdown."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import itertools
+import multiprocessing
+import resource
+import tempfile
+import time
+from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+
+import numpy as np
+
+import clsas
+from clsas import plot
+from clsas.core.image_error import levels
+from clsas.exact.backprojection import prepare
+from clsas.exact.run import execute
+from clsas.opencl.device import open_device
+from clsas.products.shadows import dark_level_db
+from clsas.trials import bench, cases, wreck
+
+TOLERANCES_DB = {"ffbp-thesis": (-40.0,), "ffbp-2k": (-50.0, -30.0)}  # -50 dB for others
+FITTED = 3  # exponents are fitted to this many of the largest sizes
+SHADOW_PIXELS = 1024  # along either side of the wreck's scene, 64 m x 56 m
+SHADOW_TOLERANCES_DB = (-20.0, -30.0, -40.0, -50.0, -60.0)
+SHADOW_LEVELS_DB = (
+    10,
+    0,
+    -5,
+    -10,
+    -15,
+    -20,
+    -25,
+)  # around a pixel, relative to the rms
+SIZES = (256, 512, 1024, 2048, 4096, 8192)
+
+
+def table(header: list[str], rows: list[list[object]]) -> None:
+    """Print a Markdown table."""
+    print("|", " | ".join(header), "|")
+    print("|", " | ".join("---" for _ in header), "|")
+    for row in rows:
+        print("|", " | ".join(str(cell) for cell in row), "|", flush=True)
+
+
+def speed(devices: list[str]) -> None:
+    """Print speed and errors of exact imaging for the built-in cases at -50 and -80 dB."""
+    rows = []
+    for case in cases.EXACT_CASES:
+        for accuracy_db in (-50.0, -80.0):
+            for device in devices:
+                r = bench.run(case, device=device, accuracy_db=accuracy_db)
+                rows.append(
+                    [
+                        case,
+                        r["device"],
+                        r["driver"],
+                        f"{r['taps']} at {r['upsampling']:.2f}",
+                        "{median:.3f} ({min:.3f} to {max:.3f})".format(**r["seconds"]),
+                        f"{r['gbp_per_s']:.2f}",
+                        f"{r['kernel_gbp_per_s']:.2f}",
+                        f"{r['gflop_per_s']:.0f}",
+                        f"{100 * r['share_of_peak']:.0f} %",
+                        f"{r['rounding_error_db']:.1f}",
+                        f"{r['true_error_db']:.1f}",
+                    ]
+                )
+    table(
+        [
+            "case",
+            "device",
+            "driver",
+            "taps, upsampling",
+            "seconds: median (min to max)",
+            "GBP/s",
+            "kernel GBP/s",
+            "GFLOP/s",
+            "of peak",
+            "rounding dB",
+            "true error dB",
+        ],
+        rows,
+    )
+
+
+def presets(devices: list[str]) -> None:
+    """Print interpolators that `accuracy_db` chooses and their errors, on the first device."""
+    rows = []
+    for accuracy_db in (-20, -30, -40, -50, -60, -70, -80, -85):
+        r = bench.run("bp-thesis", device=devices[0], accuracy_db=accuracy_db, repeats=3)
+        rows.append(
+            [
+                accuracy_db,
+                r["taps"],
+                f"{r['upsampling']:.2f}",
+                f"{r['predicted_error_db']:.1f}",
+                f"{r['true_error_db']:.1f}",
+                f"{r['rounding_error_db']:.1f}",
+                f"{r['gbp_per_s']:.2f}",
+            ]
+        )
+    header = [
+        "accuracy_db",
+        "taps",
+        "upsampling",
+        "predicted dB",
+        "true dB",
+        "rounding dB",
+        "GBP/s",
+    ]
+    table(header, rows)
+
+
+def taps(devices: list[str]) -> None:
+    """Print the kernel's time by taps, from which `clsas.signal.interpolation.COST` is taken."""
+    case = dataclasses.replace(cases.EXACT_CASES["bp-thesis"], channels=512)
+    lines, grid = case.lines(), case.grid
+    best = {}
+    for _ in range(5):
+        for name in devices:
+            device = open_device(name)
+            for count in (2, 4, 6, 8):
+                with device.profile() as times:
+                    execute(prepare(lines, grid, device=device, taps=count, upsampling=3.0))
+                seconds = times["backproject_tiles"].total_s
+                best[name, count] = min(best.get((name, count), seconds), seconds)
+    pairs = lines.channels * grid.size
+    rows = [[n, c, f"{pairs / s / 1e9:.2f}", f"{s / best[n, 4]:.2f}"] for (n, c), s in best.items()]
+    table(["device", "taps", "kernel GBP/s", "time over that of 4 taps"], rows)
+
+
+def simulation(devices: list[str]) -> None:
+    """Print times and memory of simulating 100 000 points on 1200 channels."""
+    random = np.random.default_rng(1)
+    positions = random.uniform([-40, 50, 0], [40, 90, 0], (100_000, 3))
+    scene = clsas.PointTargets(positions, random.standard_normal(100_000))
+    track = clsas.Track.straight((-40, 0, 0), (2, 0, 0), pings=200, ping_interval_s=0.2)
+    directive = clsas.Sonar.edgetech()
+    plain = dataclasses.replace(directive, tx_length_m=None, rx_length_m=None)
+    rows = []
+    for name, sonar in (("none", plain), ("of tx and rx", directive)):
+        start, processor = time.perf_counter(), time.process_time()
+        clsas.simulate(sonar, track, scene)
+        times = time.perf_counter() - start, time.process_time() - processor
+        memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+        rows.append([name, *(f"{value:.1f}" for value in times), f"{memory:.0f}"])
+    table(["element patterns", "seconds", "processor seconds", "peak memory, MiB"], rows)
+
+
+def factorized(devices: list[str], names: list[str] | None = None) -> None:
+    """Print speed and errors of factorized imaging against exact imaging, for all or some cases."""
+    rows = []
+    for case, device in itertools.product(names or cases.FACTORIZED_CASES, devices):
+        for tolerance_db in TOLERANCES_DB.get(case, (-50.0,)):
+            r = bench.run_factorized(case, device=device, tolerance_db=tolerance_db, repeats=3)
+            rows.append(
+                [
+                    case,
+                    r["device"],
+                    r["driver"],
+                    r["tolerance_db"],
+                    "{median:.3f} ({min:.3f} to {max:.3f})".format(**r["seconds"]),
+                    "{median:.3f} ({min:.3f} to {max:.3f})".format(**r["again_seconds"]),
+                    f"{r['predicted_seconds']:.3f}",
+                    f"{r['plan_seconds']:.2f}",
+                    "{median:.3f} ({min:.3f} to {max:.3f})".format(**r["exact_seconds"]),
+                    f"{r['speedup']:.1f}",
+                    f"{r['speedup_again']:.1f}",
+                    f"{r['speedup_over_default']:.1f}",
+                    f"{r['error_db']:.1f}",
+                    f"{r['predicted_error_db']:.1f}",
+                ]
+            )
+    table(
+        [
+            "case",
+            "device",
+            "driver",
+            "tolerance dB",
+            "seconds: median (min to max)",
+            "again",
+            "predicted",
+            "planning",
+            "exact: median (min to max)",
+            "speedup",
+            "again",
+            "over default",
+            "error dB",
+            "predicted dB",
+        ],
+        rows,
+    )
+
+
+def scaling(device: str, largest: int, csv_file: str | None, png_file: str | None) -> None:
+    """Print times of N channels and N x N pixels against N, and the exponents that fit them."""
+    sizes = [size for size in SIZES if size <= largest]
+    measured = [
+        # Large images take minutes, and their times vary little from run to run.
+        bench.run_factorized(cases.scaled(size), device=device, repeats=3 if size <= 4096 else 1)
+        for size in sizes
+    ]
+    seconds = {
+        "factorized": [r["seconds"]["median"] for r in measured],
+        "exact": [r["exact_seconds"]["median"] for r in measured],
+    }
+    names = ["N", "factorized_s", "exact_s", "speedup", "plan_s", "error_db", "predicted_error_db"]
+    rows = [
+        [
+            size,
+            *(f"{r[key]['median']:.4g}" for key in ("seconds", "exact_seconds")),
+            *(f"{r[key]:.4g}" for key in ("speedup", "plan_seconds")),
+            *(f"{r[key]:.1f}" for key in ("error_db", "predicted_error_db")),
+        ]
+        for size, r in zip(sizes, measured, strict=True)
+    ]
+    table(names, rows)
+    exponents = {name: exponent(sizes, times) for name, times in seconds.items()}
+    print(f"\n{measured[0]['device']}, {measured[0]['driver']}: at the end time grows as", end=" ")
+    print(", ".join(f"N^{value:.2f} ({name})" for name, value in exponents.items()))
+    if csv_file is not None:
+        with open(csv_file, "w", newline="") as file:
+            csv.writer(file).writerows([names, *rows])
+    if png_file is not None:
+        draw_scaling(sizes, seconds, exponents, measured[0]["device"], png_file)
+
+
+def exponent(sizes: list[int], times: list[float]) -> float:
+    """Return the power of N that fits the largest sizes; small images have mostly fixed costs."""
+    few = slice(-FITTED, None)
+    if len(sizes) < 2:
+        return np.nan
+    return np.polyfit(np.log(sizes[few]), np.log(times[few]), 1)[0]
+
+
+def draw_scaling(
+    sizes: list[int],
+    seconds: dict[str, list[float]],
+    exponents: dict[str, float],
+    device: str,
+    png_file: str,
+) -> None:
+    """Draw the table of `scaling`."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(7, 5), layout="constrained")
+    axes = figure.subplots()
+    for (name, times), marker in zip(seconds.items(), "oD", strict=True):
+        axes.loglog(sizes, times, marker=marker, label=f"{name}: N^{exponents[name]:.2f}")
+    axes.set(
+        xlabel="N (channels; the image has N x N pixels)", ylabel="time of the image (s)",
+        xticks=sizes, xticklabels=sizes,
+    )  # fmt: skip
+    axes.set_title(f"tolerance -50 dB\n{device}", fontsize="small")
+    axes.minorticks_off()
+    axes.grid(alpha=0.3)
+    axes.legend()
+    plot.save_png(figure, png_file)
+
+
+SURVEY_M = 500.0
+SURVEY_PARTS, SURVEY_PINGS = 26, 50  # files, and pings of each, 0.4 m apart
+DAY_S = 86_400.0
+
+
+def shadows(devices: list[str]) -> None:
+    """Print errors in the wreck's shadows: relative to the mean level around, by that level."""
+    lines, grid = wreck.lines(), wreck.grid(SHADOW_PIXELS)
+    beam = cases.MOSAIC_CASES["mosaic-wreck"][1]
+    rows = []
+    for device in devices:
+        exact = clsas.backproject(lines, grid, beam=beam, accuracy_db=-85, device=device).pixels
+        level_db = 10 * np.log10(levels(exact) / np.mean(np.abs(exact / np.abs(exact).max()) ** 2))
+        for tolerance_db in SHADOW_TOLERANCES_DB:
+            image = clsas.factorize(lines, grid, tolerance_db, beam=beam, device=device).pixels
+            errors = [f"{clsas.relative_error_db(image, exact):.1f}"]
+            errors.append(f"{clsas.relative_error_db(image, exact, darkest=0.1):.1f}")
+            for middle_db in SHADOW_LEVELS_DB:
+                chosen = np.abs(level_db - middle_db) <= 2.5
+                error_db = clsas.relative_error_db(image[chosen], exact[chosen])
+                errors.append(f"{error_db:.1f}")
+            rows.append([device, tolerance_db, *errors])
+        share = [np.mean(np.abs(level_db - middle_db) <= 2.5) for middle_db in SHADOW_LEVELS_DB]
+        darkest = f"{dark_level_db(exact):.1f} dB"
+        rows.append([device, "share", "1", darkest, *(f"{each:.4f}" for each in share)])
+    header = ["device", "tolerance (dB)", "image", "darkest tenth"]
+    table([*header, *(f"{middle_db} dB" for middle_db in SHADOW_LEVELS_DB)], rows)
+
+
+def survey_lines(folder: str, part: int) -> None:
+    """Write one file of a survey by a swaying Edgetech array over one point per square metre."""
+    pings = np.arange(part * SURVEY_PINGS, (part + 1) * SURVEY_PINGS)
+    # The track extends 10 m beyond the image at either end, which is more than half a beam.
+    centre_m = np.zeros((len(pings), 3))
+    centre_m[:, 0] = 0.4 * pings - 10
+    centre_m[:, 1] = 0.2 * np.sin(2 * np.pi * pings / 57)
+    centre_m[:, 2] = 20
+    sonar = clsas.Sonar.edgetech()
+    rx_m = (centre_m[:, None] + sonar.rx_m).reshape(-1, 3)
+    tx_m = np.repeat(centre_m, sonar.receivers, axis=0)
+    random = np.random.default_rng(1)
+    points = np.zeros((int(100 * (SURVEY_M + 60)), 3))
+    points[:, 0] = random.uniform(-30, SURVEY_M + 30, len(points))
+    points[:, 1] = random.uniform(30, 130, len(points))
+    near = np.abs(points[:, 0] - centre_m[:, 0].mean()) < 20
+    amplitudes = (random.standard_normal((len(points), 2)) @ [1, 1j])[near]
+    lines = clsas.simulate_lines(
+        tx_m,
+        rx_m,
+        clsas.PointTargets(points[near], amplitudes),
+        carrier_hz=sonar.pulse.carrier_hz,
+        bandwidth_hz=sonar.pulse.bandwidth_hz,
+        first_range_m=30.0,
+        length=4096,
+    )
+    clsas.save(Path(folder) / f"{part:04}.h5", lines)
+
+
+def survey(devices: list[str]) -> None:
+    """Print rate and peak memory of a mosaic of 100 m x 500 m at 5 cm from 300 MB of files."""
+    grid = clsas.Grid.plane((0, SURVEY_M, 10_001), (30, 130, 2001))
+    beam = clsas.BeamWindow(6.0, "hann")
+    with tempfile.TemporaryDirectory() as folder:
+        # In other processes, so that the peak memory of this one is that of imaging.
+        with ProcessPoolExecutor(2, multiprocessing.get_context("spawn")) as pool:
+            list(pool.map(survey_lines, [folder] * SURVEY_PARTS, range(SURVEY_PARTS)))
+        size = sum(file.stat().st_size for file in Path(folder).iterdir())
+        rows = []
+        for name in devices:
+            before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+            start = time.perf_counter()
+            mosaic = clsas.mosaic(
+                folder,
+                grid,
+                Path(folder) / f"{len(rows)}.zarr",
+                tolerance_db=-40,
+                beam=beam,
+                device=name,
+            )
+            records = [patch.record for patch in mosaic]
+            seconds = time.perf_counter() - start
+            peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+            rate = grid.size / seconds
+            square_m = np.linalg.norm(grid.row_step_m) * np.linalg.norm(grid.column_step_m)
+            rows.append(
+                [
+                    name,
+                    f"{size / 2**20:.0f}",
+                    "{} x {} of {} x {}".format(*mosaic.shape, *mosaic.patch_shape),
+                    f"{seconds:.1f}",
+                    f"{sum(r.plan_seconds for r in records):.1f}",
+                    f"{sum(r.read_seconds for r in records):.1f}",
+                    f"{max(r.predicted_error_db for r in records):.1f}",
+                    f"{rate / 1e6:.2f}",
+                    f"{rate * square_m * DAY_S / 1e6:.0f}",
+                    f"{peak:.0f} ({before:.0f})",
+                ]
+            )
+    table(
+        [
+            "device",
+            "lines, MiB",
+            "patches",
+            "seconds",
+            "planning",
+            "reading",
+            "predicted dB",
+            "Mpixel/s",
+            "square km per day",
+            "peak memory, MiB (before)",
+        ],
+        rows,
+    )
