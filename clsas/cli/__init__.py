@@ -15,48 +15,48 @@ import click
 
 import clsas
 
-# A command's module imports the library, which takes a second: --help and --version do without.
-# By command: its module, and the first sentence of its help.
+# Module and first sentence of the help of every command. Importing a command's module takes a
+# second, so --help and --version do without.
 _COMMANDS = {
-    "devices": ("machine", "List OpenCL devices, and say which one is used and why."),
+    "devices": ("machine", "List OpenCL devices, and show which one is used and why."),
     "simulate": ("lines", "Simulate the echoes of a scene file."),
     "compress": ("lines", "Compress echoes into range lines."),
     "image": ("images", "Form the image of range lines, fast to a tolerance or exactly."),
     "plan": (
         "images",
-        "Show how an image would be formed, how long it takes and how much it errs.",
+        "Show the plan of an image, with its predicted time and error.",
     ),
     "assess": (
         "assess",
-        "Tell which effects an image needs, what error leaving each out adds, and what it costs.",
+        "Show which effects an image needs, the error of leaving each out, and its cost.",
     ),
     "mosaic": ("mosaics", "Form an image of any size patch by patch, into a Zarr store."),
     "quality": (
         "measures",
-        "Measure an image: contrast, a point's response, the error to another image.",
+        "Measure an image: contrast, response of a point, error against another image.",
     ),
     "tradeoff": (
         "measures",
-        "Measure speed against accuracy: one image in many ways, timed and compared.",
+        "Measure speed against accuracy: one image with many tolerances, timed and compared.",
     ),
     "bench": (
         "measures",
-        "Time a benchmark case and measure its error; without CASE, all of them run for minutes.",
+        "Time a benchmark case and measure its error.",
     ),
     "demo": (
         "machine",
-        "Run the thesis's wide-beam case, from simulation to picture and measured figures.",
+        "Run the thesis's wide-beam case, from simulation to a measured image.",
     ),
     "calibrate": (
         "machine",
-        "Measure what the parts of imaging cost on a device, and store it for planning.",
+        "Measure the costs of imaging steps on a device, and store them for planning.",
     ),
     "selftest": ("selftest", "Test this device's accuracy at the extremes, in about a minute."),
 }
 
 
 class _Commands(click.Group):
-    """Imports a command when it is run; turns exceptions and warnings into messages."""
+    """Group of commands that imports each when it runs, and prints exceptions as messages."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         return list(_COMMANDS)
@@ -74,7 +74,7 @@ class _Commands(click.Group):
     def invoke(self, ctx: click.Context) -> Any:
         import pyopencl
 
-        # What users cause, and what machines lack.
+        # Errors of users, and limits of their machines.
         errors = (
             ValueError,
             TypeError,
@@ -94,7 +94,7 @@ class _Commands(click.Group):
                 error.message = _printable(error.message)  # type: ignore[misc]
                 raise
             except BrokenPipeError:
-                raise  # click's: whoever reads our output has left
+                raise  # click handles this: the reader of our output has left
             except KeyboardInterrupt:
                 click.echo("Interrupted", err=True)
                 ctx.exit(130)
@@ -123,7 +123,7 @@ def main(traceback: bool) -> None:
 
 
 def _showing(others: Callable[..., None]) -> Callable[..., None]:
-    """Return what shows a warning: one of clsas as a message, others as Python does."""
+    """Return a function that shows clsas's warnings as messages and others as Python does."""
 
     def show(message: Warning | str, category: type[Warning], *where: Any, **options: Any) -> None:
         if issubclass(category, clsas.ClsasWarning):
@@ -135,8 +135,8 @@ def _showing(others: Callable[..., None]) -> Callable[..., None]:
 
 
 def _printable(text: str) -> str:
-    """Return a message without control characters; NumPy, which this imports, is slow to load."""
-    from clsas.core import validate
+    """Return a message without control characters."""
+    from clsas.core import validate  # imports NumPy, which is slow
 
     return validate.printable(text)
 

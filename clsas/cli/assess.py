@@ -1,4 +1,4 @@
-"""The command that tells which effects an image needs: assess."""
+"""Command for the effects that an image needs: assess."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import click
 
 import clsas
 from clsas.cli import options
-from clsas.cli.inputs import load, read_beam, read_grid, read_wish
+from clsas.cli.inputs import load, read_beam, read_grid, read_request
 from clsas.cli.outputs import json_able, report
 from clsas.cli.parameters import INPUT
 from clsas.planning.planner import (
@@ -25,12 +25,12 @@ _HDF5 = b"\x89HDF"
 @click.command()
 @click.argument("file", metavar="SCENE.TOML|LINES.H5", type=INPUT)
 @options.grid
-@options.dial
+@options.method
 @options.beam
 @options.device
 @click.option(
     "--repeats", type=click.IntRange(0), default=0, show_default=True,
-    help="Also form the image with and without every effect so often, and tell measured times.",
+    help="Also time this many images with and without every effect.",
 )  # fmt: skip
 @options.as_json
 def assess(
@@ -41,11 +41,12 @@ def assess(
     as_json: bool,
     **given: Any,
 ) -> None:
-    """Tell which effects an image needs, what error leaving each out adds, and what it costs.
+    """Show which effects an image needs, the error of leaving each out, and its cost.
 
-    Of a scene before anything is simulated, or of range lines with the grid of --scene or of --x,
-    --y and --z. Sonar and track of a scene tell element patterns too, and the motion of receivers
-    where the lines hold none. Grid, beam and tolerance as for `clsas image`.
+    Assess a scene before anything is simulated, or range lines with a grid from --scene or from
+    --x, --y and --z. With the scene's sonar and track, element patterns are assessed too, and the
+    receivers' motion if the lines have no velocities. Grid, beam and tolerance are those of
+    `clsas image`.
 
     \b
     Example:  clsas assess scene.toml --tolerance-db -40
@@ -56,7 +57,7 @@ def assess(
     if not is_lines:
         if scene is not None:
             raise click.UsageError(
-                f"--scene goes with LINES.H5, and {file} is none: give one of them"
+                f"--scene requires LINES.H5, but {file} is a scene: give one of them"
             )
         scene = file
     described, grid = read_grid(scene, given)
@@ -65,7 +66,7 @@ def assess(
     if is_lines:
         lines = load(file, clsas.RangeLines)
         sonar, track = described.sonar, described.track
-        # A scene may describe another survey than that of the lines: then it tells grid and beam.
+        # If the scene describes another survey than the lines do, use only its grid and beam.
         if sonar and track and sonar.receivers * track.pings == lines.channels:
             known = {"sonar": sonar, "track": track}
     else:
@@ -85,7 +86,7 @@ def assess(
         lines,
         grid,
         beam=read_beam(described, given),
-        tolerance_db=_tolerance_db(read_wish(described, given)),
+        tolerance_db=_tolerance_db(read_request(described, given)),
         device=device,
         repeats=repeats,
         **known,
@@ -100,11 +101,13 @@ def assess(
     )
 
 
-def _tolerance_db(wish: dict[str, Any]) -> float:
-    """Return the tolerance that a wish stands for: that of the exact image is its accuracy."""
-    if wish.get("stages") is not None:
-        raise click.UsageError("--stages has no tolerance to assess by: give --tolerance-db")
-    tolerance_db = tolerance_in_db(wish.get("tolerance_db"), wish.get("tolerance_wavelengths"))
+def _tolerance_db(request: dict[str, Any]) -> float:
+    """Return the tolerance of a request; for an exact image this is its accuracy."""
+    if request.get("stages") is not None:
+        raise click.UsageError("--stages has no tolerance: give --tolerance-db")
+    tolerance_db = tolerance_in_db(
+        request.get("tolerance_db"), request.get("tolerance_wavelengths")
+    )
     if tolerance_db is None:
-        tolerance_db = wish.get("accuracy_db", TOLERANCE_DB)
+        tolerance_db = request.get("accuracy_db", TOLERANCE_DB)
     return min(max(tolerance_db, BEST_TOLERANCE_DB), WORST_TOLERANCE_DB)

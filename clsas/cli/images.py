@@ -1,4 +1,4 @@
-"""Commands that form an image of range lines, or say how: image, plan."""
+"""Commands that form an image of range lines or plan it: image, plan."""
 
 from __future__ import annotations
 
@@ -12,7 +12,14 @@ import click
 
 import clsas
 from clsas.cli import options
-from clsas.cli.inputs import DEFAULT_WISH, load, read_beam, read_grid, read_wish, warn_of_sampling
+from clsas.cli.inputs import (
+    DEFAULT_REQUEST,
+    load,
+    read_beam,
+    read_grid,
+    read_request,
+    warn_of_sampling,
+)
 from clsas.cli.outputs import progress_bar, report
 from clsas.cli.parameters import INPUT
 from clsas.core import validate
@@ -29,13 +36,15 @@ from clsas.signal.interpolation import MOST_UPSAMPLING, TAPS
 @click.argument("lines_file", metavar="LINES.H5", type=INPUT)
 @options.output("Image")
 @options.grid
-@options.dial
-@click.option("--exact", is_flag=True, help="Backproject plainly, as the three options below do.")
+@options.method
+@click.option(
+    "--exact", is_flag=True, help="Form an exact image; the three options below imply it."
+)
 @click.option(
     "--accuracy-db",
     type=float,
     callback=options.check_accuracy_db,
-    help="Relative rms error wanted. [default: -60]",
+    help="Relative rms error of the exact image, dB. [default: -60]",
 )
 @click.option(
     "--taps",
@@ -48,7 +57,7 @@ from clsas.signal.interpolation import MOST_UPSAMPLING, TAPS
     callback=options.checked(
         partial(validate.number, "upsampling", least=1.0, most=MOST_UPSAMPLING)
     ),
-    help="Fix how much lines are upsampled.",
+    help="Fix the upsampling factor of the lines.",
 )  # fmt: skip
 @options.beam
 @options.device
@@ -70,32 +79,32 @@ def image(
 ) -> None:
     """Form the image of range lines, fast to a tolerance or exactly.
 
-    The grid is that of --scene, or given by --x, --y and --z. How is told by one of
-    --tolerance-db, --tolerance-wavelengths, --stages and --exact, or by [image] of the scene;
-    otherwise the error against the exact image is to stay below -50 dB. Where nothing is faster
-    within a tolerance, the image is backprojected plainly.
+    The grid is that of --scene, or given by --x, --y and --z. Choose the method with one of
+    --tolerance-db, --tolerance-wavelengths, --stages and --exact, or with [image] of the scene. The
+    default is a tolerance of -50 dB against the exact image. The image is exact if no faster method
+    keeps the tolerance.
 
     \b
     Example:  clsas image lines.h5 --x -2.5:2.5:1024 --y 40:45:1024 -o image.h5 --png image.png
     """
     described, grid = read_grid(scene, given)
-    wish = read_wish(described, given, exact)
+    request = read_request(described, given, exact)
     beam = read_beam(described, given)
-    # A scene that is simulated has been warned of when that was done, with its own grid.
+    # `clsas simulate` has already warned about the scene's own grid.
     if described.targets is None or grid is not described.grid:
         warn_of_sampling(described, grid)
     lines = load(lines_file, clsas.RangeLines)
     opened = open_device(device)
     results: dict[str, Any] = {"method": "exact"}
     chosen, why, warned = None, "", False
-    if wish.keys() & set(PLAN_KEYS):
+    if request.keys() & set(PLAN_KEYS):
         start = time.perf_counter()
-        chosen = clsas.plan(lines, grid, **wish, beam=beam, device=opened)
+        chosen = clsas.plan(lines, grid, **request, beam=beam, device=opened)
         results["plan_seconds"] = time.perf_counter() - start
         _warn_of_error(chosen)
         warned = chosen.kept["warned"]
         if chosen.is_exact:
-            wish = {"accuracy_db": chosen.accuracy_db}
+            request = {"accuracy_db": chosen.accuracy_db}
             why, chosen = f"exact: nothing faster within {chosen.tolerance_db:.4g} dB; ", None
     with (
         progress_bar("imaging") as progress,
@@ -104,7 +113,7 @@ def image(
         start = time.perf_counter()
         if chosen is not None:
             formed = clsas.factorize(lines, grid, chosen, device=opened, progress=progress)
-            how = f"{summary(chosen)}; error predicted {chosen.predicted_error_db:.0f} dB"
+            how = f"{summary(chosen)}; predicted error {chosen.predicted_error_db:.0f} dB"
             left_out = chosen.left_out
             results |= {
                 "method": "stages" if chosen.nearest else "factorized",
@@ -112,8 +121,8 @@ def image(
                 "predicted_seconds": chosen.predicted_seconds,
             }
         else:
-            preparation = prepare(lines, grid, device=opened, beam=beam, **wish)
-            if not why:  # else the plan has warned
+            preparation = prepare(lines, grid, device=opened, beam=beam, **request)
+            if not why:  # otherwise the plan has warned
                 preparation.warn_of_ambiguity()
             formed = execute(preparation, progress=progress, warned=warned)
             interpolator, ratio = preparation.interpolator, preparation.resampling.ratio
@@ -155,13 +164,13 @@ def image(
 @click.command()
 @click.argument("lines_file", metavar="LINES.H5", type=INPUT)
 @options.grid
-@options.dial
+@options.method
 @options.beam
 @options.device
 @options.as_json
 @click.option(
     "--filters", is_flag=True,
-    help="With --json, print the filters' coefficients too, for clsas.Plan.from_json.",
+    help="With --json, include the filters' coefficients, for clsas.Plan.from_json.",
 )  # fmt: skip
 def plan(
     lines_file: Path,
@@ -171,30 +180,30 @@ def plan(
     filters: bool,
     **given: Any,
 ) -> None:
-    """Show how an image would be formed, how long it takes and how much it errs.
+    """Show the plan of an image, with its predicted time and error.
 
-    Grid, dial and beam as for `clsas image`; where the scene asks for an exact image, a
-    tolerance of -50 dB counts. With --json and --filters the plan is printed whole, as
-    clsas.Plan.from_json reads it.
+    Grid, method and beam are those of `clsas image`. If the scene requests an exact image, a
+    tolerance of -50 dB is used instead. With --json and --filters the plan is complete, for
+    clsas.Plan.from_json.
 
     \b
     Example:  clsas plan lines.h5 --x -2.5:2.5:1024 --y 40:45:1024 --tolerance-db -40
     """
     if filters and not as_json:
-        raise click.UsageError("--filters goes with --json")
+        raise click.UsageError("--filters requires --json")
     described, grid = read_grid(scene, given)
-    wish = read_wish(described, given)
+    request = read_request(described, given)
     beam = read_beam(described, given)
     lines = load(lines_file, clsas.RangeLines)
-    if not wish.keys() & set(PLAN_KEYS):
-        wish = DEFAULT_WISH
-    chosen = clsas.plan(lines, grid, **wish, beam=beam, device=device)
+    if not request.keys() & set(PLAN_KEYS):
+        request = DEFAULT_REQUEST
+    chosen = clsas.plan(lines, grid, **request, beam=beam, device=device)
     _warn_of_error(chosen)
     click.echo(chosen.to_json(filters=filters) if as_json else chosen.describe())
 
 
 def _warn_of_error(chosen: clsas.Plan) -> None:
-    """Warn where the thesis's method may leave no image."""
+    """Warn if the error of the thesis's method may be as large as the image."""
     if chosen.nearest and chosen.predicted_error_db > WORST_TOLERANCE_DB:
         click.echo(
             f"Warning: with these stages the error may be as large as "

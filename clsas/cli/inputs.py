@@ -1,4 +1,4 @@
-"""What a command is given: files, grid, beam, and how an image is wanted."""
+"""Inputs of commands: files, grid, beam, and the requested accuracy or method."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from clsas.files.scene_files import SceneFile
 from clsas.files.scene_tables import EXACT_KEYS, PLAN_KEYS
 from clsas.planning.planner import TOLERANCE_DB
 
-DEFAULT_WISH = {"tolerance_db": TOLERANCE_DB}
+DEFAULT_REQUEST = {"tolerance_db": TOLERANCE_DB}
 
 
 def load(path: Path, kind: type) -> Any:
-    """Return what a file holds, which must be of a kind."""
+    """Return the object in a file; raise ValueError unless it is of type `kind`."""
     obj = clsas.load(path)
     if isinstance(obj, kind):
         return obj
@@ -35,7 +35,7 @@ def load(path: Path, kind: type) -> Any:
 
 
 def read_scene(path: Path) -> SceneFile:
-    """Return what a scene file describes; nothing may be written over a file that it names."""
+    """Return a scene; the command may not overwrite a file that the scene refers to."""
     described = config.read_scene(path)
     for key, file in described.files.items():
         for option, written in written_to(click.get_current_context()).items():
@@ -46,15 +46,15 @@ def read_scene(path: Path) -> SceneFile:
 def read_grid(
     scene: Path | None, given: dict[str, Any], memory: bool = True
 ) -> tuple[SceneFile, clsas.Grid]:
-    """Return what a scene file describes, or nothing, and the grid that is wanted.
+    """Return the scene, empty if there is none, and the grid of the options or of the scene.
 
-    Its image must fit into the `memory`, if so told.
+    With `memory`, raise ValueError if the image does not fit into memory.
     """
     x, y, z = (given[name] for name in ("x", "y", "z"))
     if (x is None) != (y is None) or (z is not None and x is None):
-        raise click.UsageError("--x and --y go together, and --z with them")
+        raise click.UsageError("--x and --y must be given together; --z requires them")
     if scene is None and x is None:
-        raise click.UsageError("a grid is needed: --scene, or --x and --y")
+        raise click.UsageError("no grid given: use --scene, or --x and --y")
     described = read_scene(scene) if scene is not None else SceneFile(name="")
     grid = clsas.Grid.plane(x, y, z or 0.0) if x and y else described.need("grid")[0]
     if memory:
@@ -62,36 +62,41 @@ def read_grid(
     return described, grid
 
 
-def read_wish(described: SceneFile, given: dict[str, Any], exact: bool = False) -> dict[str, Any]:
-    """Return how an image is wanted: one of `PLAN_KEYS`, or else what the exact image takes."""
-    dial, exactly = (
+def read_request(
+    described: SceneFile, given: dict[str, Any], exact: bool = False
+) -> dict[str, Any]:
+    """Return the request of the options or of the scene: a plan's (one of `PLAN_KEYS`) or exact.
+
+    Exact requests are empty or have some of `EXACT_KEYS`.
+    """
+    planned, exactly = (
         {name: given[name] for name in names if given.get(name) is not None}
         for names in (PLAN_KEYS, EXACT_KEYS)
     )
-    if len(dial) + exact > 1:
+    if len(planned) + exact > 1:
         raise click.UsageError(
-            "--tolerance-db, --tolerance-wavelengths, --stages and --exact exclude each other"
+            "give only one of --tolerance-db, --tolerance-wavelengths, --stages and --exact"
         )
-    if dial and exactly:
+    if planned and exactly:
         raise click.UsageError(
-            "--accuracy-db, --taps and --upsampling are of the exact image, and play no part with "
-            f"--{next(iter(dial)).replace('_', '-')}"
+            "--accuracy-db, --taps and --upsampling are for exact images and cannot be combined "
+            f"with --{next(iter(planned)).replace('_', '-')}"
         )
     if len(exactly) == len(EXACT_KEYS):
         raise click.UsageError(
-            "--accuracy-db plays no part where --taps and --upsampling are given"
+            "--accuracy-db has no effect with both --taps and --upsampling: leave one out"
         )
-    if dial:
-        return dial
+    if planned:
+        return planned
     described_exactly = {key: value for key, value in described.image.items() if key in EXACT_KEYS}
     if exact or exactly:
         return described_exactly | exactly
-    described_dial = {key: value for key, value in described.image.items() if key in PLAN_KEYS}
-    return described_dial or described_exactly or DEFAULT_WISH
+    described_plan = {key: value for key, value in described.image.items() if key in PLAN_KEYS}
+    return described_plan or described_exactly or DEFAULT_REQUEST
 
 
 def read_beam(described: SceneFile, given: dict[str, Any]) -> clsas.BeamWindow | None:
-    """Return a scene file's beam, changed by what is given, or the beam that is."""
+    """Return the beam of the options, or the scene's beam with the options' changes."""
     beam = described.image.get("beam")
     options = {"width_deg": "beam_deg", "shape": "beam_shape", "squint_deg": "squint_deg"}
     options |= {"element_length_m": "element_length_m", "track_pings": "track_pings"}
@@ -100,21 +105,21 @@ def read_beam(described: SceneFile, given: dict[str, Any]) -> clsas.BeamWindow |
         return beam
     if beam is None and "width_deg" not in changes:
         raise click.UsageError(
-            "--beam-shape, --squint-deg, --element-length-m and --track-pings go with --beam-deg"
+            "--beam-shape, --squint-deg, --element-length-m and --track-pings require --beam-deg"
         )
     try:
         changed = replace(beam, **changes) if beam is not None else clsas.BeamWindow(**changes)
         if "element_length_m" in changes and changed.shape != "inverse":
             raise ValueError(
-                f"--element-length-m goes with --beam-shape inverse, got {changed.shape}"
+                f"--element-length-m requires --beam-shape inverse, got {changed.shape}"
             )
         return changed
-    except ValueError as error:  # the scene's own was checked when it was read
+    except ValueError as error:  # the scene's own beam was checked when it was read
         raise click.UsageError(str(error)) from error
 
 
 def warn_of_sampling(scene: SceneFile, grid: clsas.Grid | None = None) -> None:
-    """Warn where a scene's survey breaks a limit of sampling, on its own grid or another."""
+    """Warn if a scene's survey violates a sampling limit, for its own grid or another."""
     grid = scene.grid if grid is None else grid
     if scene.sonar is None or scene.track is None or grid is None:
         return

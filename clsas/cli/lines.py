@@ -53,11 +53,11 @@ def simulate(scene_file: Path, output: Path, png: Path | None, as_json: bool) ->
 @options.output("Range lines")
 @options.scene
 @click.option(
-    "--window", help="Band window: none, hamming, taylor, ... [default: none]",
+    "--window", help="Window over the band: none, hamming, taylor, ... [default: none]",
     callback=options.checked(lambda window: check_options(window=window)),
 )  # fmt: skip
 @click.option(
-    "--oversampling", type=float, help="Samples per bandwidth. [default: 2]",
+    "--oversampling", type=float, help="Sample rate over bandwidth. [default: 2]",
     callback=options.checked(lambda rate: check_options(oversampling=rate)),
 )  # fmt: skip
 @options.png("the lines")
@@ -76,13 +76,13 @@ def compress(
     \b
     Example:  clsas compress echoes.h5 -o lines.h5 --window hamming
     """
-    wanted = _overruled(
+    settings = _overridden(
         read_scene(scene).compress if scene else {}, window=window, oversampling=oversampling
     )
     echoes = load(echoes_file, clsas.Echoes)
     with progress_bar("compressing") as progress:
         start = time.perf_counter()
-        lines = clsas.compress(echoes, **wanted, progress=progress)
+        lines = clsas.compress(echoes, **settings, progress=progress)
         seconds = time.perf_counter() - start
     clsas.save(output, lines)
     if png is not None:
@@ -98,6 +98,6 @@ def compress(
     )  # fmt: skip
 
 
-def _overruled(described: dict[str, Any], **given: Any) -> dict[str, Any]:
-    """Return a scene file's options, overruled by those given."""
+def _overridden(described: dict[str, Any], **given: Any) -> dict[str, Any]:
+    """Return a scene file's settings, overridden by the options."""
     return described | {name: value for name, value in given.items() if value is not None}

@@ -18,7 +18,7 @@ from clsas.trials import demo as demonstration
 @click.command()
 @options.as_json
 def devices(as_json: bool) -> None:
-    """List OpenCL devices, and say which one is used and why.
+    """List OpenCL devices, and show which one is used and why.
 
     \b
     Example:  CLSAS_DEVICE=0 clsas devices
@@ -43,7 +43,7 @@ def devices(as_json: bool) -> None:
 @options.device
 @options.as_json
 def calibrate(device: str | None, as_json: bool) -> None:
-    """Measure what the parts of imaging cost on a device, and store it for planning.
+    """Measure the costs of imaging steps on a device, and store them for planning.
 
     \b
     Example:  clsas calibrate --device 0
@@ -67,12 +67,12 @@ def calibrate(device: str | None, as_json: bool) -> None:
 @click.command()
 @click.option(
     "--out", type=File(file_okay=False), default="clsas-demo",
-    show_default=True, help="Folder for the files, new or of a demo.",
+    show_default=True, help="Folder for the files, new or from an earlier demo.",
 )  # fmt: skip
 @options.device
 @options.as_json
 def demo(out: Path, device: str | None, as_json: bool) -> None:
-    """Run the thesis's wide-beam case, from simulation to picture and measured figures.
+    """Run the thesis's wide-beam case, from simulation to a measured image.
 
     \b
     Example:  clsas demo --out my-demo

@@ -1,4 +1,4 @@
-"""Commands that measure images, and how fast they are formed: quality, tradeoff, bench."""
+"""Commands that measure images and the speed of imaging: quality, tradeoff, bench."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import clsas
 from clsas.cli import options
 from clsas.cli.inputs import load, read_beam, read_grid
 from clsas.cli.outputs import json_able, print_json, progress_bar, report
-from clsas.cli.parameters import INPUT, PLACE, STAGES, Output
+from clsas.cli.parameters import INPUT, POSITION, STAGES, Output
 from clsas.core import validate
 from clsas.files.scene_files import SceneFile
 from clsas.products.quality import Cut, PointResponse
@@ -25,18 +25,18 @@ from clsas.products.tradeoff import TOLERANCES_DB
 @click.argument("image_file", metavar="IMAGE.H5", type=INPUT)
 @click.option(
     "--near",
-    type=PLACE,
-    help="Measure the point near a place on the image's axes, or near x, y, z (m).",
+    type=POSITION,
+    help="Measure the point near this position on the image's axes, or near x, y, z (m).",
 )
 @click.option(
-    "--search-m", type=float, help="How far from there its peak may be.",
+    "--search-m", type=float, help="Largest distance of the point's peak from there (m).",
     callback=options.checked(partial(validate.positive, "search_m", unit="m")),
 )  # fmt: skip
 @click.option(
-    "--extent-m", type=float, help="How far from its peak side lobes are looked for.",
+    "--extent-m", type=float, help="Distance from the peak up to which side lobes count (m).",
     callback=options.checked(partial(validate.positive, "extent_m", unit="m")),
 )  # fmt: skip
-@click.option("--reference", type=INPUT, help="Image to give the relative error to.")
+@click.option("--reference", type=INPUT, help="Exact image, to measure the relative error.")
 @options.png("cuts through the point")
 @options.as_json
 def quality(
@@ -48,13 +48,13 @@ def quality(
     png: Path | None,
     as_json: bool,
 ) -> None:
-    """Measure an image: contrast, a point's response, the error to another image.
+    """Measure an image: contrast, response of a point, error against another image.
 
     \b
     Example:  clsas quality image.h5 --near 0,42.5 --png cuts.png
     """
     if near is None and (search_m, extent_m, png) != (None, None, None):
-        raise click.UsageError("--search-m, --extent-m and --png go with --near")
+        raise click.UsageError("--search-m, --extent-m and --png require --near")
     pixels = load(image_file, clsas.Image)
     results: dict[str, Any] = {
         "entropy": clsas.entropy(pixels),
@@ -62,15 +62,15 @@ def quality(
     }
     text = [f"entropy {results['entropy']:.3f} nats, contrast {results['contrast']:.3f}"]
     if reference is not None:
-        wanted = load(reference, clsas.Image)
-        error = clsas.relative_error_db(pixels, wanted)
-        dark_error = clsas.relative_error_db(pixels, wanted, darkest=DARKEST)
-        level = dark_level_db(wanted)
+        exact = load(reference, clsas.Image)
+        error = clsas.relative_error_db(pixels, exact)
+        dark_error = clsas.relative_error_db(pixels, exact, darkest=DARKEST)
+        level = dark_level_db(exact)
         results["relative_error_db"] = error
         results["dark_error_db"], results["dark_level_db"] = dark_error, level
         text.append(
-            f"error relative to {reference}: {error:.1f} dB; its darkest tenth lies at "
-            f"{level:.1f} dB and errs by {dark_error:.1f} dB of that level"
+            f"error relative to {reference}: {error:.1f} dB; its darkest tenth is at "
+            f"{level:.1f} dB, with an error of {dark_error:.1f} dB relative to that level"
         )
     if near is not None:
         response = clsas.measure_point(pixels, near, search_m=search_m, extent_m=extent_m)
@@ -85,23 +85,27 @@ def quality(
 
 @click.command()
 @click.argument("lines_file", metavar="[LINES.H5]", type=INPUT, required=False)
-@click.option("--case", help="A built-in case of `clsas bench` instead: ffbp-thesis, ffbp-2k, ...")
+@click.option("--case", help="Use a case of `clsas bench`: ffbp-thesis, ffbp-2k, ...")
 @options.grid
 @click.option(
     "--tolerance-db",
     type=float,
     multiple=True,
     callback=options.check_tolerance_db,
-    help=f"Once for every tolerance. [default: {' '.join(f'{db:g}' for db in TOLERANCES_DB)}]",
+    help="Tolerance, dB; repeat the option for several. "
+    f"[default: {' '.join(f'{db:g}' for db in TOLERANCES_DB)}]",
 )
 @click.option(
     "--stages",
     type=STAGES,
     metavar="QRxQI,...",
     multiple=True,
-    help="Once for every plan of the thesis's method. [default: 1 to 5 of 2x2, 2 of 2x4]",
+    help="Stages of the thesis's method; repeat the option for several. "
+    "[default: 1 to 5 of 2x2, 2 of 2x4]",
 )
-@click.option("--study", is_flag=True, help="Also sweep the taps of filters and the stages.")
+@click.option(
+    "--study", is_flag=True, help="Also vary the taps of the filters and the number of stages."
+)
 @options.beam
 @options.device
 @click.option("--repeats", type=click.IntRange(1), default=3, show_default=True, help="Timed runs.")
@@ -122,25 +126,25 @@ def tradeoff(
     as_json: bool,
     **given: Any,
 ) -> None:
-    """Measure speed against accuracy: one image in many ways, timed and compared.
+    """Measure speed against accuracy: one image with many tolerances, timed and compared.
 
-    Range lines of your own on a grid as for `clsas image`, or a built-in case. Resolution and side
-    lobes are those of the strongest point.
+    Use your own range lines with a grid as for `clsas image`, or a built-in case. Resolution and
+    side lobes are those of the strongest point.
 
     \b
     Example:  clsas tradeoff --case ffbp-thesis --csv tradeoff.csv --png tradeoff.png
     """  # fmt: skip
     if lines_file is None and case is None:
-        raise click.UsageError("either LINES.H5 or --case is needed")
+        raise click.UsageError("give either LINES.H5 or --case")
     if lines_file is not None and case is not None:
-        raise click.UsageError("--case has its own lines: LINES.H5 goes without")
+        raise click.UsageError("--case has its own lines: leave out LINES.H5")
     if case is None:
         described, grid = read_grid(scene, given)
         beam = read_beam(described, given)
         lines = load(lines_file, clsas.RangeLines)
     else:
         if scene is not None or any(given[name] is not None for name in ("x", "y", "z")):
-            raise click.UsageError("--case has its own grid: --scene, --x, --y and --z go without")
+            raise click.UsageError("--case has its own grid: leave out --scene, --x, --y and --z")
         built_in = _case(case)
         lines, grid = built_in.lines(), built_in.grid
         beam = read_beam(SceneFile(name="", image={"beam": built_in.beam}), given)
@@ -171,11 +175,11 @@ def tradeoff(
     "--accuracy-db",
     type=float,
     callback=options.check_accuracy_db,
-    help="Error wanted in exact cases. [default: -50]",
+    help="Accuracy of exact cases, dB. [default: -50]",
 )
 @click.option(
     "--tolerance-db", type=float, callback=options.check_tolerance_db,
-    help="And in factorized ones. [default: -50, of the mosaic -40]",
+    help="Tolerance of factorized cases, dB. [default: -50; mosaic: -40]",
 )  # fmt: skip
 @click.option("--repeats", type=click.IntRange(1), default=5, show_default=True, help="Timed runs.")
 @options.as_json
@@ -187,11 +191,11 @@ def bench(
     repeats: int,
     as_json: bool,
 ) -> None:
-    """Time a benchmark case and measure its error; without CASE, all of them run for minutes.
+    """Time a benchmark case and measure its error. Without CASE, run all cases for minutes.
 
-    Cases bp-... are exact imaging; cases ffbp-... are factorized imaging, compared with exact
-    imaging; mosaic-wreck is a mosaic, compared with exact imaging with and without the beam's
-    limits (its lines are simulated first, once, for minutes). With --json every case is one line.
+    Cases bp-... are exact imaging. Cases ffbp-... are factorized imaging, compared with exact
+    imaging. mosaic-wreck is a mosaic, compared with exact imaging with and without a beam; its
+    lines are simulated once, which takes minutes. With --json every case is one line.
 
     \b
     Example:  clsas bench ffbp-2k --tolerance-db -40 --json
@@ -205,20 +209,20 @@ def bench(
     if case is not None:
         _one_of(case, measures)
         if (tolerance_db if case in cases.EXACT_CASES else accuracy_db) is not None:
-            raise click.UsageError("--accuracy-db goes with bp-..., --tolerance-db with others")
+            raise click.UsageError("--accuracy-db is for bp-..., --tolerance-db for other cases")
     for name in [case] if case else measures:
         exact, measure = name in cases.EXACT_CASES, measures[name]
         option, value = ("accuracy_db", accuracy_db) if exact else ("tolerance_db", tolerance_db)
-        wish = {} if value is None else {option: value}
+        request = {} if value is None else {option: value}
         with progress_bar(name) as progress:
-            result = measure(name, device=device, repeats=repeats, progress=progress, **wish)
+            result = measure(name, device=device, repeats=repeats, progress=progress, **request)
         if as_json:
             print_json(result, indent=None)
             continue
         for key, value in result.items():
             parts = value.items() if isinstance(value, dict) else [("", value)]
-            told = ", ".join(f"{part} {_plain(item)}".strip() for part, item in parts)
-            click.echo(f"{key:>26}  " + told.replace("\n", "\n" + 28 * " "))
+            text = ", ".join(f"{part} {_plain(item)}".strip() for part, item in parts)
+            click.echo(f"{key:>26}  " + text.replace("\n", "\n" + 28 * " "))
 
 
 def _case(name: str) -> Any:

@@ -1,4 +1,4 @@
-"""The command that forms an image patch by patch: mosaic."""
+"""Command that forms an image patch by patch: mosaic."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, T
 
 import clsas
 from clsas.cli import options
-from clsas.cli.inputs import read_beam, read_grid, read_scene, read_wish, warn_of_sampling
+from clsas.cli.inputs import read_beam, read_grid, read_request, read_scene, warn_of_sampling
 from clsas.cli.outputs import progress_bar, report
 from clsas.cli.parameters import COUNTS, INPUT, File, Store, keep_apart
 from clsas.core.extras import install_command
@@ -25,43 +25,44 @@ from clsas.files.scene_tables import PLAN_KEYS
 from clsas.mosaics.patches import patch_shape_of
 from clsas.opencl.device import open_device
 
-_SCHEDULER_S = 10  # to answer
-_IDLE_S = 60.0  # after which nothing more is expected to come
-_LISTED = 3  # patches of one kind, at most
+_SCHEDULER_S = 10  # time for a scheduler to answer
+_IDLE_S = 60.0  # default of --idle-s
+_LISTED = 3  # patches that are listed for each kind of defect
 
 
 @click.command()
 @click.argument("scene", metavar="SCENE.TOML", type=INPUT)
 @click.option(
     "--lines", "lines_path", type=File(exists=True),
-    help="Range lines, or a folder of files of them. [default: simulated from the scene]",
+    help="File of range lines, or a folder of such files. [default: simulated from the scene]",
 )  # fmt: skip
 @click.option(
     "-o", "--output", type=Store(),
-    help="Zarr store to write or go on with. [default: SCENE.zarr]",
+    help="Zarr store to write or to continue. [default: SCENE.zarr]",
 )  # fmt: skip
 @options.axes
-@options.dial
+@options.method
 @click.option(
     "--accuracy-db", type=float, callback=options.check_accuracy_db,
-    help="Backproject exactly, with this rms error.",
+    help="Form an exact image with this relative rms error, dB.",
 )  # fmt: skip
 @options.beam
-@click.option("--patches", type=COUNTS, help="Patches along y and x, such as 8x8.")
-@click.option("--memory-mib", type=click.IntRange(1), help="What a patch may take. [default: 1024]")
-@click.option("--device", multiple=True, help="Once for every device that is to work.")
-@click.option("--workers", type=click.IntRange(1), help="Work in this many processes.")
+@click.option("--patches", type=COUNTS, help="Number of patches along y and x, such as 8x8.")
 @click.option(
-    "--scheduler", metavar="ADDRESS", help="Work on a Dask cluster, such as tls://host:8786."
+    "--memory-mib", type=click.IntRange(1), help="Memory of one patch, MiB. [default: 1024]"
 )
-@click.option("--follow", is_flag=True, help="Go on while files are added to the folder --lines.")
+@click.option("--device", multiple=True, help="Device to use; repeat the option to use several.")
+@click.option("--workers", type=click.IntRange(1), help="Number of worker processes.")
+@click.option("--scheduler", metavar="ADDRESS", help="Use a Dask cluster, such as tls://host:8786.")
+@click.option("--follow", is_flag=True, help="Wait for files to be added to the folder --lines.")
 @click.option(
     "--idle-s", type=float, callback=options.check_idle_s,
-    help="With --follow: until nothing came for so long, or a file `end` did. [default: 60]",
+    help="With --follow, stop after this many seconds without a new file, or when a file named "
+    "`end` appears. [default: 60]",
 )  # fmt: skip
 @click.option(
     "--verify", is_flag=True,
-    help="Form nothing; read the store and compare all patches with their checksums.",
+    help="Only compare all patches of the store with their checksums.",
 )  # fmt: skip
 @options.png("an overview in dB")
 @options.dynamic_range
@@ -85,25 +86,25 @@ def mosaic(
 ) -> None:
     """Form an image of any size patch by patch, into a Zarr store.
 
-    Grid, dial and beam as for `clsas image`, but an exact image is asked for by --accuracy-db. The
-    same command goes on where it was interrupted, by Ctrl-C or by anything else, and forms damaged
-    patches again. With --verify it only says which are damaged, and exits with 1 if any is. A scene
-    without --lines is simulated first.
+    Grid, method and beam are those of `clsas image`; --accuracy-db requests an exact image. After
+    an interruption, by Ctrl-C or anything else, the same command continues, and forms damaged
+    patches again. With --verify it only lists damaged patches; the exit code is 1 if there are any.
+    Without --lines the scene is simulated first.
 
     \b
     Example:  clsas mosaic scene.toml --lines lines.h5 -o image.zarr --png image.png
     """
     if workers is not None and scheduler is not None:
-        raise click.UsageError("--workers and --scheduler exclude each other")
+        raise click.UsageError("give only one of --workers and --scheduler")
     if device and (workers or scheduler):
-        raise click.UsageError("--device plays no part with --workers and --scheduler")
+        raise click.UsageError("--device has no effect with --workers or --scheduler")
     if verify:
         _verify(output or read_scene(scene).mosaic.get("store") or _default_store(scene), as_json)
         return
     described, grid = read_grid(scene, given, memory=False)
-    wish = read_wish(described, given)
-    if set(wish) - {*PLAN_KEYS, "accuracy_db"}:
-        raise ValueError(f"{scene}: [image] taps and upsampling play no part in a mosaic")
+    request = read_request(described, given)
+    if set(request) - {*PLAN_KEYS, "accuracy_db"}:
+        raise ValueError(f"{scene}: [image] taps and upsampling have no effect in a mosaic")
     beam = read_beam(described, given)
     warn_of_sampling(described, grid)
     devices = [open_device(name) for name in device] or None
@@ -115,9 +116,9 @@ def mosaic(
         raise click.UsageError(f"--png must not lie in the store, got {str(png)!r}")
     keep_apart("the range lines", lines_path, "the store", output)
     if follow and (lines_path is None or not lines_path.is_dir()):
-        raise click.UsageError("--follow goes with --lines, a folder")
+        raise click.UsageError("--follow requires --lines with a folder")
     if idle_s is not None and not follow:
-        raise click.UsageError("--idle-s goes with --follow")
+        raise click.UsageError("--idle-s requires --follow")
     patches = patches or in_scene.get("patches")
     if patches is not None:
         patch_shape_of(patches, grid)  # before anything is simulated
@@ -129,7 +130,7 @@ def mosaic(
     start = time.perf_counter()
     with _cluster(workers, scheduler) as client:
         formed = clsas.mosaic(
-            lines_path, grid, output, **wish, beam=beam, patches=patches,
+            lines_path, grid, output, **request, beam=beam, patches=patches,
             memory_bytes=memory_mib and memory_mib << 20, device=devices,
             client=client, follow_s=(idle_s or _IDLE_S) if follow else None,
         )  # fmt: skip
@@ -147,36 +148,37 @@ def mosaic(
 
         plot.save_png(plot.image_db(store.overview(), dynamic_range_db=dynamic_range_db), png)
     errors = [r.predicted_error_db for r in records.values() if r.predicted_error_db is not None]
-    flagged = {place: record.flags for place, record in records.items() if record.flags}
+    flagged = {index: record.flags for index, record in records.items() if record.flags}
     worst = max(errors, default=None)
     rows, columns = formed.patch_shape
-    text = [
+    rate = f"{count} formed in {seconds:.2f} s ({pixels / seconds / 1e6:.3g} Mpixel/s)"
+    summary = (
         f"{output}: {' x '.join(map(str, formed.shape))} patches of {rows} x {columns} pixels, "
-        + (
-            f"{count} formed in {seconds:.2f} s ({pixels / seconds / 1e6:.3g} Mpixel/s)"
-            if count
-            else "none to form"
-        )
-        + (f", {before} were there" if before else "")
-        + ("" if worst is None else f"; error predicted {worst:.1f} dB at most")
-    ]
-    alike: dict[str, list[str]] = {}
-    for (row, column), flags in flagged.items():
-        alike.setdefault("; ".join(flags), []).append(f"{row},{column}")
-    for flags, where in alike.items():
-        which = "; ".join(where[:_LISTED])
-        if len(where) > _LISTED:
-            which += f" and {len(where) - _LISTED} more"
-        text.append(f"  patch {which}: {flags}")
+        + (rate if count else "none to form")
+        + (f", {before} finished before" if before else "")
+        + ("" if worst is None else f"; predicted error at most {worst:.1f} dB")
+    )
     report(
         as_json,
-        "\n".join(text),
+        "\n".join([summary, *_described_flags(flagged)]),
         file=output, png=png, shape=grid.shape, patches=formed.shape,
         patch_shape=formed.patch_shape, finished=len(records), formed=count, before=before,
         seconds=seconds, pixels_per_s=pixels / seconds, predicted_error_db=worst,
         flags={f"{row},{column}": f for (row, column), f in flagged.items()},
         seconds_of_patches=sum(record.seconds for record in records.values()),
     )  # fmt: skip
+
+
+def _described_flags(flagged: dict[tuple[int, int], tuple[str, ...]]) -> list[str]:
+    """Return one line for every kind of defect, with the patches that have it."""
+    alike: dict[str, list[str]] = {}
+    for (row, column), flags in flagged.items():
+        alike.setdefault("; ".join(flags), []).append(f"{row},{column}")
+    lines = []
+    for flags, patches in alike.items():
+        more = f" and {len(patches) - _LISTED} more" if len(patches) > _LISTED else ""
+        lines.append(f"  patch {'; '.join(patches[:_LISTED])}{more}: {flags}")
+    return lines
 
 
 def _default_store(scene: Path) -> Path:
@@ -188,14 +190,14 @@ def _verify(path: Path, as_json: bool) -> None:
     store = clsas.Store.opened(path)
     with progress_bar("verifying") as progress:
         damage = store.damage(progress)
-    finished = sum(place not in damage for place in store.records())
+    finished = sum(index not in damage for index in store.records())
     damaged = {f"{row},{column}": reason for (row, column), reason in damage.items()}
     summary = f"{len(damage)} damaged" if damage else "none damaged"
     report(
         as_json,
         "\n".join(
             [f"{path}: {finished} patches match their checksums, {summary}"]
-            + [f"  patch {place}: {reason}" for place, reason in damaged.items()]
+            + [f"  patch {index}: {reason}" for index, reason in damaged.items()]
         ),
         file=path, finished=finished, damaged=damaged,
     )  # fmt: skip
@@ -204,7 +206,7 @@ def _verify(path: Path, as_json: bool) -> None:
 
 
 def _beside(output: Path, scene: Path) -> Path:
-    """Return the file for a scene's simulated range lines, beside the store."""
+    """Return the path of a scene's simulated range lines, in the folder of the store."""
     digest = simulation_digest(scene.read_bytes(), scene.parent)
     return output.with_name(f"{output.stem}-{digest}.lines.h5")
 
@@ -212,7 +214,7 @@ def _beside(output: Path, scene: Path) -> Path:
 def _simulate(
     described: SceneFile, scene: Path, path: Path, say: Callable[..., None] | None
 ) -> None:
-    """Make the file of a scene's range lines, unless it is there."""
+    """Simulate a scene's range lines and write them to `path`, unless it exists."""
     if path.exists():
         if say is not None:
             say(f"{path}: range lines, simulated before", err=True)
@@ -228,7 +230,7 @@ def _simulate(
 
 @contextmanager
 def _cluster(workers: int | None, scheduler: str | None) -> Iterator[Any]:
-    """Give a client of a Dask cluster, or None where there is none to be used."""
+    """Yield a client of a Dask cluster, or None if no cluster is requested."""
     if workers is None and scheduler is None:
         yield None
         return
@@ -255,14 +257,12 @@ def _cluster(workers: int | None, scheduler: str | None) -> Iterator[Any]:
         try:
             yield client
         except KilledWorker as error:
-            raise click.ClickException(
-                f"workers died on one patch, over and over: {error}"
-            ) from None
+            raise click.ClickException(f"workers died repeatedly on one patch: {error}") from None
 
 
 @contextmanager
 def _patch_progress(name: str, total: int, done: int) -> Iterator[Callable[[clsas.Patch], None]]:
-    """Give a function that tells of a patch: a line each and, on a terminal, a moving bar."""
+    """Yield a function that prints a line for a patch and, on a terminal, moves a progress bar."""
     columns = (
         TextColumn(name), BarColumn(), TextColumn("{task.completed}/{task.total}"),
         TaskProgressColumn(), TimeRemainingColumn(),
@@ -277,7 +277,7 @@ def _patch_progress(name: str, total: int, done: int) -> Iterator[Callable[[clsa
             record = patch.record
             parts = [f"{record.seconds:.2f} s", f"{record.channels} channels"]
             if record.predicted_error_db is not None:
-                parts.append(f"error predicted {record.predicted_error_db:.1f} dB")
+                parts.append(f"predicted error {record.predicted_error_db:.1f} dB")
             line = f"patch {patch.row},{patch.column}: {', '.join((*parts, *record.flags))}"
             console.print(line, markup=False)
             bar.advance(task)

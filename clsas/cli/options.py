@@ -17,7 +17,7 @@ from clsas.sonar.beam import SHAPES
 
 
 def checked(check: Callable[[Any], object]) -> Callable:
-    """Return an option's callback that makes a usage error of what a check of its value raises."""
+    """Return a callback for an option that turns exceptions of a check into usage errors."""
 
     def callback(ctx: click.Context, param: click.Parameter, value: Any) -> Any:
         try:
@@ -32,7 +32,7 @@ def checked(check: Callable[[Any], object]) -> Callable:
 
 
 def output(kind: str) -> Callable:
-    """Return the option for the file that is the result."""
+    """Return the option for the resulting file."""
     return click.option(
         "-o", "--output", type=Output(*SUFFIXES), required=True, help=f"{kind} to write."
     )
@@ -56,17 +56,20 @@ def _together(*options: Callable) -> Callable:
 
 as_json = click.option("--json", "as_json", is_flag=True, help="Print results as JSON.")
 dynamic_range = click.option(
-    "--dynamic-range-db", type=float, default=60.0, show_default=True, help="Of the PNG.",
+    "--dynamic-range-db", type=float, default=60.0, show_default=True,
+    help="Dynamic range of the PNG.",
     callback=checked(partial(validate.positive, "dynamic_range_db", unit="dB")),
 )  # fmt: skip
-scene = click.option("--scene", type=INPUT, help="Scene file for what the options leave out.")
+scene = click.option("--scene", type=INPUT, help="Scene file for values without an option.")
 device = click.option(
     "--device",
     help="Index, kind (cpu, gpu), platform (pocl, intel, nvidia) or part of the name, as "
     "`clsas devices` shows them.",
 )
 axes = _together(
-    click.option("--x", type=AXIS, help="First and last pixel centre along x (m), how many."),
+    click.option(
+        "--x", type=AXIS, help="First and last pixel centre along x (m), and number of pixels."
+    ),
     click.option("--y", type=AXIS, help="The same along y."),
     click.option(
         "--z", type=float, callback=checked(partial(validate.number, "z", unit="m")),
@@ -83,10 +86,10 @@ check_accuracy_db = checked(
     partial(validate.number, "accuracy_db", unit="dB", least=BEST_ACCURACY_DB, below=0.0)
 )
 check_idle_s = checked(partial(validate.positive, "idle_s", unit="s"))
-dial = _together(
+method = _together(
     click.option(
         "--tolerance-db", type=float, callback=check_tolerance_db,
-        help="Relative rms error allowed against the exact image. [default: -50]",
+        help="Largest relative rms error against the exact image, dB. [default: -50]",
     ),
     click.option(
         "--tolerance-wavelengths", type=RATIO,
@@ -96,27 +99,30 @@ dial = _together(
                 least=wavelengths(BEST_TOLERANCE_DB), most=wavelengths(WORST_TOLERANCE_DB),
             )
         ),
-        help="The same as a range error in wavelengths, such as 1/30.",
+        help="The tolerance as a range error in wavelengths, such as 1/30.",
     ),
     click.option(
         "--stages", type=STAGES, metavar="QRxQI,...",
-        help="The thesis's method: QR and QI of every stage, such as 2x2,2x2.",
+        help="Use the thesis's method with QR and QI of every stage, such as 2x2,2x2.",
     ),
 )  # fmt: skip
 beam = _together(
-    click.option("--beam-deg", type=float, help="Use a beam of this full width only."),
+    click.option("--beam-deg", type=float, help="Use only a beam of this full width, degrees."),
     click.option(
         "--beam-shape", type=click.Choice(SHAPES),
-        help="Its shape; 'hann' is the fastest to image with. [default: rectangular]",
+        help="Shape of the beam; 'hann' is the fastest. [default: rectangular]",
     ),
-    click.option("--squint-deg", type=float, help="Its middle, ahead of broadside. [default: 0]"),
+    click.option(
+        "--squint-deg", type=float,
+        help="Squint angle of the beam's axis, positive forward. [default: 0]",
+    ),
     click.option(
         "--element-length-m", type=float,
-        help="For the shape 'inverse', which divides by the two-way pattern of such elements.",
+        help="Element length for the shape 'inverse', which divides by the two-way pattern.",
     ),
     click.option(
         "--track-pings", type=int,
-        help="Over how many pings the track's direction is smoothed. [default: a quarter, 101 at "
-        "most]",
+        help="Pings over which the track's direction is smoothed. [default: a quarter, at most "
+        "101]",
     ),
 )  # fmt: skip

@@ -1,4 +1,4 @@
-"""What commands print: results as text or JSON, and progress."""
+"""Outputs of commands: results as text or JSON, and progress bars."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, T
 
 @contextmanager
 def progress_bar(what: str) -> Iterator[Callable[[int, int], None] | None]:
-    """Give a callback that moves a bar, or None where no terminal shows it."""
+    """Yield a callback that moves a progress bar, or None without a terminal."""
     if not sys.stderr.isatty():
         yield None
         return
@@ -30,7 +30,7 @@ def progress_bar(what: str) -> Iterator[Callable[[int, int], None] | None]:
 
 
 def report(as_json: bool, text: str, **results: Any) -> None:
-    """Print results as JSON, or the text that tells them."""
+    """Print results as JSON or as text."""
     if as_json:
         print_json(results)
     else:
@@ -38,12 +38,12 @@ def report(as_json: bool, text: str, **results: Any) -> None:
 
 
 def print_json(results: Any, indent: int | None = 2) -> None:
-    """Print results as JSON, on one line without an indent."""
+    """Print results as JSON; on one line if `indent` is None."""
     click.echo(json.dumps(json_able(results), indent=indent, allow_nan=False))
 
 
 def json_able(value: Any) -> Any:
-    """Return what JSON can hold: text for a path, null for infinity; curves are left out."""
+    """Return a value in types of JSON: paths as text, infinity as null, without arrays."""
     if is_dataclass(value):
         parts = {part.name: getattr(value, part.name) for part in fields(value)}
         return json_able({k: v for k, v in parts.items() if not isinstance(v, np.ndarray)})

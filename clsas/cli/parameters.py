@@ -1,4 +1,4 @@
-"""What values of options and arguments may be: their types for click."""
+"""Types of options and arguments for click."""
 
 from __future__ import annotations
 
@@ -19,29 +19,29 @@ from clsas.core.reading import check_ordinary
 
 
 class Parsed(click.ParamType):
-    """What a function reads from a text.
+    """A value that a function parses from text.
 
     Parameters
     ----------
     name : str
-        The form of the text, as --help shows it.
+        The form of the text in --help.
     parse : callable
-        Raises ValueError or ArithmeticError where the text is wrong.
-    wanted : str
-        What the text must be, as the message says it.
+        Returns the value; raises ValueError or ArithmeticError if the text is wrong.
+    expected : str
+        The form of the text in messages.
     """
 
-    def __init__(self, name: str, parse: Callable[[str], Any], wanted: str) -> None:
+    def __init__(self, name: str, parse: Callable[[str], Any], expected: str) -> None:
         self.name = name
         self._parse = parse
-        self._wanted = wanted
+        self._expected = expected
 
     def convert(self, value: str, param: Any, ctx: Any) -> Any:
-        """Return what is read; a wrong text is a usage error."""
+        """Return the value; a wrong text is a usage error."""
         try:
             return self._parse(value)
         except (ValueError, ArithmeticError):
-            self.fail(f"{validate.shown(value)} must be {self._wanted}", param, ctx)
+            self.fail(f"{validate.shown(value)} must be {self._expected}", param, ctx)
 
 
 def _axis(text: str) -> tuple[float, float, int]:
@@ -54,11 +54,11 @@ def _axis(text: str) -> tuple[float, float, int]:
     return axis
 
 
-def _place(text: str) -> tuple[float, ...]:
-    place = tuple(map(float, text.split(",")))
-    if len(place) not in (2, 3) or not all(map(math.isfinite, place)):
+def _position(text: str) -> tuple[float, ...]:
+    position = tuple(map(float, text.split(",")))
+    if len(position) not in (2, 3) or not all(map(math.isfinite, position)):
         raise ValueError
-    return place
+    return position
 
 
 def _ratio(text: str) -> float:
@@ -80,15 +80,15 @@ def _counts(text: str) -> tuple[int, int]:
     return rows, columns
 
 
-AXIS = Parsed("START:STOP:N", _axis, "START:STOP:N, two places in metres and a number of pixels")
-PLACE = Parsed("X,Y", _place, "X,Y or X,Y,Z in metres, without a space, such as 0,42.5")
+AXIS = Parsed("START:STOP:N", _axis, "START:STOP:N, two positions in metres and a number of pixels")
+POSITION = Parsed("X,Y", _position, "X,Y or X,Y,Z in metres, without a space, such as 0,42.5")
 RATIO = Parsed("NUMBER", _ratio, "a number or a fraction such as 1/30")
 STAGES = Parsed("stages", _stages, "QRxQI for every stage, such as 2x2,2x2")
 COUNTS = Parsed("ROWSxCOLUMNS", _counts, "ROWSxCOLUMNS, at least 1x1, such as 8x8")
 
 
 class File(click.Path):
-    """A file or folder that a command reads or writes: nothing is written over what it reads."""
+    """A file or folder that a command reads or writes. No output may replace an input."""
 
     written = False
 
@@ -96,7 +96,7 @@ class File(click.Path):
         super().__init__(**allowed, path_type=Path)
 
     def convert(self, value: Any, param: Any, ctx: Any) -> Path:
-        """Return the path; a file that is also another of the command's is a usage error."""
+        """Return the path; using one file twice is a usage error."""
         if not os.fspath(value):
             self.fail("must be a path, got an empty one", param, ctx)
         path: Any = super().convert(value, param, ctx)
@@ -106,7 +106,7 @@ class File(click.Path):
             except ValueError as error:
                 self.fail(str(error), param, ctx)
         for other in ctx.command.params:
-            # Whichever comes second on the command line finds the first one here.
+            # The second of the two on the command line finds the first one here.
             if other is not param and isinstance(other.type, File):
                 taken = ctx.params.get(other.name)
                 if self.written or other.type.written:
@@ -115,7 +115,7 @@ class File(click.Path):
 
 
 class Output(File):
-    """A file of some format to write: what would keep it from being written is said at once."""
+    """A file to write. The command checks that it can be written before it does any work."""
 
     written = True
 
@@ -124,7 +124,7 @@ class Output(File):
         self._suffixes = suffixes
 
     def convert(self, value: Any, param: Any, ctx: Any) -> Path:
-        """Return the path; what keeps it from being written is a usage error."""
+        """Return the path; a file that cannot be written is a usage error."""
         path = super().convert(value, param, ctx)
         try:
             validate.suffix("the file's name", path, *self._suffixes)
@@ -146,7 +146,7 @@ class Output(File):
 
 
 class Store(File):
-    """A Zarr store to write, which is a folder."""
+    """A Zarr store, which is a folder, to write."""
 
     written = True
 
@@ -155,25 +155,25 @@ INPUT = File(exists=True, dir_okay=False)
 
 
 def keep_apart(one: str, path: Path | None, other: str, path_of_other: Path | None) -> None:
-    """End the command where two of its files, so called, are one."""
+    """End the command if two of its files, whose names are `one` and `other`, are the same."""
     if path and path_of_other and os.path.realpath(path) == os.path.realpath(path_of_other):
         raise click.UsageError(f"{one} and {other} must be two files, got {str(path)!r}")
 
 
 def written_to(ctx: click.Context) -> dict[str, Path]:
-    """Return the files that the running command is to write, by the names of their options."""
+    """Return the files that the running command writes, by option."""
     outputs = [p for p in ctx.command.params if isinstance(p.type, File) and p.type.written]
     paths = {_option_name(param): ctx.params.get(param.name) for param in outputs}
     return {shown: path for shown, path in paths.items() if path is not None}
 
 
 def _option_name(param: click.Parameter) -> str:
-    """Return how a parameter is called on the command line."""
+    """Return the name of a parameter on the command line."""
     return param.opts[0] if isinstance(param, click.Option) else (param.metavar or "").strip("[]")
 
 
 def _exists(path: Path) -> bool:
-    """Return whether a path is taken; raises OSError where it cannot be (a long name)."""
+    """Return whether a path exists; raises OSError if it is not possible (a long name)."""
     try:
         path.stat()
     except FileNotFoundError:
@@ -182,6 +182,6 @@ def _exists(path: Path) -> bool:
 
 
 def need_matplotlib() -> None:
-    """End the command where pictures cannot be drawn."""
+    """End the command if pictures cannot be drawn."""
     if importlib.util.find_spec("matplotlib") is None:
         raise click.ClickException(f"pictures need matplotlib: {install_command('plot')}")

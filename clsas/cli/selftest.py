@@ -1,4 +1,4 @@
-"""The command that tests accuracy on the user's own device: selftest."""
+"""Command that tests accuracy on the user's own device: selftest."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from clsas.opencl.device import open_device
 def selftest(ctx: click.Context, device: str | None, as_json: bool) -> None:
     """Test this device's accuracy at the extremes, in about a minute.
 
-    Images of scenes whose ideal is known analytically are formed by every imager and compared.
-    The exit code is 1 if any errs by more than it may.
+    Every imager forms images of scenes whose ideal image is known analytically. The exit code is 1
+    if the error of any image exceeds its bound.
 
     \b
     Example:  clsas selftest --device 0

@@ -236,7 +236,7 @@ def test_plan(made):
     assert "coefficients" not in json.dumps(short)
     assert short["align"]["taps"] == 2
     assert short["predicted_error_db"] == plan.predicted_error_db
-    assert "--filters goes with --json" in run(*args, "--filters", code=2)[1]
+    assert "--filters requires --json" in run(*args, "--filters", code=2)[1]
     assert not (made[0] / "plan.json").exists()
 
 
@@ -431,22 +431,22 @@ FIXED = ["--taps", "4", "--upsampling", "2"]
         (
             ["image", "lines.h5", *GRID, "-o", "new.h5", *FIXED, "--accuracy-db", "-60"],
             2,
-            "--accuracy-db plays no part",
+            "--accuracy-db has no effect",
         ),
         (
             ["image", "lines.h5", *GRID, "-o", "new.h5", "--tolerance-db", "-30", "--exact"],
             2,
-            "--stages and --exact exclude each other",
+            "give only one of --tolerance-db, --tolerance-wavelengths, --stages and --exact",
         ),
         (
             ["plan", "lines.h5", *GRID, "--tolerance-db", "-30", "--stages", "2x2"],
             2,
-            "--stages and --exact exclude each other",
+            "give only one of --tolerance-db, --tolerance-wavelengths, --stages and --exact",
         ),
         (
             ["image", "lines.h5", *GRID, "-o", "new.h5", "--stages", "2x2", "--taps", "4"],
             2,
-            "--taps and --upsampling are of the exact image, and play no part with --stages",
+            "--taps and --upsampling are for exact images and cannot be combined with --stages",
         ),
         (["plan", "lines.h5", *GRID, "--stages", "2x2,2"], 2, "'2x2,2' must be QRxQI for every"),
         (["plan", "lines.h5", *GRID, "--stages", "1x9"], 1, "stages must leave a line and a pixel"),
@@ -456,14 +456,14 @@ FIXED = ["--taps", "4", "--upsampling", "2"]
         (["tradeoff", "lines.h5", *GRID, "--tolerance-db", "-9"], 2, "dB, got -9"),
         (["plan", "lines.h5", *GRID, "--tolerance-wavelengths", "9"], 2, "wavelengths, got 9"),
         (["plan", "lines.h5", *GRID, "--stages", "2x0"], 2, "'2x0' must be QRxQI for every"),
-        (["plan", "lines.h5", *GRID, "--squint-deg", "3"], 2, "go with --beam-deg"),
-        (["plan", "lines.h5", *GRID, "--element-length-m", "1"], 2, "go with --beam-deg"),
-        (["plan", "lines.h5", *GRID, "--track-pings", "9"], 2, "go with --beam-deg"),
+        (["plan", "lines.h5", *GRID, "--squint-deg", "3"], 2, "require --beam-deg"),
+        (["plan", "lines.h5", *GRID, "--element-length-m", "1"], 2, "require --beam-deg"),
+        (["plan", "lines.h5", *GRID, "--track-pings", "9"], 2, "require --beam-deg"),
         (["plan", "lines.h5", *GRID, "--beam-deg", "9", "--track-pings", "1"], 2, "at least 5"),
         (
             ["plan", "lines.h5", *GRID, "--beam-deg", "9", "--element-length-m", "1"],
             2,
-            "--element-length-m goes with --beam-shape inverse, got rectangular",
+            "--element-length-m requires --beam-shape inverse, got rectangular",
         ),
         (
             ["plan", "lines.h5", *GRID, "--beam-deg", "9", "--beam-shape", "inverse"],
@@ -471,17 +471,21 @@ FIXED = ["--taps", "4", "--upsampling", "2"]
             "element_length_m must be given for the shape 'inverse'",
         ),
         (["plan", "lines.h5", *GRID, "--beam-deg", "-3"], 2, "width_deg must be finite"),
-        (["plan", "lines.h5"], 2, "a grid is needed: --scene, or --x and --y"),
-        (["tradeoff", *GRID], 2, "either LINES.H5 or --case is needed"),
-        (["tradeoff", "lines.h5", "--case", "bp-thesis"], 2, "--case has its own lines: LINES.H5"),
+        (["plan", "lines.h5"], 2, "no grid given: use --scene, or --x and --y"),
+        (["tradeoff", *GRID], 2, "give either LINES.H5 or --case"),
+        (
+            ["tradeoff", "lines.h5", "--case", "bp-thesis"],
+            2,
+            "--case has its own lines: leave out LINES.H5",
+        ),
         (["tradeoff", "--case", "bp-nothing"], 2, "'bp-nothing' is not one of bp-thesis, "),
         (["tradeoff", "--case", "bp-thesis", *GRID], 2, "--case has its own grid"),
         (["tradeoff", "lines.h5", *GRID, "--csv", "new", "--png", "new"], 2, "must be two files"),
-        (["image", "lines.h5", "-o", "new.h5"], 2, "a grid is needed: --scene, or --x and --y"),
-        (["image", "lines.h5", *GRID[:2], "-o", "new.h5"], 2, "--x and --y go together"),
+        (["image", "lines.h5", "-o", "new.h5"], 2, "no grid given: use --scene, or --x and --y"),
+        (["image", "lines.h5", *GRID[:2], "-o", "new.h5"], 2, "--x and --y must be given together"),
         (["image", "lines.h5", "--x", "0:1", *GRID[2:], "-o", "new.h5"], 2, "START:STOP:N"),
         (["quality", "image.h5", "--near", "0"], 2, "must be X,Y or X,Y,Z in metres"),
-        (["quality", "image.h5", "--png", "new.png"], 2, "go with --near"),
+        (["quality", "image.h5", "--png", "new.png"], 2, "require --near"),
         (["bench", "bp-nothing"], 2, "'bp-nothing' is not one of bp-thesis, "),
         (["imagine"], 2, "No such command 'imagine'"),
     ],
@@ -616,7 +620,7 @@ def test_bench(monkeypatch):
     assert (result["case"], result["tolerance_db"]) == ("fast", -30)
     assert result["error_db"] < -28
     for args in (["fast", "--accuracy-db", "-30"], ["one", "--tolerance-db", "-30"]):
-        assert "--tolerance-db with others" in run("bench", *args, code=2)[1]
+        assert "--tolerance-db for other cases" in run("bench", *args, code=2)[1]
     text, _ = run("bench", "one", "--repeats", 1)
     assert re.search(r"^ +gbp_per_s  \d", text, re.MULTILINE)
     assert "'one' or 'two'" not in text

@@ -74,7 +74,7 @@ def made(tmp_path_factory):
 def test_a_scene_is_all_it_needs(made):
     folder, (stdout, stderr) = made
     assert "2 x 2 patches of 50 x 40 pixels, 4 formed in" in stdout
-    assert "error predicted -40" in stdout
+    assert "predicted error at most -40" in stdout
     told = stderr.splitlines()
     assert re.search(r"scene-\w{12}\.lines\.h5: range lines, simulated from .*scene.toml$", told[0])
     assert sum(line.startswith("patch ") for line in told) == 4
@@ -90,7 +90,7 @@ def test_the_same_command_goes_on(made):
     shutil.rmtree(folder / "scene.zarr" / "patches" / "1.0")
     stdout, stderr = run("mosaic", folder / "scene.toml")
     assert "1 formed in" in stdout
-    assert "3 were there" in stdout
+    assert "3 finished before" in stdout
     assert "simulated before" in stderr
     result = json.loads(run("mosaic", folder / "scene.toml", "--json")[0])
     assert result["before"] == result["finished"] == 4
@@ -109,7 +109,7 @@ def test_ctrl_c_keeps_what_is_finished(made, tmp_path, workers):
     assert stderr.splitlines()[-1] == "Interrupted"
     assert "Traceback" not in stderr
     stdout, _ = run(*command[:-2] if workers else command)
-    there = int(re.search(r"(\d+) were there", stdout).group(1))
+    there = int(re.search(r"(\d+) finished before", stdout).group(1))
     assert 0 < there < 80
     assert f"{80 - there} formed in" in stdout
 
@@ -185,8 +185,8 @@ def test_flags_are_told(made, tmp_path):
         (["--patches", "2y2"], 2, "'2y2' must be ROWSxCOLUMNS"),
         (["--patches", "0x2"], 2, "'0x2' must be ROWSxCOLUMNS, at least 1x1"),
         (["--patches", "90x2"], 1, "patches must leave each some of 100 pixels"),
-        (["--workers", "2", "--scheduler", "tcp://localhost:1"], 2, "exclude each other"),
-        (["--workers", "2", "--device", "0"], 2, "--device plays no part"),
+        (["--workers", "2", "--scheduler", "tcp://localhost:1"], 2, "give only one of"),
+        (["--workers", "2", "--device", "0"], 2, "--device has no effect"),
         (["--lines", "folder", "-o", "./folder"], 2, "--lines and -o must be two files"),
         (["-o", "new", "--png", "new"], 2, "-o and --png must be two files"),
         (
@@ -194,7 +194,7 @@ def test_flags_are_told(made, tmp_path):
             2,
             "--png must not lie in the store",
         ),
-        (["--follow"], 2, "--follow goes with --lines, a folder"),
+        (["--follow"], 2, "--follow requires --lines with a folder"),
         (["--tolerance-db", "-30"], 1, "tolerance_db is -40.0 there, -30.0 given"),
         (["--tolerance-db", "-300"], 2, "tolerance_db must be"),
         (["--memory-mib", "0"], 2, "--memory-mib"),
@@ -204,7 +204,7 @@ def test_flags_are_told(made, tmp_path):
         (["--lines", "scene.toml"], 1, "scene.toml is not an HDF5 file"),
         (["--idle-s", "-1", "--lines", "folder", "--follow"], 2, "idle_s must be"),
         (["--accuracy-db", "3"], 2, "accuracy_db must be"),
-        (["--idle-s", "5"], 2, "--idle-s goes with --follow"),
+        (["--idle-s", "5"], 2, "--idle-s requires --follow"),
         (["--idle-s", "0.1", "--lines", "folder", "--follow"], 1, "folder has no file"),
     ],
 )

@@ -348,7 +348,7 @@ def test_lines_are_assessed_with_the_scene_that_made_them(scene, tmp_path):
     ("arguments", "says"),
     [
         (["--stages", "2x2"], "--stages has no tolerance"),
-        (["--scene", "SCENE"], "--scene goes with LINES.H5"),
+        (["--scene", "SCENE"], "--scene requires LINES.H5"),
         (["--repeats", "-1"], "--repeats"),
     ],
 )
