@@ -1,8 +1,8 @@
-"""Files and folders that appear whole or not at all, even if the process is killed or power fails.
+"""Files and folders that appear complete or not at all, even after a crash or power failure.
 
-A file is written under a temporary name, `.clsas-*.part`, in the folder where it will lie. Its
-writer holds a lock on it, so a temporary file without a lock is a leftover of a killed process; the
-next writer in that folder removes it. Contents reach the disk before the name does.
+A file is written under a temporary name, `.clsas-*.part`, in its destination folder. The writer
+holds a lock on it. A temporary file without a lock was left by a killed process; the next writer in
+the folder removes it. The contents reach the disk before the name does.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ _PATTERN = ".clsas-*.part"
 
 @contextmanager
 def replacing(path: str | os.PathLike) -> Iterator[Path]:
-    """Give an empty temporary file to write; rename it to `path` on success, else remove it.
+    """Yield an empty temporary file to write; rename it to `path` on success, else remove it.
 
     Raises
     ------
     OSError
         If the folder of `path` does not exist or cannot be written, if `path` is a folder, or on a
-        full disk. It names `path`, not the temporary file.
+        full disk. The error names `path`, not the temporary file.
     """
     path = Path(path)
     if not path.parent.is_dir():
@@ -43,9 +43,9 @@ def replacing(path: str | os.PathLike) -> Iterator[Path]:
 
 @contextmanager
 def creating(path: Path) -> Iterator[Path]:
-    """Give an empty temporary folder to fill; rename it to `path` on success, else remove it.
+    """Yield an empty temporary folder to fill; rename it to `path` on success, else remove it.
 
-    If another process has made a folder with contents at `path` by then, that one stays.
+    If another process has meanwhile created a folder with contents at `path`, that one stays.
 
     Raises
     ------
@@ -63,7 +63,7 @@ def creating(path: Path) -> Iterator[Path]:
 
 
 def make_folders(path: Path) -> None:
-    """Make a folder and its parents where they are missing, and wait until the disk has them."""
+    """Create a folder and missing parents, and wait until they are on the disk."""
     missing = [each for each in (path, *path.parents) if not each.exists()]
     path.mkdir(parents=True, exist_ok=True)
     for each in missing:
@@ -76,7 +76,7 @@ def sync_folder(path: Path) -> None:
     try:
         os.fsync(descriptor)
     except OSError as error:
-        # Some network file systems do not sync folders; they have no other way to offer.
+        # Some network file systems cannot sync folders, and offer nothing else.
         if error.errno not in (errno.EINVAL, errno.ENOTSUP):
             raise
     finally:
@@ -85,7 +85,7 @@ def sync_folder(path: Path) -> None:
 
 @contextmanager
 def _temporary(path: Path, make: Callable[[Path], object]) -> Iterator[tuple[Path, int]]:
-    """Give a locked temporary beside `path` and its descriptor; remove it if it is left."""
+    """Yield a locked temporary beside `path` and its descriptor; remove it if it still exists."""
     temporary = None
     try:
         _remove_leftovers(path.parent)
@@ -96,7 +96,7 @@ def _temporary(path: Path, make: Callable[[Path], object]) -> Iterator[tuple[Pat
             _remove(temporary)
             os.close(descriptor)
     except OSError as error:
-        # A full disk names no file, and the temporary name means nothing to a user.
+        # Errors of a full disk name no file, and a temporary name would not help the user.
         named = error.filename
         ours = named is None or (isinstance(named, str | Path) and Path(named).match(_PATTERN))
         if error.errno is not None and ours:
@@ -110,9 +110,9 @@ def _claim(folder: Path, make: Callable[[Path], object]) -> tuple[Path, int]:
         make(path)
         with suppress(FileNotFoundError):
             descriptor = _open(path)
-            with suppress(OSError):  # not every file system has locks; leftovers then stay
+            with suppress(OSError):  # some file systems have no locks, so leftovers stay
                 fcntl.flock(descriptor, fcntl.LOCK_EX)
-            # Another process may have taken it for a leftover before it was locked.
+            # Another process may have removed it as a leftover before it was locked.
             if path.exists():
                 return path, descriptor
             os.close(descriptor)
@@ -120,7 +120,7 @@ def _claim(folder: Path, make: Callable[[Path], object]) -> tuple[Path, int]:
 
 def _remove_leftovers(folder: Path) -> None:
     for path in folder.glob(_PATTERN):
-        with suppress(OSError):  # another user's, or gone meanwhile
+        with suppress(OSError):  # of another user, or removed in the meantime
             descriptor = _open(path)
             try:
                 fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)  # raises if in use
@@ -134,7 +134,7 @@ def _make_file(path: Path) -> None:
 
 
 def _open(path: Path) -> int:
-    # NFS locks only what is open for writing; a folder cannot be.
+    # NFS locks only files that are open for writing. Folders cannot be opened that way.
     access = os.O_RDONLY if path.is_dir() else os.O_RDWR
     return os.open(path, access | os.O_NOFOLLOW | os.O_NONBLOCK)
 

@@ -1,4 +1,4 @@
-"""The folder of what is kept from run to run."""
+"""Folder of cached files, such as measured costs and simulated lines."""
 
 from __future__ import annotations
 
@@ -9,5 +9,5 @@ from platformdirs import user_cache_path
 
 
 def cache_folder() -> Path:
-    """Return the folder of what is kept from run to run: CLSAS_CACHE, or else the user's cache."""
+    """Return the cache folder: that of the variable CLSAS_CACHE, or else the user's default."""
     return Path(os.environ.get("CLSAS_CACHE") or user_cache_path("clsas"))

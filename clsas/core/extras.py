@@ -1,4 +1,4 @@
-"""Packages that only some of the work needs, and the commands that install them."""
+"""Optional packages, and the commands that install them."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ PACKAGES = {
 def install_command(extra: str) -> str:
     """Return the command that installs the packages of an extra.
 
-    It names the packages themselves: `clsas[extra]` would be looked for on a package index, where
-    a checkout is not.
+    It names the packages, since pip would look for `clsas[extra]` on a package index, also if clsas
+    runs from a checkout.
     """
     return "pip install " + " ".join(f"'{package}'" for package in PACKAGES[extra])

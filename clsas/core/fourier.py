@@ -1,4 +1,4 @@
-"""Fourier integrals and smooth edges: what simulation and compression share."""
+"""Fourier integrals and smooth edges, for simulation and pulse compression."""
 
 from __future__ import annotations
 
@@ -9,18 +9,19 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import erfc
 
-# Half the width of a smooth edge in standard deviations: what is left beyond it is 6e-8 (-145 dB).
-_EDGE_SIGMAS = 5.3
-# Width of an edge times the extent of its Fourier transform to the same level.
+_EDGE_SIGMAS = 5.3  # half the width of a smooth edge, standard deviations; 6e-8 (-145 dB) remain
+
 EDGE_PRODUCT = _EDGE_SIGMAS**2 / np.pi
+"""Width of a smooth edge times the extent of its Fourier transform, both to -145 dB."""
+
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(16)
 
 
 def smooth_edge(position: ArrayLike) -> NDArray[np.float64]:
-    """Return an edge that falls from 1 at position <= 0 to 0 at position >= 1 (both to 6e-8).
+    """Return an edge that falls from 1 at position <= 0 to 0 at position >= 1, both to 6e-8.
 
-    It is an integrated Gaussian, so its Fourier transform falls as fast: an edge of width w
-    decays within `EDGE_PRODUCT`/w, to below the same level.
+    It is an integrated Gaussian. The Fourier transform of an edge of width w falls below 6e-8
+    within `EDGE_PRODUCT`/w.
     """
     return 0.5 * erfc(_EDGE_SIGMAS * (2 * np.asarray(position) - 1) / np.sqrt(2))
 
@@ -42,7 +43,7 @@ def fourier_integral(
     edges : array_like, [m]
         Ascending ends of the smooth pieces, in the unit of u.
     at : array_like
-        The points v, in cycles per unit of u.
+        Frequencies v, in cycles per unit of u.
     sign : int
         +1 or -1.
     rate : float
@@ -50,11 +51,13 @@ def fourier_integral(
 
     Returns
     -------
-    complex128 array of the shape of `at`; about twelve digits relative to the largest.
+    complex128 array of the shape of `at`
+        Accurate to about twelve digits of the largest value.
 
     Notes
     -----
-    16-point Gauss-Legendre panels of at most two cycles each, summed by a type-3 non-uniform FFT.
+    Gauss-Legendre quadrature with 16 points per panel of at most two cycles. A type-3 non-uniform
+    FFT computes the sum.
     """
     edges = np.asarray(edges, dtype=np.float64)
     at = np.asarray(at, dtype=np.float64)

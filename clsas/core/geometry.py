@@ -1,4 +1,4 @@
-"""Path lengths between transmitter, point and receiver: the one place where ranges are computed."""
+"""Path lengths between transmitter, point and receiver. All ranges are computed here."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ def legs_m(
     rx_velocity_m_s: ArrayLike | None = None,
     sound_speed_m_s: float | None = None,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the outward (tx to point) and the inward (point to rx) path length.
+    """Return the path lengths from transmitter to point and from point to receiver.
 
     Parameters
     ----------
     points_m, tx_m, rx_m : array_like, [..., 3]
-        Positions in metres; leading axes broadcast. The receiver's is that at transmission.
+        Positions in metres; leading axes broadcast. The receiver's position is at transmission.
     rx_velocity_m_s : array_like, [..., 3], optional
-        Velocity of the receiver while the sound travels. None: it stands still ("stop and hop").
+        Velocity of the receiver while the sound travels. None is stop-and-hop.
     sound_speed_m_s : float, optional
-        Needed with a velocity, and only then.
+        Required with a velocity.
 
     Returns
     -------
@@ -32,14 +32,14 @@ def legs_m(
     Raises
     ------
     ValueError
-        If a velocity comes without a sound speed or is not below it, or a last axis is not 3.
+        If a velocity is given without a sound speed or is not below it, or a last axis is not 3.
 
     Notes
     -----
-    When the sound reaches the point, the receiver has moved to rx + b R, where R is the outward
-    leg and b = v/c. With d = x - rx - b R, the inward leg l solves |d - b l| = l, that is
-    (1 - b.b) l^2 + 2 (d.b) l - d.d = 0. Its positive root below is free of cancellation for any
-    speed small against that of sound, and is exactly |x - rx| at rest.
+    When the sound reaches the point, the receiver has moved to rx + b R, with R the outward path
+    length and b = v/c. With d = x - rx - b R, the return path length l satisfies |d - b l| = l, or
+    (1 - b.b) l^2 + 2 (d.b) l - d.d = 0. The formula for its positive root is free of cancellation
+    for speeds far below the sound speed, and equals |x - rx| exactly at rest.
     """
     points, tx, rx = (
         _vectors(name, value)
@@ -72,8 +72,8 @@ def bistatic_range_m(
 ) -> NDArray[np.float64]:
     """Return half the two-way path, rho = (|x - tx| + |x - rx|)/2, in metres.
 
-    The two-way delay is 2 rho/c. Parameters, errors and the motion during flight are those of
-    `legs_m`; the result is float64 with the broadcast leading shape.
+    The two-way delay is 2 rho/c. Parameters, exceptions and the motion during flight are those of
+    `legs_m`. The result is float64 with the broadcast leading shape.
     """
     out, back = legs_m(points_m, tx_m, rx_m, rx_velocity_m_s, sound_speed_m_s)
     return 0.5 * (out + back)
@@ -86,9 +86,10 @@ def pairwise_range_m(
     rx_velocity_m_s: NDArray[np.float64] | None = None,
     sound_speed_m_s: float | None = None,
 ) -> NDArray[np.float64]:
-    """Return `bistatic_range_m` of every point and channel, float64 [points, channels].
+    """Return `bistatic_range_m` for every pair of a point and a channel, [points, channels].
 
-    Takes points [points, 3] and channels [channels, 3]; at rest it needs no memory for vectors.
+    Points are [points, 3] and channels [channels, 3]. For receivers at rest no memory is needed for
+    [points, channels, 3].
     """
     if rx_velocity_m_s is not None:
         return bistatic_range_m(points_m[:, None], tx_m, rx_m, rx_velocity_m_s, sound_speed_m_s)

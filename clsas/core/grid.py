@@ -1,4 +1,4 @@
-"""Where to image: a plane of pixels, a plane with heights, or arbitrary points."""
+"""Pixel grids: a plane, a plane with heights, or arbitrary points."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ from numpy.typing import ArrayLike, NDArray
 from clsas.core import validate
 
 _ALL = slice(None)
-_PARALLEL = 1e-12  # sine of the angle between steps: float64 leaves 1e-16
+_PARALLEL = 1e-12  # sine of the angle between parallel steps; float64 rounds to 1e-16
 
 
 class Axis(NamedTuple):
-    """One side of a plane: along which coordinate it runs, and where its pixels lie.
+    """One side of a plane: the coordinate along it, and the positions of its pixels.
 
     Attributes
     ----------
     name : str
-        "x", "y" or "z" where the side is parallel to that coordinate, else "along columns" or
-        "along rows".
+        "x", "y" or "z" if the side is parallel to that coordinate, else "along columns" or "along
+        rows".
     places_m : ndarray of float64
-        That coordinate of every column (or row); else its distance from the first one. Metres.
+        That coordinate for every column (or row), or the distance from the first one, metres.
     """
 
     name: str
@@ -33,7 +33,7 @@ class Axis(NamedTuple):
 
     @property
     def step_m(self) -> float:
-        """Distance from one place to the next, metres: negative where the coordinate falls."""
+        """Distance between pixels, metres; negative if the coordinate decreases."""
         return float(self.places_m[-1] - self.places_m[0]) / max(len(self.places_m) - 1, 1)
 
 
@@ -41,13 +41,13 @@ class Axis(NamedTuple):
 class Grid:
     """Pixel positions of an image, in metres (x along-track, y across-track, z up).
 
-    Made by `Grid.plane`, `Grid.oriented`, `Grid.height_map` or `Grid.points`. On a plane, pixel
+    Use `Grid.plane`, `Grid.oriented`, `Grid.height_map` or `Grid.points`. On a plane, pixel
     [row, column] lies at
 
         origin_m + row row_step_m + column column_step_m (+ height_m[row, column] along z).
 
-    All coordinates are float64, so that UTM-sized ones (1e7 m) keep nanometres. Arrays that need
-    no conversion are not copied: do not write into them afterwards.
+    All coordinates are float64, which resolves UTM-sized ones (1e7 m) to nanometres. Arrays that
+    need no conversion are not copied, so do not write into them afterwards.
 
     Attributes
     ----------
@@ -56,7 +56,7 @@ class Grid:
     shape : tuple of int
         Shape of the image: (rows, columns), or that of the points.
     height_m : ndarray of float64, shape [rows, columns], or None
-        Height of every pixel over the plane, added to z.
+        Height of every pixel above the plane, added to z.
     points_m : ndarray of float64, shape [*shape, 3], or None
         Arbitrary positions.
     """
@@ -118,16 +118,16 @@ class Grid:
         Parameters
         ----------
         x, y : (start, stop, count)
-            Centres of the first and the last pixel, metres, and number of pixels, as in
-            `numpy.linspace`. With one pixel, `start` is where it lies.
+            Centres of the first and the last pixel, metres, and number of pixels, as for
+            `numpy.linspace`. A single pixel lies at `start`.
         z : float
             Height of the plane, metres.
 
         Raises
         ------
         TypeError, ValueError
-            If an axis is not (start, stop, count) with finite ends, that differ where there is
-            more than one pixel.
+            If an axis is not (start, stop, count) with finite ends, or has several pixels and
+            equal ends.
         """
         x_start, x_step, columns = _axis("x", x)
         y_start, y_step, rows = _axis("y", y)
@@ -142,14 +142,14 @@ class Grid:
         column_step_m: ArrayLike,
         shape: tuple[int, int],
     ) -> Self:
-        """Return a plane of any direction.
+        """Return a plane of any orientation.
 
         Parameters
         ----------
         origin_m : array_like, shape [3]
             Position of pixel [0, 0], metres.
         row_step_m, column_step_m : array_like, shape [3]
-            From one pixel to the next row, and to the next column, metres. They need not be
+            Steps from one pixel to the next row, and to the next column, metres. They need not be
             perpendicular.
         shape : (rows, columns)
             Number of pixels.
@@ -157,8 +157,8 @@ class Grid:
         Raises
         ------
         TypeError, ValueError
-            If an argument has a wrong kind or shape or is not finite, or the steps are zero or
-            parallel, so that pixels would coincide.
+            If an argument has the wrong type or shape or is not finite, or if pixels would
+            coincide because steps are zero or parallel.
         """
         return cls(origin_m, row_step_m, column_step_m, shape)
 
@@ -176,11 +176,11 @@ class Grid:
         Raises
         ------
         TypeError, ValueError
-            If the points are not finite real numbers, or there is none, or the last axis is not
-            of length 3.
+            If the points are not finite real numbers, there is none, or the last axis does not have
+            length 3.
         """
-        wanted = (*(None,) * max(np.ndim(points_m) - 1, 1), 3)
-        checked = validate.array("points_m", points_m, np.float64, wanted)
+        shape = (*(None,) * max(np.ndim(points_m) - 1, 1), 3)
+        checked = validate.array("points_m", points_m, np.float64, shape)
         return cls(None, None, None, checked.shape[:-1], points_m=checked)
 
     def with_height(self, height_m: ArrayLike) -> Self:
@@ -199,7 +199,7 @@ class Grid:
 
     @property
     def is_planar(self) -> bool:
-        """Whether the pixels lie on one plane by equal steps."""
+        """Whether the pixels lie on a plane with equal steps."""
         return self.points_m is None and self.height_m is None
 
     @property
@@ -209,7 +209,7 @@ class Grid:
 
     @property
     def has_axes(self) -> bool:
-        """Whether columns run along x and rows along y, so that `axes_m` describes them."""
+        """Whether columns run along x and rows along y, so that the grid has `axes_m`."""
         if self.points_m is not None:
             return False
         return not (np.any(self.column_step_m[1:]) or np.any(self.row_step_m[[0, 2]]))
@@ -233,7 +233,7 @@ class Grid:
 
     @property
     def sides(self) -> tuple[Axis, Axis]:
-        """The axes of a plane or height map: what runs along its columns, and along its rows.
+        """The axes of a plane or height map, along its columns and along its rows.
 
         Raises
         ------
@@ -249,7 +249,7 @@ class Grid:
         return across, self._side("along rows", self.row_step_m, rows, free="".join(free))
 
     def _side(self, name: str, step_m: NDArray[np.float64], count: int, free: str) -> Axis:
-        """Return the axis of some steps; without any it is that of the first `free` coordinate."""
+        """Return the axis of one side; if its step is zero, along the first `free` coordinate."""
         along = np.flatnonzero(np.abs(step_m) > _PARALLEL * np.abs(step_m).max())
         if len(along) > 1:
             return Axis(name, np.arange(count) * float(np.linalg.norm(step_m)))
@@ -262,7 +262,7 @@ class Grid:
         Parameters
         ----------
         rows, columns : slice
-            Which rows and columns (the first two axes of points).
+            Rows and columns to return (the first two axes of points).
         """
         if self.points_m is not None:
             return self.points_m[self._index(rows, columns)].copy()
@@ -274,7 +274,7 @@ class Grid:
         return positions
 
     def at(self, index: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the positions of some pixels, counted row by row, float64 [..., 3], metres."""
+        """Return the positions of pixels with row-major indices, float64 [..., 3], metres."""
         if self.points_m is not None:
             return self.points_m.reshape(-1, 3)[index]
         row, column = np.divmod(index[..., None], self.shape[1])
@@ -284,16 +284,16 @@ class Grid:
         return positions
 
     def spread(self, most: int) -> NDArray[np.float64]:
-        """Return some pixels all over the grid, its edges too, [n, 3]: so many a side at most."""
-        places = [np.unique(np.linspace(0, n - 1, most).round().astype(int)) for n in self.shape]
-        return self.at(np.ravel_multi_index(np.ix_(*places), self.shape).ravel())
+        """Return sample points all over the grid, edges included, [n, 3]; up to `most` a side."""
+        indices = [np.unique(np.linspace(0, n - 1, most).round().astype(int)) for n in self.shape]
+        return self.at(np.ravel_multi_index(np.ix_(*indices), self.shape).ravel())
 
     def window(self, rows: slice = _ALL, columns: slice = _ALL) -> Self:
         """Return the sub-grid of some rows and columns (the first two axes of points).
 
-        Its pixels are this grid's `positions_m(rows, columns)`: the first bit for bit, the others
-        of a plane to the last bit of a float64 coordinate. `image.pixels[rows, columns]` is what
-        belongs to it.
+        Its pixels are this grid's `positions_m(rows, columns)`: the first one bit for bit, the
+        others of a plane to the last bit of a float64 coordinate. `image.pixels[rows, columns]` are
+        the pixels on it.
 
         Raises
         ------
@@ -320,7 +320,7 @@ class Grid:
         )
 
     def _index(self, rows: slice, columns: slice) -> tuple[slice, ...]:
-        """Index of some rows and columns of points, which may have one axis only."""
+        """Index of rows and columns of points, which may have only one axis."""
         if len(self.shape) > 1:
             return rows, columns
         if columns != _ALL:
@@ -352,14 +352,14 @@ def _axis(name: str, axis: tuple[float, float, int]) -> tuple[float, float, int]
 def _check_steps(
     row_step_m: NDArray[np.float64], column_step_m: NDArray[np.float64], shape: tuple[int, ...]
 ) -> None:
-    """Refuse steps that put two pixels of a plane at one place."""
+    """Raise ValueError if the steps put two pixels of a plane at the same position."""
     steps = {"row_step_m": row_step_m, "column_step_m": column_step_m}
     for (name, step), count in zip(steps.items(), shape, strict=True):
         if count > 1 and not step.any():
             raise ValueError(f"{name} must not be zero m, got {step} for {count} pixels")
     if min(shape) == 1:
         return
-    # Of steps of any length, by the sine of the angle between them.
+    # Compare directions, since steps may have any length.
     directions = (step / np.abs(step).max() for step in steps.values())
     sine = np.linalg.norm(np.cross(*(d / np.linalg.norm(d) for d in directions)))
     if sine < _PARALLEL:

@@ -1,4 +1,4 @@
-"""How far two images differ."""
+"""Error of one image relative to another."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from clsas.core import validate
 from clsas.core.grid import Grid
 from clsas.core.image import Image
 
-# Pixels along either side over which levels are averaged. A single pixel of speckle is dark by
-# chance: the darkest tenth would be its nulls, 13 dB below the mean. Over 81 pixels, some 20 of
-# them independent, the mean varies by 1 dB.
+# Pixels along either side over which levels are averaged. Single pixels of speckle are dark by
+# chance: the darkest tenth would be its nulls, 13 dB below the mean. The mean over 81 pixels, of
+# which some 20 are independent, varies by 1 dB.
 _AROUND = 9
 
 
@@ -25,16 +25,15 @@ def relative_error_db(
     Parameters
     ----------
     image, reference : Image or array_like
-        Complex images of one shape and, where both are Images, of the same pixel positions.
+        Complex images of one shape. Two Images must also have the same pixel positions.
     darkest : float, optional
-        Take both norms over the darkest pixels of the reference only, this share of them (0.1 is
-        a tenth): the error in shadows, against their own level. See `darkest_pixels` for which
-        these are.
+        Take both norms over this share of the pixels, the darkest of the reference (0.1 is a
+        tenth). This is the error in shadows, relative to their own level; see `darkest_pixels`.
 
     Returns
     -------
     float
-        -inf when they are equal.
+        The error; -inf if the images are equal.
 
     Raises
     ------
@@ -54,7 +53,7 @@ def relative_error_db(
     if darkest is not None:
         chosen = darkest_pixels(wanted, darkest)
         given, wanted = given[chosen], wanted[chosen]
-    # Scaled by the greatest part, so that no square overflows or vanishes.
+    # Scaled by the largest part, so that no square overflows or underflows.
     given, wanted = given.view(np.float64), wanted.view(np.float64)
     scale = max(np.abs(given).max(), np.abs(wanted).max())
     error = given / scale - wanted / scale
@@ -64,7 +63,7 @@ def relative_error_db(
 
 
 def complex_values(name: str, image: Image | ArrayLike) -> NDArray[np.complex128]:
-    """Return complex values, checked, in double precision."""
+    """Return checked complex values in double precision."""
     values = np.asanyarray(image.pixels if isinstance(image, Image) else image)
     if values.dtype.kind in "iuf":
         values = values.astype(np.complex128)
@@ -72,13 +71,13 @@ def complex_values(name: str, image: Image | ArrayLike) -> NDArray[np.complex128
 
 
 def _check_one_grid(image: Grid, reference: Grid) -> None:
-    """Refuse grids of one shape whose pixels lie elsewhere."""
+    """Raise ValueError unless two grids of one shape have the same pixel positions."""
     part = [slice(None)] * 2
     if image.is_planar and reference.is_planar:
         part = [slice(None, None, max(count - 1, 1)) for count in image.shape]  # the corners
-    places = reference.positions_m(*part)
-    apart_m = np.abs(image.positions_m(*part) - places).max()
-    if apart_m > 1e-9 + 1e-14 * np.abs(places).max():
+    positions_m = reference.positions_m(*part)
+    apart_m = np.abs(image.positions_m(*part) - positions_m).max()
+    if apart_m > 1e-9 + 1e-14 * np.abs(positions_m).max():
         raise ValueError(
             "image and reference must lie on one grid, got pixel positions that are up to "
             f"{apart_m:g} m apart"
@@ -91,22 +90,22 @@ def _norm_db(values: NDArray[np.float64]) -> float:
 
 
 def darkest_pixels(image: NDArray[np.complexfloating], darkest: float) -> NDArray[np.bool_]:
-    """Return which pixels are the darkest ones.
+    """Return which pixels are the darkest ones, bool with the image's shape.
 
-    A pixel is as dark as the mean intensity of the 9 x 9 pixels around it, so that shadows count
-    and nulls of speckle do not; pixels with one axis, which may lie anywhere, count one by one.
-    Pixels of exactly zero were not imaged: they do not count.
+    The level of a pixel is the mean intensity of the 9 x 9 pixels around it, so that shadows count
+    and nulls of speckle do not. With one axis, whose pixels may lie anywhere, it is the pixel's own
+    intensity. Pixels of exactly zero were not imaged and do not count.
 
     Parameters
     ----------
     image : complex array
     darkest : float
-        Share of the pixels, above 0 to 1.
+        Share of the pixels, above 0 and at most 1.
 
     Raises
     ------
     TypeError, ValueError
-        If `darkest` is not allowed, or the image is zero everywhere.
+        If `darkest` is outside its limits, or the image is zero everywhere.
     """
     darkest = validate.number("darkest", darkest, above=0.0, most=1.0)
     imaged = image != 0
@@ -121,11 +120,11 @@ def darkest_pixels(image: NDArray[np.complexfloating], darkest: float) -> NDArra
 
 
 def levels(image: NDArray[np.complexfloating]) -> NDArray[np.float64]:
-    """Return the mean intensity around every pixel, over that of the brightest pixel.
+    """Return the mean intensity around every pixel, relative to that of the brightest pixel.
 
     The image must not be zero everywhere.
     """
-    from scipy import ndimage  # takes a while to import, and few need it
+    from scipy import ndimage  # slow to import, and rarely needed
 
     amplitude = np.abs(image)
     intensity = (amplitude / amplitude.max()) ** 2

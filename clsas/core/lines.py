@@ -1,4 +1,4 @@
-"""Range lines: compressed echoes with their geometry, the one input of every imager."""
+"""Range lines: compressed echoes with their geometry, the input of every imager."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _GOLDEN = (np.sqrt(5) - 1) / 2
 
 @dataclass(frozen=True, eq=False)
 class RangeLines:
-    """Pulse-compressed complex echoes of every channel, and where each was taken.
+    """Pulse-compressed complex echoes of every channel, with the channels' geometry.
 
     A channel is one (ping, receiver) pair, in ping-major order. Range is half the two-way path,
     rho(x) = (|x - tx| + |x - rx|) / 2, so that monostatic range is range. A point of amplitude A
@@ -29,16 +29,16 @@ class RangeLines:
     Parameters
     ----------
     samples : array_like of complex, shape [channels, length]
-        Kept as complex64.
+        Complex samples, stored as complex64.
     first_range_m : float or array_like, shape [channels]
-        Range of each channel's first sample, metres; one number stands for every channel.
+        Range of each channel's first sample, metres; one number applies to all channels.
     range_step_m : float
         Range between samples, metres: sound_speed_m_s / (2 sample rate).
     tx_m, rx_m : array_like of float, shape [channels, 3] or [3]
-        Transmitter and receiver positions (x, y, z) at transmission, metres, kept as float64;
-        one position stands for every channel. Monostatic is `rx_m=tx_m`.
+        Transmitter and receiver positions (x, y, z) at transmission, metres, stored as float64; one
+        position applies to all channels. A monostatic sonar has `rx_m=tx_m`.
     carrier_hz : float
-        Frequency that was mixed out, hertz; 0 when the lines still carry their carrier.
+        Frequency that was mixed out, hertz; 0 if the lines still have their carrier.
     sound_speed_m_s : float
         Speed of the waves, metres per second.
     rx_velocity_m_s : array_like of float, shape [channels, 3] or [3], optional
@@ -48,17 +48,16 @@ class RangeLines:
     Raises
     ------
     TypeError
-        If an argument is of a wrong kind; real samples, which hold no phase, among them.
+        If an argument has the wrong type. This includes real samples, which have no phase.
     ValueError
         If shapes disagree, an array is empty, a value is NaN or infinite, a step or speed is not
-        positive, the carrier is negative, or a receiver is not slower than the waves. Also if
-        wider samples are all so small or large that complex64 loses their digits.
+        positive, the carrier is negative, a receiver is not slower than the waves, or complex64
+        cannot represent the samples to its precision.
 
     Notes
     -----
-    Arrays that need no conversion are not copied, since samples are large: the fields are
-    read-only views of them. Do not write into your own arrays afterwards; what is written is
-    not checked again.
+    Arrays that need no conversion are not copied, since samples are large; the fields are read-only
+    views. Do not write into your arrays afterwards, since new values are not checked.
     """
 
     samples: NDArray[np.complex64]
@@ -127,12 +126,12 @@ class RangeLines:
 
     @property
     def phase_centres_m(self) -> NDArray[np.float64]:
-        """Middles between transmitters and receivers, metres, shape [channels, 3]."""
+        """Midpoints between transmitters and receivers, metres, shape [channels, 3]."""
         return (self.tx_m + self.rx_m) / 2
 
     @property
     def ping_starts(self) -> NDArray[np.int64]:
-        """First channel of every ping: successive channels of one transmitter position are one."""
+        """First channel of every ping; consecutive channels with one tx position are a ping."""
         return np.flatnonzero(np.append(True, (np.diff(self.tx_m, axis=0) != 0).any(axis=1)))
 
     @property
@@ -142,7 +141,7 @@ class RangeLines:
 
     @property
     def carrier_cycles_per_m(self) -> float:
-        """Phase of the carrier per metre of range (two ways), cycles."""
+        """Phase of the carrier per metre of range (two-way), cycles."""
         return 2 * self.carrier_hz / self.sound_speed_m_s
 
     @property
@@ -156,13 +155,12 @@ class RangeLines:
         Parameters
         ----------
         channels : slice or array_like
-            Which channels: a slice (samples are then shared, not copied), indices, or a mask of
-            bools.
+            A slice (samples are then shared, not copied), indices, or a mask of bools.
 
         Raises
         ------
         IndexError
-            If an index is outside the channels.
+            If an index is out of range.
         TypeError
             If `channels` is neither a slice nor whole numbers nor bools.
         ValueError
@@ -187,14 +185,14 @@ class RangeLines:
         )
 
     def without_samples(self) -> RangeLines:
-        """Return everything about these lines but their samples: of each there is one, 0."""
+        """Return these lines with a single sample per channel, which is zero."""
         return replace(self, samples=np.zeros((self.channels, 1), np.complex64))
 
 
 def some_channels(count: int, most: int) -> NDArray[np.int64]:
-    """Return about so many channels of a number, evenly but not regularly.
+    """Return up to `most` of `count` channels, spread evenly but at irregular intervals.
 
-    Arrays come in regular steps.
+    Regular intervals could always pick the same receiver of an array.
     """
     if count <= most:
         return np.arange(count)
@@ -203,12 +201,12 @@ def some_channels(count: int, most: int) -> NDArray[np.int64]:
 
 
 def wavelength_m(lines: RangeLines) -> float:
-    """Return the wavelength of the carrier, infinite without one."""
+    """Return the wavelength of the carrier, metres; infinite without a carrier."""
     return lines.sound_speed_m_s / lines.carrier_hz if lines.carrier_hz else math.inf
 
 
 def fastest(lines: RangeLines) -> float:
-    """Return the speed of the fastest receiver over that of sound."""
+    """Return the speed of the fastest receiver relative to the sound speed."""
     if lines.rx_velocity_m_s is None:
         return 0.0
     return float(np.linalg.norm(lines.rx_velocity_m_s, axis=1).max()) / lines.sound_speed_m_s

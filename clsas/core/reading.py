@@ -1,4 +1,4 @@
-"""Reading files that users hand over: their kind, size and nesting are checked first."""
+"""Reading of users' files, after checks of their type, size and nesting."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from typing import Any
 
 from clsas.core import validate
 
-# Memory that parsing takes per byte of TOML or JSON: an empty list, "[],", is 64 bytes of Python.
+# Memory for parsing one byte of TOML or JSON: an empty list, "[],", takes 64 bytes in Python.
 _PARSED_BYTES = 32
-_NO_FILE = {
+_NOT_ORDINARY = {
     stat.S_ISFIFO: "a pipe",
     stat.S_ISSOCK: "a socket",
     stat.S_ISCHR: "a device",
@@ -22,25 +22,25 @@ _NO_FILE = {
 
 
 def check_ordinary(path: str | os.PathLike) -> None:
-    """Raise ValueError if a path is a pipe, a socket or a device: reading those may never end.
+    """Raise ValueError if a path is a pipe, a socket or a device, whose reading may never end.
 
-    Raises OSError if there is nothing at the path.
+    Raises OSError if the path does not exist.
     """
     mode = os.stat(path).st_mode
-    for is_kind, kind in _NO_FILE.items():
+    for is_kind, kind in _NOT_ORDINARY.items():
         if is_kind(mode):
             raise ValueError(f"{os.fspath(path)} must be an ordinary file, got {kind}")
 
 
 def read_bytes(path: str | os.PathLike) -> bytes:
-    """Return what an ordinary file holds, to be parsed.
+    """Return the content of an ordinary file, to be parsed.
 
     Raises
     ------
     ValueError
-        If it is not an ordinary file, or too large to be parsed in this machine's memory.
+        If the file is not an ordinary one, or too large to be parsed in this machine's memory.
     OSError
-        If it cannot be read.
+        If the file cannot be read.
     """
     path = Path(path)
     check_ordinary(path)
@@ -49,7 +49,7 @@ def read_bytes(path: str | os.PathLike) -> bytes:
 
 
 def parse_toml(text: bytes) -> dict[str, Any]:
-    """Return the tables of a TOML text; raises ValueError if it is none, or nested too deep."""
+    """Return the tables of a TOML text; raises ValueError if it is invalid or nested too deep."""
     try:
         return tomllib.loads(text.decode())
     except RecursionError:
@@ -57,7 +57,7 @@ def parse_toml(text: bytes) -> dict[str, Any]:
 
 
 def parse_json(text: str | bytes) -> Any:
-    """Return what a JSON text holds; raises ValueError if it is none, or nested too deep."""
+    """Return the value of a JSON text; raises ValueError if it is invalid or nested too deep."""
     try:
         return json.loads(text)
     except RecursionError:

@@ -1,8 +1,8 @@
 """Work in threads that Ctrl-C can end at any time.
 
-Python raises `KeyboardInterrupt` wherever the main thread happens to be, even between taking a lock
-of `threading` and the code that gives it back. Threads that need the lock then wait for ever. So
-Ctrl-C is held back while the main thread uses what it shares with other threads.
+Python raises `KeyboardInterrupt` anywhere in the main thread, even between acquiring a lock and the
+code that releases it. Threads that need the lock then wait for ever. Ctrl-C is therefore held back
+while the main thread uses objects that it shares with other threads.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from typing import TypeVar
 
 from clsas.core import validate
 
-_POLL_S = 0.1  # how long Ctrl-C may be held back
+_POLL_S = 0.1  # longest time for which waiting holds Ctrl-C back
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -29,7 +29,7 @@ Result = TypeVar("Result")
 def uninterrupted() -> Iterator[None]:
     """Hold Ctrl-C back until the end of the block, which must be short."""
     handler = signal.getsignal(signal.SIGINT)
-    # Signals interrupt the main thread only, and only by a handler of Python's.
+    # Only handlers of Python interrupt, and only the main thread.
     if threading.current_thread() is not threading.main_thread() or not callable(handler):
         yield
         return
@@ -44,7 +44,7 @@ def uninterrupted() -> Iterator[None]:
 
 
 def wait(futures: Collection[Future], timeout: float | None = None) -> set[Future]:
-    """Return the futures that are done once any is, or none after `timeout` seconds."""
+    """Wait until any future is done, and return those that are; none after `timeout` seconds."""
     left = timeout
     while True:
         with uninterrupted():
@@ -59,16 +59,16 @@ def wait(futures: Collection[Future], timeout: float | None = None) -> set[Futur
 def in_threads(
     function: Callable[[Item], Result], items: Iterable[Item], workers: int | None = None
 ) -> Iterator[Result]:
-    """Yield the function of every item in order, computed by threads; stop early if closed.
+    """Yield the results of a function for every item, in order, computed by threads.
 
     Parameters
     ----------
     function : callable
-        Called with one item. Ctrl-C waits for the calls that have begun.
+        Called with one item. Ctrl-C, or closing the generator, waits for the calls that have begun.
     items : iterable
-        Taken whole before the first result.
+        Read completely before the first result.
     workers : int, optional
-        Threads, as many as the machine has cores by default.
+        Number of threads; by default as many as the machine has cores.
     """
     if workers is not None:
         workers = validate.count("workers", workers)

@@ -1,6 +1,6 @@
-"""Checks of user input, made once where it enters the library.
+"""Checks of user input, at the point where it enters the library.
 
-Every check raises one exception that names the argument, what was given and what is allowed.
+Every check raises one exception that names the argument, its value and what is allowed.
 """
 
 from __future__ import annotations
@@ -18,19 +18,19 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
-_LONGEST = 100  # characters of what was given, in a message
-_LONGEST_LINE = 1000  # characters of a message's line
-# Largest parts of a value that a message shows; lists within lists end in "...".
+_LONGEST = 100  # characters of a value in a message
+_LONGEST_LINE = 1000  # characters of a line of a message
+# Largest parts of a value in a message; longer parts and deeper lists end in "...".
 _REPR = reprlib.Repr()
 _REPR.maxlevel = 4
 _REPR.maxlist = _REPR.maxtuple = _REPR.maxdict = _REPR.maxset = _REPR.maxfrozenset = 20
 _REPR.maxstring = _REPR.maxother = _REPR.maxlong = 2 * _LONGEST
-# Files that hold the most memory of a process's control group, version 2 and 1.
+# Files with the memory limit of a process's control group, versions 2 and 1.
 _GROUP_LIMITS = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes")
 
 
 class ClsasWarning(UserWarning):
-    """A result that is valid but probably not what was meant, with what was done instead."""
+    """The result is valid but probably not the intended one."""
 
 
 def warn(message: str) -> None:
@@ -109,7 +109,7 @@ def count(name: str, value: int, *, least: int = 1, most: int | None = None) -> 
 
 
 def one_of(name: str, value: str, allowed: Sequence[str]) -> str:
-    """Return `value` if it is one of `allowed`; raises ValueError naming them all."""
+    """Return `value`; raises ValueError unless it is one of `allowed`."""
     if value not in allowed:
         raise ValueError(
             f"{name} must be one of {', '.join(map(repr, allowed))}, got {shown(value)}"
@@ -118,14 +118,14 @@ def one_of(name: str, value: str, allowed: Sequence[str]) -> str:
 
 
 def instance(name: str, value: object, *kinds: type) -> None:
-    """Raise TypeError unless `value` is of one of the classes `kinds`."""
+    """Raise TypeError unless `value` is an instance of one of the classes `kinds`."""
     if not isinstance(value, kinds):
         names = " or ".join(kind.__name__ for kind in kinds)
         raise TypeError(f"{name} must be of type {names}, got {type(value).__name__}")
 
 
 def path(name: str, value: object) -> Path:
-    """Return `value` as a path; raises TypeError unless it is one, ValueError if it is empty."""
+    """Return `value` as a Path; raises TypeError for other types, ValueError if it is empty."""
     if not isinstance(value, (str, os.PathLike)):
         raise TypeError(f"{name} must be a path, got {shown(value)}")
     if not os.fspath(value):
@@ -134,34 +134,34 @@ def path(name: str, value: object) -> Path:
 
 
 def suffix(name: str, value: Path, *allowed: str) -> None:
-    """Raise ValueError if a file's name ends as one of another format.
+    """Raise ValueError if a file's name has the suffix of another format.
 
-    A name without a suffix, such as `image`, goes with any format.
+    A name without a suffix, such as `image`, is allowed.
     """
     if value.suffix and value.suffix.lower() not in allowed:
         raise ValueError(f"{name} must end in {' or '.join(allowed)}, got {shown(str(value))}")
 
 
 def progress(given: object) -> None:
-    """Raise TypeError unless `given`, a progress argument, can be called or is None."""
+    """Raise TypeError unless `given`, a progress argument, is callable or None."""
     if not (given is None or callable(given)):
         raise TypeError(f"progress must be a function or None, got {shown(given)}")
 
 
 def shown(value: object) -> str:
-    """Return a value as a message shows it: shortened, and without control characters."""
+    """Return a value as text for a message: shortened, and without control characters."""
     try:
         text = _REPR.repr(value)
-    except Exception:  # what a stranger's __repr__ raises must not hide the message
+    except Exception:  # an error in another library's __repr__ must not hide the message
         text = f"<{type(value).__name__}>"
     text = text if len(text) <= _LONGEST else f"{text[: _LONGEST - 3]}..."
     return printable(text)
 
 
 def printable(text: str) -> str:
-    """Return a text whose control characters but for line feeds are escaped, its lines shortened.
+    """Return a text with shortened lines and escaped control characters, except line feeds.
 
-    A terminal obeys control characters, and names of files may hold any.
+    Terminals obey control characters, and names of files may contain any.
     """
     escaped = "".join(
         c if c.isprintable() or c == "\n" else c.encode("unicode_escape").decode() for c in text
@@ -173,10 +173,10 @@ def printable(text: str) -> str:
 
 
 def memory(name: str, size_bytes: float) -> None:
-    """Raise ValueError if what `name` asks for is larger than the memory of this process.
+    """Raise ValueError if the argument `name` requires more memory than this process may have.
 
-    That is the machine's, or less where the process's control group or address space is limited.
-    Where the system does not tell nothing is refused.
+    That is the machine's memory, or the limit of the process's control group or address space.
+    Nothing is refused if the system does not report it.
     """
     available = _memory_bytes()
     if not size_bytes <= available:  # nor NaN
@@ -191,7 +191,7 @@ def memory(name: str, size_bytes: float) -> None:
 
 
 def _memory_bytes() -> float:
-    """Return the most memory that this process may have, infinite where that is not told."""
+    """Memory that this process may have, infinite if the system does not report it."""
     limits = [math.inf]
     if "SC_PHYS_PAGES" in getattr(os, "sysconf_names", ()):
         limits.append(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
@@ -221,14 +221,14 @@ def array(
     name : str
         The argument's name, for the message.
     value : array_like
-        What was given. Converted when its kind allows it (integers and other float widths to
-        float, complex128 to complex64); a caller's own array is never modified.
+        The argument. Integers and other floats are converted to `dtype`, complex128 to complex64. A
+        caller's own array is never modified.
     dtype : dtype
-        Wanted type. A real array is refused where complex is due, and the reverse.
+        Required type. Real arrays are refused for complex types, and the reverse.
     shape : tuple of int or None
-        Wanted shape; None stands for any length of at least 1.
+        Required shape; None stands for any length of at least 1.
     broadcast : bool
-        A value of shape `shape[1:]` stands for every entry along the first axis.
+        Whether a value of shape `shape[1:]` is repeated along the first axis.
 
     Raises
     ------
@@ -236,11 +236,11 @@ def array(
         If the values are not numbers of a kind that fits `dtype`.
     ValueError
         If the shape differs, an axis is empty, a value is NaN, infinite or masked, or `dtype`
-        cannot hold the values: they overflow, or all are too small to be told apart.
+        cannot represent the values: they overflow, or all of them underflow.
 
     Notes
     -----
-    What needs no conversion is not copied: the result is a read-only view of it.
+    An array that needs no conversion is not copied; the result is a read-only view of it.
     """
     dtype = np.dtype(dtype)
     try:
@@ -273,7 +273,7 @@ def array(
     with np.errstate(over="ignore", under="ignore"):
         result = np.ascontiguousarray(given, dtype=dtype)
     with np.errstate(over="ignore", invalid="ignore"):
-        finite = np.isfinite(np.add.reduce(result, axis=None))  # else sums may merely be too large
+        finite = np.isfinite(np.add.reduce(result, axis=None))  # or the sum overflowed
     if not finite and not np.isfinite(result).all():
         bad = int(np.size(result) - np.isfinite(result).sum())
         raise ValueError(
@@ -285,10 +285,10 @@ def array(
 
 
 def _check_narrowing(name: str, given: NDArray, dtype: np.dtype) -> None:
-    """Raise ValueError unless a narrower float type holds values to its precision.
+    """Raise ValueError unless a narrower float type represents the largest value to its precision.
 
-    What is small beside the largest value may become 0. From the least normal number on, the
-    largest one keeps all its digits, and the others what these leave.
+    The largest value must be a normal number of the type. Values that are small relative to it may
+    become 0.
     """
     kind = np.finfo(dtype)
     least, most = float(kind.tiny), float(kind.max)

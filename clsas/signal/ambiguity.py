@@ -1,7 +1,8 @@
-"""Errors that no imager can avoid, because the lines do not hold what an image needs.
+"""Errors that no imager can avoid, because the lines do not determine the image.
 
-Samples beyond the ends of a line are unknown, and so is which side of the guard band the energy in
-it belongs to. Every imager adds these errors to its prediction and warns where they are too large.
+Samples beyond the ends of a line are unknown. So is the side of the guard band to which energy
+inside it belongs. Every imager adds these errors to its prediction, and warns if they are too
+large.
 """
 
 from __future__ import annotations
@@ -20,11 +21,15 @@ from clsas.signal.spectrum import NEEDED_OVERSAMPLING, Spectrum
 from clsas.sonar.beam import BeamWindow
 from clsas.sonar.visibility import sines
 
-_AT_END, _END = 0.03, 4  # measured on noise that fills 40 to 90 % of the sampled band; samples
-_BESIDE = 5  # samples
-_CUT, _FADING = 0.01, 16  # a line fades if its last sample has less power than so many before it
-_THIN = 0.42  # cycles per sample: with a narrower half band, cuts are not felt beyond `_BESIDE`
-_CHANNELS, _PLACES = 64, 16  # sampled channels, and pixels along either side of a grid
+_AT_END = 0.03  # error near an end over its power; measured on noise in 40 to 90 % of the band
+_END = 4  # samples whose mean power is that of an end
+_NEAR_END = 5  # samples around an end within which interpolators differ
+_CUT, _FADING = (
+    0.01,
+    16,
+)  # an end fades if its power is below 1 % of the last 16 samples'
+_THIN = 0.42  # half bandwidth, cycles per sample, up to which a cut only affects `_NEAR_END`
+_CHANNELS, _POINTS = 64, 16  # sampled channels, and sample points along either side of the grid
 _MOST, _LEAST = 0.5, 1e-3  # shares of the allowed error power: above, warn; below, ignore
 
 
@@ -37,7 +42,7 @@ class Ambiguity:
     ends : float
         From samples beyond the ends of lines that do not fade.
     aliasing : float
-        From a band that fills all that is sampled: its edges cannot be told apart.
+        From edges of the band that alias, if it fills the whole sampled band.
     oversampling : float
         Sample rate over the width of the occupied band.
     """
@@ -48,36 +53,37 @@ class Ambiguity:
 
     @property
     def error_power(self) -> float:
-        """All of it."""
+        """Total relative error power."""
         return self.ends + self.aliasing
 
-    def rest_db(self, wanted_db: float, other_error: float = 0.0) -> float:
-        """Error left to everything else, dB, so that the whole image keeps `wanted_db`.
+    def rest_db(self, requested_db: float, other_error: float = 0.0) -> float:
+        """Error left for all other causes, dB, so that the whole image keeps `requested_db`.
 
-        `other_error` is power that is spent too. Where both take too much for that, it is
-        `wanted_db`; `warn` then warns.
+        `other_error` is the error power of causes that are already known. If these leave too
+        little, the result is `requested_db`, and `warn` warns.
         """
-        wanted, spent = power(wanted_db), self.error_power + other_error
-        if _LEAST * wanted < spent <= _MOST * wanted:
-            return in_db(wanted - spent)
-        return wanted_db
+        allowed, spent = power(requested_db), self.error_power + other_error
+        if _LEAST * allowed < spent <= _MOST * allowed:
+            return in_db(allowed - spent)
+        return requested_db
 
-    def warn(self, name: str, wanted_db: float) -> None:
-        """Warn where the error asked for by the argument `name` may be missed."""
-        wanted = power(wanted_db)
+    def warn(self, name: str, requested_db: float) -> None:
+        """Warn if the error requested by the argument `name` may be exceeded."""
+        allowed = power(requested_db)
 
         def outcome(error_power: float) -> str:
-            found_db = in_db(wanted + error_power)
-            return f"the error may be {found_db:.0f} dB in place of {name} {wanted_db:.3g} dB"
+            found_db = in_db(allowed + error_power)
+            return f"the error may be {found_db:.0f} dB in place of {name} {requested_db:.3g} dB"
 
-        if self.ends > _MOST * wanted:
+        if self.ends > _MOST * allowed:
             validate.warn(
                 "lines do not fade towards ends that the grid reaches, or their guard band is thin "
-                f"(oversampling {self.oversampling:.4g}) and the cut is felt farther inside: what "
-                f"pixels get depends on how lines are interpolated, so that {outcome(self.ends)}; "
+                f"(oversampling {self.oversampling:.4g}) and the cut affects samples farther "
+                f"inside: pixels depend on how lines are interpolated, so that "
+                f"{outcome(self.ends)}; "
                 "let the grid end before the lines, let the lines fade, or sample them more finely"
             )
-        if self.aliasing > _MOST * wanted:
+        if self.aliasing > _MOST * allowed:
             validate.warn(
                 "the lines' band fills all that is sampled, so that its edges may alias: "
                 f"oversampling is {self.oversampling:.4g}, more than {NEEDED_OVERSAMPLING:.4g} is "
@@ -93,9 +99,9 @@ def ambiguity(
     beam: BeamWindow | None = None,
     along: NDArray[np.float64] | None = None,
 ) -> Ambiguity:
-    """Error power that lines leave open in an image on a grid.
+    """Unavoidable error power of an image on a grid.
 
-    `along` are the track's directions for a beam, [channels, 3].
+    `along` holds the track's unit directions for a beam, [channels, 3].
     """
     ends = ends_error(lines, grid, spectrum, beam, along)
     return Ambiguity(ends, spectrum.aliasing, spectrum.oversampling)
@@ -112,28 +118,30 @@ def ends_error(
 
     Notes
     -----
-    Pixels within five samples of an end get what filters make of the cut, every filter another:
-    `_AT_END` of an end sample's power altogether. A thin guard band carries the cut farther: at m
-    samples from the end, the sinc interpolation of a component at distance d from the spectral
-    centre errs by 1/(2 pi m cos(pi d)) of its amplitude. Summed over the samples from `near` to
-    `far`, and over what a flat band of half width h holds beyond `_THIN`, that makes of an end
-    sample's power, unless lines fade
+    Within five samples of an end every interpolator responds differently to the cut. The total
+    error is `_AT_END` of an end sample's power. With a thin guard band the cut also affects samples
+    farther inside: m samples from the end, the sinc interpolation of a component at distance d from
+    the spectral centre has an error of 1/(2 pi m cos(pi d)) of its amplitude. Summed over the
+    samples from `near` to `far`, and over the part of a flat band of half width h beyond `_THIN`,
+    the error is
 
-        S/pi^2 (1/near - 1/far),  S = (tan(pi h) - tan(pi _THIN))/(4 pi h).
+        S/pi^2 (1/near - 1/far),  S = (tan(pi h) - tan(pi _THIN))/(4 pi h),
+
+    of an end sample's power, unless the lines fade.
     """
     some = some_channels(lines.channels, _CHANNELS)
-    part, points_m = lines.select(some), grid.spread(_PLACES)
+    part, points_m = lines.select(some), grid.spread(_POINTS)
     range_m = pairwise_range_m(
         points_m, part.tx_m, part.rx_m, part.rx_velocity_m_s, part.sound_speed_m_s
     )
-    place = (range_m - part.first_range_m) / part.range_step_m
-    seen = np.ones(place.shape, bool)
+    sample = (range_m - part.first_range_m) / part.range_step_m
+    visible = np.ones(sample.shape, bool)
     if beam is not None:
         low, high = beam.limits
         sine = sines(points_m, part.phase_centres_m, along[some]).T
-        seen = (sine > low) & (sine < high)
-    nearest = np.where(seen, place, np.inf).min(axis=0)
-    farthest = np.where(seen, place, -np.inf).max(axis=0)
+        visible = (sine > low) & (sine < high)
+    nearest = np.where(visible, sample, np.inf).min(axis=0)
+    farthest = np.where(visible, sample, -np.inf).max(axis=0)
     half_width = np.clip(0.5 / spectrum.oversampling, _THIN, 0.499)
     steepness = np.tan(np.pi * half_width) - np.tan(np.pi * _THIN)
     inside = steepness / (4 * np.pi**3 * half_width)
@@ -145,11 +153,11 @@ def ends_error(
         if not within.size:
             continue
         total += _mean_square(within) * len(within)
-        # From either end: its samples, and how far off the nearest and the farthest pixel are.
+        # Samples from either end on, and the distances of the nearest and the farthest pixel.
         for end, first, beyond in ((line, near, far), (line[::-1], last - far, last - near)):
-            share = _AT_END if first < _BESIDE and beyond > -_BESIDE else 0.0
+            share = _AT_END if first < _NEAR_END and beyond > -_NEAR_END else 0.0
             if _mean_square(end[:1]) > _CUT * _mean_square(end[:_FADING]):
-                first = max(first, _BESIDE)
+                first = max(first, _NEAR_END)
                 share += inside * max(1 / first - 1 / max(beyond, first), 0.0)
             at_ends += share * _mean_square(end[:_END])
     return at_ends / total if total else 0.0

@@ -1,4 +1,7 @@
-"""From raw echoes to range lines: matched filter, basebanding, band window, resampling."""
+"""Pulse compression: matched filter, basebanding, band window and resampling.
+
+Equations in brackets are those of the thesis (Ødegaard 2004).
+"""
 
 from __future__ import annotations
 
@@ -19,10 +22,8 @@ from clsas.sonar.system import Pulse
 
 Window = str | float | tuple
 
-# Width, in bandwidths, of the edge that the truncation of the filter gives its band.
-_BAND_EDGE = 0.1
-# Samples of a block of channels in work, complex128.
-_BLOCK = 1 << 22
+_BAND_EDGE = 0.1  # width, in bandwidths, of the edges that truncating the filter gives its band
+_BLOCK = 1 << 22  # complex128 samples of the channels that are compressed together
 
 
 def compress(
@@ -38,31 +39,33 @@ def compress(
     Parameters
     ----------
     echoes : Echoes
-        Complex baseband, or real passband, which is turned into its analytic signal and mixed to
-        baseband here.
+        Complex baseband, or real passband, which is converted to the analytic signal and mixed to
+        baseband.
     window : str, float or tuple
-        Window over the band: "none", or what `scipy.signal.get_window` takes, such as "hamming",
+        Window over the band: "none", or a window of `scipy.signal.get_window`, such as "hamming",
         "taylor" or ("kaiser", 6.0).
     oversampling : float
-        Rate of the lines' samples in bandwidths, at least 1. It is met to 1e-6 by a ratio of
-        whole numbers, which `range_step_m` of the result states exactly.
+        Sample rate of the lines over the bandwidth, at least 1. A ratio of whole numbers
+        approximates it to 1e-6; `range_step_m` of the result is exact.
     bandwidth_hz : float, optional
-        Band kept, centred on the carrier; the pulse's unless given, and needed without a pulse.
+        Width of the band that is kept, centred on the carrier; by default the pulse's. Required
+        without a pulse.
     progress : callable, optional
         Called as progress(channels done, channels).
 
     Returns
     -------
     RangeLines
-        Starting at the range of each channel's first sample, and as long as a whole pulse is in
-        the recording. A point of amplitude A gives a peak of A, with the phase
+        Lines from the range of each channel's first sample up to the last range whose pulse is
+        completely recorded. A point of amplitude A has a peak of A with the phase
         exp(-j 2 pi fc tau) = exp(-j 2 k rho).
 
     Raises
     ------
     TypeError, ValueError
-        If an argument is of another type or outside its limits, the band is not inside what was
-        sampled, the recording is no longer than the pulse, or the lines do not fit into memory.
+        If an argument has the wrong type or is outside its limits, the band is not within the
+        sampled band, the recording is not longer than the pulse, or the lines do not fit into
+        memory.
 
     Notes
     -----
@@ -70,10 +73,9 @@ def compress(
 
         h(t) = integral over the band of W(f) P*(f) exp(j 2 pi f t) df / integral of W |P|^2
 
-    (THESIS [17], [37]); without a pulse P is flat. The sharp ends of the band make h infinitely
-    long. Its part that reaches from one end of the recording to the other is used as it is, and
-    fades out smoothly in the padding behind that, so the sum is that linear convolution:
-    nothing wraps around, and nothing is cut off.
+    [17], [37]. Without a pulse P is flat. The sharp ends of the band make h infinitely long. The
+    part of h that is as long as the recording is unchanged, and the rest fades smoothly in the
+    padding. The result is therefore exactly the linear convolution, without wrap-around.
     """
     validate.instance("echoes", echoes, Echoes)
     validate.progress(progress)
@@ -103,7 +105,7 @@ def compress(
 
     outermost = math.ceil((0.5 + _BAND_EDGE) * band * padded / rate)
     bins = np.arange(-outermost, outermost + 1)
-    # Twice the points where the filter's edges would not fit otherwise; every other one is kept.
+    # If the filter's edges do not fit, compute twice the points and keep every other one.
     every = 1 if resampled >= len(bins) else 2
     response = _filter_response(pulse, band, weights, bins, padded / rate, echoes.length / rate)
     response *= every * resampled / padded
@@ -133,7 +135,7 @@ def compress(
 
 
 def check_options(*, window: Window = "none", oversampling: float = 2.0) -> None:
-    """Raise TypeError or ValueError unless `compress` takes these for any echoes."""
+    """Raise TypeError or ValueError for options that `compress` refuses for all echoes."""
     band_window(window, 1.0)
     validate.number("oversampling", oversampling, least=1.0)
 
@@ -146,7 +148,7 @@ def band_window(
     Parameters
     ----------
     window : str, float or tuple
-        "none", or what `scipy.signal.get_window` takes; its 4097 symmetric samples are
+        "none", or a window of `scipy.signal.get_window`, whose 4097 symmetric samples are
         interpolated by cubic splines.
     bandwidth_hz : float
         Width of the band.
@@ -154,7 +156,7 @@ def band_window(
     Raises
     ------
     ValueError
-        If SciPy knows no such window, or it is not finite.
+        If SciPy has no such window, or it is not finite.
     """
     if isinstance(window, str) and window == "none":
         return np.ones_like
@@ -190,7 +192,7 @@ def _band(echoes: Echoes, bandwidth_hz: float | None) -> float:
 
 
 def _fraction(ratio: float) -> Fraction:
-    """Return a ratio of small whole numbers, right to 1e-6."""
+    """Ratio of small whole numbers that approximates a ratio to 1e-6."""
     if ratio > 1:
         return Fraction(ratio).limit_denominator(1000)
     return 1 / Fraction(1 / ratio).limit_denominator(1000)
@@ -204,7 +206,7 @@ def _filter_response(
     period_s: float,
     reach_s: float,
 ) -> NDArray[np.complex128]:
-    """Return the transfer function at bins/period of the filter that is whole up to +-reach."""
+    """Transfer function, at frequencies bins/period, of the filter that fades beyond +-reach."""
 
     def spectrum(frequency: NDArray) -> NDArray:
         return np.full(len(frequency), 1 / band) if pulse is None else pulse.spectrum(frequency)
@@ -216,7 +218,7 @@ def _filter_response(
         return weights(frequency) * np.abs(spectrum(frequency)) ** 2
 
     edges = [-band / 2, band / 2]
-    # P turns as fast as its delay, a window some cycles over the band.
+    # The phase rate of P is its delay. Windows have a few cycles over the band.
     rate = 8 / band + (0.0 if pulse is None else pulse.duration_s)
     points = fft.next_fast_len(math.ceil(1.25 * band * period_s))
     lag = fft.fftfreq(points) * period_s
@@ -227,10 +229,10 @@ def _filter_response(
 
 
 def _baseband(echoes: Echoes, block: slice) -> NDArray:
-    """Return complex baseband samples of some channels.
+    """Complex baseband samples of some channels.
 
-    Real ones are mixed down and doubled. The band filter that follows drops the image at twice
-    the carrier, which makes it the analytic signal's baseband.
+    Real samples are mixed down and doubled. The band filter then removes the image at twice the
+    carrier, which leaves the baseband of the analytic signal.
     """
     samples = echoes.samples[block]
     if not echoes.is_passband:

@@ -1,4 +1,4 @@
-"""Raw echoes as received, before compression."""
+"""Raw echoes, before pulse compression."""
 
 from __future__ import annotations
 
@@ -14,39 +14,39 @@ from clsas.sonar.system import Pulse
 
 @dataclass(frozen=True, eq=False)
 class Echoes:
-    """Raw echoes of every channel and where each was taken.
+    """Raw echoes of every channel, with the channels' geometry.
 
-    Sample n of channel i was taken start_time_s[i] + n/sample_rate_hz after transmission began.
-    A point of amplitude A at two-way delay tau gives A p(t - tau) exp(-j 2 pi fc tau) in complex
-    baseband, with p the pulse's envelope and fc the carrier; in passband the real part of
-    A p(t - tau) exp(+j 2 pi fc (t - tau)).
+    Sample n of channel i was taken start_time_s[i] + n/sample_rate_hz after the start of
+    transmission. A point of amplitude A at the two-way delay tau gives
+    A p(t - tau) exp(-j 2 pi fc tau) in complex baseband, with p the pulse's envelope and fc the
+    carrier. In passband it gives the real part of A p(t - tau) exp(+j 2 pi fc (t - tau)).
 
     Parameters
     ----------
     samples : array_like, [channels, length]
-        Complex baseband (kept as complex64), or real passband still on its carrier (float32).
+        Complex baseband (stored as complex64), or real passband (float32).
     start_time_s : array_like, [channels] or scalar
         Time of the first sample after the start of transmission.
     sample_rate_hz : float
         Samples per second.
     carrier_hz : float
-        Frequency that was mixed out, or that a real signal is still on.
+        Frequency that was mixed out; for real samples the frequency of their carrier.
     tx_m, rx_m : array_like, [channels, 3] or [3]
         Transmitter and receiver positions at transmission.
     sound_speed_m_s : float
         Speed of sound.
     pulse : Pulse, optional
-        What was transmitted, with the same carrier. None: the echoes are of a pulse too short to
-        need compression.
+        Transmitted pulse, with the same carrier. None: the pulse is too short to need
+        compression.
     rx_velocity_m_s : array_like, [channels, 3] or [3], optional
         Velocity of the receivers during the echoes' flight; None is stop-and-hop.
 
     Raises
     ------
     TypeError, ValueError
-        If an array has the wrong kind or shape, is empty or not finite, a number is outside its
-        limits, the pulse's carrier differs, or wider samples are all so small or large that
-        float32 loses their digits.
+        If an array has the wrong type or shape, is empty or not finite, a number is outside its
+        limits, the pulse has another carrier, or float32 cannot represent the samples to its
+        precision.
     """
 
     samples: NDArray[np.complex64] | NDArray[np.float32]

@@ -1,4 +1,4 @@
-"""Range interpolation: least-squares filters, and how finely lines must be sampled for them."""
+"""Range interpolation: least-squares filters, and the upsampling that they need."""
 
 from __future__ import annotations
 
@@ -18,15 +18,17 @@ TAPS = (2, 4, 6, 8)
 UPSAMPLINGS = (1.0, 1.25, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0, 12.0, 16.0)
 MOST_UPSAMPLING = 64.0
 
-# Device time per pixel and channel by taps, relative to 4 taps: measured with PoCL and Intel's
-# runtime on an AVX-512 CPU (scripts/bench taps). With AVX2 more taps cost a tenth more.
 COST = {2: 0.75, 4: 1.0, 6: 1.3, 8: 1.55}
-# The same, in such, for one upsampled sample: an FFT on the host.
-_UPSAMPLING_COST = 40.0
+"""Device time per pixel and channel by taps, relative to 4 taps. Measured with PoCL and Intel's
+runtime on an AVX-512 CPU (`scripts/bench taps`); with AVX2 more taps cost a tenth more."""
+
+_UPSAMPLING_COST = 40.0  # host time of one upsampled sample, in units of `COST`
+
 Gain = Callable[[NDArray[np.float64]], NDArray[np.float64]]
-"""A factor of spectra, by the distance from their centre in cycles per sample."""
-_POSITIONS = 17
-_SCATTER_DB = 0.5
+"""Spectral gain as a function of the distance from the spectral centre, cycles per sample."""
+
+_POSITIONS = 17  # between two samples, at which filters are fitted
+_SCATTER_DB = 0.5  # margin for the scatter of measured errors around the predicted one
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +40,7 @@ class Interpolator:
     taps : int
         Samples per evaluation: 2, 4, 6 or 8.
     upsampling : float
-        By how much the lines are upsampled first, by FFT.
+        Upsampling factor of the lines, by FFT, before the filter is applied.
     coefficients : float64 [taps/2, 2, taps/2]
         Per pair of taps from the innermost, the polynomials E and O, highest power first: the
         weight of the tap at +-(pair + 1/2) from the middle is E(nu^2) +- nu O(nu^2), with nu in
@@ -46,8 +48,8 @@ class Interpolator:
     error_db : float
         Predicted relative rms error of an evaluation of these lines, dB.
     scatter_db : float
-        What is left of it once the mean of the filter's response over all positions, `response`, is
-        divided out of the lines beforehand.
+        Predicted error if the mean response of the filter over all positions, `response`, is
+        divided out of the lines beforehand, dB.
     """
 
     taps: int
@@ -71,40 +73,38 @@ class Interpolator:
         return np.concatenate([(even - odd)[..., ::-1], even + odd], axis=-1)
 
     def response(self, frequency: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the gain at some frequencies, mean over all positions.
+        """Return the filter's gain at some frequencies, averaged over all positions.
 
-        `frequency` is in cycles per (upsampled) sample, from the spectral centre.
+        `frequency` is the distance from the spectral centre, cycles per upsampled sample.
         """
         nu = np.linspace(-0.5, 0.5, _POSITIONS)
-        place = np.arange(self.taps) - (self.taps - 1) / 2
-        away = place - nu[:, None]
-        turns = np.asarray(frequency)[..., None, None] * away
-        return np.mean(np.sum(self.weights(nu) * np.cos(2 * np.pi * turns), axis=-1), axis=-1)
+        taps_at = np.arange(self.taps) - (self.taps - 1) / 2
+        cycles = np.asarray(frequency)[..., None, None] * (taps_at - nu[:, None])
+        return np.mean(np.sum(self.weights(nu) * np.cos(2 * np.pi * cycles), axis=-1), axis=-1)
 
 
 def design(taps: int, upsampling: float, spectrum: Spectrum) -> Interpolator:
-    """Return the interpolator of least rms error for lines of a given spectrum.
+    """Return the interpolator with the smallest rms error for lines with a given spectrum.
 
     Parameters
     ----------
     taps : int
         2 (linear interpolation), 4, 6 or 8.
     upsampling : float
-        By how much the lines will be upsampled first, >= 1.
+        Upsampling factor of the lines before the filter, >= 1.
     spectrum : Spectrum
-        Of the lines before that.
+        Spectrum of the lines before upsampling.
 
     Notes
     -----
-    With frequency f in cycles per (upsampled) sample and taps at +-a, a = 1/2, 3/2, ..., a
-    symmetric filter errs by
+    With frequency f in cycles per upsampled sample and taps at +-a, a = 1/2, 3/2, ..., the error of
+    a symmetric filter is
 
         2 sum_a E_a(nu^2) cos(2 pi f a) - cos(2 pi f nu)
-        + j [2 nu sum_a O_a(nu^2) sin(2 pi f a) - sin(2 pi f nu)],
+        + j [2 nu sum_a O_a(nu^2) sin(2 pi f a) - sin(2 pi f nu)].
 
-    two separate least-squares problems in the polynomials' coefficients, weighted by the power
-    at f.
-    Linear interpolation is the one filter that is given: E = 1/2, O = 1.
+    Its real and imaginary parts are two separate least-squares problems in the coefficients of the
+    polynomials, weighted by the power at f. Linear interpolation is fixed: E = 1/2, O = 1.
     """
     f = spectrum.frequency / upsampling
     nu = np.linspace(-0.5, 0.5, _POSITIONS)
@@ -112,7 +112,7 @@ def design(taps: int, upsampling: float, spectrum: Spectrum) -> Interpolator:
     even = nu[:, None] ** (2 * np.arange(taps // 2)[::-1])
     aims = np.cos(2 * np.pi * np.outer(f, nu)), np.sin(2 * np.pi * np.outer(f, nu))
     bases = (2 * np.cos(turns), even), (2 * np.sin(turns), nu[:, None] * even)
-    # A floor keeps the empty part of the band from making the problem singular.
+    # A noise floor keeps the problem regular where the band is empty.
     share = np.sqrt(spectrum.power + 1e-13)[:, None]
     coefficients = np.empty((taps // 2, 2, taps // 2))
     residuals = []
@@ -120,12 +120,12 @@ def design(taps: int, upsampling: float, spectrum: Spectrum) -> Interpolator:
         if taps == 2:
             solution = np.array([[(0.5, 1.0)[part]]])
         else:
-            # All products of functions of f and of nu: one after the other.
+            # The basis is a product of functions of f and of nu, so they are fitted one by one.
             at_positions = lstsq(share * of_frequency, share * aim, lapack_driver="gelsy")[0]
             solution = lstsq(of_position, at_positions.T, lapack_driver="gelsy")[0].T
         coefficients[:, part] = solution
         residuals.append(of_frequency @ solution @ of_position.T - aim)
-    # Turned back by the position it is the response less 1; its mean is real.
+    # With the phase of the position removed, the error is the response minus 1; its mean is real.
     turned = aims[0] - 1j * aims[1]
     error = (residuals[0] + 1j * residuals[1]) * turned
     scatter = (error - (bias := error.mean(axis=1, keepdims=True).real)) / (1 + bias)
@@ -146,31 +146,32 @@ def choose(
     pixels_per_sample: float = np.inf,
     most_upsampling: Mapping[int, float] | None = None,
 ) -> Interpolator:
-    """Return the cheapest interpolator that keeps the error below `accuracy_db`.
+    """Return the fastest interpolator that keeps the error below `accuracy_db`.
 
-    Half a decibel is left for the scatter of measured errors about the predicted one, and up to
-    four where the power lies at few frequencies, so that errors do not average out.
+    A margin of half a decibel allows for the scatter of measured errors around the predicted one.
+    It is up to four decibels larger if the power lies at few frequencies, since errors then do not
+    average out.
 
     Parameters
     ----------
     spectrum : Spectrum
-        Of the lines.
+        Spectrum of the lines.
     accuracy_db : float
-        Wanted relative rms error, dB, negative.
+        Requested relative rms error, dB, negative.
     taps, upsampling : int, float, optional
-        Fix one or both; with both, `accuracy_db` plays no part.
+        Fix one or both. With both, `accuracy_db` has no effect.
     other_error : float
-        Relative rms error that comes from elsewhere and adds in power.
+        Relative rms error from other causes, which adds in power.
     pixels_per_sample : float
-        Pixels over samples of a line: how soon upsampling pays.
+        Pixels over samples of a line. The more pixels, the less the time of upsampling matters.
     most_upsampling : mapping of float, optional
-        By taps: prefer not to upsample beyond this (where the device's fast lookup ends).
+        By taps: upsampling up to which the device's fast lookup works; more is avoided.
 
     Raises
     ------
     ValueError
-        If `taps` is not one of 2, 4, 6, 8, `upsampling` is below 1, or the fixed one cannot reach
-        `accuracy_db`.
+        If `taps` is not one of 2, 4, 6, 8, `upsampling` is below 1, or `accuracy_db` cannot be
+        reached with the fixed one.
     """
     if taps is not None and not (isinstance(taps, (int, np.integer)) and taps in TAPS):
         raise ValueError(f"taps must be one of {TAPS}, got {validate.shown(taps)}")
@@ -192,7 +193,7 @@ def choose(
         fixed = f"taps={taps}" if taps is not None else f"upsampling={upsampling}"
         raise ValueError(
             f"accuracy_db={accuracy_db:g} cannot be reached with {fixed}; "
-            f"the best there is {found.error_db:.1f} dB"
+            f"the best is {found.error_db:.1f} dB"
         )
 
     def cost(candidate: Interpolator) -> tuple[bool, float]:
@@ -205,21 +206,22 @@ def choose(
 
 @dataclass(frozen=True)
 class Resampling:
-    """Where samples go when a line is shifted to its spectral centre and upsampled.
+    """Map from samples of a line to samples shifted to the spectral centre and upsampled.
 
-    A line is zero beyond its ends. Upsampled sample m lies at index (m + first) / ratio - lead of
-    the line it came from, and has been turned by -centre_cycles_per_sample (index + lead) cycles.
+    A line is zero beyond its ends. Upsampled sample m corresponds to index
+    (m + first) / ratio - lead of the line, with its phase changed by
+    -centre_cycles_per_sample (index + lead) cycles.
 
     Attributes
     ----------
     lead : int
-        Zeros that come before a line.
+        Zeros before a line.
     period, upsampled_period : int
-        Samples that become so many. With an FFT these are its lengths.
+        Number of samples before and after upsampling; with an FFT its lengths.
     shift : int
-        Cycles per period by which lines are turned.
+        Frequency shift in cycles per period.
     first, length : int
-        First upsampled sample that is kept, and how many are.
+        First upsampled sample that is kept, and number of those.
     """
 
     lead: int
@@ -236,11 +238,11 @@ class Resampling:
 
     @property
     def centre_cycles_per_sample(self) -> float:
-        """Frequency made zero, cycles per (given) sample."""
+        """Frequency that is shifted to zero, cycles per original sample."""
         return self.shift / self.period
 
     def samples_per_m(self, lines: RangeLines) -> float:
-        """Return the upsampled samples per metre of range."""
+        """Return the number of upsampled samples per metre of range."""
         return self.ratio / lines.range_step_m
 
     def cycles_per_m(self, lines: RangeLines) -> float:
@@ -249,7 +251,7 @@ class Resampling:
 
     @property
     def frequency(self) -> NDArray[np.float64]:
-        """Distance of every frequency of the FFT from the spectral centre, cycles per sample."""
+        """Distances of the FFT's frequencies from the spectral centre, cycles per sample."""
         return np.abs(scipy.fft.fftfreq(self.period))
 
     def apply(
@@ -259,7 +261,7 @@ class Resampling:
     ) -> NDArray[np.complexfloating]:
         """Return lines [channels, n] upsampled by FFT, [channels, length], in their own precision.
 
-        `gain` multiplies the spectrum at every `frequency`.
+        `gain` is a factor for the spectrum at every `frequency`.
         """
         padded = np.zeros((len(samples), self.period), samples.dtype)
         padded[:, self.lead : self.lead + samples.shape[1]] = samples
@@ -279,13 +281,13 @@ class Resampling:
         return result[:, self.first : self.first + self.length]
 
 
-# Zeros around a line during its FFT, in samples: what a band-limited line rings beyond one end
-# must have died away before it comes in again at the other.
+# Zeros at either end of a line during its FFT, in samples. A band-limited line rings beyond its
+# ends; the ringing must decay before it wraps around to the other end.
 _GUARD = 64
 
 
 def resampling(length: int, interpolator: Interpolator, spectrum: Spectrum) -> Resampling:
-    """Return how lines of `length` samples are upsampled by FFT for an interpolator."""
+    """Return the resampling of lines of `length` samples by FFT for an interpolator."""
     fft_length = scipy.fft.next_fast_len(length + 2 * _GUARD)
     upsampled_length = scipy.fft.next_fast_len(round(np.ceil(fft_length * interpolator.upsampling)))
     ratio = upsampled_length / fft_length
@@ -297,23 +299,23 @@ def resampling(length: int, interpolator: Interpolator, spectrum: Spectrum) -> R
 
 
 PHASES = 32
-"""By how many filters lines are upsampled."""
+"""Number of polyphase filters of an `Upsampler`."""
 UPSAMPLING_TAPS = (8, 12, 16, 20, 24, 28, 32)
-_FINE = 4096  # of a filtered line's period: how finely it may be turned
-_SAME = 0.5 / 256  # cycles per sample: half of what a measured spectrum resolves
+_FINE = 4096  # frequency shifts are multiples of 1/(4096 step) cycles per sample
+_SAME = 0.5 / 256  # cycles per sample: half the resolution of a measured spectrum
 
 
 @dataclass(frozen=True, eq=False)
 class Upsampler:
-    """Filters that upsample lines by a ratio of whole numbers, and shape their spectrum.
+    """Polyphase filters that upsample lines by a ratio of whole numbers, and shape their spectrum.
 
     Attributes
     ----------
     step : int
-        Upsampled samples lie 1 / PHASES of it apart.
+        Upsampled samples are step / PHASES samples apart.
     coefficients : float64 [PHASES, taps]
-        Of filters for places p/PHASES beyond a sample. Their taps are the taps/2 samples up to
-        that one, and as many after it.
+        Filters for positions p/PHASES after a sample. Their taps are the taps/2 samples up to that
+        sample, and as many after it.
     error_db : float
         Relative rms error of upsampled lines, dB.
     """
@@ -328,11 +330,11 @@ class Upsampler:
 
     @property
     def taps(self) -> int:
-        """Samples that one upsampled sample is made of."""
+        """Number of samples that contribute to an upsampled sample."""
         return self.coefficients.shape[1]
 
     def resampling(self, length: int, beyond: int, spectrum: Spectrum) -> Resampling:
-        """Return where samples of lines of some length go, with so many beyond either end."""
+        """Return the resampling of lines of some length, with `beyond` samples past either end."""
         period, upsampled = self.step * _FINE, PHASES * _FINE
         last = (length - 1) * PHASES // self.step + beyond
         shift = 0 if abs(spectrum.centre) <= _SAME else round(spectrum.centre * period)
@@ -340,27 +342,27 @@ class Upsampler:
 
 
 def upsampler(spectrum: Spectrum, step: int, gain: Gain, most_db: float) -> Upsampler | None:
-    """Return the shortest filters that upsample by PHASES / step and err by no more than some dB.
+    """Return the shortest filters that upsample by PHASES / step with an error up to `most_db`.
 
-    None where none do: where lines fill their whole band.
+    None if no filter is accurate enough, because the lines fill the whole sampled band.
 
     Notes
     -----
-    Least squares for every phase: sum_t h_t exp(j 2 pi f x_t) ~ gain(f), with x_t the place of a
-    tap from the upsampled sample, weighted by the power at f.
+    Least-squares fit for every phase: sum_t h_t exp(j 2 pi f x_t) ~ gain(f), weighted by the power
+    at f, with x_t the position of a tap relative to the upsampled sample.
     """
     frequency = spectrum.frequency
     aim = gain(frequency)
     weight = np.sqrt(spectrum.power + 1e-13)[:, None]
-    place = np.arange(PHASES // 2 + 1)[:, None, None] / PHASES
+    phase = np.arange(PHASES // 2 + 1)[:, None, None] / PHASES
     for taps in UPSAMPLING_TAPS:
-        turns = 2 * np.pi * frequency[:, None] * (np.arange(taps) + 1 - taps // 2 - place)
-        matrix = np.concatenate([weight * np.cos(turns), weight * np.sin(turns)], axis=1)
-        wanted = np.concatenate([weight[:, 0] * aim, np.zeros(len(aim))])
+        angle = 2 * np.pi * frequency[:, None] * (np.arange(taps) + 1 - taps // 2 - phase)
+        matrix = np.concatenate([weight * np.cos(angle), weight * np.sin(angle)], axis=1)
+        target = np.concatenate([weight[:, 0] * aim, np.zeros(len(aim))])
         q, r = np.linalg.qr(matrix)
-        coefficients = np.linalg.solve(r, np.einsum("pft,f->pt", q, wanted)[..., None])[..., 0]
-        residual = np.einsum("pft,pt->pf", matrix, coefficients) - wanted
-        # Those of the second half mirror those of the first.
+        coefficients = np.linalg.solve(r, np.einsum("pft,f->pt", q, target)[..., None])[..., 0]
+        residual = np.einsum("pft,pt->pf", matrix, coefficients) - target
+        # The filters of the second half mirror those of the first.
         coefficients = np.concatenate([coefficients, coefficients[-2:0:-1, ::-1]])
         of_phases = np.sum(residual**2, axis=1)
         power = (of_phases.sum() + of_phases[1:-1].sum()) / PHASES / (spectrum.power @ aim**2)

@@ -1,4 +1,4 @@
-"""Spectra of lines: the band they occupy, and how errors at its frequencies weigh in an image."""
+"""Spectra of range lines: the occupied band, and the weight of its frequencies in an image."""
 
 from __future__ import annotations
 
@@ -13,26 +13,27 @@ from clsas.core.geometry import pairwise_range_m
 from clsas.core.grid import Grid
 from clsas.core.lines import RangeLines, some_channels
 
-MEASURED_CHANNELS, FEW_CHANNELS = 256, 32  # sampled for a spectrum: with care, in haste
+MEASURED_CHANNELS = 256  # sampled for an accurate spectrum
+FEW_CHANNELS = 32  # sampled for a quick estimate
 NEEDED_OVERSAMPLING = 1.05
-"""Sample rate over occupied bandwidth from which on a guard band keeps the band's edges apart."""
+"""Sample rate over occupied bandwidth above which a guard band separates the band's edges."""
 _FREQUENCIES = 128
-_FLOOR_WIDTH = 1 / 64  # cycles per sample: the quietest stretch, which is taken as noise
-_FLOOR_MARGIN = 2.0  # the mean of few periodograms scatters by as much
-_NOISE_LEFT = 0.1  # of the noise's power: peaks above that margin
-_OUTSIDE_BAND = (1e-8, 1e-6, 1e-4)  # of the signal's power: tails of windows and finite lines
-_CLOSING = 1 / 300  # cycles per sample to either side of where the circle closes, that may alias
-_COHERENT_CYCLES = 2.0  # of phase over the aperture, up to which common parts add up
-_COHERENT_CHANNELS, _COHERENT_PLACES, _COHERENT_FREQUENCIES = 128, 3, 256  # sampled
-_FEW_FREQUENCIES = 4.0  # power at one frequency may err by 5 times as predicted
-_LOUDEST = 16  # channels sampled besides those spread evenly
+_FLOOR_WIDTH = 1 / 64  # cycles per sample; the quietest part of this width is taken as noise
+_FLOOR_MARGIN = 2.0  # scatter of the mean of a few periodograms
+_NOISE_LEFT = 0.1  # share of the noise's power in peaks above that margin
+_OUTSIDE_BAND = (1e-8, 1e-6, 1e-4)  # of the signal's power, in tails of windows and finite lines
+_CLOSING = 1 / 300  # cycles per sample around the opposite of the centre, which may alias
+_COHERENT_CYCLES = 2.0  # phase over the aperture up to which common parts add coherently
+_COHERENT_CHANNELS, _COHERENT_POINTS, _COHERENT_FREQUENCIES = 128, 3, 256  # sampled
+_FEW_FREQUENCIES = 4.0  # with power at a single frequency errors are up to 5 times the predicted
+_LOUDEST = 16  # loudest channels, sampled in addition to those spread evenly
 _SUMMABLE = 1e-20, 1e38  # energies that float32 squares and sums without loss
-_LINES_TOGETHER = 8  # transformed at once: they stay in the processor's caches
+_LINES_TOGETHER = 8  # transformed together, so that they stay in the processor's caches
 
 
 @dataclass(frozen=True, eq=False)
 class Spectrum:
-    """Mean power spectrum of a set of lines, seen from its own centre.
+    """Mean power spectrum of a set of lines, relative to its centre.
 
     Attributes
     ----------
@@ -41,14 +42,14 @@ class Spectrum:
     frequency : float64 [n]
         Distance from the centre, cycles per sample, 0 to 0.5.
     power : float64 [n]
-        Weight of the errors at that distance, both sides together: share of the power of the lines
-        or, where that is more, of the image. Sums to 1 to 2.
+        Weight of errors at that distance, on both sides together: the share of the lines' power or
+        of the image's power, whichever is larger. The sum is 1 to 2.
     oversampling : float
         Sample rate over the width of the occupied band.
     aliasing : float
-        Relative error power from aliasing, where the band fills all that is sampled.
+        Relative error power from aliasing, if the band fills the whole sampled band.
     line_power : float64 [n] or None
-        Share of the power of the lines, where `power` has some of the image.
+        Share of the lines' power, if `power` includes the image's.
     """
 
     centre: float
@@ -96,12 +97,12 @@ def measure_spectrum(lines: RangeLines, grid: Grid | None = None) -> Spectrum:
 def _occupied_band(
     frequency: NDArray[np.float64], power: NDArray[np.float64]
 ) -> tuple[float, float, float]:
-    """Middle and width of the occupied band, cycles per sample, and the share it has to leave out.
+    """Middle and width of the occupied band, cycles per sample, and the share of power outside.
 
     Frequencies farther than half a cycle per sample from the middle alias. The band is therefore
-    the narrowest arc of the frequency circle that holds nearly all power above the noise floor: the
-    opposite point lies in the middle of the guard band, however the spectrum is shaped. As little
-    is left outside as a guard band allows.
+    the narrowest arc of the frequency circle with nearly all power above the noise floor. The
+    opposite point is then in the middle of the guard band, whatever the shape of the spectrum. The
+    share outside is the smallest one that leaves a guard band.
     """
     count = len(power)
     smoothed = uniform_filter1d(power, max(round(_FLOOR_WIDTH * count), 1), mode="wrap")
@@ -123,23 +124,24 @@ def _occupied_band(
 
 
 def _histogram(distance: NDArray[np.float64], power: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Power at the `frequency` of a `Spectrum`, shared between the two nearest.
+    """Power at the `frequency` of a `Spectrum`, shared between the two nearest bins.
 
-    A filter that fits one frequency only would miss a narrow line beside it.
+    With all power in the nearest bin, a filter could fit that frequency and miss a narrow line
+    beside it.
     """
-    place = np.clip(2 * _FREQUENCIES * distance - 0.5, 0, _FREQUENCIES - 1)
-    lower = np.minimum(place.astype(np.int64), _FREQUENCIES - 2)
-    above = power * (place - lower)
+    position = np.clip(2 * _FREQUENCIES * distance - 0.5, 0, _FREQUENCIES - 1)
+    lower = np.minimum(position.astype(np.int64), _FREQUENCIES - 2)
+    above = power * (position - lower)
     return np.bincount(lower, power - above, _FREQUENCIES) + np.bincount(
         lower + 1, above, _FREQUENCIES
     )
 
 
 def _aliasing(distance: NDArray[np.float64], power: NDArray[np.float64], width: float) -> float:
-    """Error power if what lies where the circle closes has aliased, as it may if the band is full.
+    """Error power if the power opposite of the centre has aliased, as it may in a full band.
 
-    It then misses on one side and is wrong on the other, so it counts twice. With a guard band it
-    is noise, on either side alike.
+    It is then missing on one side and wrong on the other, so it counts twice. With a guard band it
+    is noise, equal on both sides.
     """
     if width <= 1 / NEEDED_OVERSAMPLING:
         return 0.0
@@ -148,22 +150,22 @@ def _aliasing(distance: NDArray[np.float64], power: NDArray[np.float64], width: 
 
 
 def power_outside(lines: RangeLines, centre: float, half_width: float, most_channels: int) -> float:
-    """Share of the lines' power outside a band, in cycles per sample; of some lines."""
+    """Share of the power of sampled lines outside a band, in cycles per sample."""
     frequency, power, _ = _mean_power(*_sampled_lines(lines, most_channels))
     return float(power[_distance(frequency, centre) > half_width].sum())
 
 
 def _distance(frequency: NDArray[np.float64], centre: float) -> NDArray[np.float64]:
-    """Return how far frequencies are from a centre, cycles per sample, 0 to 0.5."""
+    """Distance of frequencies from a centre, cycles per sample, 0 to 0.5."""
     return np.abs((frequency - centre + 0.5) % 1.0 - 0.5)
 
 
 def _sampled_lines(
     lines: RangeLines, most_channels: int
 ) -> tuple[NDArray[np.complex64], NDArray[np.float32]]:
-    """Sample some channels, spread evenly, and the loudest; return a factor for each too.
+    """Lines of channels spread evenly and of the loudest, and a factor for each.
 
-    With these factors the sampled channels have the power of all of them.
+    With these factors the sampled channels have the power of all channels.
     """
     some = some_channels(lines.channels, most_channels)
     if len(some) == lines.channels:
@@ -178,7 +180,7 @@ def _sampled_lines(
 
 
 def _energy(samples: NDArray[np.complex64]) -> NDArray[np.float64]:
-    """Energy of every line, in a unit of its own where squares would leave float32."""
+    """Energy of every line, in another unit if squares would overflow or underflow float32."""
     parts = samples.view(np.float32)
     with np.errstate(over="ignore"):
         energy = np.einsum("ij,ij->i", parts, parts)
@@ -191,10 +193,10 @@ def _energy(samples: NDArray[np.complex64]) -> NDArray[np.float64]:
 def _mean_power(
     samples: NDArray[np.complex64], factor: NDArray[np.float32]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Frequencies, cycles per sample, and the share of the power at each, of lines as they are.
+    """Frequencies, cycles per sample; share of the power at each; the same for faded lines.
 
-    The last is the share of lines that fade to both ends: it shows the band without the leakage of
-    lines that are cut. `factor` multiplies every line.
+    Lines that fade towards both ends show the band without the leakage of cut lines. `factor`
+    multiplies every line.
     """
     largest = _largest_part(samples) or samples.real.dtype.type(1)
     length = scipy.fft.next_fast_len(max(2 * samples.shape[1], 4))
@@ -230,19 +232,19 @@ def _column_power(amplitude: NDArray[np.complexfloating]) -> NDArray[np.float64]
 def _image_power(
     lines: RangeLines, grid: Grid, frequency: NDArray[np.float64], power: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Share of an image's power that every frequency of its lines brings.
+    """Share of an image's power from every frequency of its lines.
 
-    What channels have in common near 0 Hz on the carrier, such as a constant offset, adds up in
-    phase over the whole image: its power grows as the square of the channels, that of echoes from
-    all over the scene as their number. The gain is measured by summing some channels in phase at
-    some pixels, and extrapolated to all channels.
+    Signals that are common to all channels near 0 Hz, such as a constant offset in lines on their
+    carrier, add up coherently in the whole image. Their power grows with the square of the number
+    of channels, that of echoes from all over the scene with the number. The gain is measured by
+    coherent summation of some channels at some pixels, and extrapolated to all channels.
     """
     some = some_channels(lines.channels, _COHERENT_CHANNELS)
     if len(some) < 2:
         return power
     part = lines.select(some)
     range_m = pairwise_range_m(
-        grid.spread(_COHERENT_PLACES),
+        grid.spread(_COHERENT_POINTS),
         part.tx_m,
         part.rx_m,
         part.rx_velocity_m_s,
@@ -255,7 +257,7 @@ def _image_power(
         return power
     strongest = np.argsort(power[coherent])[::-1][:_COHERENT_FREQUENCIES]
     coherent = coherent[strongest]
-    # Samples about a range near all of them keep phases small.
+    # Spectra of the lines with phases relative to range 0.
     scale = _largest_part(part.samples) or 1.0
     turns = np.exp(-2j * np.pi * np.outer(np.arange(lines.length), frequency[coherent]))
     scaled = (part.samples.view(np.float32) / scale).view(np.complex64)
@@ -273,7 +275,7 @@ def _image_power(
 
 
 def _largest_part(samples: NDArray[np.complex64]) -> np.float32:
-    """Return the largest real or imaginary part; magnitudes might overflow."""
+    """Largest real or imaginary part. Magnitudes might overflow."""
     parts = samples.view(samples.real.dtype)
     return max(parts.max(initial=0.0), -parts.min(initial=0.0))
 

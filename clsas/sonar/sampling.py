@@ -1,4 +1,7 @@
-"""Sampling limits of a survey, phase centres and far field (THESIS [22]-[34])."""
+"""Sampling limits of a survey, phase centres and far field.
+
+Equations in brackets are those of the thesis (Ødegaard 2004), [22]-[34].
+"""
 
 from __future__ import annotations
 
@@ -13,21 +16,21 @@ from clsas.core.grid import Grid
 from clsas.sonar.system import Sonar
 from clsas.sonar.track import Track, channels
 
-_SLACK = 0.01  # by which a spacing may exceed its limit
+_SLACK = 0.01  # relative; a sway of centimetres changes the spacing a little
 
 
 @dataclass(frozen=True)
 class Finding:
-    """A sampling limit that a survey does not keep.
+    """A sampling limit that a survey violates.
 
     Parameters
     ----------
     name : str
-        Which limit: "along_track_spacing" or "ping_rate".
+        "along_track_spacing" or "ping_rate".
     message : str
-        What it means, with the numbers and their units.
+        Explanation with the numbers and their units.
     value, limit : float
-        What is and what may be at most, in the unit of the message.
+        The survey's value and the largest allowed one, in the unit of the message.
     """
 
     name: str
@@ -37,29 +40,28 @@ class Finding:
 
 
 def check_sampling(sonar: Sonar, track: Track, grid: Grid) -> list[Finding]:
-    """Return the sampling limits that this survey of this grid does not keep.
+    """Return the sampling limits that a survey of a grid violates.
 
-    Checked are the spacing of the phase centres along the track against half an element
-    (THESIS [27], [31]; for elements without a length against what keeps the grating lobes of
-    anything on the grid off the grid), which it may exceed by 1 %, and the ping rate against the
-    last echo from the grid ([24]).
+    The spacing of the phase centres along the track may exceed half an element by at most 1 %
+    [27], [31]. For elements without a length the limit keeps the grating lobes of every target on
+    the grid off the grid. The ping rate must leave time for the last echo from the grid [24].
 
     Parameters
     ----------
     sonar : Sonar
     track : Track
     grid : Grid
-        What is to be imaged.
+        Grid of the image.
 
     Returns
     -------
     list of Finding
-        Empty if all is well.
+        Empty if no limit is violated.
 
     Raises
     ------
     TypeError
-        If an argument is of another type.
+        If an argument has the wrong type.
     """
     validate.instance("grid", grid, Grid)
     tx, rx, _ = channels(sonar, track)
@@ -86,7 +88,7 @@ def _check_spacing(
         spread = float(np.ptp(sine, axis=0).max())
         limit = wavelength / (2 * spread) if spread else np.inf
         meaning = "what keeps grating lobes off the grid"
-    # A sway by a few centimetres turns the course a little: grating lobes hardly change.
+    # With a sway of centimetres the principal direction deviates a little from the course.
     if spacing <= limit * (1 + _SLACK):
         return []
     near, far = ranges.min(), ranges.max()
@@ -123,10 +125,10 @@ def _check_ping_rate(sonar: Sonar, track: Track, ranges: NDArray) -> list[Findin
 
 
 def phase_centres_m(tx_m: ArrayLike, rx_m: ArrayLike) -> NDArray[np.float64]:
-    """Return the points midway between transmitters and receivers, [..., 3] (THESIS [32]).
+    """Return the points midway between transmitters and receivers, [..., 3]; equation [32].
 
-    [32] writes u = u_p + (u_rx - u_tx)/2; that is this midpoint when u_p is where the
-    transmitter is and u_rx, u_tx are positions on the platform.
+    [32] is u = u_p + (u_rx - u_tx)/2. This is the midpoint if u_p is the transmitter's position and
+    u_rx, u_tx are positions on the platform.
     """
     tx = validate.array("tx_m", np.atleast_2d(tx_m), np.float64, (None, 3))
     rx = validate.array("rx_m", np.atleast_2d(rx_m), np.float64, (None, 3))
@@ -134,12 +136,12 @@ def phase_centres_m(tx_m: ArrayLike, rx_m: ArrayLike) -> NDArray[np.float64]:
 
 
 def phase_centre_error_m(separation_m: float, beam_width_rad: float, range_m: float) -> float:
-    """Return how much the phase-centre approximation errs in two-way path within the beam.
+    """Return the error of the phase-centre approximation within the beam, as two-way path.
 
-    The path via tx and rx, a distance D apart, is D^2 cos^2(theta)/(4 R) longer than that from and
-    to their midpoint. What varies of it over a beam of full width W is D^2/(4 R) (1 - cos^2(W/2)).
-    The approximation holds where this is well below the wavelength, say below an eighth of
-    it as in [34]. That is THESIS [33], D^2/(4 lambda) (1 - cos^2(W/2)) << R: the thesis calls the
+    For tx and rx a distance D apart, the path is D^2 cos^2(theta)/(4 R) longer than the path from
+    and to their midpoint. Over a beam of full width W it varies by D^2/(4 R) (1 - cos^2(W/2)). The
+    approximation holds if that is well below the wavelength, for instance below an eighth of it as
+    in [34]. This is equation [33], D^2/(4 lambda) (1 - cos^2(W/2)) << R. The thesis calls the
     right-hand side the distance from phase centre to receiver, but it is the range.
 
     Parameters
@@ -158,7 +160,7 @@ def phase_centre_error_m(separation_m: float, beam_width_rad: float, range_m: fl
 
 
 def far_field_m(half_aperture_m: float, wavelength_m: float) -> float:
-    """Return the range 4 u^2/lambda from which on waves look plane to +-u (THESIS [34])."""
+    """Return the range 4 u^2/lambda beyond which waves are plane over +-u; equation [34]."""
     half = validate.number("half_aperture_m", half_aperture_m, "m", least=0.0)
     return 4 * half**2 / validate.positive("wavelength_m", wavelength_m, "m")
 
@@ -166,7 +168,7 @@ def far_field_m(half_aperture_m: float, wavelength_m: float) -> float:
 def receive_interval_s(
     near_m: float, far_m: float, duration_s: float, sound_speed_m_s: float = 1500.0
 ) -> tuple[float, float]:
-    """Return when the first echo starts and the last one ends (THESIS [22], [23])."""
+    """Return the times at which the first echo starts and the last one ends; [22], [23]."""
     near = validate.number("near_m", near_m, "m", least=0.0)
     far = validate.number("far_m", far_m, "m", least=near)
     duration = validate.number("duration_s", duration_s, "s", least=0.0)
@@ -175,10 +177,11 @@ def receive_interval_s(
 
 
 def ping_advance_m(sonar: Sonar) -> float:
-    """Return the farthest a platform may go from ping to ping without a gap of phase centres.
+    """Return the largest advance per ping that leaves no gap between phase centres, metres.
 
-    That is the length of the phase-centre array, half that of the receivers: N d/2 for N receivers
-    d apart (THESIS 2.5), and for one receiver half its length ([31]).
+    It is the length of the phase-centre array, half that of the receiver array: N d/2 for N
+    receivers d apart (the thesis, section 2.5), and half the element's length for one receiver
+    [31].
 
     Raises
     ------
@@ -198,19 +201,19 @@ def ping_advance_m(sonar: Sonar) -> float:
 def ping_rate_limits_hz(
     speed_m_s: float, advance_m: float, last_echo_s: float
 ) -> tuple[float, float]:
-    """Return the lowest and highest ping rate, v/advance <= PRF <= 1/Tf (THESIS [24], [30]).
+    """Return the lowest and highest ping rate, v/advance <= PRF <= 1/Tf; [24], [30].
 
-    With an advance of L/2 the lower one is the thesis's 2 v/L. Where it is above the higher one, no
-    ping rate will do.
+    With an advance of L/2 the lower limit is the thesis's 2 v/L. If the lower limit exceeds the
+    upper one, no ping rate satisfies both.
 
     Parameters
     ----------
     speed_m_s : float
         Platform speed.
     advance_m : float
-        Farthest that the platform may go from ping to ping (`ping_advance_m`).
+        Largest advance per ping (`ping_advance_m`).
     last_echo_s : float
-        When the last echo ends, Tf (`receive_interval_s`).
+        End of the last echo, Tf (`receive_interval_s`).
     """
     speed = validate.number("speed_m_s", speed_m_s, "m/s", least=0.0)
     advance = validate.positive("advance_m", advance_m, "m")
@@ -218,10 +221,10 @@ def ping_rate_limits_hz(
 
 
 def grating_lobe_m(wavelength_m: float, spacing_m: float, range_m: float) -> float:
-    """Return how far along the track from a target its first grating lobe lies.
+    """Return the distance along the track from a target to its first grating lobe.
 
-    Phase centres d apart repeat their two-way phase at sin theta = lambda/(2 d); at range R
-    that is R lambda/(2 d) along the track (THESIS [26]).
+    The two-way phase of phase centres d apart repeats at sin theta = lambda/(2 d). At range R this
+    is R lambda/(2 d) along the track [26].
     """
     wavelength = validate.positive("wavelength_m", wavelength_m, "m")
     spacing = validate.positive("spacing_m", spacing_m, "m")
@@ -234,7 +237,7 @@ def _course(centres: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _corners_m(grid: Grid) -> NDArray[np.float64]:
-    """Return the corners [n, 3] of a plane, or of the box around any other grid."""
+    """Corners [n, 3] of a plane, or of the box around any other grid."""
     if grid.is_planar:
         ends = (slice(None, None, max(1, count - 1)) for count in grid.shape)
         return grid.positions_m(*ends).reshape(-1, 3)

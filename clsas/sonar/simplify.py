@@ -1,12 +1,11 @@
-"""What an image can do without: effects whose error lies far below what is asked for.
+"""Simplification of a geometry: effects with an error far below the accuracy are left out.
 
 Modelling an effect costs time for every pixel and channel. Before an image is formed, `simplify`
-looks for a simpler model of the same geometry that no pixel can tell from the full one:
+replaces, if the error permits:
 
-- one antenna at rest in place of a transmitter and a receiver, or of a receiver in motion. Each
-  channel gets the position whose ranges to the grid are closest, by least squares: its phase
-  centre, moved by what is common to all pixels;
-- a plane in place of a grid whose relief is next to none.
+- transmitter and receiver, or a moving receiver, by one antenna at rest. Its position fits the
+  ranges to the grid by least squares: the phase centre, shifted by what is common to all pixels;
+- a grid with negligible relief by a plane.
 """
 
 from __future__ import annotations
@@ -32,40 +31,40 @@ RELIEF = "relief of the grid"
 EFFECTS = (MOTION, APART, RELIEF)
 
 SHARE = 1 / 20
-"""Of the power of the error allowed: what all that is left out may add."""
+"""Share of the allowed error power that all effects left out may add."""
 
 LEAST_PIXELS = 1 << 18
-"""Of an image worth a fit of antennas. With 640 moving receivers the fit takes 5 ms of processor
-time and saves 10 % of the exact image; of 65 000 pixels that is less than the fit takes."""
+"""Smallest image for which antennas are fitted. With 640 moving receivers the fit takes 5 ms of
+processor time and saves 10 % of the exact image. For 65 000 pixels it saves less than it takes."""
 
-_POINTS = 5  # along either side of a grid, where the antennas of all channels are fitted
-_CHECKED_POINTS = 20  # along either side, where some channels are checked, before all are fitted
-_CHECKED_CHANNELS = 32  # spread evenly; those furthest apart, and the fastest, are checked besides
-_LEAST_STEPS = 2.0  # least range, in steps between points: closer by, ranges bend between them
-_BEYOND_BEAM = 0.75  # of a step between points: half the diagonal, so that no pixel is passed over
-_RIDGE = 1e-6  # keeps positions still along directions in which no pixel tells them apart
-_ITERATIONS = 2  # of least squares: a third gains nothing
-_CHANNELS_AT_ONCE = 4096
-_ROWS_AT_ONCE = 256  # of a grid
-_WEIGHTS = 1024  # at which a beam's slope is evaluated
+_POINTS = 5  # sample points along either side of the grid, to which all antennas are fitted
+_CHECKED_POINTS = 20  # sample points along either side, at which some channels are checked first
+_CHECKED_CHANNELS = 32  # spread evenly; the widest separation and the fastest are checked, too
+_LEAST_STEPS = 2.0  # least range over the spacing of sample points; closer, ranges bend in between
+_BEYOND_BEAM = 0.75  # half the diagonal between sample points: no pixel near the beam is missed
+_RIDGE = 1e-6  # keeps antennas in place along directions that the ranges do not determine
+_ITERATIONS = 2  # of least squares; a third one changed nothing
+_CHANNELS_AT_ONCE = 4096  # bounds memory
+_ROWS_AT_ONCE = 256  # of a grid; bounds memory
+_WEIGHTS = 1024  # sines at which the slope of beam weights is evaluated
 
 
 @dataclass(frozen=True, eq=False)
 class Model:
-    """Lines, grid and beam as an image is formed of them, and what that leaves out.
+    """Lines, grid and beam from which an image is formed, and the effects that they leave out.
 
     Attributes
     ----------
     lines : RangeLines
-        Those given, or the same samples with simpler antennas.
+        The given lines, or their samples with simpler antennas.
     grid : Grid
-        That given, or the plane in its place: of the same shape.
+        The given grid, or a plane of the same shape.
     beam : BeamWindow or None
-        That given; with the track's directions where antennas were moved, since these hide it.
+        The given beam. If antennas were moved, it has the directions of the original track.
     left_out : tuple of str
-        `MOTION`, `APART` and `RELIEF`.
+        Some of `MOTION`, `APART` and `RELIEF`.
     error : float
-        Power of the error that this adds, at most, over that of the image.
+        Upper bound of the relative error power that this adds.
     """
 
     lines: RangeLines
@@ -78,23 +77,23 @@ class Model:
 def simplify(
     lines: RangeLines, grid: Grid, beam: BeamWindow | None, allowed_db: float | None
 ) -> Model:
-    """Return the simplest model whose error is a small share of that allowed.
+    """Return the simplest model whose error is a small share of the allowed one.
 
     Parameters
     ----------
     lines, grid, beam
         The full model.
     allowed_db : float or None
-        Relative rms error allowed of the image, dB; with None nothing is left out.
+        Allowed relative rms error of the image, dB. With None nothing is left out.
 
     Notes
     -----
-    A range that differs by d turns the phase by 2 pi f d, with f the highest frequency that a
-    sampled band may hold in cycles per metre of range, wherever its middle lies. Not the mean of
-    that counts but its maximum: for every channel at points all over the grid, its corners among
-    them, and for some channels at many more points. All of a grid's relief is looked at. Nothing
-    is left out of antennas where pixels come as near to them as these points to each other. The
-    amplitudes of both effects together stay within `SHARE` of the power of the error allowed.
+    A range error d changes the phase by 2 pi f d. f is the highest frequency in the sampled band,
+    in cycles per metre of range. The bound uses the largest range error: of every channel at sample
+    points all over the grid, corners included, and of some channels at many more points. All pixels
+    of a grid's relief are checked. Antennas are not simplified if pixels come as close to them as
+    the sample points are to each other. The amplitudes of all effects add up; their power stays
+    within `SHARE` of the allowed error power.
     """
     full = Model(lines, grid, beam)
     apart = not np.array_equal(lines.tx_m, lines.rx_m)
@@ -107,7 +106,7 @@ def simplify(
         most /= 2  # their amplitudes add up
     model, amplitude = full, 0.0
     if grid.size >= LEAST_PIXELS:
-        for effects in _wishes(lines):
+        for effects in _removable(lines):
             if fitted := _fitted(lines, grid, beam, effects, highest, most):
                 simpler, amplitude = fitted
                 model = Model(simpler, grid, _with_directions(beam, lines), effects)
@@ -124,7 +123,7 @@ def simplify(
 def leave_out(
     lines: RangeLines, grid: Grid, beam: BeamWindow | None, effects: tuple[str, ...]
 ) -> Model:
-    """Return the model without some effects, whatever error that adds."""
+    """Return the model without some effects, whatever the error."""
     if MOTION in effects or APART in effects:
         points_m = grid.spread(_POINTS)
         along = None if beam is None else beam.directions(lines)
@@ -132,8 +131,8 @@ def leave_out(
         for first in range(0, lines.channels, _CHANNELS_AT_ONCE):
             block = slice(first, first + _CHANNELS_AT_ONCE)
             of_block = None if along is None else along[block]
-            seen = _Seen.of(lines.select(block), beam, of_block, points_m)
-            tx_m[block], rx_m[block] = seen.antennas_m(effects)
+            geometry = _SampledRanges.of(lines.select(block), beam, of_block, points_m)
+            tx_m[block], rx_m[block] = geometry.antennas_m(effects)
         beam = _with_directions(beam, lines)
         lines = replace(lines, tx_m=tx_m, rx_m=rx_m, rx_velocity_m_s=None)
     if RELIEF in effects:
@@ -142,7 +141,7 @@ def leave_out(
 
 
 def relief_of(grid: Grid) -> NDArray[np.float64]:
-    """Return the largest distance of a pixel from the plane in place of a grid, [3], metres."""
+    """Return the largest deviation of pixels from the plane that fits a grid, [3], metres."""
     corner, rows, columns = _lattice(grid)
     largest = np.zeros(3)
     for first in range(0, grid.shape[0], _ROWS_AT_ONCE):
@@ -154,21 +153,21 @@ def relief_of(grid: Grid) -> NDArray[np.float64]:
     return largest
 
 
-def _wishes(lines: RangeLines) -> list[tuple[str, ...]]:
-    """Return what antennas may do without, the most first."""
+def _removable(lines: RangeLines) -> list[tuple[str, ...]]:
+    """Effects of antennas that may be left out together, the simplest model first."""
     moving = (MOTION,) if lines.rx_velocity_m_s is not None else ()
     if np.array_equal(lines.tx_m, lines.rx_m):
-        # A receiver that moves away from its transmitter and is put at rest is apart from it.
+        # The position at rest that fits a moving receiver differs from its transmitter's.
         return [moving] if moving else []
     return [(*moving, APART), moving] if moving else [(APART,)]
 
 
 @dataclass(frozen=True, eq=False)
-class _Seen:
-    """How channels see points: ranges [points, channels] of the full model, and which points.
+class _SampledRanges:
+    """Ranges of some channels to sample points of a grid in the full model, [points, channels].
 
-    `step_m` is how far the points lie apart. With a beam, points count as seen that have a pixel
-    around them in it.
+    `step_m` is the spacing of the points. `visible` marks the points with a pixel around them in
+    the beam.
     """
 
     lines: RangeLines
@@ -177,7 +176,7 @@ class _Seen:
     points_m: NDArray[np.float64]
     step_m: float
     range_m: NDArray[np.float64]
-    seen: NDArray[np.bool_]
+    visible: NDArray[np.bool_]
 
     @classmethod
     def of(
@@ -186,43 +185,45 @@ class _Seen:
         beam: BeamWindow | None,
         along: NDArray[np.float64] | None,
         points_m: NDArray[np.float64],
-    ) -> _Seen:
-        """Return how channels, whose track has some directions if there is a beam, see points."""
+    ) -> _SampledRanges:
+        """Return the ranges; `along` holds the track's unit directions for a beam."""
         antennas = lines.tx_m, lines.rx_m, lines.rx_velocity_m_s, lines.sound_speed_m_s
         range_m = pairwise_range_m(points_m, *antennas)
         step_m = float(np.ptp(points_m, axis=0).max() / max(math.sqrt(len(points_m)) - 1, 1.0))
-        seen = np.ones(range_m.shape, bool)
+        visible = np.ones(range_m.shape, bool)
         if beam is not None:
             around = _BEYOND_BEAM * step_m / np.maximum(range_m, 1e-30)
             sine = sines(points_m, lines.phase_centres_m, along).T
-            seen = (sine > beam.limits[0] - around) & (sine < beam.limits[1] + around)
-        return cls(lines, beam, along, points_m, step_m, range_m, seen)
+            visible = (sine > beam.limits[0] - around) & (sine < beam.limits[1] + around)
+        return cls(lines, beam, along, points_m, step_m, range_m, visible)
 
     def antennas_m(
         self, effects: tuple[str, ...]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return transmitters and receivers at rest that do without some effects, [channels, 3].
+        """Fitted transmitters and receivers at rest without some effects, [channels, 3].
 
-        They are one where these are no longer apart; otherwise the transmitter stays.
+        Without `APART` both are one antenna; otherwise the transmitter stays.
         """
         lines = self.lines
         if APART in effects or np.array_equal(lines.tx_m, lines.rx_m):
-            antenna_m = _closest(self.points_m, self.range_m, self.seen, lines.phase_centres_m)
+            antenna_m = _fit_positions(
+                self.points_m, self.range_m, self.visible, lines.phase_centres_m
+            )
             return antenna_m, antenna_m
         back_m = 2 * self.range_m - cdist(self.points_m, lines.tx_m)
-        return lines.tx_m, _closest(self.points_m, back_m, self.seen, lines.rx_m)
+        return lines.tx_m, _fit_positions(self.points_m, back_m, self.visible, lines.rx_m)
 
     def errors(self, tx_m: NDArray[np.float64], rx_m: NDArray[np.float64]) -> tuple[float, float]:
-        """Return by how much ranges, in metres, and sines of aspect angles differ at most."""
-        away_m = pairwise_range_m(self.points_m, tx_m, rx_m) - self.range_m
-        largest_m = float(np.abs(away_m).max(where=self.seen, initial=0.0))
+        """Largest error of ranges (metres) and of sines of aspect angles with other antennas."""
+        error_m = pairwise_range_m(self.points_m, tx_m, rx_m) - self.range_m
+        largest_m = float(np.abs(error_m).max(where=self.visible, initial=0.0))
         if self.beam is None:
             return largest_m, 0.0
         one, other = (
             sines(self.points_m, centres_m, self.along).T
             for centres_m in (self.lines.phase_centres_m, (tx_m + rx_m) / 2)
         )
-        return largest_m, float(np.abs(one - other).max(where=self.seen, initial=0.0))
+        return largest_m, float(np.abs(one - other).max(where=self.visible, initial=0.0))
 
 
 def _fitted(
@@ -233,9 +234,9 @@ def _fitted(
     highest: float,
     most: float,
 ) -> tuple[RangeLines, float] | None:
-    """Return lines with simpler antennas and the amplitude of their error, None where above `most`.
+    """Lines with simpler antennas and the amplitude of their error, or None if it exceeds `most`.
 
-    Some channels are looked at first: for most geometries that is the end of it.
+    Some channels are checked first, which rules out most geometries.
     """
     along = None if beam is None else beam.directions(lines)
     points_m, dense_m = grid.spread(_POINTS), grid.spread(_CHECKED_POINTS)
@@ -245,17 +246,18 @@ def _fitted(
         sine = sines(dense_m, lines.phase_centres_m[some], along[some])
         fullness = beam.fullness(sine, _wavelength_m(lines), len(some) / lines.channels)
 
-    def amplitude(away_m: float, sine: float) -> float:
-        weights = 0.0 if beam is None else math.sqrt(_shifted(beam, sine, lines)) / fullness
-        return 2 * np.pi * highest * away_m + weights
+    def amplitude(range_m: float, sine: float) -> float:
+        weights = 0.0 if beam is None else math.sqrt(_shift_error(beam, sine, lines)) / fullness
+        return 2 * np.pi * highest * range_m + weights
 
-    def seen(some: NDArray[np.int64] | slice, at_m: NDArray[np.float64]) -> _Seen:
-        return _Seen.of(lines.select(some), beam, None if along is None else along[some], at_m)
+    def sampled(some: NDArray[np.int64] | slice, at_m: NDArray[np.float64]) -> _SampledRanges:
+        of_some = None if along is None else along[some]
+        return _SampledRanges.of(lines.select(some), beam, of_some, at_m)
 
-    some = _some(lines)
-    dense = seen(some, dense_m)
-    antennas_m = seen(some, points_m).antennas_m(effects)
-    if dense.range_m.min(where=dense.seen, initial=math.inf) < _LEAST_STEPS * dense.step_m:
+    some = _checked_channels(lines)
+    dense = sampled(some, dense_m)
+    antennas_m = sampled(some, points_m).antennas_m(effects)
+    if dense.range_m.min(where=dense.visible, initial=math.inf) < _LEAST_STEPS * dense.step_m:
         return None
     largest = amplitude(*dense.errors(*antennas_m))
     tx_m, rx_m = np.empty_like(lines.tx_m), np.empty_like(lines.rx_m)
@@ -263,7 +265,7 @@ def _fitted(
         if largest > most:
             return None
         block = slice(first, first + _CHANNELS_AT_ONCE)
-        coarse = seen(block, points_m)
+        coarse = sampled(block, points_m)
         tx_m[block], rx_m[block] = coarse.antennas_m(effects)
         largest = max(largest, amplitude(*coarse.errors(tx_m[block], rx_m[block])))
     if largest > most:
@@ -271,8 +273,8 @@ def _fitted(
     return replace(lines, tx_m=tx_m, rx_m=rx_m, rx_velocity_m_s=None), largest
 
 
-def _some(lines: RangeLines) -> NDArray[np.int64]:
-    """Return some channels: evenly, the ends of the track, the furthest apart and the fastest."""
+def _checked_channels(lines: RangeLines) -> NDArray[np.int64]:
+    """Channels spread evenly, both ends of the track, the widest separation and the fastest."""
     distance_m = np.linalg.norm(lines.rx_m - lines.tx_m, axis=1)
     extreme = [0, lines.channels - 1, int(distance_m.argmax())]
     if lines.rx_velocity_m_s is not None:
@@ -280,36 +282,36 @@ def _some(lines: RangeLines) -> NDArray[np.int64]:
     return np.union1d(some_channels(lines.channels, _CHECKED_CHANNELS), extreme)
 
 
-def _closest(
+def _fit_positions(
     points_m: NDArray[np.float64],
     range_m: NDArray[np.float64],
-    seen: NDArray[np.bool_],
+    visible: NDArray[np.bool_],
     start_m: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """Return the positions whose distances from points are closest to some, [channels, 3].
+    """Positions whose distances from points fit ranges by least squares, [channels, 3].
 
-    By least squares over the points seen [points, channels], from where they start.
+    Gauss-Newton iterations from `start_m`, over the visible points [points, channels].
     """
     position_m = start_m.T.copy()
-    weights = seen.astype(np.float64)
+    weights = visible.astype(np.float64)
     ridge = _RIDGE * np.maximum(weights.sum(axis=0), 1.0)
     for _ in range(_ITERATIONS):
-        way = [point[:, None] - each for point, each in zip(points_m.T, position_m, strict=True)]
-        distance_m = np.sqrt(sum(each * each for each in way))
+        offset = [point[:, None] - each for point, each in zip(points_m.T, position_m, strict=True)]
+        distance_m = np.sqrt(sum(each * each for each in offset))
         over = weights / np.maximum(distance_m, 1e-30)
-        unit = [each * over for each in way]
-        away_m = distance_m - range_m
+        unit = [each * over for each in offset]
+        residual_m = distance_m - range_m
         normal = np.empty((len(start_m), 3, 3))
         for i, j in combinations_with_replacement(range(3), 2):
             normal[:, i, j] = normal[:, j, i] = (unit[i] * unit[j]).sum(axis=0)
         normal[:, range(3), range(3)] += ridge[:, None]
-        wanted = np.stack([(each * away_m).sum(axis=0) for each in unit], axis=-1)
-        position_m += np.linalg.solve(normal, wanted[..., None])[..., 0].T
+        right = np.stack([(each * residual_m).sum(axis=0) for each in unit], axis=-1)
+        position_m += np.linalg.solve(normal, right[..., None])[..., 0].T
     return np.ascontiguousarray(position_m.T)
 
 
-def _shifted(beam: BeamWindow, shift: float, lines: RangeLines) -> float:
-    """Return the power of the error of a beam's weights whose sines are shifted."""
+def _shift_error(beam: BeamWindow, shift: float, lines: RangeLines) -> float:
+    """Relative error power of a beam's weights whose sines are shifted."""
     low, high = np.clip(beam.limits, -1, 1)
     sine = np.linspace(low, high, _WEIGHTS + 2)[1:-1]
     weights = beam.weights(sine, _wavelength_m(lines))
@@ -323,17 +325,17 @@ def _wavelength_m(lines: RangeLines) -> float:
 
 
 def _with_directions(beam: BeamWindow | None, lines: RangeLines) -> BeamWindow | None:
-    """Return a beam with the directions of the track that lines have."""
+    """Return a beam with the directions of the lines' track."""
     return None if beam is None else replace(beam, along=beam.directions(lines))
 
 
 def _relief_m(lines: RangeLines, grid: Grid, most_m: float) -> float:
-    """Return by how much ranges differ at most without a grid's relief; infinite if by much.
+    """Largest range error without a grid's relief, or infinity if it is far above `most_m`.
 
-    Heights count by how steeply channels look down on them.
+    Heights change ranges by the sine of the depression angle.
     """
     points_m = grid.spread(_CHECKED_POINTS)
-    some = _some(lines)
+    some = _checked_channels(lines)
     share = np.ones(3)
     if grid.height_m is not None:
         steepest = 0.0
@@ -342,8 +344,8 @@ def _relief_m(lines: RangeLines, grid: Grid, most_m: float) -> float:
             steepest = max(
                 steepest, float((down_m / np.maximum(cdist(points_m, ends_m), 1e-30)).max())
             )
-        share[2] = min(1.1 * steepest + 1e-3, 1.0)  # pixels between the points
-    # A part of the pixels tells most grids with relief.
+        share[2] = min(1.1 * steepest + 1e-3, 1.0)  # with a margin for pixels in between
+    # A few pixels are enough to rule out most grids with relief.
     few = grid.window(*(slice(None, None, max(n // 32, 1)) for n in grid.shape))
     if np.linalg.norm(share * relief_of(few)) > 4 * most_m:
         return math.inf
@@ -351,35 +353,35 @@ def _relief_m(lines: RangeLines, grid: Grid, most_m: float) -> float:
 
 
 def _coordinates(grid: Grid) -> list[tuple[int, NDArray[np.float64]]]:
-    """Return the coordinates of pixels that need not lie on a plane, [rows, columns] each."""
+    """Axes and coordinates of pixels that may lie off a plane, [rows, columns] each."""
     if grid.height_m is not None:
         return [(2, grid.height_m)]
     return [(axis, grid.points_m[..., axis]) for axis in range(3)]
 
 
 def _lattice(grid: Grid) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Return corner and steps of the plane that fits a grid's coordinates best, [3] each.
+    """Corner and steps of the plane that fits a grid's coordinates by least squares, [3] each.
 
-    Of a height map they are on top of the plane below it. Over regular rows and columns either
-    slope is found by itself.
+    For a height map they add to those of the plane below it. Since rows and columns are regular,
+    the two slopes are independent of each other.
     """
     corner, steps = np.zeros(3), np.zeros((2, 3))
     for axis, values in _coordinates(grid):
         corner[axis] = values.mean()
         for side, n in enumerate(grid.shape):
-            place = np.arange(n) - (n - 1) / 2
-            steps[side, axis] = place @ values.mean(axis=1 - side) / max(place @ place, 1.0)
+            centred = np.arange(n) - (n - 1) / 2
+            steps[side, axis] = centred @ values.mean(axis=1 - side) / max(centred @ centred, 1.0)
             corner[axis] -= steps[side, axis] * (n - 1) / 2
     return corner, steps[0], steps[1]
 
 
 def _plane(grid: Grid) -> Grid | None:
-    """Return the plane that fits a grid best; None where its pixels would coincide."""
+    """Return the plane that fits a grid, or None if its pixels would coincide."""
     corner, rows, columns = _lattice(grid)
     if grid.height_m is not None:
         corner, rows = corner + grid.origin_m, rows + grid.row_step_m
         columns = columns + grid.column_step_m
     try:
         return Grid.oriented(corner, rows, columns, grid.shape)
-    except ValueError:  # points that lie in a line, or one on another
+    except ValueError:  # points on one line, or at one position
         return None

@@ -1,4 +1,7 @@
-"""What transmits and receives: the pulse, the elements and where they sit on the platform."""
+"""Sonars: the pulse, and the elements with their positions on the platform.
+
+Equations in brackets are those of the thesis (Ødegaard 2004).
+"""
 
 from __future__ import annotations
 
@@ -13,36 +16,36 @@ from clsas.core.fourier import fourier_integral
 
 BARKER_13 = (1, 1, 1, 1, 1, -1, -1, 1, 1, -1, 1, -1, 1)
 
-# The part of the sampled band that the receiver passes untouched; above it the anti-alias filter
-# falls smoothly to nothing at half the sample rate (see `clsas.simulate`).
 PASSBAND = 0.8
+"""Share of the sampled band that the receiver passes unchanged. Above it the anti-alias filter
+falls smoothly to zero at half the sample rate."""
 
 
 @dataclass(frozen=True)
 class Pulse:
-    """A transmitted pulse: a linear chirp or a binary phase code.
+    """Transmitted pulse: a linear chirp or a binary phase code.
 
-    The pulse lasts from t = 0 to `duration_s`; its complex envelope p(t), relative to the
-    carrier, has amplitude 1 (THESIS [5] and section 2.1).
+    The pulse lasts from t = 0 to `duration_s`. Its complex envelope p(t), relative to the carrier,
+    has amplitude 1 ([5] and section 2.1).
 
     Parameters
     ----------
     carrier_hz : float
         Centre frequency.
     bandwidth_hz : float
-        Swept bandwidth of a chirp; chips/duration of a phase code. At most 2 `carrier_hz`.
+        Bandwidth of a chirp; chips/duration of a phase code. At most 2 `carrier_hz`.
     duration_s : float
         Length of the pulse.
     code : {"up", "down"} or tuple of +1 and -1
         Chirp with rising or falling frequency, or the chips of a binary phase code.
     taper : float
-        Fraction 0..1 of the duration over which a cosine (Tukey) taper rises and falls, half of
-        it at each end; 0 is rectangular.
+        Fraction 0..1 of the duration with a cosine (Tukey) taper, half of it at each end; 0 is
+        rectangular.
 
     Raises
     ------
     TypeError, ValueError
-        If a value is not a number or outside its limits, or chips are not +1 and -1.
+        If a value is not a number or is outside its limits, or chips are not +1 and -1.
     """
 
     carrier_hz: float
@@ -81,7 +84,7 @@ class Pulse:
         *,
         taper: float = 0.0,
     ) -> Pulse:
-        """Return a binary phase code, one chip after the other in equal parts of the duration."""
+        """Return a binary phase code whose chips divide the duration evenly."""
         duration = validate.positive("duration_s", duration_s, "s")
         return cls(carrier_hz, len(chips) / duration, duration, tuple(chips), taper)
 
@@ -103,10 +106,10 @@ class Pulse:
         return np.where(inside, value, 0)
 
     def spectrum(self, frequency_hz: ArrayLike) -> NDArray[np.complex128]:
-        """Return P(f), the integral of p(t) exp(-j 2 pi f t) dt in seconds, at any frequency.
+        """Return P(f), the integral of p(t) exp(-j 2 pi f t) dt, in seconds.
 
-        Frequencies are relative to the carrier. Accurate to 1e-12 of the largest value returned,
-        by quadrature between the chips' and the taper's edges.
+        Frequencies are relative to the carrier. The quadrature between the edges of chips and taper
+        is accurate to 1e-12 of the largest value returned.
         """
         chips = 1 if isinstance(self.code, str) else len(self.code)
         edge = self.taper * self.duration_s / 2
@@ -125,33 +128,33 @@ class Pulse:
 
 @dataclass(frozen=True, eq=False)
 class Sonar:
-    """A platform's transmitter and receivers.
+    """Transmitter and receivers of a platform.
 
-    Positions are in the platform's frame: x forward, y to port (the side that a broadside beam
-    looks to), z up.
+    Positions are in the platform's frame: x forward, y to port (the side of a broadside beam), z
+    up.
 
     Parameters
     ----------
     pulse : Pulse
-        What is transmitted.
+        Transmitted pulse.
     rx_m : array_like, [receivers, 3]
         Receiver positions.
     tx_m : array_like, [3]
-        Transmitter position; the origin unless given.
+        Transmitter position; by default the origin.
     sample_rate_hz : float, optional
-        Rate of the complex baseband samples; twice the pulse's bandwidth unless given, and
-        always at least 1.25 of it, so that the receiver's filter leaves the band untouched.
+        Rate of the complex baseband samples; by default twice the pulse's bandwidth. It must be at
+        least 1.25 bandwidths, so that the receiver's filter passes the band unchanged.
     sound_speed_m_s : float
         Speed of sound.
     tx_length_m, rx_length_m : float, optional
-        Element lengths along x. None: the element does not direct sound in azimuth.
+        Element lengths along x. None: the element is omnidirectional in azimuth.
     tx_height_m, rx_height_m : float, optional
-        Element heights. None: the element does not direct sound in elevation.
+        Element heights. None: the element is omnidirectional in elevation.
 
     Raises
     ------
     TypeError, ValueError
-        If a value has the wrong type or shape, is not finite or outside its limits.
+        If a value has the wrong type or shape, is not finite or is outside its limits.
     """
 
     pulse: Pulse
@@ -184,7 +187,7 @@ class Sonar:
             raise TypeError(f"pulse must be a clsas.Pulse, got {type(self.pulse).__name__}")
         band = self.pulse.bandwidth_hz
         rate = 2 * band if self.sample_rate_hz is None else self.sample_rate_hz
-        # The last bit of a rate given as exactly 1.25 bandwidths must not matter.
+        # A rate of exactly 1.25 bandwidths may have a rounding error.
         least = band / PASSBAND * (1 - 1e-12)
         fields = {
             "rx_m": validate.array("rx_m", self.rx_m, np.float64, (None, 3)),
@@ -210,13 +213,13 @@ class Sonar:
 
     @property
     def element_length_m(self) -> float | None:
-        """The longer of the two element lengths, whose beam is the narrower; None if neither."""
+        """Length of the longer element, which has the narrower beam; None if neither has one."""
         lengths = [size for size in (self.tx_length_m, self.rx_length_m) if size is not None]
         return max(lengths, default=None)
 
     @property
     def is_omnidirectional(self) -> bool:
-        """Whether no element has a size, so that no pattern is ever computed."""
+        """Whether no element has a size."""
         sizes = (self.tx_length_m, self.rx_length_m, self.tx_height_m, self.rx_height_m)
         return all(size is None for size in sizes)
 
@@ -224,10 +227,10 @@ class Sonar:
     def thesis_wide_beam(cls) -> Sonar:
         """Return the thesis's wide-beam sonar (chapter 5).
 
-        1 MHz (wavelength 1.5 mm), 15 mm elements, 64 receivers. Its 640 phase centres of 10
-        pings over 5.28 m lie 8.25 mm apart, so receivers are 16.5 mm apart and the platform
-        advances 0.528 m per ping. The thesis gives no bandwidth and no pulse: 100 kHz (7.5 mm in
-        range, as in azimuth) and a chirp of 1 ms are chosen here.
+        1 MHz (wavelength 1.5 mm), 15 mm elements, 64 receivers. The 640 phase centres of 10 pings
+        over 5.28 m are 8.25 mm apart. Receivers are therefore 16.5 mm apart, and the platform
+        advances 0.528 m per ping. The thesis gives neither bandwidth nor pulse. This sonar has a
+        chirp of 1 ms and 100 kHz, which resolves 7.5 mm in range as in azimuth.
         """
         pulse = Pulse(carrier_hz=1e6, bandwidth_hz=100e3, duration_s=1e-3)
         return cls(pulse, line_array(64, 16.5e-3), tx_length_m=15e-3, rx_length_m=15e-3)
@@ -236,8 +239,9 @@ class Sonar:
     def edgetech(cls) -> Sonar:
         """Return the Edgetech SAS on HUGIN (chapter 6).
 
-        125 kHz, 15 kHz bandwidth, 6 receivers of together 1.2012 m, so 10 cm by 10 cm resolution.
-        The 5 ms chirp and a transmitter as long as a receiver, in the array's middle, are chosen.
+        125 kHz, 15 kHz bandwidth, 6 receivers of together 1.2012 m, which resolve 10 cm by 10 cm.
+        The thesis does not give the 5 ms chirp, nor the transmitter, here as long as a receiver and
+        in the middle of the array.
         """
         pulse = Pulse(carrier_hz=125e3, bandwidth_hz=15e3, duration_s=5e-3)
         length = 1.2012 / 6
@@ -247,10 +251,10 @@ class Sonar:
     def sensotek(cls) -> Sonar:
         """Return one receiver bank of the SENSOTEK SAS for HUGIN (chapter 6).
 
-        96 elements of one wavelength. The carrier is not given; 100 kHz follows from "270 m range
-        at 1.5 m/s with an overlap of 24 elements": 72 phase centres of half a wavelength in
-        2 * 270/1500 s. The bandwidth is "up to 50 kHz"; 37.5 kHz is chosen, for the quoted 2 cm
-        of resolution, and a chirp of 5 ms and a transmitter like a receiver.
+        96 elements of one wavelength. The thesis does not give the carrier. 100 kHz follows from
+        "270 m range at 1.5 m/s with an overlap of 24 elements": 72 phase centres of half a
+        wavelength in 2 * 270/1500 s. The bandwidth is "up to 50 kHz"; 37.5 kHz gives the quoted
+        resolution of 2 cm. The 5 ms chirp and a transmitter like a receiver are choices.
         """
         pulse = Pulse(carrier_hz=100e3, bandwidth_hz=37.5e3, duration_s=5e-3)
         length = 1500.0 / 100e3
@@ -260,7 +264,7 @@ class Sonar:
 def line_array(receivers: int, spacing_m: float) -> NDArray[np.float64]:
     """Return positions [receivers, 3] along x, centred on the origin."""
     receivers = validate.count("receivers", receivers)
-    validate.memory("receivers", 240 * receivers)  # their paths too, of one ping
+    validate.memory("receivers", 240 * receivers)  # including the paths of one ping
     spacing = validate.positive("spacing_m", spacing_m, "m")
     positions = np.zeros((receivers, 3))
     positions[:, 0] = spacing * (np.arange(receivers) - (receivers - 1) / 2)
@@ -274,27 +278,27 @@ def element_pattern(
     sound_speed_m_s: float,
     dtype: type[np.floating] = np.float64,
 ) -> NDArray[np.floating]:
-    """Return the amplitude pattern sinc(L/lambda sin theta) of one element (THESIS [9]-[12]).
+    """Return the amplitude pattern sinc(L/lambda sin theta) of one element; [9]-[12].
 
     Parameters
     ----------
     size_m : float
-        Length L of the element along the axis that theta turns away from perpendicular to.
+        Length L of the element along an axis.
     sine : array_like
-        sin theta, the direction's component along that axis.
+        sin theta, the direction's component along this axis.
     frequency_hz : array_like
         Acoustic frequency (carrier included); broadcasts with `sine`.
     sound_speed_m_s : float
         Speed of sound.
     dtype : numpy.float64 or numpy.float32
-        Of the result. Single precision is several times faster and right to 1e-7 at any angle.
+        Type of the result. Single precision is several times faster; its error is at most 1e-7.
 
     Returns
     -------
     array of `dtype`, 1 on the beam axis, negative in every other side lobe.
     """
     phase = np.multiply(np.pi * size_m / sound_speed_m_s * np.asarray(frequency_hz), sine)
-    # Rounded only here: the error of sin(x) grows with x, but that of sin(x)/x does not. It is even
-    # in x, and 1 at the least x that can be divided by.
+    # Rounded here and not before: the rounding error of sin(x) grows with x, that of sin(x)/x does
+    # not. The smallest positive number in place of 0 gives exactly 1.
     x = np.maximum(np.abs(phase).astype(dtype), np.finfo(dtype).tiny)
     return np.sin(x) / x

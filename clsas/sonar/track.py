@@ -1,4 +1,4 @@
-"""Where the platform was: its pose at every ping, and the channels and beams that follow."""
+"""Tracks: the platform's pose at every ping, the channels' positions and the beams' directions."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ Motion = float | ArrayLike | Callable[[NDArray[np.float64]], ArrayLike]
 
 @dataclass(frozen=True, eq=False)
 class Track:
-    """The platform's pose at the time of every ping.
+    """Pose of the platform at the time of every ping.
 
-    World coordinates: x along-track, y across-track, z up. The platform's frame is x forward,
-    y to port, z up. It is turned into the world by the rotations yaw about z, then pitch about
-    the turned y, then roll about the turned x (intrinsic z-y'-x''), each right-handed: positive
-    yaw turns the bow to port, positive pitch lowers the bow, positive roll lifts port.
+    World coordinates are x along-track, y across-track, z up. The platform's frame is x forward, y
+    to port, z up. Yaw about z, then pitch about the turned y, then roll about the turned x
+    (intrinsic z-y'-x'') rotate it into the world. All are right-handed: positive yaw turns the bow
+    to port, positive pitch lowers the bow, positive roll lifts port.
 
     Parameters
     ----------
@@ -32,15 +32,15 @@ class Track:
     time_s : array_like, [pings]
         Time of each transmission, strictly ascending.
     velocity_m_s : array_like, [pings, 3] or [3]
-        Velocity of the platform during each echo's flight; zero unless given. It is used only
-        where motion during flight is asked for.
+        Velocity of the platform during each echo's flight; zero by default. It is used only with
+        motion during flight.
     yaw_rad, pitch_rad, roll_rad : array_like, [pings] or scalar
-        Attitude; zero unless given.
+        Attitude; zero by default.
 
     Raises
     ------
     TypeError, ValueError
-        If an array has the wrong kind or shape, is not finite, or time does not ascend.
+        If an array has the wrong type or shape or is not finite, or time does not ascend.
     """
 
     positions_m: NDArray[np.float64]
@@ -86,7 +86,7 @@ class Track:
 
     @property
     def rotations(self) -> Rotation:
-        """The rotation from the platform's frame to the world, for every ping."""
+        """Rotation from the platform's frame to the world at every ping."""
         angles = np.stack([self.yaw_rad, self.pitch_rad, self.roll_rad], axis=1)
         return Rotation.from_euler("ZYX", angles)
 
@@ -105,35 +105,35 @@ class Track:
         pitch_rad: Motion = 0.0,
         roll_rad: Motion = 0.0,
     ) -> Track:
-        """Return a straight course at constant speed, with motion added to it.
+        """Return a straight course at constant speed with added motion.
 
         Parameters
         ----------
         start_m : array_like, [3]
-            Position at the first ping, at time 0, without the added motion.
+            Position at the first ping, at time 0, without added motion.
         velocity_m_s : array_like, [3]
-            Velocity along the course. The platform heads along its horizontal part (along x if
-            that is zero).
+            Velocity along the course. The heading is its horizontal direction, or x if the
+            horizontal velocity is zero.
         pings : int
             Number of pings.
         ping_interval_s : float
             Time from ping to ping.
         surge_m, sway_m, heave_m : number, array_like [pings], or function
-            Displacement forward along the heading, to port of it, and up. A function gets the
-            times, float64 [pings], and returns the displacements. The velocity that goes with
-            them (central differences) is added to the track's.
+            Displacement forward along the heading, to port, and up. A function takes the times,
+            float64 [pings], and returns the displacements. Their time derivative (central
+            differences) is added to the track's velocity.
         yaw_rad, pitch_rad, roll_rad : number, array_like [pings], or function
-            Attitude relative to the heading, level.
+            Attitude relative to the level heading.
 
         Raises
         ------
         TypeError, ValueError
-            If a value has the wrong kind or shape, is not finite, or outside its limits.
+            If a value has the wrong type or shape, is not finite, or is outside its limits.
         """
         start = validate.array("start_m", start_m, np.float64, (3,))
         velocity = validate.array("velocity_m_s", velocity_m_s, np.float64, (3,))
         pings = validate.count("pings", pings)
-        validate.memory("pings", 80 * pings)  # the ten numbers of a pose, its time and velocity
+        validate.memory("pings", 80 * pings)  # ten numbers per ping: pose, time and velocity
         interval = validate.positive("ping_interval_s", ping_interval_s, "s")
         time = interval * np.arange(pings, dtype=np.float64)
         heading = np.arctan2(velocity[1], velocity[0])
@@ -155,7 +155,7 @@ class Track:
 
 
 class Channels(NamedTuple):
-    """Element positions of every channel, float64 [channels, 3], in ping-major order."""
+    """Antenna positions of every channel, float64 [channels, 3], in ping-major order."""
 
     tx_m: NDArray[np.float64]
     rx_m: NDArray[np.float64]
@@ -163,33 +163,33 @@ class Channels(NamedTuple):
 
 
 def channels(sonar: Sonar, track: Track, *, motion_in_flight: bool = False) -> Channels:
-    """Return where every channel's transmitter and receiver were at transmission.
+    """Return the position of every channel's transmitter and receiver at transmission.
 
     Parameters
     ----------
     sonar : Sonar
-        Gives the elements on the platform.
+        Elements on the platform.
     track : Track
-        Gives the platform in the world.
+        Poses of the platform.
     motion_in_flight : bool
-        Also return the receivers' velocity: the platform's (its rotation during an echo's flight
-        is left out).
+        Also return the receivers' velocity. This is the platform's velocity; rotation during an
+        echo's flight is neglected.
 
     Returns
     -------
     Channels
-        tx_m, rx_m and rx_velocity_m_s (None unless asked for); channel = ping * receivers +
-        receiver.
+        tx_m, rx_m and rx_velocity_m_s, which is None without motion in flight. The channel's number
+        is ping * receivers + receiver.
 
     Raises
     ------
     TypeError, ValueError
-        If an argument is of another type, or there are more channels than memory holds.
+        If an argument has the wrong type, or the channels do not fit into memory.
     """
     validate.instance("sonar", sonar, Sonar)
     validate.instance("track", track, Track)
     validate.instance("motion_in_flight", motion_in_flight, bool)
-    # Nine numbers a channel, and ranges to four points, which every use of them takes.
+    # Nine numbers per channel, and the ranges to some points that every caller computes.
     validate.memory("sonar and track", 300 * track.pings * sonar.receivers)
     turn = track.rotations.as_matrix()
     tx = track.positions_m + turn @ sonar.tx_m
@@ -201,18 +201,18 @@ def channels(sonar: Sonar, track: Track, *, motion_in_flight: bool = False) -> C
 
 @dataclass(frozen=True)
 class Pointing:
-    """Where the beams look: the axis that element patterns are measured from.
+    """Direction of the beam axis, to which element patterns refer.
 
     Use `broadside`, `squint`, `scan` or `spot`. Elements turn as a whole with their beam.
 
     Parameters
     ----------
     squint_rad : tuple of float
-        Angles forward of broadside (port), one per ping, over and over.
+        Angles forward of broadside (port), one per ping, repeated.
     depression_rad : float
         Angle of the axis below the platform's horizontal plane.
     spot_m : tuple of three floats, optional
-        World position that the axis follows, in place of the angles.
+        World position at which the axis points, in place of the angles.
     """
 
     squint_rad: tuple[float, ...] = (0.0,)
@@ -230,22 +230,22 @@ class Pointing:
 
     @classmethod
     def broadside(cls, *, depression_rad: float = 0.0) -> Pointing:
-        """Look to port, square to the platform."""
+        """Point to port, perpendicular to the platform."""
         return cls(depression_rad=depression_rad)
 
     @classmethod
     def squint(cls, angle_rad: float, *, depression_rad: float = 0.0) -> Pointing:
-        """Look forward of broadside by an angle (aft if negative)."""
+        """Point forward of broadside by an angle (aft if negative)."""
         return cls((angle_rad,), depression_rad)
 
     @classmethod
     def scan(cls, angles_rad: ArrayLike, *, depression_rad: float = 0.0) -> Pointing:
-        """Step through angles forward of broadside, one per ping, over and over."""
+        """Step through angles forward of broadside, one per ping, repeatedly."""
         return cls(tuple(np.atleast_1d(angles_rad).tolist()), depression_rad)
 
     @classmethod
     def spot(cls, point_m: ArrayLike) -> Pointing:
-        """Follow a point of the world (spotlight)."""
+        """Point at a fixed position in the world (spotlight)."""
         return cls(spot_m=point_m)  # type: ignore[arg-type]
 
     def axes(self, track: Track) -> NDArray[np.float64]:
@@ -254,14 +254,15 @@ class Pointing:
         Returns
         -------
         float64 array, [pings, 3 vectors, 3]
-            Along an element's length, the beam axis, and along its height.
+            Direction of the element's length, beam axis, and direction of its height.
 
         Raises
         ------
         TypeError
             If `track` is not a Track.
         ValueError
-            If a spot lies straight ahead or astern, where an element's length has no direction.
+            If the spot lies straight ahead or astern: the direction of the element's length would
+            be undefined.
         """
         validate.instance("track", track, Track)
         if self.spot_m is None:
@@ -294,7 +295,7 @@ def _at(name: str, motion: Motion, time: NDArray[np.float64]) -> NDArray[np.floa
 def _rate(
     name: str, motion: Motion, time: NDArray[np.float64], interval: float
 ) -> NDArray[np.float64]:
-    """Return the time derivative: of a function locally, of an array from ping to ping."""
+    """Time derivative: local for a function, by differences between pings for an array."""
     if callable(motion):
         step = 1e-3 * interval
         return (_at(name, motion, time + step) - _at(name, motion, time - step)) / (2 * step)

@@ -443,7 +443,7 @@ def test_taps_of_another_kind_are_refused_by_name(good):
 
 
 def test_an_accuracy_out_of_reach_says_what_is_within(good):
-    with pytest.raises(ValueError, match=r"accuracy_db=-80.* taps=2; the best there is -\d"):
+    with pytest.raises(ValueError, match=r"accuracy_db=-80.* taps=2; the best is -\d"):
         backproject(**good, accuracy_db=-80, taps=2)
 
 
