@@ -1,1 +1,1 @@
-"""What the data are: range lines, grids, images, and the checks, files and numbers all share."""
+"""Data: range lines, grids and images, with the checks, files and numbers that all rooms share."""

@@ -1,1 +1,1 @@
-"""In and out: HDF5 and scene files."""
+"""Files: HDF5, scene files and tracks."""

@@ -16,7 +16,7 @@ _SMALLEST_SIDE = 128  # pixels; smaller patches would be read and planned more t
 
 
 class PatchWindow(NamedTuple):
-    """Which pixels of a mosaic a patch has."""
+    """Pixels of a mosaic that belong to a patch."""
 
     grid: Grid
     row: int

@@ -1,4 +1,4 @@
-"""Which channels of a survey contribute to a patch: those whose beam and ranges reach it."""
+"""Visibility in surveys: the channels whose beam and recorded ranges reach a patch."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""How lines are sampled: compression, spectra, interpolation in range."""
+"""Signals: echoes and their compression, spectra, interpolation in range."""

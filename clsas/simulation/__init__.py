@@ -1,1 +1,1 @@
-"""What would be received: scenes and the simulator."""
+"""Simulation: scenes, and the echoes or range lines that a sonar receives from them."""

@@ -37,7 +37,7 @@ class ElementPatterns:
 
     @property
     def elements(self) -> list[tuple[float, int, int]]:
-        """The one-way patterns: element size (m), end of the path (0: tx, 1: rx) and axis."""
+        """Size (m), end of the path (0: tx, 1: rx) and axis of every one-way pattern."""
         sonar = self.sonar
         sizes = (
             (sonar.tx_length_m, 0, 0),

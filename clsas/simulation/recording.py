@@ -1,4 +1,4 @@
-"""What every channel records: the sum over visible points of delayed pulses, in frequency.
+"""Samples that every channel records: delayed pulses of the visible points, summed in frequency.
 
 A channel records the pulse P, delayed, through the receiver's anti-alias filter G. The filter
 passes |f| <= 0.4 sample rates unchanged and falls as an integrated Gaussian to nothing at half the

@@ -1,1 +1,1 @@
-"""Who looks, and from where: pulse and elements, track, beam weights, what channels can see."""
+"""Sonars: pulse and elements, tracks, sampling limits, beam weights and visibility."""

@@ -41,7 +41,7 @@ def warn_unreached(
 def _reached_at_points(
     lines: RangeLines, grid: Grid, beam: BeamWindow | None, along: NDArray[np.float64] | None
 ) -> bool:
-    """Whether any sampled channel receives from any sampled pixel, as for nearly every grid."""
+    """Quick test: return True if any sampled channel receives from any sampled pixel."""
     some = some_channels(lines.channels, _SAMPLED_CHANNELS)
     part, points_m = lines.select(some), grid.spread(_SAMPLED_PIXELS)
     range_m = pairwise_range_m(
@@ -62,7 +62,7 @@ def _reached_in_boxes(
     beam: BeamWindow | None,
     along: NDArray[np.float64] | None,
 ) -> bool:
-    """Whether any channel may receive from any box; if False, certainly none does.
+    """Full test: return False only if certainly no channel receives from any box.
 
     `centres_m` and `half_m` hold the boxes' centres and half sides along x, y and z, [boxes, 3].
     """

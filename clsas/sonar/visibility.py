@@ -255,7 +255,7 @@ def _touches(
     radius_m: float | NDArray[np.float64],
     spread: float | NDArray[np.float64] = 0.0,
 ) -> NDArray[np.bool_]:
-    """Whether a beam may touch a ball whose centre lies at a sine and a distance.
+    """Return where a beam may touch a ball whose centre lies at a sine and a distance.
 
     `spread` is the largest change of the track's unit direction, as the length of a vector.
     """

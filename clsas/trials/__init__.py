@@ -1,1 +1,1 @@
-"""How we know: an independent oracle, extreme cases, the self test, benchmarks, built-in cases."""
+"""Trials: an independent oracle, extreme cases, the self-test, benchmarks and built-in cases."""
