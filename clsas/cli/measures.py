@@ -191,11 +191,12 @@ def bench(
     repeats: int,
     as_json: bool,
 ) -> None:
-    """Time a benchmark case and measure its error. Without CASE, run all cases for minutes.
+    """Time a benchmark case and measure its error.
 
-    Cases bp-... are exact imaging. Cases ffbp-... are factorized imaging, compared with exact
-    imaging. mosaic-wreck is a mosaic, compared with exact imaging with and without a beam; its
-    lines are simulated once, which takes minutes. With --json every case is one line.
+    Without CASE all cases run, for minutes. Cases bp-... are exact imaging. Cases ffbp-... are
+    factorized imaging, compared with exact imaging. mosaic-wreck is a mosaic, compared with exact
+    imaging with and without a beam; its lines are simulated once, which takes minutes. With --json
+    every case is one line.
 
     \b
     Example:  clsas bench ffbp-2k --tolerance-db -40 --json
