@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clsas.core import validate
+from clsas.core import reprs, validate
 from clsas.core.geometry import bistatic_range_m
 from clsas.core.grid import Grid
 from clsas.core.image import Image, holds_any
@@ -91,6 +91,16 @@ class Patch:
     _formed: Image | None
     _store: Store | None
 
+    def __repr__(self) -> str:
+        """Return the patch's place, size and extents."""
+        return reprs.summary(
+            self,
+            f"row {self.row}",
+            f"column {self.column}",
+            f"{reprs.by(self.grid.shape)} pixels",
+            reprs.extents(*self.grid.bounds_m),
+        )
+
     @property
     def image(self) -> Image:
         """The pixels; read from the store where another process formed them."""
@@ -127,6 +137,32 @@ class Mosaic:
     _devices: tuple[Device, ...]
     _client: Client | None
     _idle_s: float | None
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return the fields to pickle; devices are opened anew by the process that reads them.
+
+        Raises
+        ------
+        TypeError
+            If the mosaic has a client, whose connection belongs to this process.
+        """
+        if self._client is not None:
+            raise TypeError(
+                "a mosaic with a client cannot be pickled, since its connection belongs to this "
+                "process: make the mosaic where it is needed, with the same source and store"
+            )
+        return self.__dict__
+
+    def __repr__(self) -> str:
+        """Return the patches, how many of them are finished, the store and the extents."""
+        store = self._job.store
+        return reprs.summary(
+            self,
+            f"{reprs.by(self.shape)} patches of {reprs.by(self.patch_shape)} pixels",
+            f"{len(self.finished)} of {len(self)} finished",
+            None if store is None else f"store {str(store)!r}",
+            reprs.extents(*self.grid.bounds_m),
+        )
 
     @property
     def shape(self) -> tuple[int, int]:

@@ -12,6 +12,7 @@ from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
+from clsas.core import reprs
 from clsas.core.atomic import make_folders, replacing
 from clsas.core.reading import parse_json, read_bytes
 
@@ -76,6 +77,8 @@ class Record:
     driver: str = ""
     plan: dict[str, Any] | None = None
     has_pixels: bool = False
+
+    __repr__ = reprs.of_fields
 
     @property
     def is_empty(self) -> bool:

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import fft
 from scipy.ndimage import map_coordinates
 
-from clsas.core import validate
+from clsas.core import reprs, validate
 
 _TILE_M = 2.0  # side of what is within the beam or not as a whole
 _CLEAR = -1e30  # elevation where there is no seabed
@@ -87,6 +87,15 @@ class PointTargets:
         )
         object.__setattr__(self, "positions_m", positions)
         object.__setattr__(self, "amplitudes", amplitudes)
+
+    def __repr__(self) -> str:
+        """Return the number of points and where they lie."""
+        place_m = self.positions_m
+        return reprs.summary(
+            self,
+            f"{self.points} point{'s' * (self.points > 1)}",
+            reprs.extents(place_m.min(axis=0), place_m.max(axis=0)),
+        )
 
     @property
     def points(self) -> int:
@@ -205,6 +214,17 @@ class Seabed:
         object.__setattr__(self, "heights_m", heights)
         object.__setattr__(self, "texture", texture)
         validate.memory("density_m2", 100 * self.density_m2 * self._cell_areas_m2.sum())
+
+    def __repr__(self) -> str:
+        """Return extents, the lattice's step and the density of scatterers."""
+        low_m, high_m = zip(self.x_m, self.y_m, (self._level_m, self.heights_m.max()), strict=True)
+        steps = " x ".join(reprs.quantity(step, "m") for step in self.steps_m)
+        return reprs.summary(
+            self,
+            reprs.extents(low_m, high_m),
+            f"steps of {steps}",
+            f"{self.density_m2:g} scatterers per m2",
+        )
 
     @property
     def steps_m(self) -> tuple[float, float]:

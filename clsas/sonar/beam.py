@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.distance import cdist
 
-from clsas.core import validate
+from clsas.core import reprs, validate
 from clsas.core.lines import RangeLines
 from clsas.sonar.system import element_pattern
 
@@ -103,6 +103,8 @@ class BeamWindow:
             normalise: bool = False,
             track_pings: int | None = None,
         ) -> None: ...
+
+    __repr__ = reprs.of_fields
 
     def __post_init__(self) -> None:  # noqa: D105
         width = validate.number(
