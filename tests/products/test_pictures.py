@@ -1,4 +1,4 @@
-"""Pictures fit for a paper: formats, scales, colours, mosaics, volumes, and labels that do not meet."""
+"""Pictures fit for a paper: formats, scales, colours, mosaics, volumes; labels keep apart."""
 
 import base64
 import io
