@@ -90,7 +90,7 @@ def _image_to_xarray(xarray: ModuleType, image: Image) -> xarray.DataArray:
         attributes = {"units": "1", "long_name": f"{words} part of the pixels"}
         coordinates[f"pixels_{name}"] = (dims, part, attributes)
     reference = largest_amplitude(image.pixels)
-    attributes = {
+    told = {
         "long_name": "Amplitude re max",
         "units": "dB",
         "reference": reference,
@@ -98,7 +98,7 @@ def _image_to_xarray(xarray: ModuleType, image: Image) -> xarray.DataArray:
         "Conventions": "CF-1.11",
     }
     # DataArray would copy the coordinates; Dataset shares them.
-    level = {"amplitude_db": (dims, image.db(), attributes)}
+    level = {"amplitude_db": (dims, image.db(), told)}
     return xarray.Dataset(level, coordinates)["amplitude_db"]
 
 
@@ -117,10 +117,9 @@ def _grid_coordinates(grid: Grid) -> dict[str, Any]:
             for name, values in zip("xyz", positions, strict=True)
         }
     x, y = grid.axes_m
-    if grid.height_m is None:
-        z: tuple[Any, Any] = ((), grid.origin_m[2])
-    else:
-        z = (dims, grid.origin_m[2] + grid.height_m)
+    z: tuple[Any, Any] = ((), grid.positions_m(slice(1), slice(1))[0, 0, 2])
+    if grid.height_m is not None:
+        z = (dims, grid.positions_m()[..., 2])
     return {
         "x": ("x", x, _AXES["x"] | {"axis": "X"}),
         "y": ("y", y, _AXES["y"] | {"axis": "Y"}),
@@ -136,7 +135,8 @@ def _channels_to_xarray(xarray: ModuleType, obj: RangeLines | Echoes) -> xarray.
     else:
         known = {"units": "s", "long_name": "Time from the first sample"}
         offset = {"time_offset_s": ("sample", steps / obj.sample_rate_hz, known)}
-    variables, attributes = {}, {}
+    variables: dict[str, Any] = {}
+    attributes: dict[str, Any] = {}
     for field in fields(obj):
         name, value = field.name, getattr(obj, field.name)
         if isinstance(value, np.ndarray):

@@ -114,6 +114,8 @@ class Mosaic:
     """A mosaic to be formed: patch by patch, or whole as `image`.
 
     Iterating over it yields each `Patch` when finished; once more, only what the store has not.
+    It pickles, with its lines unless they are in files: the process that reads it opens devices of
+    the same names. One with a client does not, since the connection belongs to this process.
 
     Attributes
     ----------

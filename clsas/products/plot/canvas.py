@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import os
-from typing import TYPE_CHECKING
+from io import BytesIO
+from typing import TYPE_CHECKING, Any, Literal
 
 from clsas.core import validate
 from clsas.core.atomic import replacing
@@ -18,7 +19,7 @@ SUFFIXES = (".png", ".pdf", ".svg")
 
 _NAMES = {"x": "Along-track", "y": "Across-track", "z": "Height"}
 _PNG_DPI, _VECTOR_DPI = 150.0, 300.0  # of screens, and of the images within a printed page
-_SETTINGS = {
+_SETTINGS: Any = {
     "pdf.fonttype": 42,  # TrueType: publishers refuse matplotlib's default, Type 3
     "svg.hashsalt": "clsas",  # the same picture gives the same file
 }
@@ -56,7 +57,7 @@ def save(figure: Figure, path: str | os.PathLike, *, dpi: float | None = None) -
     validate.positive("dpi", dpi, "pixels per inch")
     import matplotlib as mpl
 
-    options = {"metadata": _DATES[kind]} if kind in _DATES else {}
+    options: Any = {"metadata": _DATES[kind]} if kind in _DATES else {}
     with replacing(path) as temporary, mpl.rc_context(_SETTINGS):
         # What the layout leaves outside, as labels beside square axes, is drawn too.
         figure.savefig(temporary, format=kind, dpi=dpi, bbox_inches="tight", **options)
@@ -77,6 +78,17 @@ def save_png(figure: Figure, path: str | os.PathLike, *, dpi: float = _PNG_DPI) 
     save(figure, path, dpi=dpi)
 
 
+def with_fewer_colours(png: str | os.PathLike | BytesIO, colours: int) -> bytes:
+    """Return a PNG of at most so many colours, up to 256, which takes a third of the bytes."""
+    from PIL import Image  # which matplotlib brings
+
+    reduced = BytesIO()
+    with Image.open(png) as picture:
+        few = picture.convert("RGB").quantize(colours, dither=Image.Dither.NONE)
+    few.save(reduced, format="png", optimize=True)
+    return reduced.getvalue()
+
+
 def figure_class() -> type[Figure]:
     """Return matplotlib's class of figures.
 
@@ -92,7 +104,9 @@ def figure_class() -> type[Figure]:
     return Figure
 
 
-def new_figure(width_in: float, height_in: float, layout: str = "constrained") -> Figure:
+def new_figure(
+    width_in: float, height_in: float, layout: Literal["constrained", "compressed"] = "constrained"
+) -> Figure:
     """Return a figure that belongs to no window."""
     return figure_class()(figsize=(width_in, height_in), layout=layout)
 

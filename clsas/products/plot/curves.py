@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from itertools import product
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -156,7 +156,7 @@ def _spread(axes: Axes, labels: list[Annotation]) -> None:
     from matplotlib.text import Text
     from matplotlib.transforms import Bbox
 
-    figure = axes.get_figure(root=True)
+    figure: Any = axes.get_figure(root=True)
     renderer = FigureCanvasAgg(figure).get_renderer()
     figure.draw_without_rendering()  # settles where the axes lie
     point, inside = figure.dpi / 72, axes.get_window_extent()

@@ -22,6 +22,7 @@ from clsas.products.plot.canvas import (
     length_unit,
     new_figure,
     plain_ticks,
+    with_fewer_colours,
 )
 from clsas.products.plot.colours import COLOUR_MAP, colour_map
 
@@ -38,7 +39,7 @@ _MOST_PIXELS = 1500  # along an axis: more than a picture shows
 _COUNTED = 1 << 22  # pixels that percentiles are taken of, at most
 _WIDTH_IN = 7.0  # of figures of images, or nearly the height of those that are higher than wide
 _FLAT = 0.4  # height over width of an image below which the scale of levels goes below it
-_PREVIEW_IN, _PREVIEW_DPI = 4.5, 96.0  # size of a picture in a notebook: 20 to 90 kB
+_PREVIEW_IN, _PREVIEW_DPI, _PREVIEW_COLOURS = 4.5, 96.0, 64  # in a notebook: 20 to 90 kB
 
 
 @dataclass(frozen=True)
@@ -198,13 +199,9 @@ def image_html(image: Image) -> str:
         return text
     figure = new_figure(*_size_in(image, _PREVIEW_IN), layout="compressed")
     _draw_image(image, figure.subplots())
-    drawn, small = BytesIO(), BytesIO()
+    drawn = BytesIO()
     figure.savefig(drawn, format="png", dpi=_PREVIEW_DPI, bbox_inches="tight")
-    from PIL import Image as Picture  # which matplotlib brings
-
-    # Of speckle, 64 colours take a third of the bytes.
-    Picture.open(drawn).convert("RGB").quantize(64).save(small, format="png")
-    picture = base64.b64encode(small.getbuffer()).decode()
+    picture = base64.b64encode(with_fewer_colours(drawn, _PREVIEW_COLOURS)).decode()
     return f'<div><img alt="Amplitude in dB" src="data:image/png;base64,{picture}">{text}</div>'
 
 
@@ -278,7 +275,8 @@ def add_colour_bar(drawn: AxesImage, scale: Scale, ends: tuple[bool, bool], **wh
     """Draw the scale of levels; an end is pointed where levels lie beyond it."""
     pointed = {(True, True): "both", (True, False): "min", (False, True): "max"}
     extend = pointed.get(ends, "neither")
-    drawn.get_figure().colorbar(drawn, label=scale.label, extend=extend, **where)
+    figure: Any = drawn.get_figure()
+    figure.colorbar(drawn, label=scale.label, extend=extend, **where)
 
 
 def edges(axis: NDArray, other: NDArray) -> tuple[float, float]:

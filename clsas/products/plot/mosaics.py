@@ -57,8 +57,8 @@ def mosaic(
         store = Store.opened(store)
     validate.instance("borders", borders, bool)
     figure = image_db(store.overview(most), **options)
-    if borders:
-        patch_borders(figure.axes[0], store.grid, store.pixels.chunks)
+    if borders and store.patch_shape is not None:
+        patch_borders(figure.axes[0], store.grid, store.patch_shape)
     return figure
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from matplotlib import rcParams, ticker
 from matplotlib.font_manager import FontProperties
@@ -22,11 +24,11 @@ class FittingLocator(ticker.MaxNLocator):
     def __init__(self) -> None:
         super().__init__(nbins=_MOST_BINS, steps=(1, 2, 2.5, 5, 10))
 
-    def tick_values(self, vmin: float, vmax: float) -> NDArray[np.float64]:
+    def tick_values(self, vmin: float, vmax: float) -> Any:
         """Return the places of the ticks between two ends of an axis."""
         for bins in range(_MOST_BINS, 0, -1):
             self.set_params(nbins=bins)
-            places = super().tick_values(vmin, vmax)
+            places = np.asarray(super().tick_values(vmin, vmax))
             if self._fit(places, vmin, vmax):
                 return places
         low, high = sorted((vmin, vmax))
@@ -37,9 +39,11 @@ class FittingLocator(ticker.MaxNLocator):
         """Return whether labels at some places lie beside each other."""
         if len(places) < 2:
             return True
-        axis = self.axis
+        axis: Any = self.axis
         figure, box = axis.axes.get_figure(root=True), axis.axes.get_window_extent()
-        size = axis.get_tick_params().get("labelsize", rcParams[f"{axis.axis_name}tick.labelsize"])
+        usual: Any = rcParams
+        size = usual[f"{axis.axis_name}tick.labelsize"]
+        size = axis.get_tick_params().get("labelsize", size)
         em = FontProperties(size=size).get_size_in_points()
         pitch = abs(places[1] - places[0]) / abs(vmax - vmin) * 72 / figure.dpi
         if axis.axis_name != "x":

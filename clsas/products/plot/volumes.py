@@ -110,7 +110,7 @@ def volume(
         panel.set_title(what, fontsize="medium")
         panel.set_aspect("equal")
         if indices is not None:
-            line = {"color": "white", "linewidth": 0.6, "alpha": 0.7, "linestyle": "--"}
+            line: Any = {"color": "white", "linewidth": 0.6, "alpha": 0.7, "linestyle": "--"}
             panel.axvline(views[0][indices[across]], **line)
             panel.axhline(views[1][indices[upward]], **line)
     top, side, front = panels
@@ -191,8 +191,8 @@ def _sides_m(grid: Grid) -> dict[str, NDArray[np.float64]]:
 def _nearest(box: _Box, at: Sequence[float] | None) -> dict[str, int]:
     """Return the indices of the pixel at a place, or of the brightest one, by coordinate."""
     if at is None:
-        found = np.unravel_index(box.level.argmax(), box.level.shape)
-        return {name: int(index) for name, index in zip("zyx", found, strict=True)}
+        brightest = np.unravel_index(box.level.argmax(), box.level.shape)
+        return {name: int(index) for name, index in zip("zyx", brightest, strict=True)}
     place_m = validate.array("at", at, np.float64, (3,))
     found = {}
     for name, value in zip("xyz", place_m, strict=True):
