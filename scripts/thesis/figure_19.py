@@ -52,7 +52,7 @@ def main() -> None:
     numbers = np.arange(1, 8)
     axes.plot(numbers, by_formula, "o-", label="Nearest beam, by [45]")
     axes.plot(numbers, largest, "s-", label="Nearest beam, largest measured")
-    label = f"interpolated, {TOLERANCE_DB} dB: from the image's error"
+    label = f"Interpolated, {TOLERANCE_DB} dB: from the image's error"
     axes.plot(len(plan.sides) + 1, interpolated_m, "^", label=label)
     axes.axhline(WAVELENGTH_M / 4, color="grey", linestyle=":", label="λ/4")
     axes.set(xlabel="Number of stages (1: backprojection)", ylabel="Range error (m)")

@@ -89,9 +89,9 @@ def main() -> None:
     axes.set_yticks(ticks, [f"λ/{tick}" for tick in ticks])
     axes.minorticks_off()
     axes.set(xlabel="Number of stages", ylabel="Error by [45]", xticks=range(2, 6))
-    axes.set_title("nearest beam: usable (o) and not (x)")
+    axes.set_title("Nearest beam: usable (o) and not (x)")
     axes.grid(alpha=0.3)
-    axes.legend()
+    figure.legend(loc="outside lower center", ncols=3)
     chapter5.save(figure, given.out, "figure_37")
 
 

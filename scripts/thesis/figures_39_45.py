@@ -24,7 +24,7 @@ DYNAMIC_RANGE_DB = 40
 BRIGHTEST = 99.5  # percentile of the exact image's power that is the pictures' 0 dB
 PANEL = 256  # pixels along a picture's side, about
 STEPS = 16  # of the grey scale
-DPI = {1: 130, 2: 110}  # by pictures a side: files of less than 200 kB
+DPI = {1: 180, 2: 110}  # by pictures a side: files of less than 200 kB
 
 Picture = tuple[str, clsas.Image, float]  # title, image, power of its 0 dB
 
@@ -213,6 +213,7 @@ def draw(pictures: list[Picture], out: Path, stem: str) -> None:
 
     side = 1 if len(pictures) == 1 else 2
     figure = chapter5.figure(*((7.5, 6.2) if side == 1 else (10.5, 8.6)))
+    figure.set_layout_engine("compressed")
     panels = figure.subplots(side, side, sharex=True, sharey=True, squeeze=False).ravel()
     for (title, image, reference), axes in zip(pictures, panels, strict=True):
         drawn = axes.imshow(
@@ -230,7 +231,7 @@ def draw(pictures: list[Picture], out: Path, stem: str) -> None:
     for axes in panels[::side]:
         axes.set_ylabel("Across-track (m)")
     figure.colorbar(drawn, ax=list(panels), label=f"Power (dB re {BRIGHTEST:g}th percentile)")
-    chapter5.save(figure, out, stem, dpi=DPI[side], colours=STEPS)
+    chapter5.save(figure, out, stem, dpi=DPI[side])
 
 
 if __name__ == "__main__":
