@@ -146,6 +146,19 @@ def test_colours_span_percentiles():
     assert level_of(plot.image_db(nothing, percentiles=(1, 99))).get_clim() == (-60, 0)
 
 
+@pytest.mark.parametrize("scale", np.linspace(0.1, 3, 30))
+def test_the_scale_is_pointed_where_levels_lie_beyond_it(scale):
+    def pointed(**options):
+        return level_of(plot.image_db(image, **options)).colorbar.extend
+
+    image = Image((scale * SPECKLE.pixels).astype(np.complex64), GRID)
+    assert pointed(dynamic_range_db=20) == "min"  # whatever the largest level is rounded to
+    if scale == 0.1:
+        assert pointed(dynamic_range_db=200) == "neither"
+        assert pointed(percentiles=(1, 99)) == "both"
+        assert pointed(reference=0.1, dynamic_range_db=200) == "max"
+
+
 def lightness_and_colour(colours):
     """CIELAB of sRGB colours."""
     linear = np.where(colours <= 0.04045, colours / 12.92, ((colours + 0.055) / 1.055) ** 2.4)

@@ -36,6 +36,7 @@ DYNAMIC_RANGE_DB = 60.0
 """What a picture shows below the reference unless told otherwise, dB."""
 
 _MOST_PIXELS = 1500  # along an axis: more than a picture shows
+_SAME_DB = 1e-3  # between levels that are the same but for rounding
 _COUNTED = 1 << 22  # pixels that percentiles are taken of, at most
 _WIDTH_IN = 7.0  # of figures of images, or nearly the height of those that are higher than wide
 _FLAT = 0.4  # height over width of an image below which the scale of levels goes below it
@@ -252,7 +253,6 @@ def draw_levels(
     The scale of levels goes to the side `bar` of the axes, "right" or "bottom", or nowhere.
     """
     low, high = scale.limits(level)
-    ends = bool(level.min() < low), bool(level.max() > high)
     drawn = axes.imshow(
         np.maximum(_greatest(level), low),
         cmap=colour_map(scale.colour_map),
@@ -267,13 +267,17 @@ def draw_levels(
         slim = max(abs((extent[3] - extent[2]) / (extent[1] - extent[0])), 1.0)
         beside = {"fraction": min(0.1 * slim, 0.9), "pad": min(0.02 * slim, 0.4)}
         share = {"shrink": 0.8} if bar == "bottom" else beside
-        add_colour_bar(drawn, scale, ends, ax=axes, location=bar, aspect=30, **share)
+        add_colour_bar(drawn, scale, level, ax=axes, location=bar, aspect=30, **share)
     return drawn
 
 
-def add_colour_bar(drawn: AxesImage, scale: Scale, ends: tuple[bool, bool], **where: Any) -> None:
+def add_colour_bar(
+    drawn: AxesImage, scale: Scale, level: NDArray[np.float32], **where: Any
+) -> None:
     """Draw the scale of levels; an end is pointed where levels lie beyond it."""
     pointed = {(True, True): "both", (True, False): "min", (False, True): "max"}
+    low, high = drawn.get_clim()
+    ends = bool(level.min() < low - _SAME_DB), bool(level.max() > high + _SAME_DB)
     extend = pointed.get(ends, "neither")
     figure: Any = drawn.get_figure()
     figure.colorbar(drawn, label=scale.label, extend=extend, **where)

@@ -119,8 +119,7 @@ def volume(
     front.set(xlabel=axis_label("x", unit), ylabel=axis_label("z", unit))
     top.tick_params(labelbottom=False)  # those of the views below and to the left
     side.tick_params(labelleft=False)
-    ends = bool(box.level.min() < low), bool(box.level.max() > high)
-    add_colour_bar(drawn, scale, ends, cax=beside)
+    add_colour_bar(drawn, scale, box.level, cax=beside)
     figure.suptitle(title)
     return figure
 
