@@ -14,7 +14,8 @@ if TYPE_CHECKING:
     from clsas.exact.backprojection import backproject
     from clsas.exact.wavenumber import wavenumber
     from clsas.factorized.plan import Plan
-    from clsas.files.hdf5 import FileFormatError, load, save, to_xarray
+    from clsas.files.hdf5 import FileFormatError, load, save
+    from clsas.files.xarrays import to_xarray
     from clsas.mosaics.mosaic import Mosaic, Patch, mosaic
     from clsas.mosaics.store import Store
     from clsas.opencl.device import DeviceError, list_devices
@@ -90,7 +91,8 @@ _MODULES = {
     "exact.backprojection": "backproject",
     "exact.wavenumber": "wavenumber",
     "factorized.plan": "Plan",
-    "files.hdf5": "FileFormatError load save to_xarray",
+    "files.hdf5": "FileFormatError load save",
+    "files.xarrays": "to_xarray",
     "mosaics.mosaic": "Mosaic Patch mosaic",
     "mosaics.store": "Store",
     "opencl.device": "DeviceError list_devices",

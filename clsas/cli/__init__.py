@@ -117,7 +117,7 @@ def main(traceback: bool) -> None:
     A first try:     clsas demo
     Step by step:    clsas simulate scene.toml -o echoes.h5
                      clsas compress echoes.h5 -o lines.h5
-                     clsas image lines.h5 --scene scene.toml -o image.h5 --png image.png
+                     clsas image lines.h5 --scene scene.toml -o image.h5 --picture image.png
                      clsas quality image.h5 --near 0,42.5
     """
 

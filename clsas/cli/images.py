@@ -17,6 +17,7 @@ from clsas.cli.inputs import (
     load,
     read_beam,
     read_grid,
+    read_levels,
     read_request,
     warn_of_sampling,
 )
@@ -61,8 +62,8 @@ from clsas.signal.interpolation import MOST_UPSAMPLING, TAPS
 )  # fmt: skip
 @options.beam
 @options.device
-@options.png("the image in dB")
-@options.dynamic_range
+@options.picture("the image in dB")
+@options.levels
 @click.option("--profile", is_flag=True, help="Also report the time of every kernel.")
 @options.as_json
 def image(
@@ -71,8 +72,10 @@ def image(
     scene: Path | None,
     exact: bool,
     device: str | None,
-    png: Path | None,
-    dynamic_range_db: float,
+    picture: Path | None,
+    dynamic_range_db: float | None,
+    percentiles: tuple[float, float] | None,
+    colour_map: str | None,
     profile: bool,
     as_json: bool,
     **given: Any,
@@ -85,8 +88,9 @@ def image(
     keeps the tolerance.
 
     \b
-    Example:  clsas image lines.h5 --x -2.5:2.5:1024 --y 40:45:1024 -o image.h5 --png image.png
+    Example:  clsas image lines.h5 --x -2.5:2.5:1024 --y 40:45:1024 -o image.h5 --picture image.png
     """
+    levels = read_levels(dynamic_range_db, percentiles, colour_map)
     described, grid = read_grid(scene, given)
     request = read_request(described, given, exact)
     beam = read_beam(described, given)
@@ -141,10 +145,10 @@ def image(
     results["left_out"] = left_out
     how += f"; without {', '.join(left_out)}, far below the error allowed" if left_out else ""
     clsas.save(output, formed)
-    if png is not None:
+    if picture is not None:
         from clsas.products import plot
 
-        plot.save_png(plot.image_db(formed, dynamic_range_db=dynamic_range_db), png)
+        plot.save(plot.image_db(formed, **levels), picture)
     planned = f", planned in {results['plan_seconds']:.2f} s" if "plan_seconds" in results else ""
     table = "".join(
         f"\n  {name}: {times.count} runs of {1e3 * times.minimum_s:.3g} to "
@@ -155,7 +159,7 @@ def image(
         as_json,
         f"{output}: {' x '.join(map(str, grid.shape))} pixels from {lines.channels} lines in "
         f"{seconds:.2f} s{planned} on {opened.info.label} ({how}){table}",
-        file=output, png=png, shape=grid.shape, channels=lines.channels,
+        file=output, picture=picture, shape=grid.shape, channels=lines.channels,
         device=opened.info.label, driver=opened.info.driver, **results, seconds=seconds,
         kernels=kernels,
     )  # fmt: skip

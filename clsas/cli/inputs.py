@@ -9,12 +9,13 @@ from typing import Any
 import click
 
 import clsas
-from clsas.cli.parameters import keep_apart, written_to
+from clsas.cli.parameters import keep_apart, need_matplotlib, written_to
 from clsas.core import validate
 from clsas.files import scene_files as config
 from clsas.files.scene_files import SceneFile
 from clsas.files.scene_tables import EXACT_KEYS, PLAN_KEYS
 from clsas.planning.planner import TOLERANCE_DB
+from clsas.products.plot.colours import colour_map as check_colour_map
 
 DEFAULT_REQUEST = {"tolerance_db": TOLERANCE_DB}
 
@@ -116,6 +117,28 @@ def read_beam(described: SceneFile, given: dict[str, Any]) -> clsas.BeamWindow |
         return changed
     except ValueError as error:  # the scene's own beam was checked when it was read
         raise click.UsageError(str(error)) from error
+
+
+def read_levels(
+    dynamic_range_db: float | None,
+    percentiles: tuple[float, float] | None,
+    colour_map: str | None,
+) -> dict[str, Any]:
+    """Return the arguments of `clsas.plot.image` that say which levels a picture shows, checked."""
+    if dynamic_range_db is not None and percentiles is not None:
+        raise click.UsageError("--dynamic-range-db and --percentiles exclude each other")
+    given = {
+        "dynamic_range_db": dynamic_range_db,
+        "percentiles": percentiles,
+        "colour_map": colour_map,
+    }
+    if colour_map is not None:
+        need_matplotlib()
+        try:
+            check_colour_map(colour_map)
+        except ValueError as error:
+            raise click.UsageError(str(error).replace("colour_map", "--colour-map")) from error
+    return {name: value for name, value in given.items() if value is not None}
 
 
 def warn_of_sampling(scene: SceneFile, grid: clsas.Grid | None = None) -> None:

@@ -10,7 +10,7 @@ import click
 
 import clsas
 from clsas.cli import options
-from clsas.cli.inputs import load, read_scene, warn_of_sampling
+from clsas.cli.inputs import load, read_levels, read_scene, warn_of_sampling
 from clsas.cli.outputs import progress_bar, report
 from clsas.cli.parameters import INPUT
 from clsas.signal.compression import check_options
@@ -20,9 +20,9 @@ from clsas.simulation.simulator import check_size
 @click.command()
 @click.argument("scene_file", metavar="SCENE.TOML", type=INPUT)
 @options.output("Echoes")
-@options.png("track and grid")
+@options.picture("track and grid")
 @options.as_json
-def simulate(scene_file: Path, output: Path, png: Path | None, as_json: bool) -> None:
+def simulate(scene_file: Path, output: Path, picture: Path | None, as_json: bool) -> None:
     """Simulate the echoes of a scene file.
 
     \b
@@ -37,14 +37,15 @@ def simulate(scene_file: Path, output: Path, png: Path | None, as_json: bool) ->
         echoes = clsas.simulate(sonar, track, targets, **scene.simulate, progress=progress)
         seconds = time.perf_counter() - start
     clsas.save(output, echoes)
-    if png is not None:
+    if picture is not None:
         from clsas.products import plot
 
-        plot.save_png(plot.geometry(echoes, scene.grid), png)
+        plot.save(plot.geometry(echoes, scene.grid), picture)
     report(
         as_json,
         f"{output}: {echoes.channels} channels of {echoes.length} samples in {seconds:.2f} s",
-        file=output, png=png, channels=echoes.channels, length=echoes.length, seconds=seconds,
+        file=output, picture=picture, channels=echoes.channels, length=echoes.length,
+        seconds=seconds,
     )  # fmt: skip
 
 
@@ -60,7 +61,8 @@ def simulate(scene_file: Path, output: Path, png: Path | None, as_json: bool) ->
     "--oversampling", type=float, help="Sample rate over bandwidth. [default: 2]",
     callback=options.checked(lambda rate: check_options(oversampling=rate)),
 )  # fmt: skip
-@options.png("the lines")
+@options.picture("the lines")
+@options.levels
 @options.as_json
 def compress(
     echoes_file: Path,
@@ -68,7 +70,10 @@ def compress(
     scene: Path | None,
     window: str | None,
     oversampling: float | None,
-    png: Path | None,
+    picture: Path | None,
+    dynamic_range_db: float | None,
+    percentiles: tuple[float, float] | None,
+    colour_map: str | None,
     as_json: bool,
 ) -> None:
     """Compress echoes into range lines.
@@ -76,6 +81,7 @@ def compress(
     \b
     Example:  clsas compress echoes.h5 -o lines.h5 --window hamming
     """
+    levels = read_levels(dynamic_range_db, percentiles, colour_map)
     settings = _overridden(
         read_scene(scene).compress if scene else {}, window=window, oversampling=oversampling
     )
@@ -85,15 +91,15 @@ def compress(
         lines = clsas.compress(echoes, **settings, progress=progress)
         seconds = time.perf_counter() - start
     clsas.save(output, lines)
-    if png is not None:
+    if picture is not None:
         from clsas.products import plot
 
-        plot.save_png(plot.range_lines(lines), png)
+        plot.save(plot.range_lines(lines, **levels), picture)
     report(
         as_json,
         f"{output}: {lines.channels} lines of {lines.length} samples, "
         f"{1e3 * lines.range_step_m:.4g} mm apart, in {seconds:.2f} s",
-        file=output, png=png, channels=lines.channels, length=lines.length,
+        file=output, picture=picture, channels=lines.channels, length=lines.length,
         range_step_m=lines.range_step_m, seconds=seconds,
     )  # fmt: skip
 

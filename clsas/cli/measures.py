@@ -37,7 +37,7 @@ from clsas.products.tradeoff import TOLERANCES_DB
     callback=options.checked(partial(validate.positive, "extent_m", unit="m")),
 )  # fmt: skip
 @click.option("--reference", type=INPUT, help="Exact image, to measure the relative error.")
-@options.png("cuts through the point")
+@options.picture("cuts through the point")
 @options.as_json
 def quality(
     image_file: Path,
@@ -45,16 +45,16 @@ def quality(
     search_m: float | None,
     extent_m: float | None,
     reference: Path | None,
-    png: Path | None,
+    picture: Path | None,
     as_json: bool,
 ) -> None:
     """Measure an image: contrast, response of a point, error against another image.
 
     \b
-    Example:  clsas quality image.h5 --near 0,42.5 --png cuts.png
+    Example:  clsas quality image.h5 --near 0,42.5 --picture cuts.png
     """
-    if near is None and (search_m, extent_m, png) != (None, None, None):
-        raise click.UsageError("--search-m, --extent-m and --png require --near")
+    if near is None and (search_m, extent_m, picture) != (None, None, None):
+        raise click.UsageError("--search-m, --extent-m and --picture require --near")
     pixels = load(image_file, clsas.Image)
     results: dict[str, Any] = {
         "entropy": clsas.entropy(pixels),
@@ -76,10 +76,10 @@ def quality(
         response = clsas.measure_point(pixels, near, search_m=search_m, extent_m=extent_m)
         results["point"] = response
         text.append(_describe(response))
-        if png is not None:
+        if picture is not None:
             from clsas.products import plot
 
-            plot.save_png(plot.cuts(response), png)
+            plot.save(plot.cuts(response), picture)
     report(as_json, "\n".join(text), **results)
 
 
@@ -110,7 +110,7 @@ def quality(
 @options.device
 @click.option("--repeats", type=click.IntRange(1), default=3, show_default=True, help="Timed runs.")
 @click.option("--csv", type=Output(".csv"), help="Also write the table.")
-@options.png("time over error")
+@options.picture("time over error")
 @options.as_json
 def tradeoff(
     lines_file: Path | None,
@@ -122,7 +122,7 @@ def tradeoff(
     device: str | None,
     repeats: int,
     csv: Path | None,
-    png: Path | None,
+    picture: Path | None,
     as_json: bool,
     **given: Any,
 ) -> None:
@@ -132,7 +132,7 @@ def tradeoff(
     side lobes are those of the strongest point.
 
     \b
-    Example:  clsas tradeoff --case ffbp-thesis --csv tradeoff.csv --png tradeoff.png
+    Example:  clsas tradeoff --case ffbp-thesis --csv tradeoff.csv --picture tradeoff.png
     """  # fmt: skip
     if lines_file is None and case is None:
         raise click.UsageError("give either LINES.H5 or --case")
@@ -157,8 +157,10 @@ def tradeoff(
         )  # fmt: skip
     if csv is not None:
         measured.save_csv(csv)
-    if png is not None:
-        measured.save_png(png, title=case or lines_file.name)
+    if picture is not None:
+        from clsas.products import plot
+
+        plot.save(plot.tradeoff(measured, title=case or lines_file.name), picture)
     report(
         as_json,
         f"{measured.channels} lines, {' x '.join(map(str, measured.pixels))} pixels on "

@@ -15,7 +15,14 @@ from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, T
 
 import clsas
 from clsas.cli import options
-from clsas.cli.inputs import read_beam, read_grid, read_request, read_scene, warn_of_sampling
+from clsas.cli.inputs import (
+    read_beam,
+    read_grid,
+    read_levels,
+    read_request,
+    read_scene,
+    warn_of_sampling,
+)
 from clsas.cli.outputs import progress_bar, report
 from clsas.cli.parameters import COUNTS, INPUT, File, Store, keep_apart
 from clsas.core.extras import install_command
@@ -64,8 +71,9 @@ _LISTED = 3  # patches that are listed for each kind of defect
     "--verify", is_flag=True,
     help="Only compare all patches of the store with their checksums.",
 )  # fmt: skip
-@options.png("an overview in dB")
-@options.dynamic_range
+@options.picture("an overview in dB")
+@options.levels
+@click.option("--borders", is_flag=True, help="Draw the borders of the patches into the picture.")
 @options.as_json
 def mosaic(
     scene: Path,
@@ -79,8 +87,11 @@ def mosaic(
     follow: bool,
     idle_s: float | None,
     verify: bool,
-    png: Path | None,
-    dynamic_range_db: float,
+    picture: Path | None,
+    dynamic_range_db: float | None,
+    percentiles: tuple[float, float] | None,
+    colour_map: str | None,
+    borders: bool,
     as_json: bool,
     **given: Any,
 ) -> None:
@@ -92,7 +103,7 @@ def mosaic(
     Without --lines the scene is simulated first.
 
     \b
-    Example:  clsas mosaic scene.toml --lines lines.h5 -o image.zarr --png image.png
+    Example:  clsas mosaic scene.toml --lines lines.h5 -o image.zarr --picture image.png
     """
     if workers is not None and scheduler is not None:
         raise click.UsageError("give only one of --workers and --scheduler")
@@ -101,6 +112,7 @@ def mosaic(
     if verify:
         _verify(output or read_scene(scene).mosaic.get("store") or _default_store(scene), as_json)
         return
+    levels = read_levels(dynamic_range_db, percentiles, colour_map)
     described, grid = read_grid(scene, given, memory=False)
     request = read_request(described, given)
     if set(request) - {*PLAN_KEYS, "accuracy_db"}:
@@ -111,9 +123,11 @@ def mosaic(
     in_scene = described.mosaic
     output = output or in_scene.get("store") or _default_store(scene)
     lines_path = lines_path or in_scene.get("lines")
-    keep_apart("--png", png, "the store", output)
-    if png is not None and Path(os.path.realpath(png)).is_relative_to(os.path.realpath(output)):
-        raise click.UsageError(f"--png must not lie in the store, got {str(png)!r}")
+    keep_apart("--picture", picture, "the store", output)
+    if picture is not None and Path(os.path.realpath(picture)).is_relative_to(
+        os.path.realpath(output)
+    ):
+        raise click.UsageError(f"--picture must not lie in the store, got {str(picture)!r}")
     keep_apart("the range lines", lines_path, "the store", output)
     if follow and (lines_path is None or not lines_path.is_dir()):
         raise click.UsageError("--follow requires --lines with a folder")
@@ -125,7 +139,7 @@ def mosaic(
     memory_mib = memory_mib or in_scene.get("memory_mib")
     if lines_path is None:
         lines_path = _beside(output, scene)
-        keep_apart("--png", png, "the simulated range lines", lines_path)
+        keep_apart("--picture", picture, "the simulated range lines", lines_path)
         _simulate(described, scene, lines_path, click.echo if not as_json else None)
     start = time.perf_counter()
     with _cluster(workers, scheduler) as client:
@@ -143,10 +157,10 @@ def mosaic(
     seconds = time.perf_counter() - start
     store = clsas.Store.opened(output)
     records = store.records()
-    if png is not None:
+    if picture is not None:
         from clsas.products import plot
 
-        plot.save_png(plot.image_db(store.overview(), dynamic_range_db=dynamic_range_db), png)
+        plot.save(plot.mosaic(store, borders=borders, **levels), picture)
     errors = [r.predicted_error_db for r in records.values() if r.predicted_error_db is not None]
     flagged = {index: record.flags for index, record in records.items() if record.flags}
     worst = max(errors, default=None)
@@ -161,7 +175,7 @@ def mosaic(
     report(
         as_json,
         "\n".join([summary, *_described_flags(flagged)]),
-        file=output, png=png, shape=grid.shape, patches=formed.shape,
+        file=output, picture=picture, shape=grid.shape, patches=formed.shape,
         patch_shape=formed.patch_shape, finished=len(records), formed=count, before=before,
         seconds=seconds, pixels_per_s=pixels / seconds, predicted_error_db=worst,
         flags={f"{row},{column}": f for (row, column), f in flagged.items()},

@@ -8,11 +8,12 @@ from typing import Any
 
 import click
 
-from clsas.cli.parameters import AXIS, INPUT, RATIO, STAGES, Output
+from clsas.cli.parameters import AXIS, INPUT, PERCENTILES, RATIO, STAGES, Output
 from clsas.core import validate
 from clsas.exact.backprojection import BEST_ACCURACY_DB
 from clsas.files.hdf5 import SUFFIXES
 from clsas.planning.planner import BEST_TOLERANCE_DB, WORST_TOLERANCE_DB, wavelengths
+from clsas.products.plot.canvas import SUFFIXES as PICTURES
 from clsas.sonar.beam import SHAPES
 
 
@@ -38,9 +39,12 @@ def output(kind: str) -> Callable:
     )
 
 
-def png(what: str) -> Callable:
-    """Return the option for a picture of the result."""
-    return click.option("--png", type=Output(".png"), help=f"Also draw {what}.")
+def picture(what: str) -> Callable:
+    """Return the option for a picture of the result; --png is its name of earlier versions."""
+    return click.option(
+        "--picture", "--png", "picture", type=Output(*PICTURES),
+        help=f"Also draw {what}, as PNG, PDF or SVG after the file's name.",
+    )  # fmt: skip
 
 
 def _together(*options: Callable) -> Callable:
@@ -55,10 +59,21 @@ def _together(*options: Callable) -> Callable:
 
 
 as_json = click.option("--json", "as_json", is_flag=True, help="Print results as JSON.")
-dynamic_range = click.option(
-    "--dynamic-range-db", type=float, default=60.0, show_default=True,
-    help="Dynamic range of the PNG.",
-    callback=checked(partial(validate.positive, "dynamic_range_db", unit="dB")),
+levels = _together(
+    click.option(
+        "--dynamic-range-db", type=float,
+        help="Dynamic range of the picture, below the largest level. [default: 60]",
+        callback=checked(partial(validate.positive, "dynamic_range_db", unit="dB")),
+    ),
+    click.option(
+        "--percentiles", type=PERCENTILES,
+        help="Show levels between these percentiles of all pixels instead, such as 1,99.5.",
+    ),
+    click.option(
+        "--colour-map",
+        help="Colours of the picture: sonar (black, copper, cream), gray, cividis or any other of "
+        "matplotlib's. [default: inferno]",
+    ),
 )  # fmt: skip
 scene = click.option("--scene", type=INPUT, help="Scene file for values without an option.")
 device = click.option(

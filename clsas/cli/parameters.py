@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import math
 import os
 import tempfile
@@ -14,7 +13,7 @@ from typing import Any
 import click
 
 from clsas.core import validate
-from clsas.core.extras import install_command
+from clsas.core.extras import install_command, is_installed
 from clsas.core.reading import check_ordinary
 
 
@@ -80,10 +79,20 @@ def _counts(text: str) -> tuple[int, int]:
     return rows, columns
 
 
+def _percentiles(text: str) -> tuple[float, float]:
+    low, high = map(float, text.split(","))
+    if not 0 <= low < high <= 100:
+        raise ValueError
+    return low, high
+
+
 AXIS = Parsed("START:STOP:N", _axis, "START:STOP:N, two positions in metres and a number of pixels")
 POSITION = Parsed("X,Y", _position, "X,Y or X,Y,Z in metres, without a space, such as 0,42.5")
 RATIO = Parsed("NUMBER", _ratio, "a number or a fraction such as 1/30")
 STAGES = Parsed("stages", _stages, "QRxQI for every stage, such as 2x2,2x2")
+PERCENTILES = Parsed(
+    "LOW,HIGH", _percentiles, "LOW,HIGH from 0 to 100, without a space, such as 1,99.5"
+)
 COUNTS = Parsed("ROWSxCOLUMNS", _counts, "ROWSxCOLUMNS, at least 1x1, such as 8x8")
 
 
@@ -140,7 +149,7 @@ class Output(File):
             self.fail(f"{str(path)!r} cannot be written: {error.strerror}", param, ctx)
         if special:
             self.fail(f"{str(path)!r} is not an ordinary file", param, ctx)
-        if param.name == "png":
+        if param.name == "picture":
             need_matplotlib()
         return path
 
@@ -183,5 +192,5 @@ def _exists(path: Path) -> bool:
 
 def need_matplotlib() -> None:
     """End the command if pictures cannot be drawn."""
-    if importlib.util.find_spec("matplotlib") is None:
+    if not is_installed("matplotlib"):
         raise click.ClickException(f"pictures need matplotlib: {install_command('plot')}")

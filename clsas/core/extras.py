@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import importlib.util
+
 PACKAGES = {
     "pocl": ("pyopencl[pocl]>=2024.1",),
     "plot": ("matplotlib>=3.8",),
@@ -17,3 +19,8 @@ def install_command(extra: str) -> str:
     runs from a checkout.
     """
     return "pip install " + " ".join(f"'{package}'" for package in PACKAGES[extra])
+
+
+def is_installed(package: str) -> bool:
+    """Return whether a package can be imported, without importing it."""
+    return importlib.util.find_spec(package) is not None

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, NamedTuple, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from clsas.core import validate
+from clsas.core import reprs, validate
 
 _ALL = slice(None)
 _PARALLEL = 1e-12  # sine of the angle between parallel steps; float64 rounds to 1e-16
@@ -109,6 +109,10 @@ class Grid:
         if self.height_m is not None:
             put("height_m", shape)
 
+    def __repr__(self) -> str:
+        """Return the shape and extents: x, y and z of the pixels, metres."""
+        return reprs.summary(self, f"{reprs.by(self.shape)} pixels", reprs.extents(*self.bounds_m))
+
     @classmethod
     def plane(
         cls, x: tuple[float, float, int], y: tuple[float, float, int], z: float = 0.0
@@ -196,6 +200,23 @@ class Grid:
         return type(self)(
             self.origin_m, self.row_step_m, self.column_step_m, self.shape, height_m=height_m
         )
+
+    @property
+    def bounds_m(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Lowest and highest x, y and z of a box that holds all pixels, metres, [3] each."""
+        if self.points_m is not None:
+            places_m = self.points_m.reshape(-1, 3)
+            return places_m.min(axis=0), places_m.max(axis=0)
+        down_m, right_m = (
+            step * (n - 1)
+            for step, n in zip((self.row_step_m, self.column_step_m), self.shape, strict=True)
+        )
+        corners_m = self.origin_m + [0 * down_m, down_m, right_m, down_m + right_m]
+        low_m, high_m = corners_m.min(axis=0), corners_m.max(axis=0)
+        if self.height_m is not None:
+            low_m[2] += self.height_m.min()
+            high_m[2] += self.height_m.max()
+        return low_m, high_m
 
     @property
     def is_planar(self) -> bool:

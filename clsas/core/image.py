@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
-from clsas.core import validate
+from clsas.core import reprs, validate
+from clsas.core.decibels import level_db
 from clsas.core.grid import Grid
+
+if TYPE_CHECKING:
+    import xarray
+    from matplotlib.axes import Axes
 
 _AT_ONCE = 1 << 16  # pixels that are looked at
 
@@ -55,6 +60,81 @@ class Image:
         validate.instance("grid", self.grid, Grid)
         pixels = validate.array("pixels", self.pixels, np.complex64, self.grid.shape)
         object.__setattr__(self, "pixels", pixels)
+
+    def __repr__(self) -> str:
+        """Return the shape and the extents of the grid, metres."""
+        pixels = f"{reprs.by(self.shape)} complex pixels"
+        return reprs.summary(self, pixels, reprs.extents(*self.grid.bounds_m))
+
+    def _repr_html_(self) -> str:
+        import clsas  # the public face, which imports the room of pictures when it is used
+
+        return clsas.plot.image_html(self)
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Shape of the pixels: (rows, columns), or that of the grid's points."""
+        return self.grid.shape
+
+    def db(self, *, reference: float | None = None) -> NDArray[np.float32]:
+        """Return the pixels' amplitude in dB.
+
+        Parameters
+        ----------
+        reference : float, optional
+            Amplitude of 0 dB; the image's largest unless given.
+
+        Returns
+        -------
+        ndarray of float32, shape `grid.shape`
+            20 log10(amplitude / reference); minus infinity where a pixel is 0.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If `reference` is not a positive number.
+        """
+        return level_db(self.pixels, reference)
+
+    def plot(self, axes: Axes | None = None, **options: Any) -> Axes:
+        """Draw the image in dB over metres; the same as `clsas.plot.image`.
+
+        Parameters
+        ----------
+        axes : matplotlib.axes.Axes, optional
+            Where to draw; those of a new pyplot figure unless given, so that notebooks and
+            `pyplot.show` show it.
+        **options
+            Further arguments of `clsas.plot.image`, such as `dynamic_range_db`.
+
+        Returns
+        -------
+        matplotlib.axes.Axes
+
+        Raises
+        ------
+        ImportError
+            If matplotlib is not installed.
+        TypeError, ValueError
+            As `clsas.plot.image` does.
+        """
+        import clsas
+
+        return clsas.plot.image(self, axes, **options)
+
+    def to_xarray(self) -> xarray.DataArray:
+        """Return the image as xarray's: the level in dB with coordinates, names and units.
+
+        The same as `clsas.to_xarray`, which says what it holds.
+
+        Raises
+        ------
+        ImportError
+            If xarray is not installed.
+        """
+        import clsas
+
+        return clsas.to_xarray(self)
 
     def __array__(self, dtype: DTypeLike | None = None, copy: bool | None = None) -> NDArray:
         """Return the pixels, so that NumPy's functions take an image.

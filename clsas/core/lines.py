@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from clsas.core import validate
+from clsas.core import reprs, validate
 
 _GOLDEN = (np.sqrt(5) - 1) / 2
 
@@ -108,10 +108,13 @@ class RangeLines:
 
     def __repr__(self) -> str:
         """Return sizes and extents: the arrays are long."""
-        return (
-            f"RangeLines({self.channels} channels of {self.length} samples, "
-            f"{self.first_range_m.min():.6g} m to {self.last_range_m.max():.6g} m in steps of "
-            f"{self.range_step_m:.4g} m, carrier {self.carrier_hz:.6g} Hz)"
+        range_m = float(self.first_range_m.min()), float(self.last_range_m.max())
+        return reprs.summary(
+            self,
+            f"{self.channels} channels of {self.length} samples",
+            f"range {reprs.span(*range_m, 'm')} in steps of "
+            f"{reprs.quantity(self.range_step_m, 'm')}",
+            f"carrier {reprs.quantity(self.carrier_hz, 'Hz')}",
         )
 
     @property

@@ -13,10 +13,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clsas.core import validate
+from clsas.core import reprs, validate
 from clsas.core.grid import Grid
 from clsas.core.lines import RangeLines
 from clsas.core.reading import parse_json
+from clsas.core.tables import Report, Table
 from clsas.factorized.estimates import ErrorBudget, Work, estimate_of
 from clsas.opencl import phases
 from clsas.signal.interpolation import PHASES, UPSAMPLING_TAPS, Interpolator, Resampling, Upsampler
@@ -293,8 +294,29 @@ class Plan:
         """True for exact backprojection."""
         return not self.sides
 
+    def __repr__(self) -> str:
+        """Return what was asked for, what is expected, and the sides of the subimages."""
+        asked = "stages as given"
+        if self.tolerance_db is not None:
+            asked = f"tolerance {reprs.quantity(self.tolerance_db, 'dB')}"
+        sides = ", ".join(map(reprs.by, self.sides))
+        return reprs.summary(
+            self,
+            asked,
+            f"subimages of {sides} pixels" if sides else "exact",
+            f"predicted error {self.predicted_error_db:.1f} dB",
+            f"predicted time {_seconds(self.predicted_seconds)}",
+            f"{reprs.quantity(self.memory_bytes, 'bytes')} of device memory",
+        )
+
+    def _repr_html_(self) -> str:
+        return self._report().html()
+
     def describe(self) -> str:
         """Return a table of what is expected, stage by stage."""
+        return self._report().text()
+
+    def _report(self) -> Report:
         if self.tolerance_db is None:
             wish = "stages as given, nearest beam" if self.sides else "no stage, as given"
         else:
@@ -318,7 +340,7 @@ class Plan:
         )
         if self.is_exact:
             reason = "" if self.tolerance_db is None else ": no factorization is faster within it"
-            return "\n".join([*lines, f"Plain backprojection{reason}.", *self._causes(), *usual])
+            return Report([*lines, f"Plain backprojection{reason}.", *self._causes(), *usual])
         taps = f"{self.align.taps} taps in range at {self.resampling.ratio:.2f} x the lines' rate"
         if self.nearest:
             beams = f"sums of {', '.join(map(str, self.nearest))} neighbours"
@@ -349,14 +371,8 @@ class Plan:
             for s in self.stages
         ]
         labels = [*(str(i + 1) for i in range(len(rows) - 1)), "last"]
-        table = [
-            ("stage", *names),
-            *((label, *row) for label, row in zip(labels, rows, strict=True)),
-        ]
-        widths = [max(map(len, column)) for column in zip(*table, strict=True)]
-        for row in table:
-            lines.append("  ".join(f"{cell:>{w}}" for cell, w in zip(row, widths, strict=True)))
-        return "\n".join([*lines, *self._causes(), *usual])
+        table = [(label, *row) for label, row in zip(labels, rows, strict=True)]
+        return Report([*lines, Table(("stage", *names), table), *self._causes(), *usual])
 
     def _causes(self) -> list[str]:
         """Return what the predicted error is made of, line by line."""

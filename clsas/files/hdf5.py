@@ -1,4 +1,4 @@
-"""Grids, range lines, echoes and images in HDF5 files, and as xarray objects.
+"""Grids, range lines, echoes and images in HDF5 files.
 
 docs/format.md describes the schema. It follows the dataclasses: arrays are datasets, numbers and
 strings are attributes, nested objects are groups, and fields that are None are left out.
@@ -10,11 +10,10 @@ import math
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import fields, is_dataclass
+from dataclasses import fields
 from io import BytesIO
 from pathlib import Path
-from types import ModuleType
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import h5py
 import numpy as np
@@ -26,9 +25,6 @@ from clsas.core.image import Image
 from clsas.core.lines import RangeLines
 from clsas.signal.echoes import Echoes
 from clsas.sonar.system import Pulse
-
-if TYPE_CHECKING:
-    import xarray
 
 FORMAT = "clsas"
 VERSION = 1
@@ -177,38 +173,6 @@ def _opened(path: str | os.PathLike) -> Iterator[h5py.File]:
         raise FileFormatError(f"{path} is damaged: {error}") from error
 
 
-def to_xarray(obj: Saved) -> xarray.DataArray | xarray.Dataset:
-    """Return an object as an xarray object, with coordinates in metres.
-
-    An image becomes a DataArray, and a grid a Dataset that has only coordinates. Range lines and
-    echoes become Datasets over (channel, sample). `attrs["units"]` of a coordinate is its unit.
-    Numbers that belong to no axis are attributes with the unit in their name.
-
-    Parameters
-    ----------
-    obj : Grid, RangeLines, Image or Echoes
-        The object. Its arrays are shared, not copied.
-
-    Raises
-    ------
-    ImportError
-        If xarray is not installed.
-    TypeError
-        If `obj` is of another type.
-    """
-    try:
-        import xarray
-    except ImportError:
-        raise ImportError("to_xarray needs xarray: pip install xarray") from None
-    validate.instance("obj", obj, *_SAVED)
-    match obj:
-        case Grid():
-            return xarray.Dataset(coords=_grid_coordinates(obj))
-        case Image(pixels=pixels, grid=grid):
-            return xarray.DataArray(pixels, _grid_coordinates(grid), _grid_dims(grid), "pixels")
-    return _channels_to_xarray(xarray, obj)
-
-
 def _write(group: h5py.Group, obj: Any) -> None:
     _set(group, "kind", next(name for name, kind in _KINDS.items() if type(obj) is kind))
     for field in fields(obj):
@@ -337,48 +301,3 @@ def _check_header(file: h5py.File) -> None:
         )
     if version < 1:
         raise FileFormatError(f"is of format version {version}, but the first one is 1")
-
-
-def _grid_dims(grid: Grid) -> tuple[str, ...]:
-    if grid.points_m is not None:
-        return tuple(f"point_{axis}" for axis in range(len(grid.shape)))
-    return ("y", "x") if grid.has_axes else ("row", "column")
-
-
-def _grid_coordinates(grid: Grid) -> dict[str, tuple]:
-    metres = {"units": "m"}
-    dims = _grid_dims(grid)
-    if not grid.has_axes:
-        positions = np.moveaxis(grid.positions_m(), -1, 0)
-        return {name: (dims, values, metres) for name, values in zip("xyz", positions, strict=True)}
-    x, y = grid.axes_m
-    if grid.height_m is None:
-        z = ((), grid.origin_m[2], metres)
-    else:
-        z = (dims, grid.origin_m[2] + grid.height_m, metres)
-    return {"x": ("x", x, metres), "y": ("y", y, metres), "z": z}
-
-
-_UNITS = {"_m_s": "m s-1", "_m": "m", "_s": "s", "_hz": "Hz"}
-
-
-def _channels_to_xarray(xarray: ModuleType, obj: RangeLines | Echoes) -> xarray.Dataset:
-    steps = np.arange(obj.samples.shape[1])
-    if isinstance(obj, RangeLines):
-        offset = {"range_offset_m": ("sample", steps * obj.range_step_m, {"units": "m"})}
-    else:
-        offset = {"time_offset_s": ("sample", steps / obj.sample_rate_hz, {"units": "s"})}
-    variables, attributes = {}, {}
-    for field in fields(obj):
-        name, value = field.name, getattr(obj, field.name)
-        if isinstance(value, np.ndarray):
-            dims = ("channel", "sample" if name == "samples" else "axis")[: value.ndim]
-            unit = next((unit for end, unit in _UNITS.items() if name.endswith(end)), None)
-            variables[name] = (dims, value, {} if unit is None else {"units": unit})
-        elif is_dataclass(value):
-            attributes |= {
-                f"{name}_{part.name}": getattr(value, part.name) for part in fields(value)
-            }
-        elif value is not None:
-            attributes[name] = value
-    return xarray.Dataset(variables, {**offset, "axis": ["x", "y", "z"]}, attributes)

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clsas.core import validate
+from clsas.core import reprs, validate
 from clsas.core.grid import Grid
 from clsas.core.image import Image
 from clsas.core.lines import RangeLines
@@ -70,6 +70,16 @@ class Patch:
     _formed: Image | None
     _store: Store | None
 
+    def __repr__(self) -> str:
+        """Return the patch's index, size and extents."""
+        return reprs.summary(
+            self,
+            f"row {self.row}",
+            f"column {self.column}",
+            f"{reprs.by(self.grid.shape)} pixels",
+            reprs.extents(*self.grid.bounds_m),
+        )
+
     @property
     def image(self) -> Image:
         """The pixels. They are read from the store if another process formed them."""
@@ -84,6 +94,10 @@ class Mosaic:
 
     Iteration yields every `Patch` as soon as it is finished. A second iteration forms only the
     patches that the store does not have.
+
+    A mosaic pickles, with its lines unless they are in files. The process that reads it opens
+    devices of the same names. A mosaic with a client does not pickle, since the connection belongs
+    to this process.
 
     Attributes
     ----------
@@ -101,6 +115,32 @@ class Mosaic:
     patch_shape: tuple[int, int]
     finished: dict[PatchIndex, Record]
     _run: Run
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return the fields to pickle; devices are opened anew by the process that reads them.
+
+        Raises
+        ------
+        TypeError
+            If the mosaic has a client, whose connection belongs to this process.
+        """
+        if self._run.client is not None:
+            raise TypeError(
+                "a mosaic with a client cannot be pickled, since its connection belongs to this "
+                "process: make the mosaic where it is needed, with the same source and store"
+            )
+        return self.__dict__
+
+    def __repr__(self) -> str:
+        """Return the patches, how many of them are finished, the store and the extents."""
+        store = self._run.job.store
+        return reprs.summary(
+            self,
+            f"{reprs.by(self.shape)} patches of {reprs.by(self.patch_shape)} pixels",
+            f"{len(self.finished)} of {len(self)} finished",
+            None if store is None else f"store {str(store)!r}",
+            reprs.extents(*self.grid.bounds_m),
+        )
 
     @property
     def shape(self) -> tuple[int, int]:

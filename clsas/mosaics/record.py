@@ -10,6 +10,7 @@ from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
+from clsas.core import reprs
 from clsas.mosaics.documents import DamageError, is_intact, read_attributes, with_checksum
 
 PIXELS_CHECKSUM = "pixels_crc32c"
@@ -65,6 +66,8 @@ class Record:
     driver: str = ""
     plan: dict[str, Any] | None = None
     has_pixels: bool = False
+
+    __repr__ = reprs.of_fields
 
     @property
     def is_empty(self) -> bool:

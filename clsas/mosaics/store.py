@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clsas.core import validate
+from clsas.core import reprs, validate
 from clsas.core.atomic import sync_folder
 from clsas.core.extras import install_command
 from clsas.core.grid import Grid
@@ -54,6 +54,10 @@ class Store:
     """
 
     path: Path
+
+    def __repr__(self) -> str:
+        """Return where the store is."""
+        return reprs.summary(self, repr(str(self.path)))
 
     @classmethod
     def at(cls, path: str | os.PathLike) -> Store:

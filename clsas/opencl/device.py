@@ -20,6 +20,7 @@ import numpy as np
 import pyopencl as cl
 from numpy.typing import DTypeLike
 
+from clsas.core import reprs
 from clsas.core.extras import install_command
 
 ENVIRONMENT_VARIABLE = "CLSAS_DEVICE"
@@ -84,6 +85,8 @@ class DeviceInfo:
     width: int
     permute: bool
 
+    __repr__ = reprs.of_fields
+
     @property
     def half_precision(self) -> bool:
         """Whether kernels take half-precision numbers in and out as fast as others.
@@ -138,6 +141,15 @@ class Device:
     # By source and options; the program used last is the last one.
     _kernels: dict[tuple, _Program] = field(default_factory=dict, repr=False)
     _events: list[tuple[str, cl.Event]] | None = field(default=None, repr=False)
+
+    def __repr__(self) -> str:
+        """Return the platform and the name."""
+        return reprs.summary(self, repr(self.info.label))
+
+    def __reduce__(self) -> tuple[Callable[[DeviceInfo], Device], tuple[DeviceInfo]]:
+        """Pickle as what it is called: the process that reads it opens its own device."""
+        return _opened_alike, (self.info,)
+
     # A kernel holds its arguments from when they are set until it is enqueued.
     _lock: threading.RLock = field(default_factory=threading.RLock, repr=False)
 
@@ -478,6 +490,18 @@ def _open(index: int) -> Device:
     queue = cl.CommandQueue(context, properties=cl.command_queue_properties.PROFILING_ENABLE)
     info = _describe(index, device)
     return Device(info, context, queue, cl.CommandQueue(context))
+
+
+def _opened_alike(info: DeviceInfo) -> Device:
+    """Return the device of this process that is like another process's: what unpickling does."""
+    alike = [each for each in list_devices() if each.label == info.label]
+    if not alike:
+        known = ", ".join(each.label for each in list_devices())
+        raise DeviceError(
+            f"the pickled device {info.label!r} is not on this machine, which has: {known}"
+        )
+    same = [each for each in alike if each.index == info.index] or alike
+    return _open(same[0].index)
 
 
 def open_device(wish: Device | str | int | None = None) -> Device:

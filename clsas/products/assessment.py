@@ -8,11 +8,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from clsas.core import validate
+from clsas.core import reprs, validate
 from clsas.core.decibels import in_db, power
 from clsas.core.geometry import pairwise_range_m
 from clsas.core.grid import Grid
 from clsas.core.lines import RangeLines
+from clsas.core.tables import Report, Table
 from clsas.exact.backprojection import prepare
 from clsas.exact.run import execute
 from clsas.factorized.plan import Plan
@@ -83,6 +84,8 @@ class Effect:
     seconds: float | None
     key: str
 
+    __repr__ = reprs.of_fields
+
 
 @dataclass(frozen=True)
 class Assessment:
@@ -117,6 +120,20 @@ class Assessment:
     simple_seconds: float
     effects: tuple[Effect, ...]
 
+    def __repr__(self) -> str:
+        """Return the tolerance, and which effects are missing and which could be left out."""
+        return reprs.summary(
+            self,
+            f"tolerance {reprs.quantity(self.tolerance_db, 'dB')}",
+            f"{len(self.effects)} effects",
+            f"needed and not modelled: {', '.join(self.missing) or 'none'}",
+            f"modelled and not needed: {', '.join(self.spare) or 'none'}",
+            self.device,
+        )
+
+    def _repr_html_(self) -> str:
+        return self._report().html()
+
     def __getitem__(self, name: str) -> Effect:
         """Return the effect of a name."""
         return {effect.name: effect for effect in self.effects}[name]
@@ -135,7 +152,11 @@ class Assessment:
 
     def describe(self) -> str:
         """Return a table of the effects."""
-        rows = [("effect", "modelled", "error", "wavelengths", "needed", "costs", "left out")]
+        return self._report().text()
+
+    def _report(self) -> Report:
+        names = ("effect", "modelled", "error", "wavelengths", "needed", "costs", "left out")
+        rows = []
         for e in self.effects:
             rows.append(
                 (
@@ -148,22 +169,20 @@ class Assessment:
                     "yes" if e.left_out else "-",
                 )
             )
-        widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-        table = ["  ".join(f"{c:<{w}}" for c, w in zip(r, widths, strict=True)) for r in rows]
         how = "measured" if self.measured else "predicted"
-        text = [
+        before = [
             f"{' x '.join(map(str, self.pixels))} pixels from {self.channels} channels, tolerance "
             f"{self.tolerance_db:.4g} dB, wavelength {1e3 * self.wavelength_m:.4g} mm; "
             f"{1e3 * self.seconds:.0f} ms with all effects modelled, "
             f"{1e3 * self.simple_seconds:.0f} ms as it is formed ({how}, {self.device})",
-            *(row.rstrip() for row in table),
         ]
+        after = []
         for name in self.missing:
-            text.append(f"Needed and not modelled: {name}")
+            after.append(f"Needed and not modelled: {name}")
         for name in self.spare:
             how = f": {KEYS[name]}" if KEYS[name] else ""
-            text.append(f"Modelled and not needed: {name}{how}")
-        return "\n".join(text)
+            after.append(f"Modelled and not needed: {name}{how}")
+        return Report([*before, Table(names, rows, align="left"), *after])
 
 
 def assess(

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from clsas.core import validate
+from clsas.core import reprs, validate
 from clsas.core.grid import Axis, Grid
 from clsas.core.image import Image
 from clsas.core.image_error import complex_values
@@ -58,6 +58,8 @@ class Cut:
     islr_db: float
     lobes: tuple[int, int]
 
+    __repr__ = reprs.of_fields
+
 
 @dataclass(frozen=True, eq=False)
 class PointResponse:
@@ -81,6 +83,17 @@ class PointResponse:
     amplitude: float
     azimuth: Cut
     range: Cut
+
+    def __repr__(self) -> str:
+        """Return where the peak is, its amplitude and the resolutions."""
+        place = zip("xyz", (self.x_m, self.y_m, self.z_m), strict=True)
+        return reprs.summary(
+            self,
+            *(f"{name} {value:.7g} m" for name, value in place),
+            f"amplitude {self.amplitude:.4g}",
+            f"azimuth resolution {reprs.quantity(self.azimuth.resolution_m, 'm')}",
+            f"range resolution {reprs.quantity(self.range.resolution_m, 'm')}",
+        )
 
 
 def measure_point(

@@ -15,12 +15,13 @@ from itertools import product
 
 import numpy as np
 
-from clsas.core import validate
+from clsas.core import reprs, validate
 from clsas.core.atomic import replacing
 from clsas.core.grid import Grid
 from clsas.core.image import Image
 from clsas.core.image_error import relative_error_db
 from clsas.core.lines import RangeLines
+from clsas.core.tables import Report, Table
 from clsas.exact.backprojection import ACCURACY_DB, form_exactly
 from clsas.factorized.filters import ALIGN_TAPS, APERTURE_TAPS
 from clsas.factorized.plan import Plan
@@ -138,6 +139,22 @@ class Tradeoff:
     rows: tuple[Row, ...]
     dark_level_db: float = 0.0
 
+    def __repr__(self) -> str:
+        """Return the sizes, the device, and the spans of times and errors."""
+        seconds = [row.seconds for row in self.rows]
+        errors_db = [row.error_db for row in self.rows]
+        return reprs.summary(
+            self,
+            f"{len(self.rows)} images of {reprs.by(self.pixels)} pixels from "
+            f"{self.channels} channels",
+            f"{reprs.quantity(min(seconds), 's')} to {reprs.quantity(max(seconds), 's')}",
+            f"errors {reprs.span(min(errors_db), max(errors_db), 'dB')}",
+            self.device,
+        )
+
+    def _repr_html_(self) -> str:
+        return self._report().html()
+
     @property
     def exact(self) -> Row:
         """The exact image."""
@@ -158,10 +175,13 @@ class Tradeoff:
 
         "In the dark" is the error in the darkest tenth of the image against the level there.
         """
+        return self._report().text()
+
+    def _report(self) -> Report:
         names = ("", "time (s)", "predicted (s)", "speedup", "error (dB)", "predicted (dB)")
         names += ("in the dark (dB)",)
         names += ("azimuth", "range", "azimuth PSLR", "range PSLR")
-        table = [names]
+        table = []
         for row in self.rows:
             cells = (
                 row.label,
@@ -179,11 +199,7 @@ class Tradeoff:
             )
             cells += tuple(f"{one.pslr_db:.1f}" if one else "-" for one, _ in pairs)
             table.append(cells)
-        widths = [max(map(len, column)) for column in zip(*table, strict=True)]
-        return "\n".join(
-            "  ".join(f"{cell:>{width}}" for cell, width in zip(cells, widths, strict=True))
-            for cells in table
-        )
+        return Report([Table(names, table)])
 
     def save_csv(self, path: str | os.PathLike) -> None:
         """Write all rows as CSV, replacing a file of that name at once or not at all.

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from clsas.core import validate
+from clsas.core import reprs, validate
 from clsas.sonar.system import Pulse
 
 
@@ -106,9 +106,11 @@ class Echoes:
 
     def __repr__(self) -> str:
         """Return sizes and rates: the arrays are long."""
-        return (
-            f"Echoes({self.channels} channels of {self.length} samples at "
-            f"{self.sample_rate_hz:.6g} Hz, carrier {self.carrier_hz:.6g} Hz)"
+        return reprs.summary(
+            self,
+            f"{self.channels} channels of {self.length} samples at "
+            f"{reprs.quantity(self.sample_rate_hz, 'Hz')}",
+            f"carrier {reprs.quantity(self.carrier_hz, 'Hz')}",
         )
 
     @property

@@ -10,7 +10,7 @@ import scipy.fft
 from numpy.typing import NDArray
 from scipy.linalg import lstsq
 
-from clsas.core import validate
+from clsas.core import reprs, validate
 from clsas.core.lines import RangeLines
 from clsas.signal.spectrum import Spectrum, cycles_per_m_at
 
@@ -57,6 +57,8 @@ class Interpolator:
     coefficients: NDArray[np.float64]
     error_db: float
     scatter_db: float
+
+    __repr__ = reprs.of_fields
 
     def __post_init__(self) -> None:
         """Keep the coefficients from being changed."""
@@ -323,6 +325,8 @@ class Upsampler:
     step: int
     coefficients: NDArray[np.float64]
     error_db: float
+
+    __repr__ = reprs.of_fields
 
     def __post_init__(self) -> None:
         """Keep the coefficients from being changed."""

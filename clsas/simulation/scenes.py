@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from clsas.core import validate
+from clsas.core import reprs, validate
 from clsas.simulation.height_field import HeightField
 from clsas.simulation.scatterers import Scatterers, draw_scatterers
 
@@ -86,6 +86,15 @@ class PointTargets:
         )
         object.__setattr__(self, "positions_m", positions)
         object.__setattr__(self, "amplitudes", amplitudes)
+
+    def __repr__(self) -> str:
+        """Return the number of points and where they lie."""
+        place_m = self.positions_m
+        return reprs.summary(
+            self,
+            f"{self.points} point{'s' * (self.points > 1)}",
+            reprs.extents(place_m.min(axis=0), place_m.max(axis=0)),
+        )
 
     @property
     def points(self) -> int:
@@ -204,6 +213,18 @@ class Seabed:
         object.__setattr__(self, "heights_m", heights)
         object.__setattr__(self, "texture", texture)
         validate.memory("density_m2", 100 * self.density_m2 * self._surface.cell_areas_m2.sum())
+
+    def __repr__(self) -> str:
+        """Return extents, the lattice's step and the density of scatterers."""
+        heights_m = self.heights_m.min(), self.heights_m.max()
+        low_m, high_m = zip(self.x_m, self.y_m, heights_m, strict=True)
+        steps = " x ".join(reprs.quantity(step, "m") for step in self.steps_m)
+        return reprs.summary(
+            self,
+            reprs.extents(low_m, high_m),
+            f"steps of {steps}",
+            f"{self.density_m2:g} scatterers per m2",
+        )
 
     @property
     def steps_m(self) -> tuple[float, float]:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from clsas.core import validate
+from clsas.core import reprs, validate
 from clsas.core.lines import RangeLines
 from clsas.sonar.directions import track_directions
 from clsas.sonar.system import element_pattern
@@ -96,6 +96,8 @@ class BeamWindow:
             normalise: bool = False,
             track_pings: int | None = None,
         ) -> None: ...
+
+    __repr__ = reprs.of_fields
 
     def __post_init__(self) -> None:  # noqa: D105
         width = validate.number(

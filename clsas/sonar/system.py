@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from clsas.core import validate
+from clsas.core import reprs, validate
 from clsas.core.fourier import fourier_integral
 
 BARKER_13 = (1, 1, 1, 1, 1, -1, -1, 1, 1, -1, 1, -1, 1)
@@ -53,6 +53,8 @@ class Pulse:
     duration_s: float
     code: str | tuple[int, ...] = "up"
     taper: float = 0.0
+
+    __repr__ = reprs.of_fields
 
     def __post_init__(self) -> None:  # noqa: D105
         carrier = validate.positive("carrier_hz", self.carrier_hz, "Hz")
@@ -200,6 +202,19 @@ class Sonar:
             fields[name] = None if size is None else validate.positive(name, size, "m")
         for name, value in fields.items():
             object.__setattr__(self, name, value)
+
+    def __repr__(self) -> str:
+        """Return the array's size, the pulse's band and the elements' length."""
+        pulse, length_m = self.pulse, float(np.ptp(self.rx_m, axis=0).max())
+        element_m = self.element_length_m
+        return reprs.summary(
+            self,
+            f"{self.receivers} receiver{'s' * (self.receivers > 1)} over "
+            f"{reprs.quantity(length_m, 'm')}",
+            f"carrier {reprs.quantity(pulse.carrier_hz, 'Hz')}",
+            f"bandwidth {reprs.quantity(pulse.bandwidth_hz, 'Hz')}",
+            None if element_m is None else f"elements of {reprs.quantity(element_m, 'm')}",
+        )
 
     @property
     def receivers(self) -> int:

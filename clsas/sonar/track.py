@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
-from clsas.core import validate
+from clsas.core import reprs, validate
 from clsas.sonar.system import Sonar
 
 Motion = float | ArrayLike | Callable[[NDArray[np.float64]], ArrayLike]
@@ -83,6 +83,16 @@ class Track:
     def pings(self) -> int:
         """Number of pings."""
         return len(self.positions_m)
+
+    def __repr__(self) -> str:
+        """Return the number of pings, the time they take and where they lie."""
+        place_m = self.positions_m
+        time_s = float(self.time_s[-1] - self.time_s[0])
+        return reprs.summary(
+            self,
+            f"{self.pings} ping{'s' * (self.pings > 1)} in {reprs.quantity(time_s, 's')}",
+            reprs.extents(place_m.min(axis=0), place_m.max(axis=0)),
+        )
 
     @property
     def rotations(self) -> Rotation:
@@ -161,6 +171,14 @@ class Channels(NamedTuple):
     rx_m: NDArray[np.float64]
     rx_velocity_m_s: NDArray[np.float64] | None
 
+    def __repr__(self) -> str:
+        """Return the number of channels and where the receivers lie."""
+        return reprs.summary(
+            self,
+            f"{len(self.rx_m)} channels",
+            f"receivers at {reprs.extents(self.rx_m.min(axis=0), self.rx_m.max(axis=0))}",
+        )
+
 
 def channels(sonar: Sonar, track: Track, *, motion_in_flight: bool = False) -> Channels:
     """Return the position of every channel's transmitter and receiver at transmission.
@@ -218,6 +236,8 @@ class Pointing:
     squint_rad: tuple[float, ...] = (0.0,)
     depression_rad: float = 0.0
     spot_m: tuple[float, float, float] | None = None
+
+    __repr__ = reprs.of_fields
 
     def __post_init__(self) -> None:
         """Check every field and convert it."""

@@ -24,6 +24,7 @@ import clsas
 from clsas import plot
 from clsas.factorized import thesis as nearest
 from clsas.opencl.device import Device, open_device
+from clsas.products.plot.canvas import with_fewer_colours
 from clsas.sonar.system import Sonar, line_array
 
 Stages = Sequence[tuple[int, int]]  # (QR, QI)
@@ -301,7 +302,9 @@ def figure(width: float = 6.0, height: float = 4.0):
     return Figure(figsize=(width, height), layout="constrained")
 
 
-def save(drawn, out: Path, stem: str, dpi: float = 100.0) -> None:
-    """Write a figure as PNG."""
-    plot.save_png(drawn, out / f"{stem}.png", dpi=dpi)
+def save(drawn, out: Path, stem: str, dpi: float = 120.0, colours: int = 64) -> None:
+    """Write a figure as PNG of so many colours, so that it takes few bytes."""
+    path = out / f"{stem}.png"
+    plot.save(drawn, path, dpi=dpi)
+    path.write_bytes(with_fewer_colours(path, colours))
     print(f"wrote {out / stem}.csv and .png")

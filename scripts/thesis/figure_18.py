@@ -42,10 +42,12 @@ def main() -> None:
 
     figure = chapter5.figure()
     axes = figure.subplots()
-    axes.plot(range(1, 8), [seconds[k] for k in range(1, 8)], "o-", label="nearest beam, 2 x 2")
+    axes.plot(range(1, 8), [seconds[k] for k in range(1, 8)], "o-", label="Nearest beam, 2 x 2")
     for row, key in zip(rows[7:], list(plans)[6:], strict=True):
         axes.plot(row["stages"], seconds[key], "s", label=row["plan"])
-    axes.set(xlabel="number of stages (1: backprojection)", ylabel="time (s)", ylim=(0, None))
+    axes.set(
+        xlabel="Number of stages (1: backprojection)", ylabel="Imaging time (s)", ylim=(0, None)
+    )
     axes.grid(alpha=0.3)
     axes.legend()
     chapter5.save(figure, given.out, "figure_18")

@@ -50,12 +50,12 @@ def main() -> None:
     figure = chapter5.figure()
     axes = figure.subplots()
     numbers = np.arange(1, 8)
-    axes.plot(numbers, by_formula, "o-", label="nearest beam, by [45]")
-    axes.plot(numbers, largest, "s-", label="nearest beam, largest measured")
-    label = f"interpolated, {TOLERANCE_DB} dB: from the image's error"
+    axes.plot(numbers, by_formula, "o-", label="Nearest beam, by [45]")
+    axes.plot(numbers, largest, "s-", label="Nearest beam, largest measured")
+    label = f"Interpolated, {TOLERANCE_DB} dB: from the image's error"
     axes.plot(len(plan.sides) + 1, interpolated_m, "^", label=label)
     axes.axhline(WAVELENGTH_M / 4, color="grey", linestyle=":", label="λ/4")
-    axes.set(xlabel="number of stages (1: backprojection)", ylabel="range error (m)")
+    axes.set(xlabel="Number of stages (1: backprojection)", ylabel="Range error (m)")
     axes.grid(alpha=0.3)
     axes.legend()
     chapter5.save(figure, given.out, "figure_19")

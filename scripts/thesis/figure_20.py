@@ -78,10 +78,10 @@ def main() -> None:
         axes.axhline(seconds["exact"], color="grey", linestyle=":", label="backprojection")
         axes.grid(alpha=0.3)
         axes.legend(fontsize="small")
-    thesis.set(xlabel="log10 of the error by [45] (m)", ylabel="time (s)", ylim=(0, None))
+    thesis.set(xlabel="log10 of the error by [45] (m)", ylabel="Imaging time (s)", ylim=(0, None))
     thesis.set_title("nearest beam: the fastest plan for an error")
     ours.set(
-        xlabel="measured error of an image of 300 points (dB)",
+        xlabel="Measured error of an image of 300 points (dB)",
         title="every plan, and interpolated ones",
     )
     chapter5.save(figure, given.out, "figure_20", dpi=80)

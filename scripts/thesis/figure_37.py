@@ -82,16 +82,16 @@ def main() -> None:
         if row["[45]"]:
             style = "go" if row["usable"] == "yes" else "rx"
             axes.semilogy(row["stages"], float(row["[45]"].removeprefix("λ/")), style)
-    axes.plot(largest.keys(), largest.values(), "k-", label="the largest usable of these")
-    axes.plot(*THESIS, "b--", label="the thesis's figure, its ends")
+    axes.plot(largest.keys(), largest.values(), "k-", label="The largest usable of these")
+    axes.plot(*THESIS, "b--", label="The thesis's figure, its ends")
     axes.axhline(4, color="grey", linestyle=":", label="λ/4")
     ticks = (1, 2, 3, 4, 6, 8, 12, 16)
     axes.set_yticks(ticks, [f"λ/{tick}" for tick in ticks])
     axes.minorticks_off()
-    axes.set(xlabel="number of stages", ylabel="error by [45]", xticks=range(2, 6))
-    axes.set_title("nearest beam: usable (o) and not (x)")
+    axes.set(xlabel="Number of stages", ylabel="Error by [45]", xticks=range(2, 6))
+    axes.set_title("Nearest beam: usable (o) and not (x)")
     axes.grid(alpha=0.3)
-    axes.legend()
+    figure.legend(loc="outside lower center", ncols=3)
     chapter5.save(figure, given.out, "figure_37")
 
 

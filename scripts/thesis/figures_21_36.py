@@ -83,12 +83,14 @@ def main() -> None:
         curve.grid(alpha=0.3)
     for below, left in ((panels[5:], panels[::5]), (curves[5:], curves[::5])):
         for axes in below:
-            axes.set_xlabel("azimuth (m)")
+            axes.set_xlabel("Along-track (m)")
         for axes in left:
-            axes.set_ylabel("range (m)" if axes in panels else "over the exact peak (dB)")
-    pictures.colorbar(drawn, ax=list(panels), label="over the picture's peak (dB)", shrink=0.8)
-    chapter5.save(pictures, given.out, "figures_21_36_images", dpi=72)
-    chapter5.save(responses, given.out, "figures_21_36", dpi=72)
+            axes.set_ylabel(
+                "Across-track (m)" if axes in panels else "Amplitude (dB re exact peak)"
+            )
+    pictures.colorbar(drawn, ax=list(panels), label="Amplitude (dB re max)", shrink=0.8)
+    chapter5.save(pictures, given.out, "figures_21_36_images", dpi=90)
+    chapter5.save(responses, given.out, "figures_21_36", dpi=90)
 
 
 if __name__ == "__main__":

@@ -24,6 +24,7 @@ DYNAMIC_RANGE_DB = 40
 BRIGHTEST = 99.5  # percentile of the exact image's power that is the pictures' 0 dB
 PANEL = 256  # pixels along a picture's side, about
 STEPS = 16  # of the grey scale
+DPI = {1: 180, 2: 110}  # by pictures a side: files of less than 200 kB
 
 Picture = tuple[str, clsas.Image, float]  # title, image, power of its 0 dB
 
@@ -200,10 +201,10 @@ def draw_track(scene: chapter6.Scene, out: Path) -> None:
     figure = chapter5.figure(8, 2.8)
     axes = figure.subplots()
     axes.plot(tx_m[:, 0], tx_m[:, 1], ".-", markersize=3, linewidth=0.5)
-    axes.set(xlabel="along the track, x (m)", ylabel="sway, y (m)")
+    axes.set(xlabel="Along-track (m)", ylabel="Sway (m)")
     axes.set_title(f"39: {len(tx_m)} pings")
     axes.grid(alpha=0.3)
-    chapter5.plot.save_png(figure, out / "figure_39.png", dpi=72)
+    chapter5.save(figure, out, "figure_39")
 
 
 def draw(pictures: list[Picture], out: Path, stem: str) -> None:
@@ -212,6 +213,7 @@ def draw(pictures: list[Picture], out: Path, stem: str) -> None:
 
     side = 1 if len(pictures) == 1 else 2
     figure = chapter5.figure(*((7.5, 6.2) if side == 1 else (10.5, 8.6)))
+    figure.set_layout_engine("compressed")
     panels = figure.subplots(side, side, sharex=True, sharey=True, squeeze=False).ravel()
     for (title, image, reference), axes in zip(pictures, panels, strict=True):
         drawn = axes.imshow(
@@ -221,14 +223,15 @@ def draw(pictures: list[Picture], out: Path, stem: str) -> None:
             cmap=colormaps["gray"].resampled(STEPS),
             vmin=-DYNAMIC_RANGE_DB,
             vmax=0,
+            interpolation="nearest",  # no shades between these
         )
         axes.set(title=title, aspect="equal")
     for axes in panels[-side:]:
-        axes.set_xlabel("x (m)")
+        axes.set_xlabel("Along-track (m)")
     for axes in panels[::side]:
-        axes.set_ylabel("y (m)")
-    figure.colorbar(drawn, ax=list(panels), label="power over the brightest (dB)")
-    chapter5.plot.save_png(figure, out / f"{stem}.png", dpi=54 if side > 1 else 72)
+        axes.set_ylabel("Across-track (m)")
+    figure.colorbar(drawn, ax=list(panels), label=f"Power (dB re {BRIGHTEST:g}th percentile)")
+    chapter5.save(figure, out, stem, dpi=DPI[side])
 
 
 if __name__ == "__main__":

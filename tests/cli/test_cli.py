@@ -363,7 +363,7 @@ def test_a_grid_that_no_line_reaches_is_a_warning(made, tmp_path):
 @pytest.mark.parametrize(
     ("option", "name", "words"),
     [
-        ("--png", "x.pdf", "must end in .png, got 'x.pdf'"),
+        ("--png", "x.tif", "must end in .png or .pdf or .svg, got 'x.tif'"),
         ("-o", "x.tif", "must end in .h5 or .hdf5 or .he5, got 'x.tif'"),
     ],
 )

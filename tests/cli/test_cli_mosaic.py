@@ -188,11 +188,11 @@ def test_flags_are_told(made, tmp_path):
         (["--workers", "2", "--scheduler", "tcp://localhost:1"], 2, "give only one of"),
         (["--workers", "2", "--device", "0"], 2, "--device has no effect"),
         (["--lines", "folder", "-o", "./folder"], 2, "--lines and -o must be two files"),
-        (["-o", "new", "--png", "new"], 2, "-o and --png must be two files"),
+        (["-o", "new", "--png", "new"], 2, "-o and --picture must be two files"),
         (
             ["-o", "scene.zarr", "--png", "scene.zarr/all.png"],
             2,
-            "--png must not lie in the store",
+            "--picture must not lie in the store",
         ),
         (["--follow"], 2, "--follow requires --lines with a folder"),
         (["--tolerance-db", "-30"], 1, "tolerance_db is -40.0 there, -30.0 given"),
@@ -237,17 +237,17 @@ def test_lines_that_were_simulated_are_not_written_over(made, monkeypatch):
     name = lines_of(made).name
     before = lines_of(made).read_bytes()
     _, stderr = run("mosaic", "scene.toml", "--png", name, code=2)
-    assert f"the file's name must end in .png, got {name!r}" in stderr
+    assert f"the file's name must end in .png or .pdf or .svg, got {name!r}" in stderr
     assert lines_of(made).read_bytes() == before
 
 
 @pytest.mark.parametrize(
     ("mosaic", "args", "message"),
     [
-        ("", ["-o", "a.png", "--png", "a.png"], "-o and --png must be two files"),
-        ('store = "a.png"', ["--png", "a.png"], "--png and the store must be two files"),
+        ("", ["-o", "a.png", "--png", "a.png"], "-o and --picture must be two files"),
+        ('store = "a.png"', ["--png", "a.png"], "--picture and the store must be two files"),
         ('lines = "folder"', ["-o", "folder"], "mosaic.lines and -o must be two files"),
-        ('lines = "a"', ["--png", "./a"], "mosaic.lines and --png must be two files"),
+        ('lines = "a"', ["--png", "./a"], "mosaic.lines and --picture must be two files"),
         ('lines = "folder"\nstore = "folder"', [], "the range lines and the store must be two"),
     ],
 )

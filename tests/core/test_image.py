@@ -40,3 +40,33 @@ def test_a_copy_is_made_when_asked_for():
 def test_phases_are_not_lost():
     with pytest.raises(TypeError, match="dtype must be complex, as pixels are, got float64"):
         np.asarray(IMAGE, float)
+
+
+def test_levels_are_in_decibels():
+    level = IMAGE.db()
+    assert level.dtype == np.float32
+    np.testing.assert_allclose(
+        level, 20 * np.log10(np.abs(PIXELS) / np.abs(PIXELS).max()), atol=1e-5
+    )
+    np.testing.assert_allclose(
+        IMAGE.db(reference=2.0), 20 * np.log10(np.abs(PIXELS) / 2), atol=1e-5
+    )
+    assert IMAGE.shape == level.shape == (2, 3)
+
+
+def test_levels_of_nothing_are_infinitely_low():
+    pixels = np.array([[0, 1e-30, 1]], complex)
+    np.testing.assert_allclose(
+        Image(pixels, Grid.plane((0, 1, 3), (0, 0, 1))).db(), [[-np.inf, -600, 0]], atol=1e-3
+    )
+    nothing = Image(0 * PIXELS, IMAGE.grid)
+    for reference in (None, 3.0):
+        assert (nothing.db(reference=reference) == -np.inf).all()
+
+
+@pytest.mark.parametrize("reference", [0, -1, np.nan, np.inf])
+def test_a_reference_is_positive(reference):
+    with pytest.raises(ValueError, match="reference must be finite and > 0"):
+        IMAGE.db(reference=reference)
+    with pytest.raises(TypeError, match="reference must be one real number"):
+        IMAGE.db(reference="max")

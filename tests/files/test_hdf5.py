@@ -13,7 +13,7 @@ from clsas.core.grid import Grid
 from clsas.core.image import Image
 from clsas.core.lines import RangeLines
 from clsas.files import hdf5 as io
-from clsas.files.hdf5 import FileFormatError, load, read_geometry, read_samples, save, to_xarray
+from clsas.files.hdf5 import FileFormatError, load, read_geometry, read_samples, save
 from clsas.signal.echoes import Echoes
 from clsas.sonar.system import Pulse
 
@@ -375,56 +375,3 @@ def test_damaged_bytes_never_become_data(tmp_path):
         except FileFormatError:
             found += 1
     assert found > 200
-
-
-def test_xarray_of_an_image():
-    image = OBJECTS["image"]
-    array = to_xarray(image)
-    assert array.dims == ("y", "x")
-    assert np.shares_memory(array.values, image.pixels)
-    for name, axis in zip(("x", "y"), PLANE.axes_m, strict=True):
-        np.testing.assert_array_equal(array[name], axis)
-        assert array[name].attrs["units"] == "m"
-    assert float(array.z) == -1 / 3
-    assert array.sel(x=1e6 + 0.7, y=40, method="nearest").item() == image.pixels[0, 4]
-
-
-@pytest.mark.parametrize("name", ["oriented", "height map", "points", "image of points"])
-def test_xarray_positions_are_the_grids(name):
-    obj = OBJECTS[name]
-    grid = obj.grid if isinstance(obj, Image) else obj
-    converted = to_xarray(obj)
-    dims = converted.z.dims
-    assert converted.z.shape == grid.shape
-    assert converted.z.attrs["units"] == "m"
-    x, y, z = (converted[axis].broadcast_like(converted.z).transpose(*dims) for axis in "xyz")
-    np.testing.assert_allclose(np.stack([x, y, z], -1), grid.positions_m(), rtol=1e-15)
-
-
-def test_xarray_of_lines():
-    lines = OBJECTS["moving lines"]
-    data = to_xarray(lines)
-    assert data.samples.dims == ("channel", "sample")
-    assert data.tx_m.dims == ("channel", "axis")
-    assert data.rx_velocity_m_s.attrs["units"] == "m s-1"
-    assert data.attrs["carrier_hz"] == 0
-    assert data.first_range_m.attrs["units"] == data.range_offset_m.attrs["units"] == "m"
-    last = (data.first_range_m + data.range_offset_m)[:, -1]
-    np.testing.assert_allclose(last, lines.last_range_m)
-    np.testing.assert_array_equal(data.rx_m.sel(axis="z"), lines.rx_m[:, 2])
-
-
-def test_xarray_of_echoes():
-    data = to_xarray(OBJECTS["phase code"])
-    assert data.attrs["pulse_carrier_hz"] == 1e6
-    assert len(data.attrs["pulse_code"]) == 13
-    assert data.time_offset_s[1] == 1e-5
-    assert data.start_time_s.attrs["units"] == "s"
-
-
-def test_xarray_names_bad_input(monkeypatch):
-    with pytest.raises(TypeError, match="obj must be of type Grid or"):
-        to_xarray(np.ones(3))
-    monkeypatch.setitem(sys.modules, "xarray", None)
-    with pytest.raises(ImportError, match="pip install xarray"):
-        to_xarray(PLANE)

@@ -41,15 +41,15 @@ def test_image_is_in_decibels_over_metres():
     assert limits == (-50, 0)
     axes, bar = figure.axes
     assert axes.get_aspect() == 1
-    assert (axes.get_xlabel(), axes.get_ylabel()) == ("x (m)", "y (m)")
+    assert (axes.get_xlabel(), axes.get_ylabel()) == ("Along-track (m)", "Across-track (m)")
     assert axes.get_title() == "a point"
-    assert bar.get_ylabel() == "amplitude over the greatest (dB)"
+    assert bar.get_ylabel() == "Amplitude (dB re max)"
 
 
 def test_reference_sets_zero_decibels():
     figure = plot.image_db(IMAGE, reference=20)
     assert shown(figure)[0].max() == pytest.approx(-20)
-    assert figure.axes[1].get_ylabel() == "amplitude over 20 (dB)"
+    assert figure.axes[1].get_ylabel() == "Amplitude (dB re 20)"
 
 
 def test_zero_image_is_black():
@@ -87,7 +87,7 @@ def test_oriented_planes_show_distances():
     # Rows run along z, columns along neither x nor y.
     np.testing.assert_allclose(shown(figure)[1], [-0.25, 2.25, 2.75, 4.25])
     labels = figure.axes[0].get_xlabel(), figure.axes[0].get_ylabel()
-    assert labels == ("along columns (m)", "z (m)")
+    assert labels == ("Distance along columns (m)", "Height (m)")
 
 
 DEPTH = Grid.oriented([-0.01, 0, -0.02], [0, 0, -1e-4], [1e-4, 0, 0], (150, 200))
@@ -97,14 +97,14 @@ def test_small_planes_in_depth_are_in_millimetres():
     figure = plot.image_db(Image(np.ones(DEPTH.shape, complex), DEPTH))
     np.testing.assert_allclose(shown(figure)[1], [-10.05, 9.95, -19.95, -34.95])
     axes = figure.axes[0]
-    assert (axes.get_xlabel(), axes.get_ylabel()) == ("x (mm)", "z (mm)")
+    assert (axes.get_xlabel(), axes.get_ylabel()) == ("Along-track (mm)", "Height (mm)")
     assert axes.get_ylim() == pytest.approx((-34.95, -19.95))  # up is up
 
 
 def test_cuts_in_depth_name_their_axes():
     response = measure_point(Image(PIXELS, DEPTH), (-0.002, -0.026))
     figure = plot.cuts(response)
-    assert figure.axes[1].get_xlabel() == "z (up) from the peak (mm)"
+    assert figure.axes[1].get_xlabel() == "Height from the peak (mm)"
     assert "z = -0.0260 m" in figure.axes[0].get_title()
 
 
@@ -113,7 +113,7 @@ def test_geometry_of_a_plane_in_depth_is_seen_from_its_side():
     data = RangeLines(np.ones((10, 4), complex), 0.0, 1e-4, rx_m, rx_m, 0, 1500)
     figure = plot.geometry(data, DEPTH)
     axes = figure.axes[0]
-    assert (axes.get_xlabel(), axes.get_ylabel()) == ("x (mm)", "z (mm)")
+    assert (axes.get_xlabel(), axes.get_ylabel()) == ("Along-track (mm)", "Height (mm)")
     np.testing.assert_allclose(axes.get_lines()[2].get_ydata().min(), -34.9)
 
 
@@ -127,7 +127,7 @@ def test_cuts_show_the_figures():
         text = axes.get_legend().get_texts()[0].get_text()
         for words in (f"{1e3 * cut.resolution_m:.4g} mm", f"ISLR {cut.islr_db:.1f} dB (10 + 10"):
             assert words in text
-    assert figure.axes[0].get_xlabel() == "x (along track) from the peak (mm)"
+    assert figure.axes[0].get_xlabel() == "Along-track from the peak (mm)"
 
 
 def test_geometry_shows_places_and_outline():
@@ -227,6 +227,10 @@ def test_bad_input_is_named():
 def test_only_figures_are_saved(tmp_path):
     with pytest.raises(ValueError, match=r"path must end in .png, got '.*a.pdf'"):
         plot.save_png(plot.image_db(IMAGE), tmp_path / "a.pdf")
+    with pytest.raises(ValueError, match=r"path must end in .png or .pdf or .svg, got '.*a.jpg'"):
+        plot.save(plot.image_db(IMAGE), tmp_path / "a.jpg")
+    with pytest.raises(ValueError, match="dpi must be finite and > 0 pixels per inch"):
+        plot.save(plot.image_db(IMAGE), tmp_path / "a.pdf", dpi=0)
     with pytest.raises(TypeError, match="figure must be of type Figure, got int"):
         plot.save_png(5, tmp_path / "a.png")
     with pytest.raises(TypeError, match="response must be of type PointResponse, got Image"):

@@ -186,7 +186,7 @@ def test_picture(tmp_path):
     hollow = [line for line in axes.get_lines() if line.get_fillstyle() == "none"]
     drawn = {tuple(point) for line in hollow for point in line.get_xydata()}
     assert drawn == {(row.predicted_error_db, row.predicted_seconds) for row in MADE.rows}
-    legend = [text.get_text() for text in axes.get_legend().get_texts()]
+    legend = [text.get_text() for text in figure.legends[0].get_texts()]
     assert len(legend) == len(set(legend)) == 5
     MADE.save_png(tmp_path / "t.png")
     assert (tmp_path / "t.png").read_bytes().startswith(b"\x89PNG")

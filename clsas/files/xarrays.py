@@ -1,0 +1,153 @@
+"""Grids, images, range lines and echoes as xarray's arrays: with coordinates, names and units."""
+
+from __future__ import annotations
+
+from dataclasses import fields, is_dataclass
+from types import ModuleType
+from typing import TYPE_CHECKING, Any, overload
+
+import numpy as np
+
+from clsas.core import validate
+from clsas.core.decibels import largest_amplitude
+from clsas.core.grid import Grid
+from clsas.core.image import Image
+from clsas.core.lines import RangeLines
+from clsas.signal.echoes import Echoes
+
+if TYPE_CHECKING:
+    import xarray
+
+_KINDS = (Grid, RangeLines, Image, Echoes)
+_AXES = {
+    "x": {"units": "m", "long_name": "Along-track"},
+    "y": {"units": "m", "long_name": "Across-track"},
+    "z": {"units": "m", "long_name": "Height", "positive": "up"},
+}
+_NAMES = {
+    "samples": "Samples",
+    "tx_m": "Transmitter position",
+    "rx_m": "Receiver position",
+    "rx_velocity_m_s": "Receiver velocity",
+    "first_range_m": "Range of the first sample",
+    "start_time_s": "Time of the first sample after transmission",
+}
+_UNITS = {"_m_s": "m s-1", "_m": "m", "_s": "s", "_hz": "Hz"}
+
+
+@overload
+def to_xarray(obj: Image) -> xarray.DataArray: ...
+@overload
+def to_xarray(obj: Grid | RangeLines | Echoes) -> xarray.Dataset: ...
+def to_xarray(obj: Grid | RangeLines | Image | Echoes) -> xarray.DataArray | xarray.Dataset:
+    """Return an object as an xarray one, with coordinates in metres.
+
+    An image becomes a DataArray of its level in dB, relative to its largest amplitude. The complex
+    pixels come along as the coordinates `pixels_real` and `pixels_imag`, since neither pictures
+    nor netCDF take complex numbers: `.plot()` and `.to_netcdf()` work as they are, and
+    `a["pixels_real"] + 1j * a["pixels_imag"]` are the pixels. The amplitude of 0 dB is
+    `attrs["reference"]`.
+
+    A grid becomes a Dataset of coordinates only. Range lines and echoes become Datasets over
+    (channel, sample), whose `samples` are complex as they are.
+
+    Parameters
+    ----------
+    obj : Grid, RangeLines, Image or Echoes
+        What to convert. Its arrays are shared, not copied.
+
+    Returns
+    -------
+    xarray.DataArray of an image, xarray.Dataset of anything else
+        Names and units stand in the attributes `long_name` and `units` after the CF conventions.
+        Numbers that belong to no axis are attributes, with the unit in their name.
+
+    Raises
+    ------
+    ImportError
+        If xarray is not installed.
+    TypeError
+        If `obj` is of another type.
+    """
+    try:
+        import xarray
+    except ImportError:
+        raise ImportError("to_xarray needs xarray: pip install xarray") from None
+    validate.instance("obj", obj, *_KINDS)
+    match obj:
+        case Grid():
+            return xarray.Dataset(coords=_grid_coordinates(obj), attrs={"Conventions": "CF-1.11"})
+        case Image():
+            return _image_to_xarray(xarray, obj)
+    return _channels_to_xarray(xarray, obj)
+
+
+def _image_to_xarray(xarray: ModuleType, image: Image) -> xarray.DataArray:
+    dims = _grid_dims(image.grid)
+    coordinates = _grid_coordinates(image.grid)
+    for name, part in (("real", image.pixels.real), ("imag", image.pixels.imag)):
+        words = {"real": "Real", "imag": "Imaginary"}[name]
+        attributes = {"units": "1", "long_name": f"{words} part of the pixels"}
+        coordinates[f"pixels_{name}"] = (dims, part, attributes)
+    reference = largest_amplitude(image.pixels)
+    told = {
+        "long_name": "Amplitude re max",
+        "units": "dB",
+        "reference": reference,
+        "comment": "20 log10(amplitude / reference); minus infinity where a pixel is 0",
+        "Conventions": "CF-1.11",
+    }
+    # DataArray would copy the coordinates; Dataset shares them.
+    level = {"amplitude_db": (dims, image.db(), told)}
+    return xarray.Dataset(level, coordinates)["amplitude_db"]
+
+
+def _grid_dims(grid: Grid) -> tuple[str, ...]:
+    if grid.points_m is not None:
+        return tuple(f"point_{axis}" for axis in range(len(grid.shape)))
+    return ("y", "x") if grid.has_axes else ("row", "column")
+
+
+def _grid_coordinates(grid: Grid) -> dict[str, Any]:
+    dims = _grid_dims(grid)
+    if not grid.has_axes:
+        positions = np.moveaxis(grid.positions_m(), -1, 0)
+        return {
+            name: (dims, values, dict(_AXES[name]))
+            for name, values in zip("xyz", positions, strict=True)
+        }
+    x, y = grid.axes_m
+    z: tuple[Any, Any] = ((), grid.positions_m(slice(1), slice(1))[0, 0, 2])
+    if grid.height_m is not None:
+        z = (dims, grid.positions_m()[..., 2])
+    return {
+        "x": ("x", x, _AXES["x"] | {"axis": "X"}),
+        "y": ("y", y, _AXES["y"] | {"axis": "Y"}),
+        "z": (*z, dict(_AXES["z"])),
+    }
+
+
+def _channels_to_xarray(xarray: ModuleType, obj: RangeLines | Echoes) -> xarray.Dataset:
+    steps = np.arange(obj.samples.shape[1])
+    if isinstance(obj, RangeLines):
+        known = {"units": "m", "long_name": "Range from the first sample"}
+        offset = {"range_offset_m": ("sample", steps * obj.range_step_m, known)}
+    else:
+        known = {"units": "s", "long_name": "Time from the first sample"}
+        offset = {"time_offset_s": ("sample", steps / obj.sample_rate_hz, known)}
+    variables: dict[str, Any] = {}
+    attributes: dict[str, Any] = {}
+    for field in fields(obj):
+        name, value = field.name, getattr(obj, field.name)
+        if isinstance(value, np.ndarray):
+            dims = ("channel", "sample" if name == "samples" else "axis")[: value.ndim]
+            unit = next((unit for end, unit in _UNITS.items() if name.endswith(end)), "1")
+            known = {"long_name": _NAMES[name], "units": unit}
+            variables[name] = (dims, value, known)
+        elif is_dataclass(value):
+            attributes |= {
+                f"{name}_{part.name}": getattr(value, part.name) for part in fields(value)
+            }
+        elif value is not None:
+            attributes[name] = value
+    return xarray.Dataset(variables, {**offset, "axis": ["x", "y", "z"]}, attributes)

@@ -1,0 +1,33 @@
+"""Pictures: images, mosaics, volumes, point responses, geometry, range lines and trade-offs.
+
+Functions that return a `matplotlib.figure.Figure` touch no window and no global state; `save`
+writes it as PNG, PDF or SVG. `image` draws into axes of your own, or into a new pyplot figure.
+"""
+
+from clsas.products.plot.canvas import save as save
+from clsas.products.plot.canvas import save_png as save_png
+from clsas.products.plot.curves import cuts as cuts
+from clsas.products.plot.curves import tradeoff as tradeoff
+from clsas.products.plot.levels import image as image
+from clsas.products.plot.levels import image_db as image_db
+from clsas.products.plot.levels import image_html as image_html
+from clsas.products.plot.levels import range_lines as range_lines
+from clsas.products.plot.mosaics import mosaic as mosaic
+from clsas.products.plot.mosaics import patch_borders as patch_borders
+from clsas.products.plot.survey import geometry as geometry
+from clsas.products.plot.volumes import volume as volume
+
+__all__ = [
+    "cuts",
+    "geometry",
+    "image",
+    "image_db",
+    "image_html",
+    "mosaic",
+    "patch_borders",
+    "range_lines",
+    "save",
+    "save_png",
+    "tradeoff",
+    "volume",
+]

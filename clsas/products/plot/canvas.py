@@ -1,0 +1,139 @@
+"""What all pictures share: figures, axes in metres, and writing files."""
+
+from __future__ import annotations
+
+import os
+from io import BytesIO
+from typing import TYPE_CHECKING, Any, Literal
+
+from clsas.core import validate
+from clsas.core.atomic import replacing
+from clsas.core.extras import install_command
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+SUFFIXES = (".png", ".pdf", ".svg")
+"""What names of pictures may end in."""
+
+_NAMES = {"x": "Along-track", "y": "Across-track", "z": "Height"}
+_PNG_DPI, _VECTOR_DPI = 150.0, 300.0  # of screens, and of the images within a printed page
+_SETTINGS: Any = {
+    "pdf.fonttype": 42,  # TrueType: publishers refuse matplotlib's default, Type 3
+    "svg.hashsalt": "clsas",  # the same picture gives the same file
+}
+_DATES = {"pdf": {"CreationDate": None}, "svg": {"Date": None}}
+
+
+def save(figure: Figure, path: str | os.PathLike, *, dpi: float | None = None) -> None:
+    """Write a figure as PNG, PDF or SVG, replacing a file of that name at once or not at all.
+
+    Parameters
+    ----------
+    figure : matplotlib.figure.Figure
+    path : path-like
+        The suffix decides the format: .png, .pdf or .svg; PNG without a suffix.
+    dpi : float, optional
+        Pixels per inch: 150 for PNG unless given. In PDF and SVG, where lines and labels are drawn
+        at any size, that of the images: 300 unless given.
+
+    Raises
+    ------
+    ImportError
+        If matplotlib is not installed.
+    TypeError, ValueError
+        If `figure` is not a Figure, `path` ends in another suffix, or `dpi` is not a positive
+        number.
+    OSError
+        If the folder does not exist or the file cannot be written.
+    """
+    validate.instance("figure", figure, figure_class())
+    path = validate.path("path", path)
+    validate.suffix("path", path, *SUFFIXES)
+    kind = path.suffix.lower().removeprefix(".") or "png"
+    if dpi is None:
+        dpi = _PNG_DPI if kind == "png" else _VECTOR_DPI
+    validate.positive("dpi", dpi, "pixels per inch")
+    import matplotlib as mpl
+
+    options: Any = {"metadata": _DATES[kind]} if kind in _DATES else {}
+    with replacing(path) as temporary, mpl.rc_context(_SETTINGS):
+        # What the layout leaves outside, as labels beside square axes, is drawn too.
+        figure.savefig(temporary, format=kind, dpi=dpi, bbox_inches="tight", **options)
+
+
+def save_png(figure: Figure, path: str | os.PathLike, *, dpi: float = _PNG_DPI) -> None:
+    """Write a figure as PNG; `save` also writes PDF and SVG.
+
+    Raises
+    ------
+    ImportError, TypeError, OSError
+        As `save` does.
+    ValueError
+        If `path` ends in another suffix than .png, or `dpi` is not a positive number.
+    """
+    validate.instance("figure", figure, figure_class())
+    validate.suffix("path", validate.path("path", path), ".png")
+    save(figure, path, dpi=dpi)
+
+
+def with_fewer_colours(png: str | os.PathLike | BytesIO, colours: int) -> bytes:
+    """Return a PNG of at most so many colours, up to 256, which takes a third of the bytes."""
+    from PIL import Image  # which matplotlib brings
+
+    reduced = BytesIO()
+    with Image.open(png) as picture:
+        few = picture.convert("RGB").quantize(colours, dither=Image.Dither.NONE)
+    few.save(reduced, format="png", optimize=True)
+    return reduced.getvalue()
+
+
+def figure_class() -> type[Figure]:
+    """Return matplotlib's class of figures.
+
+    Raises
+    ------
+    ImportError
+        If matplotlib is not installed; the message says how to install it.
+    """
+    try:
+        from matplotlib.figure import Figure
+    except ImportError:
+        raise ImportError(f"pictures need matplotlib: {install_command('plot')}") from None
+    return Figure
+
+
+def new_figure(
+    width_in: float, height_in: float, layout: Literal["constrained", "compressed"] = "constrained"
+) -> Figure:
+    """Return a figure that belongs to no window."""
+    return figure_class()(figsize=(width_in, height_in), layout=layout)
+
+
+def length_unit(length_m: float) -> tuple[float, str]:
+    """Return the factor and the unit in which a length is shown: millimetres below half a metre."""
+    return (1e3, "mm") if length_m < 0.5 else (1.0, "m")
+
+
+def axis_label(name: str, unit: str, of: str = "") -> str:
+    """Return the label of a coordinate's axis, such as "Along-track (m)".
+
+    Parameters
+    ----------
+    name : str
+        "x", "y" or "z", or "along columns" or "along rows" as of `clsas.core.grid.Axis`.
+    unit : str
+    of : str
+        What it is measured from, as in "Along-track from the peak (mm)".
+    """
+    return " ".join(filter(None, (_NAMES.get(name, f"Distance {name}"), of, f"({unit})")))
+
+
+def plain_ticks(axes: Axes) -> None:
+    """Write coordinates in full, however far the origin is, and as few as fit beside each other."""
+    from clsas.products.plot.ticks import FittingLocator
+
+    axes.ticklabel_format(style="plain", useOffset=False)
+    axes.xaxis.set_major_locator(FittingLocator())
+    axes.yaxis.set_major_locator(FittingLocator())

@@ -1,0 +1,331 @@
+"""Pictures of levels in dB: images and range lines."""
+
+from __future__ import annotations
+
+import base64
+from dataclasses import dataclass
+from html import escape
+from io import BytesIO
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsas.core import validate
+from clsas.core.decibels import level_db
+from clsas.core.extras import is_installed
+from clsas.core.image import Image
+from clsas.core.lines import RangeLines
+from clsas.products.plot.canvas import (
+    axis_label,
+    figure_class,
+    length_unit,
+    new_figure,
+    plain_ticks,
+    with_fewer_colours,
+)
+from clsas.products.plot.colours import COLOUR_MAP, colour_map
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.colors import Colormap
+    from matplotlib.figure import Figure
+    from matplotlib.image import AxesImage
+
+DYNAMIC_RANGE_DB = 60.0
+"""What a picture shows below the reference unless told otherwise, dB."""
+
+_MOST_PIXELS = 1500  # along an axis: more than a picture shows
+_SAME_DB = 1e-3  # between levels that are the same but for rounding
+_COUNTED = 1 << 22  # pixels that percentiles are taken of, at most
+_WIDTH_IN = 7.0  # of figures of images, or nearly the height of those that are higher than wide
+_FLAT = 0.4  # height over width of an image below which the scale of levels goes below it
+_PREVIEW_IN, _PREVIEW_DPI, _PREVIEW_COLOURS = 4.5, 96.0, 64  # in a notebook: 20 to 90 kB
+
+
+@dataclass(frozen=True)
+class Scale:
+    """Which levels a picture shows, and in which colours; the arguments of `image`."""
+
+    dynamic_range_db: float | None = None
+    percentiles: tuple[float, float] | None = None
+    reference: float | None = None
+    colour_map: str | Colormap = COLOUR_MAP
+
+    def __post_init__(self) -> None:
+        """Check every field but the colours, which need matplotlib."""
+        if self.reference is not None:
+            validate.positive("reference", self.reference)
+        if self.percentiles is None:
+            if self.dynamic_range_db is not None:
+                validate.positive("dynamic_range_db", self.dynamic_range_db, "dB")
+            return
+        if self.dynamic_range_db is not None:
+            raise ValueError("dynamic_range_db and percentiles exclude each other, got both")
+        try:
+            low, high = self.percentiles
+        except (TypeError, ValueError):
+            got = validate.shown(self.percentiles)
+            raise TypeError(f"percentiles must be (low, high), got {got}") from None
+        validate.number("low of percentiles", low, least=0.0, below=100.0)
+        validate.number("high of percentiles", high, above=low, most=100.0)
+
+    @property
+    def label(self) -> str:
+        """Label of the colour bar."""
+        if self.reference is None:
+            return "Amplitude (dB re max)"
+        return f"Amplitude (dB re {self.reference:g})"
+
+    def limits(self, level: NDArray[np.float32]) -> tuple[float, float]:
+        """Return the levels of the first and the last colour, dB."""
+        if self.percentiles is None:
+            return -(self.dynamic_range_db or DYNAMIC_RANGE_DB), 0.0
+        some = level.ravel()[:: -(-level.size // _COUNTED)]
+        some = some[np.isfinite(some)]
+        if not some.size:
+            return -DYNAMIC_RANGE_DB, 0.0
+        low, high = np.percentile(some, self.percentiles).tolist()
+        return min(low, high - 1.0), high  # colours need a range, also of equal pixels
+
+
+def image(
+    image: Image,
+    axes: Axes | None = None,
+    *,
+    dynamic_range_db: float | None = None,
+    percentiles: tuple[float, float] | None = None,
+    reference: float | None = None,
+    colour_map: str | Colormap = COLOUR_MAP,
+    colour_bar: bool = True,
+    title: str = "",
+) -> Axes:
+    """Draw the amplitude of an image in dB over metres.
+
+    Parameters
+    ----------
+    image : Image
+        On a plane of any direction or a height map. The axes are the coordinates that columns and
+        rows run along (x and y, or x and z of a plane in depth), else distances along them; in
+        millimetres where all of them are less than 0.5 m, else in metres. Columns and rows are
+        drawn at right angles also where they are not.
+    axes : matplotlib.axes.Axes, optional
+        Where to draw. Unless given those of a new pyplot figure, so that notebooks and
+        `pyplot.show` show it.
+    dynamic_range_db : float, optional
+        The first colour stands for levels so far below the reference and less, 60 dB unless given;
+        the last one for the reference and more.
+    percentiles : (low, high), optional
+        In place of `dynamic_range_db`: the colours span these percentiles, 0 to 100, of the levels
+        of all pixels that are not 0. (1, 99.5) shows speckle beside bright targets.
+    reference : float, optional
+        Amplitude of 0 dB; the image's greatest unless given.
+    colour_map : str or matplotlib.colors.Colormap
+        "sonar" (black, copper, cream), or any of matplotlib's names. "inferno", "sonar",
+        "cividis" and "gray" are perceptually even: equal steps in dB look equally large.
+    colour_bar : bool
+        Whether to draw the scale of levels beside the axes.
+    title : str
+        Put above.
+
+    Returns
+    -------
+    matplotlib.axes.Axes
+
+    Raises
+    ------
+    ImportError
+        If matplotlib is not installed.
+    TypeError, ValueError
+        If an argument is of a wrong kind or outside its limits, or the image is one of arbitrary
+        points (`volume` draws those of a box).
+    """
+    validate.instance("image", image, Image)
+    if image.grid.points_m is not None:
+        raise ValueError("image must be on a plane or height map to be drawn, got points")
+    scale = Scale(dynamic_range_db, percentiles, reference, colour_map)
+    figure_class()  # raises where matplotlib is missing
+    if axes is None:
+        from matplotlib import pyplot
+
+        axes = pyplot.figure(figsize=_size_in(image), layout="compressed").subplots()
+    _check_axes(axes)
+    across, upward = image.grid.sides
+    factor, unit = length_unit(max(float(np.abs(s.places_m).max()) for s in (across, upward)))
+    places = factor * across.places_m, factor * upward.places_m
+    extent = (*edges(*places), *edges(*reversed(places)))
+    flat = _height_per_width(image) < _FLAT
+    side = ("bottom" if flat else "right") if colour_bar else None
+    draw_levels(axes, image.db(reference=reference), extent, scale, side)
+    axes.set(
+        xlabel=axis_label(across.name, unit), ylabel=axis_label(upward.name, unit), title=title
+    )
+    axes.set_aspect("equal" if min(image.shape) > 1 else "auto")
+    return axes
+
+
+def image_db(image: Image, *, title: str = "", **options: Any) -> Figure:
+    """Draw the amplitude of an image in dB over metres, in a figure that belongs to no window.
+
+    Parameters
+    ----------
+    image, title
+        As for `image`.
+    **options
+        Further arguments of `image`: `dynamic_range_db`, `percentiles`, `reference`, `colour_map`
+        and `colour_bar`.
+
+    Raises
+    ------
+    ImportError, TypeError, ValueError
+        As `image` does.
+    """
+    validate.instance("image", image, Image)
+    figure = new_figure(*_size_in(image), layout="compressed")
+    _draw_image(image, figure.subplots(), title=title, **options)
+    return figure
+
+
+_draw_image = image  # which functions here hide behind an argument of that name
+
+
+def image_html(image: Image) -> str:
+    """Return an image as HTML for notebooks: a small picture and its summary.
+
+    The picture is a PNG within the HTML. Without matplotlib, and of arbitrary points, there is only
+    the summary.
+    """
+    text = f"<pre>{escape(repr(image))}</pre>"
+    if image.grid.points_m is not None or not is_installed("matplotlib"):
+        return text
+    figure = new_figure(*_size_in(image, _PREVIEW_IN), layout="compressed")
+    _draw_image(image, figure.subplots())
+    drawn = BytesIO()
+    figure.savefig(drawn, format="png", dpi=_PREVIEW_DPI, bbox_inches="tight")
+    picture = base64.b64encode(with_fewer_colours(drawn, _PREVIEW_COLOURS)).decode()
+    return f'<div><img alt="Amplitude in dB" src="data:image/png;base64,{picture}">{text}</div>'
+
+
+def range_lines(
+    lines: RangeLines,
+    *,
+    dynamic_range_db: float | None = None,
+    percentiles: tuple[float, float] | None = None,
+    colour_map: str | Colormap = COLOUR_MAP,
+    title: str = "",
+) -> Figure:
+    """Draw the amplitude of range lines in dB: channels across, range upward.
+
+    Parameters
+    ----------
+    lines : RangeLines
+        What to draw. Lines that start elsewhere than others are shown where they lie.
+    dynamic_range_db, percentiles, colour_map, title
+        As for `image`; levels are relative to the greatest sample.
+
+    Raises
+    ------
+    ImportError
+        If matplotlib is not installed.
+    TypeError, ValueError
+        If an argument is of a wrong kind or outside its limits.
+    """
+    validate.instance("lines", lines, RangeLines)
+    scale = Scale(dynamic_range_db, percentiles, None, colour_map)
+    amplitude, first_m, last_m = _aligned(lines)
+    extent = (-0.5, lines.channels - 0.5, first_m, last_m)
+    figure = new_figure(_WIDTH_IN, 6.0)
+    axes = figure.subplots()
+    draw_levels(axes, level_db(amplitude), extent, scale)
+    axes.set(xlabel="Channel", ylabel="Range (m)", title=title, aspect="auto")
+    return figure
+
+
+def draw_levels(
+    axes: Axes,
+    level: NDArray[np.float32],
+    extent: tuple[float, float, float, float],
+    scale: Scale,
+    bar: str | None = "right",
+) -> AxesImage:
+    """Draw levels [upward, across] in dB over `extent` (left, right, bottom, top).
+
+    The scale of levels goes to the side `bar` of the axes, "right" or "bottom", or nowhere.
+    """
+    low, high = scale.limits(level)
+    drawn = axes.imshow(
+        np.maximum(_greatest(level), low),
+        cmap=colour_map(scale.colour_map),
+        vmin=low,
+        vmax=high,
+        origin="lower",
+        extent=extent,
+    )
+    axes.set(xlim=sorted(extent[:2]), ylim=sorted(extent[2:]))
+    plain_ticks(axes)
+    if bar is not None:
+        slim = max(abs((extent[3] - extent[2]) / (extent[1] - extent[0])), 1.0)
+        beside = {"fraction": min(0.1 * slim, 0.9), "pad": min(0.02 * slim, 0.4)}
+        share = {"shrink": 0.8} if bar == "bottom" else beside
+        add_colour_bar(drawn, scale, level, ax=axes, location=bar, aspect=30, **share)
+    return drawn
+
+
+def add_colour_bar(
+    drawn: AxesImage, scale: Scale, level: NDArray[np.float32], **where: Any
+) -> None:
+    """Draw the scale of levels; an end is pointed where levels lie beyond it."""
+    pointed = {(True, True): "both", (True, False): "min", (False, True): "max"}
+    low, high = drawn.get_clim()
+    ends = bool(level.min() < low - _SAME_DB), bool(level.max() > high + _SAME_DB)
+    extend = pointed.get(ends, "neither")
+    figure: Any = drawn.get_figure()
+    figure.colorbar(drawn, label=scale.label, extend=extend, **where)
+
+
+def edges(axis: NDArray, other: NDArray) -> tuple[float, float]:
+    """Return the outer edges of the pixels of an axis; a single one is as wide as the other's."""
+    step = next((a[1] - a[0] for a in (axis, other) if len(a) > 1), 1.0)
+    return axis[0] - step / 2, axis[-1] + step / 2
+
+
+def _greatest(level: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return the greatest of the pixels that share a dot: a mean would hide a point among many."""
+    for axis in (0, 1):
+        count = level.shape[axis]
+        first = np.linspace(0, count, min(count, _MOST_PIXELS), endpoint=False).astype(int)
+        level = np.maximum.reduceat(level, first, axis)
+    return level
+
+
+def _size_in(image: Image, width_in: float = _WIDTH_IN) -> tuple[float, float]:
+    """Return the size of a figure, inches, with as much room as an image and its labels take."""
+    high = _height_per_width(image)
+    if high < _FLAT:  # with the scale of levels below
+        return width_in, max((width_in - 1.2) * high, 0.5) + 1.7
+    axes_in = min(width_in - 1.9, width_in / high)
+    return axes_in + 1.9, axes_in * high + 0.9
+
+
+def _height_per_width(image: Image) -> float:
+    """Return the height of an image as it is drawn, over its width; that of a line is free."""
+    if image.grid.points_m is not None or min(image.shape) == 1:
+        return 0.75
+    across_m, upward_m = (abs(s.step_m) * len(s.places_m) for s in image.grid.sides)
+    return upward_m / across_m
+
+
+def _check_axes(axes: object) -> None:
+    from matplotlib.axes import Axes
+
+    validate.instance("axes", axes, Axes)
+
+
+def _aligned(lines: RangeLines) -> tuple[NDArray, float, float]:
+    """Return amplitudes [range, channel] on one range axis, and that axis's outer edges."""
+    first_m, step_m = lines.first_range_m.min(), lines.range_step_m
+    start = np.rint((lines.first_range_m - first_m) / step_m).astype(int)
+    amplitude = np.zeros((start.max() + lines.length, lines.channels), np.float32)
+    for channel, (at, samples) in enumerate(zip(start, lines.samples, strict=True)):
+        amplitude[at : at + lines.length, channel] = np.abs(samples)
+    return amplitude, first_m - step_m / 2, first_m + (len(amplitude) - 0.5) * step_m

@@ -1,0 +1,89 @@
+"""The geometry of a survey: antennas and the outline of the grid."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsas.core import validate
+from clsas.core.grid import Grid
+from clsas.core.lines import RangeLines
+from clsas.products.plot.canvas import axis_label, length_unit, new_figure, plain_ticks
+from clsas.signal.echoes import Echoes
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+def geometry(lines: RangeLines | Echoes, grid: Grid | None = None) -> Figure:
+    """Draw where transmitters and receivers were, and the grid's outline.
+
+    A view from above, x and y; of a grid in depth along x or y, a view from its side.
+
+    Parameters
+    ----------
+    lines : RangeLines or Echoes
+        Whose `tx_m` and `rx_m` are drawn.
+    grid : Grid, optional
+        What is imaged: its outline, or every point.
+
+    Raises
+    ------
+    ImportError
+        If matplotlib is not installed.
+    TypeError
+        If `lines` or `grid` is of another type.
+    """
+    validate.instance("lines", lines, RangeLines, Echoes)
+    if grid is not None:
+        validate.instance("grid", grid, Grid)
+    shown = _coordinates(grid)
+    # Metres, but for what is small altogether.
+    ends_m = [lines.rx_m, lines.tx_m] + ([] if grid is None else [_outline(grid)[0]])
+    scale, unit = length_unit(max(float(np.abs(each[:, shown]).max()) for each in ends_m))
+    figure = new_figure(7.0, 6.0)
+    axes = figure.subplots()
+    for name, position_m, marker in (
+        ("Receiver", lines.rx_m, "."),
+        ("Transmitter", lines.tx_m, "x"),
+    ):
+        places = np.unique(position_m[:, shown].round(6), axis=0)  # micrometres
+        axes.plot(
+            *(scale * places.T), marker, markersize=5, label=f"{name} ({len(places)} positions)"
+        )
+    if grid is not None:
+        outline_m, style = _outline(grid)
+        axes.plot(
+            *(scale * outline_m[:, shown].T),
+            style,
+            linewidth=1.5,
+            markersize=2,
+            label="Grid " + " × ".join(map(str, grid.shape)),
+        )
+    across, upward = ("xyz"[coordinate] for coordinate in shown)
+    axes.set(xlabel=axis_label(across, unit), ylabel=axis_label(upward, unit), aspect="equal")
+    axes.set_adjustable("datalim")
+    axes.grid(alpha=0.3)
+    figure.legend(loc="outside lower center", ncols=3, fontsize="small")
+    plain_ticks(axes)
+    return figure
+
+
+def _coordinates(grid: Grid | None) -> list[int]:
+    """Return which two coordinates a view of the geometry shows, across and upward."""
+    if grid is not None and grid.points_m is None and min(grid.shape) > 1:
+        names = "".join(sorted(side.name for side in grid.sides))
+        if names in ("xz", "yz"):
+            return ["xyz".index(name) for name in names]
+    return [0, 1]
+
+
+def _outline(grid: Grid) -> tuple[NDArray, str]:
+    """Return the places to draw for a grid, [n, 3], and how."""
+    if grid.points_m is not None:
+        return grid.points_m.reshape(-1, 3), "."
+    down, right = (count - 1 for count in grid.shape)
+    corners = np.array([[0, 0], [0, right], [down, right], [down, 0], [0, 0]])
+    return grid.origin_m + corners @ [grid.row_step_m, grid.column_step_m], "-"

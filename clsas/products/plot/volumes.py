@@ -1,0 +1,206 @@
+"""Pictures of volumes: maximum projections and slices along x, y and z."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsas.core import validate
+from clsas.core.grid import Grid
+from clsas.core.image import Image
+from clsas.products.plot.canvas import axis_label, figure_class, length_unit
+from clsas.products.plot.levels import Scale, add_colour_bar, draw_levels, edges
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+KINDS = ("maximum", "slices")
+_VIEWS = (("x", "y", "z"), ("z", "y", "x"), ("x", "z", "y"))  # across, upward, looked along
+_IN, _LEAST_IN = 6.0, 0.8  # sizes of two views beside each other, and of a view of something flat
+_LEFT, _BOTTOM, _GAP, _RIGHT, _TOP = 0.9, 0.6, 0.4, 1.3, 0.7  # inches about the views
+_TOLERANCE = 1e-3  # of a step, by which points may lie beside the box
+
+
+@dataclass(frozen=True, eq=False)
+class _Box:
+    """Levels on a regular box of points, and the places along its axes.
+
+    Parameters
+    ----------
+    level : ndarray, [z, y, x]
+    places_m : dict of ndarray
+        By "x", "y" and "z".
+    """
+
+    level: NDArray[np.float32]
+    places_m: dict[str, NDArray[np.float64]]
+
+    def view(self, across: str, upward: str, along: str, index: int | None) -> NDArray[np.float32]:
+        """Return a slice at an index of `along`, or the maximum over it, [upward, across]."""
+        axis = "zyx".index(along)
+        flat = self.level.max(axis=axis) if index is None else np.take(self.level, index, axis)
+        left = "zyx".replace(along, "")
+        return flat if left == upward + across else flat.T
+
+
+def volume(
+    image: Image,
+    *,
+    kind: str = "maximum",
+    at: Sequence[float] | None = None,
+    title: str = "",
+    **options: Any,
+) -> Figure:
+    """Draw a volume from above, from its side and from its front, in dB over metres.
+
+    Parameters
+    ----------
+    image : Image
+        On points [n, m, k, 3] that form a regular box with sides along x, y and z, in any
+        order, as of::
+
+            z, y, x = np.meshgrid(z_m, y_m, x_m, indexing="ij")
+            grid = clsas.Grid.points(np.stack([x, y, z], axis=-1))
+
+    kind : str
+        "maximum": the greatest amplitude along the line of sight. "slices": three planes through
+        a point; dashed lines show where.
+    at : (x, y, z), optional
+        With "slices": that point, metres; the nearest pixel counts. The brightest one unless given.
+    title : str
+        Put above.
+    **options
+        `dynamic_range_db`, `percentiles`, `reference` and `colour_map` of `clsas.plot.image`; one
+        scale holds for all views.
+
+    Raises
+    ------
+    ImportError
+        If matplotlib is not installed.
+    TypeError, ValueError
+        If an argument is of a wrong kind or outside its limits, the image is not on such a box, or
+        `at` lies outside it.
+    """
+    validate.instance("image", image, Image)
+    validate.one_of("kind", kind, KINDS)
+    scale = Scale(**options)
+    if at is not None and kind != "slices":
+        raise ValueError(f"at goes with kind 'slices', got kind {kind!r}")
+    box = _box_of(image, scale.reference)
+    indices = _nearest(box, at) if kind == "slices" else None
+    factor, unit = length_unit(max(float(np.abs(p).max()) for p in box.places_m.values()))
+    low, high = scale.limits(box.level)
+    fixed = Scale(reference=scale.reference, colour_map=scale.colour_map)
+    figure, panels, beside = _panels(box)
+    for panel, (across, upward, along) in zip(panels, _VIEWS, strict=True):
+        place = None if indices is None else indices[along]
+        views = factor * box.places_m[across], factor * box.places_m[upward]
+        extent = (*edges(*views), *edges(*reversed(views)))
+        level = box.view(across, upward, along, place)
+        drawn = draw_levels(panel, level, extent, fixed, bar=None)
+        drawn.set_clim(low, high)
+        what = f"Maximum over {along}"
+        if place is not None:
+            what = f"{along} = {factor * box.places_m[along][place]:.6g} {unit}"
+        panel.set_title(what, fontsize="medium")
+        panel.set_aspect("equal")
+        if indices is not None:
+            line: Any = {"color": "white", "linewidth": 0.6, "alpha": 0.7, "linestyle": "--"}
+            panel.axvline(views[0][indices[across]], **line)
+            panel.axhline(views[1][indices[upward]], **line)
+    top, side, front = panels
+    top.set_ylabel(axis_label("y", unit))
+    side.set_xlabel(axis_label("z", unit))
+    front.set(xlabel=axis_label("x", unit), ylabel=axis_label("z", unit))
+    top.tick_params(labelbottom=False)  # those of the views below and to the left
+    side.tick_params(labelleft=False)
+    add_colour_bar(drawn, scale, box.level, cax=beside)
+    figure.suptitle(title)
+    return figure
+
+
+def _panels(box: _Box) -> tuple[Figure, list[Axes], Axes]:
+    """Return a figure, the axes of the views from above, side and front, and of the colour bar.
+
+    Views stand beside each other at one scale; what is flat is drawn no smaller than can be seen.
+    """
+    lengths_m = {
+        name: float(np.ptp(place)) * len(place) / max(len(place) - 1, 1)
+        for name, place in box.places_m.items()
+    }
+    longest_m = max(lengths_m["x"], lengths_m["y"]) + lengths_m["z"] or 1.0
+    x, y, z = (max(_IN * lengths_m[name] / longest_m, _LEAST_IN) for name in "xyz")
+    width, height = _LEFT + x + _GAP + z + _RIGHT, _BOTTOM + z + _GAP + y + _TOP
+    figure = figure_class()(figsize=(width, height))
+
+    def axes(left: float, bottom: float, wide: float, high: float) -> Axes:
+        return figure.add_axes((left / width, bottom / height, wide / width, high / height))
+
+    upper, right = _BOTTOM + z + _GAP, _LEFT + x + _GAP
+    views = [axes(_LEFT, upper, x, y), axes(right, upper, z, y), axes(_LEFT, _BOTTOM, x, z)]
+    return figure, views, axes(right + z + 0.3, _BOTTOM, 0.18, z + _GAP + y)
+
+
+def _box_of(image: Image, reference: float | None) -> _Box:
+    """Return the levels of a volume in the order [z, y, x], all axes ascending.
+
+    Raises ValueError if its points form no regular box.
+    """
+    places_m = _sides_m(image.grid)
+    order = list(places_m)  # the coordinate of every axis of the points
+    level = image.db(reference=reference).transpose([order.index(name) for name in "zyx"])
+    turned = {name: slice(None, None, -1 if p[-1] < p[0] else 1) for name, p in places_m.items()}
+    level = level[tuple(turned[name] for name in "zyx")]
+    return _Box(level, {name: p[turned[name]] for name, p in places_m.items()})
+
+
+def _sides_m(grid: Grid) -> dict[str, NDArray[np.float64]]:
+    """Return the places along the axes of a regular box of points, by the coordinates they change.
+
+    Raises ValueError if the points form none.
+    """
+    wanted = "image must be on points [n, m, k, 3] that form a regular box along x, y and z"
+    points_m = grid.points_m
+    if points_m is None or points_m.ndim != 4:
+        kind = "a plane or height map" if points_m is None else "points"
+        raise ValueError(f"{wanted}, got {kind} of shape {grid.shape}")
+    lines_m = points_m[:, 0, 0], points_m[0, :, 0], points_m[0, 0, :]
+    changes_m = np.array([np.abs(line[-1] - line[0]) for line in lines_m])
+    free, order = {0, 1, 2}, [0, 1, 2]
+    for axis in np.argsort([-len(line) for line in lines_m], kind="stable"):  # of one point last
+        order[axis] = max(free, key=lambda c: (changes_m[axis, c], c))
+        free.remove(order[axis])
+    places_m = {"xyz"[c]: line[:, c] for c, line in zip(order, lines_m, strict=True)}
+    steps_m = [abs(p[-1] - p[0]) / (len(p) - 1) for p in places_m.values() if len(p) > 1]
+    room_m = _TOLERANCE * min(steps_m, default=1.0)
+    for axis, (c, place_m) in enumerate(zip(order, places_m.values(), strict=True)):
+        even_m = np.linspace(place_m[0], place_m[-1], len(place_m))
+        shape = [-1 if other == axis else 1 for other in range(3)]
+        off_m = np.abs(points_m[..., c] - even_m.reshape(shape)).max()
+        if off_m > room_m or (len(place_m) > 1 and place_m[0] == place_m[-1]):
+            raise ValueError(f"{wanted}, got points that do not, by {off_m:.3g} m along {'xyz'[c]}")
+    return places_m
+
+
+def _nearest(box: _Box, at: Sequence[float] | None) -> dict[str, int]:
+    """Return the indices of the pixel at a place, or of the brightest one, by coordinate."""
+    if at is None:
+        brightest = np.unravel_index(box.level.argmax(), box.level.shape)
+        return {name: int(index) for name, index in zip("zyx", brightest, strict=True)}
+    place_m = validate.array("at", at, np.float64, (3,))
+    found = {}
+    for name, value in zip("xyz", place_m, strict=True):
+        places = box.places_m[name]
+        step = np.ptp(places) / max(len(places) - 1, 1)
+        if not places[0] - step / 2 <= value <= places[-1] + step / 2:
+            raise ValueError(
+                f"at must lie in the volume, {name} from {places[0]:g} to {places[-1]:g} m, got "
+                f"{value:g} m"
+            )
+        found[name] = int(np.abs(places - value).argmin())
+    return found

@@ -1,0 +1,95 @@
+"""Pictures that commands draw: formats, levels, colours and borders."""
+
+import numpy as np
+import pytest
+from cases import along_x, lines_over
+from click.testing import CliRunner
+
+import clsas
+from clsas.cli import main
+from clsas.core.grid import Grid
+from clsas.products import plot
+
+pytest.importorskip("matplotlib")
+
+LINES = lines_over(
+    Grid.plane((-1, 1, 40), (20, 22, 33)), along_x(32, 0.05), carrier_hz=1e5, step_m=0.01
+)
+GRID = ("--x", "-1:1:40", "--y", "20:22:33")
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    clsas.save(tmp_path / "lines.h5", LINES)
+    (tmp_path / "scene.toml").write_text(
+        "[grid]\nx = { start_m = -1, stop_m = 1, count = 40 }\n"
+        "y = { start_m = 20, stop_m = 22, count = 33 }\n"
+    )
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.fixture
+def figures(monkeypatch):
+    """Figures that a command saves."""
+    saved = []
+    save = plot.save
+
+    def recorded(figure, path, **options):
+        saved.append(figure)
+        save(figure, path, **options)
+
+    monkeypatch.setattr(plot, "save", recorded)
+    return saved
+
+
+def run(*args, code=0):
+    result = CliRunner().invoke(main, [str(arg) for arg in args], prog_name="clsas")
+    assert result.exit_code == code, result.output
+    return result.output
+
+
+@pytest.mark.parametrize("option", ["--picture", "--png"])
+@pytest.mark.parametrize(("name", "start"), [("a.pdf", b"%PDF"), ("a.svg", b"<?xml")])
+def test_the_suffix_decides_the_format(folder, option, name, start):
+    run("image", "lines.h5", *GRID, "-o", "image.h5", option, name)
+    assert (folder / name).read_bytes().startswith(start)
+
+
+def test_levels_and_colours_of_an_image(folder, figures):
+    run("image", "lines.h5", *GRID, "-o", "a.h5", "--picture", "a.png", "--dynamic-range-db", 30)
+    run(
+        "image", "lines.h5", *GRID, "-o", "b.h5", "--picture", "b.png",
+        "--percentiles", "5,99", "--colour-map", "sonar",
+    )  # fmt: skip
+    one, other = (figure.axes[0].get_images()[0] for figure in figures)
+    assert one.get_clim() == (-30, 0)
+    assert (one.get_cmap().name, other.get_cmap().name) == ("inferno", "sonar")
+    level = clsas.load("b.h5").db()
+    np.testing.assert_allclose(other.get_clim(), np.percentile(level, (5, 99)), atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (("--percentiles", "99"), "'99' must be LOW,HIGH from 0 to 100"),
+        (("--percentiles", "99,1"), "'99,1' must be LOW,HIGH from 0 to 100"),
+        (("--percentiles", "1,99", "--dynamic-range-db", 40), "exclude each other"),
+        (("--colour-map", "sonnar"), "--colour-map must be 'sonar' or one of matplotlib's"),
+    ],
+)
+def test_bad_levels_and_colours_are_refused_before_any_work(folder, options, words):
+    for command in (
+        ("image", "lines.h5", *GRID, "-o", "image.h5"),
+        ("mosaic", "scene.toml", "--lines", "lines.h5"),
+    ):
+        assert words in " ".join(run(*command, "--picture", "a.png", *options, code=2).split())
+    assert {path.name for path in folder.iterdir()} == {"lines.h5", "scene.toml"}
+
+
+def test_borders_of_patches_on_request(folder, figures):
+    pytest.importorskip("zarr")
+    command = ("mosaic", "scene.toml", "--lines", "lines.h5", "--patches", "2x3")
+    run(*command, "--picture", "a.png")
+    run(*command, "--picture", "b.png", "--borders")
+    assert [len(figure.axes[0].get_lines()) for figure in figures] == [0, 3]

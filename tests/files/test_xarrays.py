@@ -1,0 +1,117 @@
+import sys
+
+import numpy as np
+import pytest
+
+from clsas.core.grid import Grid
+from clsas.core.image import Image
+from clsas.core.lines import RangeLines
+from clsas.files.xarrays import to_xarray
+from clsas.signal.echoes import Echoes
+from clsas.sonar.system import Pulse
+
+xarray = pytest.importorskip("xarray")
+
+RNG = np.random.default_rng(3)
+
+
+def noise(*shape):
+    return RNG.normal(size=shape)
+
+
+def complex_noise(*shape):
+    return (noise(*shape) + 1j * noise(*shape)).astype(np.complex64)
+
+
+PLANE = Grid.plane(x=(1e6, 1e6 + 0.7, 5), y=(40, 41 / 3, 3), z=-1 / 3)
+OBJECTS = {
+    "oriented": Grid.oriented(noise(3), noise(3), noise(3), (2, 3)),
+    "height map": PLANE.with_height(noise(3, 5)),
+    "points": Grid.points(noise(2, 3, 4, 3)),
+    "image": Image(complex_noise(3, 5), PLANE),
+    "image of points": Image(complex_noise(7), Grid.points(noise(7, 3))),
+    "moving lines": RangeLines(
+        complex_noise(4, 6), 40, 0.1, noise(4, 3), noise(4, 3), 0, 1500, noise(4, 3)
+    ),
+    "phase code": Echoes(
+        complex_noise(4, 6), noise(4), 1e5, 1e6, [0, 0, 0], [0, 0, 0], 1500,
+        Pulse.phase_code(1e6, 1e-3),
+    ),
+}  # fmt: skip
+
+
+def test_xarray_of_an_image():
+    image = OBJECTS["image"]
+    array = to_xarray(image)
+    assert array.dims == ("y", "x")
+    for part, name in ((image.pixels.real, "pixels_real"), (image.pixels.imag, "pixels_imag")):
+        np.testing.assert_array_equal(array[name], part)
+        assert np.shares_memory(array[name].values, image.pixels)
+    for name, axis in zip(("x", "y"), PLANE.axes_m, strict=True):
+        np.testing.assert_array_equal(array[name], axis)
+        assert array[name].attrs["units"] == "m"
+    assert float(array.z) == -1 / 3
+    corner = array.sel(x=1e6 + 0.7, y=40, method="nearest")
+    assert corner["pixels_real"] + 1j * corner["pixels_imag"] == image.pixels[0, 4]
+    level = 20 * np.log10(np.abs(image.pixels) / np.abs(image.pixels).max())
+    np.testing.assert_allclose(array, level, atol=1e-4)
+    assert array.attrs["reference"] == pytest.approx(np.abs(image.pixels).max())
+
+
+def test_an_image_of_xarray_is_drawn_with_names_and_units():
+    figure = pytest.importorskip("matplotlib.figure").Figure()
+    to_xarray(OBJECTS["image"]).plot(ax=figure.subplots())
+    axes, bar = figure.axes
+    assert (axes.get_xlabel(), axes.get_ylabel()) == ("Along-track [m]", "Across-track [m]")
+    assert bar.get_ylabel() == "Amplitude re max [dB]"
+
+
+@pytest.mark.parametrize("name", ["image", "image of points"])
+def test_an_image_survives_netcdf(name, tmp_path):
+    image = OBJECTS[name]
+    image.to_xarray().to_netcdf(tmp_path / "image.nc")
+    with xarray.open_dataarray(tmp_path / "image.nc") as read:
+        xarray.testing.assert_identical(read.load(), to_xarray(image))
+        pixels = read["pixels_real"].values + 1j * read["pixels_imag"].values
+    np.testing.assert_array_equal(pixels, image.pixels)
+
+
+@pytest.mark.parametrize("name", ["oriented", "height map", "points", "image of points"])
+def test_xarray_positions_are_the_grids(name):
+    obj = OBJECTS[name]
+    grid = obj.grid if isinstance(obj, Image) else obj
+    converted = to_xarray(obj)
+    dims = converted.z.dims
+    assert converted.z.shape == grid.shape
+    assert converted.z.attrs["units"] == "m"
+    x, y, z = (converted[axis].broadcast_like(converted.z).transpose(*dims) for axis in "xyz")
+    np.testing.assert_allclose(np.stack([x, y, z], -1), grid.positions_m(), rtol=1e-15)
+
+
+def test_xarray_of_lines():
+    lines = OBJECTS["moving lines"]
+    data = to_xarray(lines)
+    assert data.samples.dims == ("channel", "sample")
+    assert data.tx_m.dims == ("channel", "axis")
+    assert data.rx_velocity_m_s.attrs["units"] == "m s-1"
+    assert data.attrs["carrier_hz"] == 0
+    assert data.first_range_m.attrs["units"] == data.range_offset_m.attrs["units"] == "m"
+    last = (data.first_range_m + data.range_offset_m)[:, -1]
+    np.testing.assert_allclose(last, lines.last_range_m)
+    np.testing.assert_array_equal(data.rx_m.sel(axis="z"), lines.rx_m[:, 2])
+
+
+def test_xarray_of_echoes():
+    data = to_xarray(OBJECTS["phase code"])
+    assert data.attrs["pulse_carrier_hz"] == 1e6
+    assert len(data.attrs["pulse_code"]) == 13
+    assert data.time_offset_s[1] == 1e-5
+    assert data.start_time_s.attrs["units"] == "s"
+
+
+def test_xarray_names_bad_input(monkeypatch):
+    with pytest.raises(TypeError, match="obj must be of type Grid or"):
+        to_xarray(np.ones(3))
+    monkeypatch.setitem(sys.modules, "xarray", None)
+    with pytest.raises(ImportError, match="pip install xarray"):
+        to_xarray(PLANE)
