@@ -2,7 +2,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from cases import along_x, beside, noise, patch, thesis_lines
+from cases import along_x, beside, noise
 from factorizing import (
     BAND,
     BEAMS,
@@ -31,7 +31,6 @@ from factorizing import (
 from clsas import plan
 from clsas.core.decibels import in_db
 from clsas.core.grid import Grid
-from clsas.core.image import Image
 from clsas.core.image_error import relative_error_db
 from clsas.core.lines import RangeLines, some_channels
 from clsas.core.validate import ClsasWarning
@@ -436,21 +435,6 @@ def test_no_stages_are_plain_backprojection(platform):
 # Physics
 
 
-@pytest.mark.parametrize("amplitude", [1, -2j])
-def test_a_point_keeps_its_amplitude_and_phase(platform, amplitude):
-    target = [0.3, 40.6, -3.0]
-    lines = simulate_lines(
-        TRACK, beside(TRACK, 0.05, 0, 0), PointTargets([target], [amplitude]),
-        carrier_hz=CARRIER, bandwidth_hz=BAND * CARRIER,
-    )  # fmt: skip
-    grid = around(0.3, 40.6, shape=(65, 65), z=-3.0)
-    chosen = plan(lines, grid, tolerance_db=-55, costs=EXACT_IS_SLOW)
-    assert not chosen.is_exact
-    pixel = factorize(lines, grid, chosen, device=platform).pixels[32, 32]
-    # The rms error is over the whole image, where all other pixels are small.
-    assert abs(pixel / (len(TRACK) * amplitude) - 1) <= 3e-3
-
-
 def test_a_point_on_a_hill_keeps_its_amplitude_and_phase(platform):
     """Only where the height map has it does every line agree on it."""
     row, column = np.indices((65, 65))
@@ -466,47 +450,6 @@ def test_a_point_on_a_hill_keeps_its_amplitude_and_phase(platform):
     pixels = factorize(lines, grid, chosen, device=platform).pixels
     assert abs(pixels[32, 32] / (len(TRACK) * -2j) - 1) <= 3e-3
     assert np.unravel_index(np.abs(pixels).argmax(), pixels.shape) == (32, 32)
-
-
-@pytest.mark.parametrize(("half", "to_db"), [(False, -85), (True, -62)])
-def test_it_is_linear(half, to_db, platform):
-    """But for what is rounded: three images, to half precision four times each."""
-    one, grid = made(straight)
-    chosen = dataclasses.replace(planned(straight, -50), half_precision=half)
-    other = dataclasses.replace(one, samples=noise(one.channels, one.length, seed=9))
-    a, b = 0.3 - 2j, 1.5j
-    both = dataclasses.replace(one, samples=a * one.samples + b * other.samples)
-    image, of_one, of_other = (
-        factorize(lines, grid, chosen, device=platform).pixels for lines in (both, one, other)
-    )
-    assert relative_error_db(image, a * of_one + b * of_other) <= to_db
-
-
-def test_it_gives_the_same_twice(platform):
-    first, second = (
-        factorize(*made(arc), planned(arc, -50), device=platform).pixels for _ in range(2)
-    )
-    np.testing.assert_array_equal(first, second)
-
-
-@pytest.mark.parametrize("motion", ["shift", "rotation"])
-def test_where_the_scene_lies_does_not_matter(motion):
-    lines, grid = made(bistatic_array)
-    turn, shift = np.eye(3), np.zeros(3)
-    if motion == "shift":
-        shift = np.array([1e6, -2e6, 1e4])
-    else:
-        turn = np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0]
-    lines = dataclasses.replace(
-        lines, tx_m=lines.tx_m @ turn.T + shift, rx_m=lines.rx_m @ turn.T + shift
-    )
-    grid = Grid.oriented(
-        turn @ grid.origin_m + shift, turn @ grid.row_step_m, turn @ grid.column_step_m, grid.shape
-    )
-    chosen = plan(lines, grid, tolerance_db=-50, costs=EXACT_IS_SLOW)
-    assert not chosen.is_exact
-    image = factorize(lines, grid, chosen)
-    assert relative_error_db(image.pixels, exact(bistatic_array).pixels) <= -50
 
 
 def test_pixels_outside_the_beam_of_every_channel_are_zero(platform):
@@ -590,13 +533,6 @@ def test_pixels_near_the_aperture(grid):
     chosen = plan(lines, grid, tolerance_db=-45, costs=EXACT_IS_SLOW)
     image = factorize(lines, grid, chosen)
     assert relative_error_db(image, backproject(lines, grid, accuracy_db=-85)) <= -45
-
-
-def test_lines_of_zeros_give_zeros(platform):
-    lines, grid = made(straight)
-    nothing = dataclasses.replace(lines, samples=np.zeros_like(lines.samples))
-    chosen = plan(nothing, grid, tolerance_db=-40, costs=EXACT_IS_SLOW)
-    assert not factorize(nothing, grid, chosen, device=platform).pixels.any()
 
 
 def test_a_grid_that_no_line_reaches_warns_and_is_zero():
@@ -804,61 +740,7 @@ def test_progress_counts_pixels(platform):
     assert sorted(set(done)) == list(done)
 
 
-def test_an_interrupted_run_leaves_the_device_usable(platform):
-    def interrupt(done, total):
-        raise KeyboardInterrupt
-
-    chosen = planned(swaying, -40)
-    with pytest.raises(KeyboardInterrupt):
-        factorize(*made(swaying), chosen, device=platform, progress=interrupt)
-    image = factorize(*made(swaying), chosen, device=platform)
-    assert relative_error_db(image, exact(swaying)) <= -40
-
-
-# Bad input
-
-
-@pytest.fixture(scope="module")
-def good():
-    grid = patch(1.3, 42, 9, 8)
-    lines = thesis_lines(grid, along_x(20, 0.01))
-    return {"lines": lines, "grid": grid, "plan_or_tolerance": -40}
-
-
-@pytest.mark.parametrize(
-    ("argument", "value", "error", "says"),
-    [
-        ("lines", np.zeros((2, 3), complex), TypeError, "lines must be .*RangeLines.*ndarray"),
-        ("grid", (5, 5), TypeError, "grid must be .*Grid.*tuple"),
-        (
-            "grid",
-            Grid.plane((-1, 1, 10**6), (30, 31, 10**6)),
-            ValueError,
-            "grid must ask for at most .* GiB",
-        ),
-        ("plan_or_tolerance", -76, ValueError, r"tolerance.* must be .*>= -75 .*dB.*got -76"),
-        ("plan_or_tolerance", 0, ValueError, r"tolerance.* must be .*<= -10 dB.*got 0"),
-        ("plan_or_tolerance", np.nan, ValueError, "tolerance.* must be finite.*nan"),
-        ("plan_or_tolerance", "-40 dB", TypeError, "plan_or_tolerance must be .*-40 dB"),
-        ("plan_or_tolerance", None, TypeError, "plan_or_tolerance must be .*None"),
-        ("plan_or_tolerance", [(2, 2)], TypeError, r"plan_or_tolerance must be .*\(2, 2\)"),
-        ("beam", 20.0, TypeError, "beam must be .*BeamWindow.*float"),
-        ("device", 1.5, TypeError, "device must be .*1.5"),
-        ("progress", 5, TypeError, "progress must be a function"),
-    ],
-)
-def test_bad_arguments_are_named(good, argument, value, error, says):
-    with pytest.raises(error, match=says):
-        factorize(**(good | {argument: value}))
-
-
-def test_samples_whose_sum_overflows_are_refused(good):
-    """As by backprojection: float32 cannot hold the pixels."""
-    lines = good["lines"]
-    huge = dataclasses.replace(lines, samples=np.full_like(lines.samples, 2e37))
-    chosen = plan(huge, good["grid"], tolerance_db=-40, costs=EXACT_IS_SLOW)
-    with pytest.raises(ValueError, match="samples must be at most"):
-        factorize(huge, good["grid"], chosen)
+# At the edges of grids, tracks and beams
 
 
 @pytest.mark.parametrize("seed", [2, 5])
@@ -1046,16 +928,3 @@ def test_data_may_arrive_in_pieces(costs, platform):
         assert chosen.is_exact == (costs is not EXACT_IS_SLOW)
         image = factorize(some, grid, chosen, device=platform, accumulate=image)
     assert relative_error_db(image, whole) < -42
-
-
-def test_what_cannot_be_added_to_is_refused(platform):
-    lines, grid = made(straight)
-    other = Image(np.zeros((4, 4), complex), Grid.plane((0, 1, 4), (0, 1, 4)))
-    with pytest.raises(ValueError, match="accumulate must be an image on the same grid"):
-        factorize(lines, grid, -40, accumulate=other, device=platform)
-    with pytest.raises(TypeError, match="accumulate must be of type Image"):
-        factorize(lines, grid, -40, accumulate=np.zeros(grid.shape, complex), device=platform)
-    zero = Image(np.zeros(grid.shape, complex), grid)
-    beam = BeamWindow(60, "hann", normalise=True)
-    with pytest.raises(ValueError, match="accumulate must be None with a beam that normalises"):
-        factorize(lines, grid, -40, accumulate=zero, beam=beam, device=platform)

@@ -201,44 +201,6 @@ def test_patches_that_do_not_divide_the_grid(exact):
     assert relative_error_db(image, exact) < -65
 
 
-@pytest.mark.parametrize(
-    ("wrong", "message"),
-    [
-        ({"patches": (50, 4)}, "patches must leave each some of 60 pixels: 50 patches of 2"),
-        ({"patches": (61, 4)}, "patches must leave each some of 60 pixels"),
-        ({"patches": (0, 4)}, "every entry of patches must be .* got 0"),
-        ({"patches": 4}, r"patches must be \(rows, columns\) of patches, got 4"),
-        ({"patches": (1, 2, 3)}, r"patches must be \(rows, columns\) of patches"),
-        ({"tolerance_db": -40}, "at most one of tolerance_db, .* must be given"),
-        ({"accuracy_db": 3}, "accuracy_db must be .* dB, got 3"),
-        ({"memory_bytes": -1}, "memory_bytes must be"),
-        ({"patches": None, "memory_bytes": 1000}, "memory_bytes must be at least .* MiB"),
-        ({"beam": 8.0}, "beam must be"),
-        ({"device": []}, "device must name at least one device"),
-        ({"follow_s": 1.0}, "source must be a folder where follow_s is given"),
-    ],
-)
-def test_bad_arguments(wrong, message):
-    with pytest.raises((TypeError, ValueError), match=message):
-        clsas.mosaic(LINES, GRID, **(WISH | wrong))
-
-
-def test_bad_grids():
-    with pytest.raises(ValueError, match="grid must have two axes"):
-        clsas.mosaic(LINES, Grid.points([[0.0, 30.0, 0.0]]))
-    with pytest.raises(TypeError, match="grid must be"):
-        clsas.mosaic(LINES, (3, 4))
-
-
-def test_a_wish_is_checked_before_any_patch():
-    with pytest.raises(ValueError, match=r"tolerance_db must be .* got -200"):
-        clsas.mosaic(LINES, GRID, tolerance_db=-200)
-    with pytest.raises(ValueError, match="tolerance_wavelengths must be"):
-        clsas.mosaic(LINES, GRID, tolerance_wavelengths=-1)
-    with pytest.raises(TypeError, match="stages must be"):
-        clsas.mosaic(LINES, GRID, stages=3)
-
-
 def test_a_patch_that_no_channel_sees_is_empty_and_flagged(tmp_path):
     """Half of the scene lies behind the beams, and some beyond the lines' end."""
     grid = Grid.plane((-4, 120, 64), (30, 40, 20))
