@@ -127,7 +127,7 @@ def ends_error(
     )
     place = (range_m - part.first_range_m) / part.range_step_m
     seen = np.ones(place.shape, bool)
-    if beam is not None:
+    if beam is not None and along is not None:
         low, high = beam.limits
         sine = sines(points_m, part.phase_centres_m, along[some]).T
         seen = (sine > low) & (sine < high)

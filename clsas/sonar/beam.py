@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -143,7 +143,7 @@ class BeamWindow:
 
     @classmethod
     def of_element(
-        cls, length_m: float, wavelength_m: float, shape: str = "rectangular", **others: object
+        cls, length_m: float, wavelength_m: float, shape: str = "rectangular", **others: Any
     ) -> BeamWindow:
         """Return the window as wide as an element's beam.
 
@@ -250,7 +250,8 @@ class BeamWindow:
 
     def _all(self, wavelength_m: float) -> NDArray[np.float64]:
         """Return weights all over the window."""
-        return self._inside(np.linspace(*np.clip(self.limits, -1, 1), 65), wavelength_m)
+        low, high = np.clip(self.limits, -1, 1)
+        return self._inside(np.linspace(float(low), float(high), 65), wavelength_m)
 
     def weights(self, q: ArrayLike, wavelength_m: float = math.inf) -> NDArray[np.float64]:
         """Return the weights at sines `q` of the aspect angle; `wavelength_m` is for "inverse"."""
@@ -361,6 +362,7 @@ class BeamWindow:
             )
             return np.sin(np.pi * np.where(of_side < 0.5, share, 0.5)) ** 2
         if self.shape == "inverse":
+            assert self.element_length_m is not None  # as checked when this was made
             one_way = element_pattern(self.element_length_m, np.sin(angle), 1.0, wavelength_m)
             return 1 / np.maximum(one_way**2, 1e-30)
         return np.ones_like(q)
@@ -475,10 +477,12 @@ class Sight:
         All of them see all points; with `index` [n, places] those see a point that it names.
         """
         changes = along @ axes_m.T  # [:, axes]
+        slopes: Any  # an array, or a list of them
+        changed: Any
         if index is None:
             sine, distance_m = _sines(points_m, track_m, along)
             slopes = (axes_m @ points_m.T)[..., None] - (axes_m @ track_m.T)[:, None]
-            changes = changes.T
+            changed = changes.T
         else:
             sine, square = np.zeros(index.shape), np.zeros(index.shape)
             for point_m, place_m, direction in zip(points_m.T, track_m.T, along.T, strict=True):
@@ -492,9 +496,9 @@ class Sight:
                 each[:, None] - of_place[index]
                 for each, of_place in zip(towards_m, axes_m @ track_m.T, strict=True)
             ]
-            changes = [each[index] for each in changes.T]
+            changed = [each[index] for each in changes.T]
         inverse_m = 1 / np.maximum(distance_m, 1e-9, out=distance_m)
-        for slope, change in zip(slopes, changes, strict=True):
+        for slope, change in zip(slopes, changed, strict=True):
             slope *= inverse_m
             slope *= sine
             np.subtract(change, slope, out=slope)
@@ -603,7 +607,7 @@ def _legs(centres_m: NDArray[np.float64]) -> list[NDArray[np.float64]]:
     starts = [0]
     for start in np.flatnonzero(steps_m > _JUMP * usual_m) + 1 if usual_m else ():
         if min(start - starts[-1], len(centres_m) - start) >= _SHORTEST_LEG:
-            starts.append(start)
+            starts.append(int(start))
     return np.split(centres_m, starts[1:])
 
 
@@ -627,11 +631,11 @@ def _taylor(u: NDArray[np.float64]) -> NDArray[np.float64]:
     terms = np.arange(1, _TAYLOR_TERMS)
     a = math.acosh(10 ** (_TAYLOR_SIDE_LOBES_DB / 20)) / np.pi
     stretch = _TAYLOR_TERMS**2 / (a**2 + (_TAYLOR_TERMS - 0.5) ** 2)
-    factors = []
+    found = []
     for m in terms:
         zeros = np.prod(1 - m**2 / stretch / (a**2 + (terms - 0.5) ** 2))
         others = np.prod([1 - m**2 / n**2 for n in terms if n != m])
-        factors.append((-1) ** (m + 1) * zeros / others)
-    factors = np.array(factors)
+        found.append((-1) ** (m + 1) * zeros / others)
+    factors = np.array(found)
     total = 1 + np.cos(2 * np.pi * np.asarray(u)[..., None] * terms) @ factors
     return total / (1 + factors.sum())
