@@ -46,11 +46,13 @@ FINE = {"taps": 8, "upsampling": 4}  # an interpolator whose own error is below 
 # Accuracy
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", ORDINARY, ids=lambda case: case.__name__)
 def test_rounding_stays_below_80_db(case, device):
     assert rounding_error_db(case, device) <= -80
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("taps", "upsampling"), [(2, 5.0), (4, 4.0), (8, 2.0)])
 @pytest.mark.parametrize("case", [thesis, height_map], ids=lambda case: case.__name__)
 def test_rounding_does_not_depend_on_the_interpolator(case, device, taps, upsampling):
@@ -69,6 +71,7 @@ def test_the_cases_take_both_ways():
 SCATTER_DB = 0.6
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("accuracy_db", [-30, -50, -60, -80])
 @pytest.mark.parametrize("case", [thesis, own_starts], ids=lambda case: case.__name__)
 def test_the_true_error_is_what_was_asked_for(case, platform, accuracy_db):
@@ -76,11 +79,13 @@ def test_the_true_error_is_what_was_asked_for(case, platform, accuracy_db):
     assert true_error_db(case, image) <= accuracy_db + SCATTER_DB
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", ORDINARY, ids=lambda case: case.__name__)
 def test_the_default_accuracy_is_60_db(case):
     assert true_error_db(case, backproject(*made(case))) <= -60 + SCATTER_DB
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("taps", "upsampling"), [(2, 1.0), (2, 4.0), (4, 1.5), (4, 3.0), (6, 1.25), (6, 2.0), (8, 1.5)]
 )
@@ -90,6 +95,7 @@ def test_the_predicted_error_is_the_measured_one(taps, upsampling):
     assert measured == pytest.approx(preparation.interpolator.error_db, abs=1.5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mirrored", [False, True])
 @pytest.mark.parametrize("parts", [1, 2, STACK])
 @pytest.mark.parametrize("taps", [2, 4, 6, 8])
@@ -145,6 +151,7 @@ def test_any_shape_of_grid(device, shape, kind):
     assert relative_error_db(image, wanted) <= -80
 
 
+@pytest.mark.slow
 @settings(max_examples=25, deadline=None)
 @given(st.data())
 def test_any_geometry(data):
@@ -167,6 +174,7 @@ def test_any_geometry(data):
 # Physics
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("amplitude", [1, -2j, 3 * np.exp(1.1j)])
 def test_a_point_keeps_its_amplitude_and_phase(platform, amplitude):
     rng = np.random.default_rng(2)
@@ -236,6 +244,7 @@ def test_transmitter_and_receiver_may_be_exchanged(platform):
     assert relative_error_db(other, one) <= -100
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", [bistatic, height_map], ids=lambda case: case.__name__)
 def test_a_receiver_that_stands_still_may_be_called_moving(case, platform):
     lines, grid = made(case)
@@ -276,6 +285,7 @@ def test_accumulation_leaves_its_argument_alone(platform):
     np.testing.assert_array_equal(image.pixels, before.pixels + alone.pixels)
 
 
+@pytest.mark.slow
 def test_part_of_a_grid_is_part_of_the_image(platform):
     lines, grid = made(bistatic)
     whole = backproject(lines, grid, device=platform, **FINE).pixels[5:30, 3:20]
@@ -319,6 +329,7 @@ def test_the_warning_points_at_the_caller(good):
     assert caught[0].filename == __file__
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shape", [(1, 1), (4, 4)])
 def test_a_small_grid_just_short_of_a_line_warns_too(platform, shape):
     """What a tile holds beyond the grid's own pixels does not count."""
@@ -339,6 +350,7 @@ def test_one_sample_is_a_line(platform):
     assert pixels[1] == 0
 
 
+@pytest.mark.slow
 def test_a_device_may_be_named(good):
     for info in list_devices():
         by_index = backproject(**good, device=info.index)

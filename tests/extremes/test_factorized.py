@@ -26,6 +26,7 @@ def large_image():
     return over(grid, along_x(300, 0.02), carrier_hz=1e6, band=0.1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", [at_300_m, large_image], ids=lambda case: case.__name__)
 def test_rounding_is_part_of_what_is_predicted(case, platform):
     lines, grid = case()
@@ -45,6 +46,7 @@ def small(platform):
     return dataclasses.replace(platform, info=info)
 
 
+@pytest.mark.slow
 def test_a_small_device_is_enough(small, buffer_bytes):
     lines, grid = made(swaying)
     chosen = plan(lines, grid, tolerance_db=-40, device=small, costs=EXACT_IS_SLOW)

@@ -183,11 +183,13 @@ def check(case, tolerance_db, device, beam=None):
 # The promise
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tolerance_db", [-20, -40, -60, -75])
 def test_the_error_is_what_was_asked_for(device, tolerance_db):
     check(swaying, tolerance_db, device)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tolerance_db", [-10, -50, -65])
 @pytest.mark.parametrize("case", CASES, ids=name_of)
 def test_whatever_the_track_and_the_grid(case, tolerance_db):
@@ -206,6 +208,7 @@ def test_on_every_platform(case, platform):
     check(case, -50, platform)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tolerance_db", [-30, -50])
 @pytest.mark.parametrize("band", [0.05, 0.3])
 def test_a_point_where_subimages_of_all_sizes_meet(band, tolerance_db):
@@ -226,6 +229,7 @@ def test_a_point_where_subimages_of_all_sizes_meet(band, tolerance_db):
     assert relative_error_db(formed, form_exactly(lines, grid, accuracy_db=-80)) <= tolerance_db
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tolerance_db", [-20, -40])
 def test_pixels_much_coarser_than_the_resolution(device, tolerance_db):
     check(coarse_pixels, tolerance_db, device)
@@ -246,6 +250,7 @@ def few_arrays():
     return over(around(0, 40), tx, tx + along * np.tile(0.1 * np.arange(4), 42)[:, None])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tolerance_db", [-30, -50])
 def test_a_beam_that_hides_most_of_the_image(tolerance_db):
     lines, grid = made(wide_image)
@@ -254,6 +259,7 @@ def test_a_beam_that_hides_most_of_the_image(tolerance_db):
     assert relative_error_db(image, exact(wide_image, beam)) <= tolerance_db
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tolerance_db", [-20, -35, -50])
 def test_arrays_whose_channels_come_in_regular_steps(tolerance_db):
     lines, grid = made(few_arrays)
@@ -264,12 +270,14 @@ def test_arrays_whose_channels_come_in_regular_steps(tolerance_db):
 KINKED = BeamWindow(8, "tukey", squint_deg=2.0, taper=0.2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tolerance_db", [-20, -50, -65])
 @pytest.mark.parametrize("beam", BEAMS, ids=["hann", "wide", "squint"])
 def test_with_a_beam(beam, tolerance_db):
     check(near, tolerance_db, None, beam)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tolerance_db", [-20, -50, -65])
 @pytest.mark.parametrize(
     "beam", [KINKED, BeamWindow(12, "tukey"), BeamWindow(12, "hamming"), BeamWindow(12, "taylor")]
@@ -293,6 +301,7 @@ def jittery_and_few(off_m):
     return few_seen(110, 315, 0.457, pixel_m=(0.006, 0.004), off_m=off_m)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("costs", [EXACT_IS_SLOW, None], ids=["forced", "as they are"])
 @pytest.mark.parametrize(
     ("case", "beam", "tolerance_db"),
@@ -318,6 +327,7 @@ def test_edges_of_a_beam_that_few_channels_see(case, beam, tolerance_db, costs):
     assert relative_error_db(factorize(lines, grid, chosen), exact) <= tolerance_db
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tolerance_db", [-25, -40])
 def test_a_track_that_turns_back_within_a_few_channels(tolerance_db):
     """These are further off the mean track than all others."""
@@ -329,6 +339,7 @@ def test_a_track_that_turns_back_within_a_few_channels(tolerance_db):
     assert relative_error_db(factorize(lines, grid, chosen), exact) <= tolerance_db
 
 
+@pytest.mark.slow
 def test_a_beam_on_every_platform(platform):
     check(near, -40, platform, HANN)
 
@@ -336,17 +347,20 @@ def test_a_beam_on_every_platform(platform):
 NORMALISED = dataclasses.replace(HANN, normalise=True)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tolerance_db", [-30, -50])
 @pytest.mark.parametrize("case", [near, arc, bistatic_array, hills], ids=name_of)
 def test_a_normalised_image(case, tolerance_db):
     check(case, tolerance_db, None, NORMALISED)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", [near, hills], ids=name_of)
 def test_a_normalised_image_on_every_platform(case, platform):
     check(case, -40, platform, NORMALISED)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tolerance_db", [-25, -55])
 @pytest.mark.parametrize("case", [hills, scattered, section], ids=name_of)
 def test_off_a_plane_with_a_beam(case, tolerance_db):
@@ -365,6 +379,7 @@ def off_track():
     return (TRACK + 0.1 * np.stack([0 * turn, np.sin(turn), 0.5 * np.cos(turn)], axis=1),)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "wild",
     [
@@ -406,6 +421,7 @@ def test_a_flat_height_map_is_a_plane(platform):
     assert relative_error_db(image.pixels, exact(straight).pixels) <= -60
 
 
+@pytest.mark.slow
 def test_a_beam_with_edges_is_worth_no_more_channels_than_there_are():
     """A rectangular window has no band: denser channels help little."""
     chosen = planned(near, -30, BeamWindow(12))
@@ -414,6 +430,7 @@ def test_a_beam_with_edges_is_worth_no_more_channels_than_there_are():
     assert relative_error_db(image, exact(near, BeamWindow(12))) <= -30
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stages", [[(4, 2)], [(4, 2), (4, 2)], [(2, 1)], [(2, 3), (3, 2)]])
 def test_given_stages_err_less_than_predicted(platform, stages):
     lines, grid = made(high_frequency)
@@ -435,6 +452,7 @@ def test_no_stages_are_plain_backprojection(platform):
 # Physics
 
 
+@pytest.mark.slow
 def test_a_point_on_a_hill_keeps_its_amplitude_and_phase(platform):
     """Only where the height map has it does every line agree on it."""
     row, column = np.indices((65, 65))
@@ -452,6 +470,7 @@ def test_a_point_on_a_hill_keeps_its_amplitude_and_phase(platform):
     assert np.unravel_index(np.abs(pixels).argmax(), pixels.shape) == (32, 32)
 
 
+@pytest.mark.slow
 def test_pixels_outside_the_beam_of_every_channel_are_zero(platform):
     grid = around(14, 40, shape=(20, 400), pixel_m=(0.015, 0.06))
     lines, _ = over(grid)
@@ -473,6 +492,7 @@ def test_pixels_outside_the_beam_of_every_channel_are_zero(platform):
 SHAPES = [(1, 160), (160, 1), (2, 90), (90, 2), (17, 33), (67, 131), (300, 20)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shape", SHAPES)
 def test_any_shape_of_grid(shape):
     grid = around(0, 40, shape=shape)
@@ -483,6 +503,7 @@ def test_any_shape_of_grid(shape):
     assert relative_error_db(image, backproject(lines, grid, accuracy_db=-85)) <= -50
 
 
+@pytest.mark.slow
 def test_a_line_of_pixels_needs_no_second_step(platform):
     """`Grid.plane` makes one column with a step of zero."""
     grid = Grid.plane((0.3, 0.3, 1), (39, 41, 60))
@@ -492,6 +513,7 @@ def test_a_line_of_pixels_needs_no_second_step(platform):
     assert relative_error_db(image, backproject(lines, grid, accuracy_db=-85)) <= -50
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("spacing_m", [0.005, 0.2])
 @pytest.mark.parametrize("channels", [1, 2, 3, 5, 17])
 def test_any_number_of_channels(channels, spacing_m):
@@ -509,6 +531,7 @@ def test_one_pixel():
     assert relative_error_db(image, backproject(lines, grid, accuracy_db=-85)) <= -50
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("places", [1, 2, 5])
 def test_channels_that_share_places(places):
     grid = around(0, 40, shape=(70, 60))
@@ -518,6 +541,7 @@ def test_channels_that_share_places(places):
     assert relative_error_db(image, backproject(lines, grid, accuracy_db=-85)) <= -50
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "grid",
     [
@@ -535,6 +559,7 @@ def test_pixels_near_the_aperture(grid):
     assert relative_error_db(image, backproject(lines, grid, accuracy_db=-85)) <= -45
 
 
+@pytest.mark.slow
 def test_a_grid_that_no_line_reaches_warns_and_is_zero():
     lines, _ = made(straight)
     grid = around(0, 400)
@@ -562,6 +587,7 @@ def test_half_precision_adds_what_is_predicted(device):
     assert expected_db - 3 <= relative_error_db(image, better) <= expected_db
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tolerance_db", [-50, -56])
 @pytest.mark.parametrize("length_m", [1.0, 0.3])
 def test_dense_channels_keep_the_promise(length_m, tolerance_db):
@@ -644,6 +670,7 @@ def test_a_plan_holds_its_beam():
     assert relative_error_db(image, reference) <= -40
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tolerance_db", [-50, -75])
 def test_a_noise_floor_far_above_the_band(tolerance_db):
     """Sampled at 96 kHz, carrier kept, a sonar of 15 to 25 kHz; noise of -26 dB up to 48 kHz."""
@@ -743,6 +770,7 @@ def test_progress_counts_pixels(platform):
 # At the edges of grids, tracks and beams
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [2, 5])
 def test_roots_that_overhang_the_grid_keep_the_tolerance(seed):
     """Pixels of a root of 512 rows on a grid of 257 lie further from its middle than half of it."""
@@ -755,6 +783,7 @@ def test_roots_that_overhang_the_grid_keep_the_tolerance(seed):
     assert relative_error_db(factorize(lines, grid, chosen), exact) <= -55
 
 
+@pytest.mark.slow
 def test_a_gap_in_the_track_stays_empty(platform):
     """No channel sees the pixels beside it, though virtual channels lie there."""
     x = np.arange(-14, 14, 0.02)
@@ -775,6 +804,7 @@ def test_a_gap_in_the_track_stays_empty(platform):
     assert np.abs(image.pixels[unseen]).max() <= 0.01 * np.abs(exact.pixels).max()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("x", "beam", "tolerance_db"),
     [
@@ -792,6 +822,7 @@ def test_steps_of_a_beam_beside_a_gap_keep_the_promise(x, beam, tolerance_db):
     assert relative_error_db(factorize(lines, grid, chosen), exact) <= tolerance_db
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tolerance_db", [-20, -40])
 @pytest.mark.parametrize("gap_m", [2, 3, 4])
 @pytest.mark.parametrize(
@@ -806,6 +837,7 @@ def test_pixels_that_see_the_ends_of_a_gap_keep_the_promise(beam, gap_m, toleran
     assert relative_error_db(factorize(lines, grid, chosen), exact) <= tolerance_db
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("shape", "squint_deg", "tolerance_db"),
     [
@@ -830,6 +862,7 @@ def test_an_edge_of_the_beam_that_crosses_the_image(shape, squint_deg, tolerance
 # Memory
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("share", [1.0, 0.7])
 @pytest.mark.parametrize("relief_m", [None, 0.0, 0.2])
 @pytest.mark.parametrize("beam", [None, BeamWindow(20, "hann"), BeamWindow(3, "hann")])
@@ -848,6 +881,7 @@ def test_device_memory_is_as_planned(monkeypatch, beam, tolerance_db, relief_m, 
     assert peak <= 1.1 * chosen.memory_bytes
 
 
+@pytest.mark.slow
 def test_little_memory_makes_small_roots_or_is_refused():
     lines, grid = over(around(0, 40, shape=(600, 700)))
     wish = {"tolerance_db": -40, "costs": EXACT_IS_SLOW}
@@ -863,6 +897,7 @@ def test_little_memory_makes_small_roots_or_is_refused():
 # The thesis's method
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("width_deg", [3, 8, 30])
 def test_given_stages_with_a_beam(width_deg):
     """Leaves of many tiles, each of which sees other channels."""
@@ -891,6 +926,7 @@ def array_pings(sway_m, period_m):
     return np.repeat(ping_m, 6, axis=0), rx_m.reshape(-1, 3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("beam", [None, BeamWindow(6.0, "hann")], ids=["all", "beam"])
 @pytest.mark.parametrize("tolerance_db", [-25, -45])
 def test_overlapping_pings_of_a_swaying_array(device, beam, tolerance_db):
@@ -916,6 +952,7 @@ def test_a_beam_that_swings_with_the_track_is_not_factorized():
     assert not plan(lines, grid, tolerance_db=-30, costs=EXACT_IS_SLOW).is_exact
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("costs", [EXACT_IS_SLOW, Costs(call_ns=1e12)], ids=["stages", "exact"])
 def test_data_may_arrive_in_pieces(costs, platform):
     """Images of parts of the lines add up, also where one is backprojected."""

@@ -44,6 +44,7 @@ def any_track(request, wide):
 # What is formed
 
 
+@pytest.mark.slow
 def test_what_is_formed_is_what_was_planned(wide):
     sector = wide.sector(wide.division.roots)
     for level, (need, stage) in enumerate(zip(sector.needs, wide.plan.stages, strict=False)):
@@ -71,6 +72,7 @@ def test_nothing_is_formed_that_no_channel_reaches(wide):
         assert (need.last <= counts[:, None]).all()
 
 
+@pytest.mark.slow
 def test_subimages_use_what_their_parents_have(any_track):
     wide = any_track
     sector = wide.sector(wide.division.roots)

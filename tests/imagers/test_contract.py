@@ -26,7 +26,7 @@ def pairs(cases=None, needs=None, but=()):
             continue
         ways = OWN if "device" in imager.options else {"host": None}
         for name, way in ways.items():
-            marks = () if name in (DEFAULT, "host") else pytest.mark.slow
+            marks = () if name == DEFAULT else pytest.mark.slow
             of = f"{imager.name}-{name}"
             if cases is None:
                 found.append(pytest.param((imager, way), id=of, marks=marks))

@@ -45,6 +45,7 @@ def file(tmp_path):
     return tmp_path / "lines.h5"
 
 
+@pytest.mark.slow
 def test_patches_make_the_image(platform, exact):
     image = clsas.mosaic(LINES, GRID, **WISH, device=platform).image()
     assert image.grid is GRID
@@ -78,6 +79,7 @@ def test_a_store_holds_pixels_and_records(file, tmp_path, exact):
         assert record.seconds > 0
 
 
+@pytest.mark.slow
 def test_a_store_opens_in_xarray(file, tmp_path, exact):
     xarray = pytest.importorskip("xarray")
     for _ in clsas.mosaic(file, GRID, tmp_path / "image.zarr", **WISH):
@@ -135,6 +137,7 @@ class TestFactorized:
             patch.setattr(planner, "_SEARCH_S", 0.0)
             return mosaic.image(patches.append), patches
 
+    @pytest.mark.slow
     def test_every_patch_is_as_good_as_predicted(self, scene, formed):
         for patch in formed[1]:
             assert patch.record.plan["sides"]  # not plain backprojection
@@ -189,11 +192,13 @@ def test_an_image_larger_than_memory_is_refused():
         clsas.mosaic(LINES, grid, beam=BEAM).image()
 
 
+@pytest.mark.slow
 def test_the_thesis_stages_work_in_patches():
     patches = list(clsas.mosaic(LINES, GRID, stages=[(2, 2), (2, 2)], beam=BEAM, patches=(2, 2)))
     assert [len(patch.record.plan["nearest"]) for patch in patches] == [2] * 4
 
 
+@pytest.mark.slow
 def test_patches_that_do_not_divide_the_grid(exact):
     patches = []
     image = clsas.mosaic(LINES, GRID, **(WISH | {"patches": (7, 3)})).image(patches.append)
@@ -235,6 +240,7 @@ def test_missing_samples_are_flagged(file, tmp_path):
     assert "a gap of 0.25 m" in flagged[0].record.flags[1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("wish", [{}, {"accuracy_db": None, "tolerance_db": -65}])
 def test_missing_channels_weigh_nothing(file, wish, monkeypatch):
     """Neither with a beam that divides by what channels weigh, nor in a plan."""
@@ -335,6 +341,7 @@ class TestResuming:
         assert len(there.finished) == 8
         np.testing.assert_array_equal(there.image().pixels, before.pixels)
 
+    @pytest.mark.slow
     def test_after_kill(self, file, tmp_path, exact):
         """Kill -9 in the middle, again and again."""
         program = f"""
@@ -397,6 +404,7 @@ class TestResuming:
         shutil.rmtree(path)
         assert len(list(clsas.mosaic(LINES, GRID, path, **other))) == 12
 
+    @pytest.mark.slow
     @pytest.mark.parametrize(
         ("name", "value"),
         [
@@ -457,6 +465,7 @@ class TestResuming:
         with pytest.raises(ValueError, match=r"a.zarr (is damaged|exists and is not|is a mosaic)"):
             clsas.mosaic(LINES, GRID, tmp_path / "a.zarr", **WISH)
 
+    @pytest.mark.slow
     def test_a_file_written_anew_is_read_anew(self, file, tmp_path):
         clsas.mosaic(file, GRID, **WISH).image()
         moved = dataclasses.replace(LINES, tx_m=LINES.tx_m + 0.3, rx_m=LINES.rx_m + 0.3)
@@ -480,6 +489,7 @@ class TestResuming:
         assert [(patch.row, patch.column) for patch in again] == [(1, 2)]
 
 
+@pytest.mark.slow
 def test_a_full_disk_keeps_what_is_finished(file, tmp_path):
     program = """
         import clsas, pickle, resource, signal, sys
@@ -526,6 +536,7 @@ def test_a_store_that_is_read_only(tmp_path):
         clsas.mosaic(LINES, GRID, tmp_path / "a.zarr", **WISH)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(len(list_devices()) < 2, reason="one OpenCL device only")
 def test_devices_side_by_side(exact):
     infos = list_devices()[:2]

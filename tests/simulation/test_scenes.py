@@ -226,6 +226,7 @@ def test_without_a_mast_there_is_still_a_deck():
     assert bare.height_m(0, 60) > 1.5
 
 
+@pytest.mark.slow
 def test_the_pipeline_and_rocks():
     pipe = scene.pipeline(density_m2=1, position_m=(3, 50), heading_deg=0)
     assert pipe.heights_m.max() == pytest.approx(0.6, abs=0.02)
@@ -286,6 +287,7 @@ def test_bad_eyes(arguments, message):
         flat().lit(**{"points_m": [[0, 25, 0]], "eye_m": EYE, **arguments})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("make", [scene.wreck, scene.pipeline, scene.rocks])
 @pytest.mark.parametrize(
     ("arguments", "error", "message"),

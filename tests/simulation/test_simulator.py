@@ -86,6 +86,7 @@ def test_without_element_patterns_elements_have_no_sizes():
             simulate(sized, TRACK, SCENE, **{name: 1})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rate", [125e3, 200e3, 317e3])
 def test_rectangular_chirp_through_the_receivers_filter(rate):
     """The stated spectrum, by Fresnel integrals, summed over frequency with period 50 ms."""

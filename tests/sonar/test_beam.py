@@ -248,6 +248,7 @@ WINDOWED = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", WINDOWED)
 def test_an_image_is_the_weighted_sum(name, device):
     case, beam = WINDOWED[name]
@@ -331,6 +332,7 @@ def test_the_references_weigh_each_channel(normalise):
     assert relative_error_db(ideal(lines, where, beam=beam), wanted) <= -80
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", [bistatic, points], ids=lambda case: case.__name__)
 def test_a_window_open_on_all_sides_changes_nothing(case, device):
     lines, grid = made(case)
@@ -350,6 +352,7 @@ def test_pixels_at_the_antennas_and_ahead_of_them_are_finite(platform):
         np.testing.assert_array_equal(pixels != 0, seen)
 
 
+@pytest.mark.slow
 def test_normalising_levels_points_along_the_track(platform):
     """Points to beyond the ends of the aperture, of which the outer ones are seen by fewer."""
     x = np.linspace(-6, 6, 9)
@@ -382,6 +385,7 @@ def test_normalising_amplifies_no_errors_where_little_is_seen(shape, y_m, accura
     assert relative_error_db(image, exact) <= accuracy_db
 
 
+@pytest.mark.slow
 def test_an_unseen_pixel_of_a_normalised_image_is_zero(platform):
     grid = patch(0.0, 42, 400, 3)
     lines = thesis_lines(grid, APERTURE[300:340])
@@ -394,6 +398,7 @@ def test_an_unseen_pixel_of_a_normalised_image_is_zero(platform):
     np.testing.assert_array_equal(pixels[1] != 0, sums > 0)
 
 
+@pytest.mark.slow
 def test_a_narrow_beam_costs_little(platform):
     """Few of the pairs are prepared; the image is that of the few."""
     track = along_x(1500, 0.05)
@@ -411,6 +416,7 @@ def test_a_narrow_beam_costs_little(platform):
     assert relative_error_db(image.pixels[::9, ::9], same_interpolator(preparation, some)) <= -70
 
 
+@pytest.mark.slow
 def test_progress_counts_what_is_skipped(platform):
     calls = []
     grid = Grid.plane((-30, 30, 200), (40, 42, 40))

@@ -140,6 +140,7 @@ def test_effects_are_left_out_up_to_their_share_of_the_error(case):
     assert kept.error <= SHARE * power(begins_db)
 
 
+@pytest.mark.slow
 @ALL
 @pytest.mark.parametrize("beside_db", [7, -0.1])
 def test_exact_images_keep_their_accuracy_on_either_side(case, beside_db, platform):
@@ -155,6 +156,7 @@ def test_exact_images_keep_their_accuracy_on_either_side(case, beside_db, platfo
     assert true_error_db(case, image) <= accuracy_db + 0.3
 
 
+@pytest.mark.slow
 @ALL
 @pytest.mark.parametrize("beside_db", [7, -0.1])
 def test_factorized_images_keep_their_tolerance_on_either_side(case, beside_db, platform):
