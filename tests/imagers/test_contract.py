@@ -26,16 +26,21 @@ def pairs(cases=None, needs=None, but=()):
             continue
         ways = OWN if "device" in imager.options else {"host": None}
         for name, way in ways.items():
-            marks = () if name == DEFAULT else pytest.mark.slow
+            quick = name == DEFAULT
             of = f"{imager.name}-{name}"
             if cases is None:
-                found.append(pytest.param((imager, way), id=of, marks=marks))
+                found.append(_param((imager, way), name=of, quick=quick))
             else:
+                # The first case is the smallest.
                 found += [
-                    pytest.param((imager, way), case, id=f"{of}-{case.__name__}", marks=marks)
-                    for case in cases(imager)
+                    _param((imager, way), case, name=f"{of}-{case.__name__}", quick=quick and not n)
+                    for n, case in enumerate(cases(imager))
                 ]
     return found
+
+
+def _param(*values, name, quick):
+    return pytest.param(*values, id=name, marks=() if quick else pytest.mark.slow)
 
 
 every_imager = pytest.mark.parametrize("bound", pairs())
