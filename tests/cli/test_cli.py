@@ -113,6 +113,7 @@ def test_results_as_text(made, tmp_path):
     assert stdout.count("PSLR nearest") == 2
 
 
+@pytest.mark.slow
 def test_options_go_before_the_scene_file(made, tmp_path):
     folder, _ = made
     scene = ("--scene", folder / "scene.toml")
@@ -671,6 +672,7 @@ def test_demo_writes_over_no_other_files(tmp_path, monkeypatch):
     assert {file: file.read_bytes() for file in out.iterdir()} == before
 
 
+@pytest.mark.slow
 def test_expected_resolution_of_a_plain_aperture():
     """Without beams and far off, lambda R/(2 L) and c/(2 B), 0.886 of them at -3 dB."""
     pulse = clsas.Pulse(carrier_hz=1e5, bandwidth_hz=5e3, duration_s=0.1)

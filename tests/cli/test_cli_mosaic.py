@@ -86,6 +86,7 @@ def test_a_scene_is_all_it_needs(made):
     assert clsas.relative_error_db(image, exact) <= -40
 
 
+@pytest.mark.slow
 def test_the_same_command_goes_on(made):
     folder, _ = made
     shutil.rmtree(folder / "scene.zarr" / "patches" / "1.0")

@@ -59,6 +59,7 @@ def test_rounding_does_not_depend_on_the_interpolator(case, device, taps, upsamp
     assert rounding_error_db(case, device, taps=taps, upsampling=upsampling) <= -80
 
 
+@pytest.mark.slow
 def test_the_cases_take_both_ways():
     """A plane far away is expanded in tiles, everything else goes in groups."""
     assert isinstance(prepare(*made(thesis)).layout, Tiles)

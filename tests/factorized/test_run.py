@@ -203,6 +203,7 @@ def test_the_tightest_tolerance(case):
     check(case, -75, None)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", [bistatic_array, moving_array, arc, hills, scattered], ids=name_of)
 def test_on_every_platform(case, platform):
     check(case, -50, platform)
@@ -756,6 +757,7 @@ def test_a_beam_beside_a_plan_is_refused():
 # Progress and interruption
 
 
+@pytest.mark.slow
 def test_progress_counts_pixels(platform):
     lines, grid = made(coarse_pixels)
     calls = []

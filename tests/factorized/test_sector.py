@@ -54,6 +54,7 @@ def test_what_is_formed_is_what_was_planned(wide):
     assert 0.75 <= pixels / wide.plan.stages[-1].operations <= 1.35
 
 
+@pytest.mark.slow
 def test_both_ends_of_the_track_are_alike(wide):
     sector = wide.sector(wide.division.roots)
     need = sector.needs[-1]

@@ -123,6 +123,7 @@ def test_factorized(name, asked_db, platform, recwarn):
     assert known.error_db(image.pixels) <= bound_db
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["tilted", "oversampling 1.25 tilted 10", "far", "Hann beam"])
 @pytest.mark.parametrize("how", [{"accuracy_db": -60}, {"tolerance_db": -50}])
 def test_mosaic(name, how, platform):

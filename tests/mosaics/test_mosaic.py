@@ -145,6 +145,7 @@ class TestFactorized:
             measured = relative_error_db(patch.image, exact)
             assert measured <= patch.record.predicted_error_db <= self.TOLERANCE_DB
 
+    @pytest.mark.slow
     def test_there_are_no_seams(self, scene, formed):
         """Along borders the error is what it is elsewhere, and neighbours agree."""
         image, exact = formed[0].pixels, scene[1].pixels
@@ -549,6 +550,7 @@ def test_devices_side_by_side(exact):
 
 
 class TestDistributed:
+    @pytest.mark.slow
     def test_a_worker_that_dies_is_made_up_for(self, file, tmp_path):
         distributed = pytest.importorskip("distributed")
         for _ in clsas.mosaic(file, GRID, tmp_path / "local.zarr", **WISH):
@@ -614,6 +616,7 @@ class TestFollowing:
 
         return folder, add
 
+    @pytest.mark.slow
     def test_patches_are_formed_while_files_arrive(self, lines, record, tmp_path):
         folder, add = record
         beam = dataclasses.replace(BEAM, track_pings=101)
@@ -665,6 +668,7 @@ class TestFollowing:
         assert last < 1000
         assert passed[np.searchsorted(counts, last + 200)]  # and soon
 
+    @pytest.mark.slow
     def test_a_survey_is_followed_once_more(self, record, tmp_path):
         """Files are in the store's inputs once, whoever looked when they came."""
         folder, add = record
@@ -678,6 +682,7 @@ class TestFollowing:
         again = clsas.mosaic(folder, self.GRID, tmp_path / "a.zarr", **self.WISH, follow_s=1)
         assert len(again.finished) == 10
 
+    @pytest.mark.slow
     def test_a_survey_that_grew_twice_goes_on(self, record, tmp_path):
         """The store's inputs hold every file in its order."""
         folder, add = record
@@ -692,6 +697,7 @@ class TestFollowing:
         assert len(Store.opened(path)._attributes()["inputs"]["parts"]) == 4
         assert len(clsas.mosaic(folder, self.GRID, path, **self.WISH).finished) == 10
 
+    @pytest.mark.slow
     def test_later_channels_make_a_patch_anew(self, lines, record, tmp_path):
         folder, add = record
         add(range(4))
@@ -705,6 +711,7 @@ class TestFollowing:
         reference = clsas.backproject(lines, self.GRID, beam=beam, accuracy_db=-80)
         assert relative_error_db(Store.opened(path).image(), reference) < -65
 
+    @pytest.mark.slow
     def test_a_second_leg_while_following_again(self, lines, record, tmp_path):
         """Patches finished in an earlier run, and those begun as the last file came, too."""
         folder, add = record
@@ -757,6 +764,7 @@ class TestFollowing:
             clsas.mosaic(tmp_path / "none", self.GRID, **self.WISH, follow_s=0.1)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not os.path.exists("/proc/self/status"), reason="Linux tells the most memory")
 def test_lines_larger_than_memory_are_read_in_parts(tmp_path):
     """200 km of track, 30 GB of samples, of which next to nothing is on the disk."""

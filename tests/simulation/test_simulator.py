@@ -285,6 +285,7 @@ def test_rectangular_chirp_never_wraps():
     assert db(outside) < -120
 
 
+@pytest.mark.slow
 def test_noise_has_the_stated_power_and_is_repeatable():
     quiet = simulate(SMOOTH, TRACK, SCENE, range_m=(10, 100))
     loud = simulate(SMOOTH, TRACK, SCENE, range_m=(10, 100), snr_db=12.0, seed=3)
@@ -354,6 +355,7 @@ def box_on_sand(**others):
     return Seabed((-6, 6), (30, 42), np.where(box, 1.5, 0.0), **{"density_m2": 40, **others})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("sonar", "options"),
     [

@@ -66,6 +66,7 @@ def test_the_table_holds_the_weights(shape, width_deg, squint_deg):
     np.testing.assert_allclose(held, beam.weights(q, 1.0), atol=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("taper", [0.002, 0.004, 0.01, 0.03, 0.1, 0.2, 0.5, 1.0])
 def test_the_table_of_a_window_with_kinks_serves_blocks(taper):
     """One cubic of it serves a block: beyond its interval too, on whichever side of a kink."""
@@ -191,6 +192,7 @@ def test_a_direction_may_be_of_any_length(length):
     np.testing.assert_allclose(along, [0.6, 0.8, 0], rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_ranges_hold_every_channel_that_sees_a_part_and_few_others():
     rng = np.random.default_rng(1)
     track = along_x(1000, 0.05) + rng.normal(0, 0.05, (1000, 3))
@@ -284,6 +286,7 @@ def test_an_image_at_the_edge_of_a_window_is_as_accurate(shape, accuracy_db):
     assert relative_error_db(chosen, each) <= accuracy_db - 6
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("turned", [False, True])
 @pytest.mark.parametrize("squint_deg", [0, 10])
 @pytest.mark.parametrize("shape", ["hann", "hamming", "taylor", "rectangular"])

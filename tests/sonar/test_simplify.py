@@ -370,6 +370,7 @@ def random_survey(seed):
     return lines, grid, beam, random.uniform(-85, -10)
 
 
+@pytest.mark.slow
 def test_no_geometry_leaves_out_more_than_is_allowed(monkeypatch):
     """Every pixel and channel that see each other, of surveys that nobody would make."""
     monkeypatch.setattr("clsas.sonar.simplify.LEAST_PIXELS", 1000)
