@@ -54,12 +54,12 @@ def relative_error_db(
         chosen = darkest_pixels(wanted, darkest)
         given, wanted = given[chosen], wanted[chosen]
     # Scaled by the largest part, so that no square overflows or underflows.
-    given, wanted = given.view(np.float64), wanted.view(np.float64)
-    scale = max(np.abs(given).max(), np.abs(wanted).max())
-    error = given / scale - wanted / scale
+    parts, wanted_parts = given.view(np.float64), wanted.view(np.float64)
+    scale = max(np.abs(parts).max(), np.abs(wanted_parts).max())
+    error = parts / scale - wanted_parts / scale
     if not error.any():
         return -math.inf
-    return _norm_db(error) + 20 * math.log10(scale) - _norm_db(wanted)
+    return _norm_db(error) + 20 * math.log10(scale) - _norm_db(wanted_parts)
 
 
 def complex_values(name: str, image: Image | ArrayLike) -> NDArray[np.complex128]:

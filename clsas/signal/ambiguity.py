@@ -136,7 +136,7 @@ def ends_error(
     )
     sample = (range_m - part.first_range_m) / part.range_step_m
     visible = np.ones(sample.shape, bool)
-    if beam is not None:
+    if beam is not None and along is not None:
         low, high = beam.limits
         sine = sines(points_m, part.phase_centres_m, along[some]).T
         visible = (sine > low) & (sine < high)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any, overload
 
 import numpy as np
 import scipy.fft
@@ -132,9 +133,9 @@ def _histogram(distance: NDArray[np.float64], power: NDArray[np.float64]) -> NDA
     position = np.clip(2 * _FREQUENCIES * distance - 0.5, 0, _FREQUENCIES - 1)
     lower = np.minimum(position.astype(np.int64), _FREQUENCIES - 2)
     above = power * (position - lower)
-    return np.bincount(lower, power - above, _FREQUENCIES) + np.bincount(
-        lower + 1, above, _FREQUENCIES
-    )
+    # NumPy's types do not know that weights make it float64.
+    found: Any = np.bincount(lower, power - above, _FREQUENCIES)
+    return found + np.bincount(lower + 1, above, _FREQUENCIES)
 
 
 def _aliasing(distance: NDArray[np.float64], power: NDArray[np.float64], width: float) -> float:
@@ -280,6 +281,16 @@ def _largest_part(samples: NDArray[np.complex64]) -> np.float32:
     return max(parts.max(initial=0.0), -parts.min(initial=0.0))
 
 
-def cycles_per_m_at(lines: RangeLines, frequency: float) -> float:
+@overload
+def cycles_per_m_at(lines: RangeLines, frequency: float) -> float: ...
+
+
+@overload
+def cycles_per_m_at(lines: RangeLines, frequency: NDArray[np.float64]) -> NDArray[np.float64]: ...
+
+
+def cycles_per_m_at(
+    lines: RangeLines, frequency: float | NDArray[np.float64]
+) -> float | NDArray[np.float64]:
     """Return the phase per metre of range, cycles, at a frequency in cycles per sample."""
     return lines.carrier_cycles_per_m + frequency / lines.range_step_m

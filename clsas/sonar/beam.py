@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -136,7 +136,7 @@ class BeamWindow:
 
     @classmethod
     def of_element(
-        cls, length_m: float, wavelength_m: float, shape: str = "rectangular", **others: object
+        cls, length_m: float, wavelength_m: float, shape: str = "rectangular", **others: Any
     ) -> BeamWindow:
         """Return weights as wide as an element's half-power beam.
 
@@ -254,7 +254,8 @@ class BeamWindow:
 
     def _all(self, wavelength_m: float) -> NDArray[np.float64]:
         """Weights at 65 sines, evenly over the whole beam."""
-        return self._inside(np.linspace(*np.clip(self.limits, -1, 1), 65), wavelength_m)
+        low, high = np.clip(self.limits, -1, 1)
+        return self._inside(np.linspace(float(low), float(high), 65), wavelength_m)
 
     def weights(self, q: ArrayLike, wavelength_m: float = math.inf) -> NDArray[np.float64]:
         """Return the weights at sines `q` of the aspect angle; `wavelength_m` is for "inverse"."""
@@ -341,6 +342,7 @@ class BeamWindow:
             )
             return np.sin(np.pi * np.where(of_side < 0.5, share, 0.5)) ** 2
         if self.shape == "inverse":
+            assert self.element_length_m is not None  # as checked when this was made
             one_way = element_pattern(self.element_length_m, np.sin(angle), 1.0, wavelength_m)
             return 1 / np.maximum(one_way**2, 1e-30)
         return np.ones_like(q)
@@ -360,11 +362,11 @@ def _taylor(u: NDArray[np.float64]) -> NDArray[np.float64]:
     terms = np.arange(1, _TAYLOR_TERMS)
     a = math.acosh(10 ** (_TAYLOR_SIDE_LOBES_DB / 20)) / np.pi
     stretch = _TAYLOR_TERMS**2 / (a**2 + (_TAYLOR_TERMS - 0.5) ** 2)
-    factors = []
+    found = []
     for m in terms:
         zeros = np.prod(1 - m**2 / stretch / (a**2 + (terms - 0.5) ** 2))
         others = np.prod([1 - m**2 / n**2 for n in terms if n != m])
-        factors.append((-1) ** (m + 1) * zeros / others)
-    factors = np.array(factors)
+        found.append((-1) ** (m + 1) * zeros / others)
+    factors = np.array(found)
     total = 1 + np.cos(2 * np.pi * np.asarray(u)[..., None] * terms) @ factors
     return total / (1 + factors.sum())

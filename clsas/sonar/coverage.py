@@ -48,7 +48,7 @@ def _reached_at_points(
         points_m, part.tx_m, part.rx_m, part.rx_velocity_m_s, part.sound_speed_m_s
     )
     inside = (range_m >= part.first_range_m) & (range_m <= part.last_range_m)
-    if beam is not None:
+    if beam is not None and along is not None:
         low, high = beam.limits
         sine = sines(points_m, part.phase_centres_m, along[some]).T
         inside &= (sine > low) & (sine < high)
@@ -74,7 +74,7 @@ def _reached_in_boxes(
         radius_m = np.linalg.norm(sides_m) * (1 + 2 * _SPEED_RATIO) + beyond_m
         reached = range_m + radius_m >= lines.first_range_m
         reached &= range_m - radius_m <= lines.last_range_m
-        if beam is not None and reached.any():
+        if beam is not None and along is not None and reached.any():
             track_m, direction = lines.phase_centres_m[reached], along[reached]
             reached = touches_boxes(
                 beam.limits, centre_m[None], np.diag(sides_m), track_m, direction
@@ -125,7 +125,7 @@ def warn_unseen(
         f"the lines span {lines.first_range_m.min():.6g} to {lines.last_range_m.max():.6g} m, the "
         f"grid lies at {range_m.min():.6g} to {range_m.max():.6g} m"
     )
-    if beam is None:
+    if beam is None or along is None:
         validate.warn(
             f"no pixel of the grid lies within any line's range, so the image is zero: {spans}"
         )

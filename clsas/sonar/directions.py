@@ -66,7 +66,7 @@ def _legs(centres_m: NDArray[np.float64]) -> list[NDArray[np.float64]]:
     starts = [0]
     for start in np.flatnonzero(steps_m > _NEW_LEG * median_m) + 1 if median_m else ():
         if min(start - starts[-1], len(centres_m) - start) >= _SHORTEST_LEG:
-            starts.append(start)
+            starts.append(int(start))
     return np.split(centres_m, starts[1:])
 
 

@@ -191,7 +191,7 @@ class _SampledRanges:
         range_m = pairwise_range_m(points_m, *antennas)
         step_m = float(np.ptp(points_m, axis=0).max() / max(math.sqrt(len(points_m)) - 1, 1.0))
         visible = np.ones(range_m.shape, bool)
-        if beam is not None:
+        if beam is not None and along is not None:
             around = _BEYOND_BEAM * step_m / np.maximum(range_m, 1e-30)
             sine = sines(points_m, lines.phase_centres_m, along).T
             visible = (sine > beam.limits[0] - around) & (sine < beam.limits[1] + around)
@@ -217,7 +217,7 @@ class _SampledRanges:
         """Largest error of ranges (metres) and of sines of aspect angles with other antennas."""
         error_m = pairwise_range_m(self.points_m, tx_m, rx_m) - self.range_m
         largest_m = float(np.abs(error_m).max(where=self.visible, initial=0.0))
-        if self.beam is None:
+        if self.beam is None or self.along is None:
             return largest_m, 0.0
         one, other = (
             sines(self.points_m, centres_m, self.along).T
@@ -241,7 +241,7 @@ def _fitted(
     along = None if beam is None else beam.directions(lines)
     points_m, dense_m = grid.spread(_POINTS), grid.spread(_CHECKED_POINTS)
     fullness = 1.0
-    if beam is not None:
+    if beam is not None and along is not None:
         some = some_channels(lines.channels, 4 * _CHECKED_CHANNELS)
         sine = sines(dense_m, lines.phase_centres_m[some], along[some])
         fullness = beam.fullness(sine, _wavelength_m(lines), len(some) / lines.channels)
@@ -356,7 +356,9 @@ def _coordinates(grid: Grid) -> list[tuple[int, NDArray[np.float64]]]:
     """Axes and coordinates of pixels that may lie off a plane, [rows, columns] each."""
     if grid.height_m is not None:
         return [(2, grid.height_m)]
-    return [(axis, grid.points_m[..., axis]) for axis in range(3)]
+    assert grid.points_m is not None
+    points_m = grid.points_m
+    return [(axis, points_m[..., axis]) for axis in range(3)]
 
 
 def _lattice(grid: Grid) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
@@ -379,9 +381,9 @@ def _plane(grid: Grid) -> Grid | None:
     """Return the plane that fits a grid, or None if its pixels would coincide."""
     corner, rows, columns = _lattice(grid)
     if grid.height_m is not None:
-        corner, rows = corner + grid.origin_m, rows + grid.row_step_m
-        columns = columns + grid.column_step_m
+        origin_m, row_step_m, column_step_m = grid.vectors_m
+        corner, rows, columns = corner + origin_m, rows + row_step_m, columns + column_step_m
     try:
-        return Grid.oriented(corner, rows, columns, grid.shape)
+        return Grid(corner, rows, columns, grid.shape)
     except ValueError:  # points on one line, or at one position
         return None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -142,10 +143,12 @@ class Visibility:
             Track positions to evaluate for each point. All, unless given.
         """
         changes = along @ axes_m.T  # [:, axes]
+        slopes: Any  # an array, or a list of them
+        changed: Any
         if index is None:
             sine, distance_m = _sines(points_m, track_m, along)
             slopes = (axes_m @ points_m.T)[..., None] - (axes_m @ track_m.T)[:, None]
-            changes = changes.T
+            changed = changes.T
         else:
             sine, square = np.zeros(index.shape), np.zeros(index.shape)
             for point_m, from_m, direction in zip(points_m.T, track_m.T, along.T, strict=True):
@@ -159,9 +162,9 @@ class Visibility:
                 each[:, None] - from_m[index]
                 for each, from_m in zip(towards_m, axes_m @ track_m.T, strict=True)
             ]
-            changes = [each[index] for each in changes.T]
+            changed = [each[index] for each in changes.T]
         inverse_m = 1 / np.maximum(distance_m, 1e-9, out=distance_m)
-        for slope, change in zip(slopes, changes, strict=True):
+        for slope, change in zip(slopes, changed, strict=True):
             slope *= inverse_m
             slope *= sine
             np.subtract(change, slope, out=slope)
