@@ -162,11 +162,12 @@ __kernel void backproject_points(__global const sample_t *lines, int line_pitch,
         for (int block = 0; block < STACK; block++) {
             __global const float *x = offsets + block * WIDTH;
             const Vector offset = {LOAD(x), LOAD(x + points), LOAD(x + 2 * (size_t)points)};
-            vfloat change = 0.5f * path_change(&antennas, offset);
+            const vfloat path = path_change(&antennas, offset);
 #if ALIGNED
-            change -= scalar_product(uniform_vector(drift), offset);
+            const vfloat samples = (0.5f * path - scalar_product(uniform_vector(drift), offset)) * samples_per_m;
+#else
+            const vfloat samples = path * (0.5f * samples_per_m);
 #endif
-            const vfloat samples = change * samples_per_m;
             const vfloat t = samples + start;
 #if WINDOWS > 1
             const Lookup lookup = lookup_about(line, line_pitch, reference.sample, LANE(t, MIDDLE));

@@ -130,8 +130,7 @@ INLINE int find_item_beam(__global const float *term, int channel_pitch, const B
     item->c0 = coordinate + aside * slope_i - j * item->c1;
     item->interval = interval_of_cubic(coordinate);
 #else
-    item->coordinate = polynomial_in_j(c, at->i);
-    item->coordinate.c0 += centre;
+    item->coordinate = polynomial_in_j(centre, c, at->i);
     item->interval.all = interval_of_cubic(coordinate);
 #endif
     return 1;
@@ -213,8 +212,7 @@ __kernel void backproject_tiles(__global const sample_t *lines, int line_pitch, 
 #endif
         /* Half a sample less is what interpolate() wants. */
         const float start = reference.fraction - 0.5f;
-        Polynomial position = polynomial_in_j(coefficients_at(term, channel_pitch), at.i);
-        position.c0 += start;
+        const Polynomial position = polynomial_in_j(start, coefficients_at(term, channel_pitch), at.i);
         const float cycles = reference.phase - start * cycles_per_sample;
         const float phase = cycles - ROUNDED(cycles);
 

@@ -48,9 +48,9 @@ typedef struct {
     float c3;
 } Polynomial;
 
-INLINE Polynomial polynomial_in_j(Coefficients c, vfloat i)
+INLINE Polynomial polynomial_in_j(float at_centre, Coefficients c, vfloat i)
 {
-    return (Polynomial){J_0(c, i), J_1(c, i), J_2(c, i), J_3(c)};
+    return (Polynomial){at_centre + J_0(c, i), J_1(c, i), J_2(c, i), J_3(c)};
 }
 
 INLINE vfloat value_at(const Polynomial *p, vfloat j)

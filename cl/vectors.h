@@ -3,8 +3,8 @@
  * A work-item computes WIDTH floats at once: 16, 8 or 4 on a CPU, whose compiler may not vectorise across work-items,
  * and 1 on a GPU. A kernel is written once, in terms of vfloat and vint, for all widths.
  *
- * Products and sums are written a * b + c and left to the compiler to fuse: with some CPU drivers fma(), rint(),
- * clamp() and vloadn() are calls that are not inlined, which costs a factor of two.
+ * Products and sums are written a * b + c and left to the compiler to fuse, which it does within an expression only. With
+ * some CPU drivers fma(), rint(), clamp() and vloadn() are calls that are not inlined, which costs a factor of two.
  *
  * Build options
  *   WIDTH    lanes of a vector: 1, 4, 8 or 16.
