@@ -4,7 +4,7 @@
  * reducing radians loses bits that reducing cycles keeps.
  *
  * Build options
- *   PHASE_TERMS  terms of each polynomial; 6 err by -126 dB, fewer by more.
+ *   PHASE_TERMS  terms of each polynomial: 4 err by -61 dB, 5 by -92 dB, 6 by -126 dB, and 7 as single precision does.
  *
  * phase_polynomials: float [2][PHASE_TERMS]. With r the phase less its nearest integer, sin(2 pi r) is r times the first
  * polynomial in r^2, and cos(2 pi r) is the second one; the coefficients come highest power first.

@@ -140,11 +140,11 @@ class _Run:
         self.filters = {
             "range_filter": filter_table(device, chosen.align.coefficients),
             "aperture_filter": filter_table(device, chosen.aperture.coefficients),
-            "phase_polynomials": phase_polynomials(device, phases.TERMS[-1]),
+            "phase_polynomials": phase_polynomials(device, phases.PRECISE_TERMS),
         }
         options = {"WIDTH": self.width, "TAPS": chosen.align.taps}
         options |= {"APERTURE_TAPS": chosen.aperture.taps, "HALF": int(self.half_precision)}
-        options |= {"CHUNK": CHUNK, "PHASE_TERMS": phases.TERMS[-1]}
+        options |= {"CHUNK": CHUNK, "PHASE_TERMS": phases.PRECISE_TERMS}
         ramp = int(self.geometry.ramps)
         self.first_stage = device.kernel("stage", SHIFTS_GIVEN=1, RAMP=ramp, **options)
         self.later_stage = device.kernel("stage", SHIFTS_GIVEN=0, RAMP=0, **options)

@@ -55,9 +55,10 @@ def _with_headers(name: str, included: set[str]) -> list[str]:
 def kernel_parameters(text: str, name: str, options: Mapping[str, int]) -> dict[str, str]:
     """Return the parameters of a kernel, in order: their types by their names.
 
-    Drivers that take a built program from their cache no longer know the names of its parameters
-    (Intel's does not), so they are read from the source. The list may hold `#if`, `#else` and
-    `#endif`, with build options, `!` and `&&` as conditions.
+    They are read from the source because drivers' own answers cannot be relied on: Intel's has
+    none for a program from a cache, and PoCL renames parameters that are called like one of
+    OpenCL's functions. The list may hold `#if`, `#else` and `#endif`, with build options, `!` and
+    `&&` as conditions.
 
     Parameters
     ----------
@@ -128,6 +129,7 @@ class Kernel:
     compiled: cl.Kernel
 
     def __post_init__(self) -> None:
+        """Tell the driver the types; refuse a source that does not fit what was built."""
         self._converters = {
             parameter: _converter(type_) for parameter, type_ in self.parameters.items()
         }

@@ -41,7 +41,7 @@ def upsample(
         PERMUTE=int(device.info.permute),
         FREQUENCY_SHIFT=int(shifted),
         HALF=int(half_precision),
-        PHASE_TERMS=phases.TERMS[-1],
+        PHASE_TERMS=phases.PRECISE_TERMS,
     )
     phase = (resampling.first + np.arange(PHASES)) * step % PHASES
     filters = upsampler.coefficients[phase].reshape(-1, width, taps).swapaxes(1, 2)
@@ -50,7 +50,7 @@ def upsample(
     if shifted:
         cycles = round(resampling.centre_cycles_per_sample * 2**32) % 2**32
         shift["frequency"] = np.uint32(cycles).astype(np.int32)
-        shift["phase_polynomials"] = phase_polynomials(device, phases.TERMS[-1])
+        shift["phase_polynomials"] = phase_polynomials(device, phases.PRECISE_TERMS)
     channels, count = samples.shape
     lines = device.buffer(sample_bytes(half_precision) * channels * pitch)
     at_once = max(GIVEN_BYTES // (8 * count), 1)
