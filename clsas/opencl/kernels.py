@@ -82,6 +82,8 @@ def kernel_parameters(text: str, name: str, options: Mapping[str, int]) -> dict[
     parameters = {}
     for declaration in declarations.split(","):
         parameter = _PARAMETER.fullmatch(declaration.strip())
+        if parameter is None:
+            raise ValueError(f"parameter {declaration.strip()!r} of kernel {name} has no name")
         type_ = parameter["type"].strip()
         parameters[parameter["name"]] = "buffer" if type_.endswith("*") else type_
     return parameters
@@ -106,10 +108,13 @@ def _compiled_lines(lines: Sequence[str], options: Mapping[str, int]) -> list[st
 
 
 def _is_true(condition: str, options: Mapping[str, int]) -> bool:
-    terms = [_TERM.fullmatch(term.strip()) for term in condition.split("&&")]
-    if None in terms:
-        raise ValueError(f"parameters of kernels cannot depend on {condition!r}")
-    return all(bool(options.get(term["option"], 0)) != bool(term["negated"]) for term in terms)
+    for term in condition.split("&&"):
+        found = _TERM.fullmatch(term.strip())
+        if found is None:
+            raise ValueError(f"parameters of kernels cannot depend on {condition!r}")
+        if bool(options.get(found["option"], 0)) == bool(found["negated"]):
+            return False
+    return True
 
 
 @dataclass(eq=False)
