@@ -1,6 +1,11 @@
-/* Arithmetic peak: every work-item runs 16 independent chains of multiply-adds on vectors of WIDTH floats.
- * result: float [items]; a sum that keeps the compiler from dropping the work. Flops per item:
- * steps * 16 * WIDTH * 2. */
+/* Arithmetic peak of a device: every work-item runs 16 independent chains of multiply-adds on vectors of WIDTH floats,
+ * which is steps * 16 * WIDTH * 2 floating-point operations.
+ *
+ * result: float [items]; a sum that keeps the compiler from dropping the work.
+ */
+
+#include "vectors.h"
+
 __kernel void peak(int steps, float factor, __global float *result)
 {
     vfloat chain[16];

@@ -1,79 +1,174 @@
-/* A stage of factorized backprojection: the lines of a parent subimage become fewer, virtual lines of each
- * child,
+/* A stage of factorized backprojection: from the lines of a parent subimage it forms fewer lines, of virtual channels, for
+ * each child,
  *
- *     v_m(k) = sum_n a_nm exp(j 2 pi (cycles_n + ramp_n (k - half))) sum_t h_t(nu_n) s_n(start_n + k + t),
+ *     v_m(k) = sum_n a_nm exp(j 2 pi (cycles_n + ramp_n (k - half_length))) sum_t h_t(nu_n) s_n(start_n + k + t),
  *
- * that is, every line is brought to the child's centre (a constant shift: a short filter h over contiguous
- * samples, and a phase), and summed with weights a that interpolate the aperture. The ramp makes up for
- * channels whose ranges grow a little faster or slower across the child than those on the track do. Channels come in the order
- * of the virtual channels they contribute to: channel n adds to APERTURE_TAPS consecutive ones from
- * base[n] on, so that as many sums are open at a time.
+ * that is, it aligns every line on the child's centre (a constant shift by a short filter h over contiguous samples, and
+ * a phase), and sums lines with weights a that interpolate the aperture. The ramp corrects channels whose ranges grow a
+ * little faster or slower across the child than the mean track's. Channels come in the order of the virtual channels they
+ * contribute to: channel n adds to APERTURE_TAPS consecutive ones from first_virtual[n] on, so that as many sums are open
+ * at a time.
  *
- * Build options
- *   WIDTH          lanes: consecutive samples of a line, or consecutive channels (common.h).
- *   TAPS           of the range interpolation h, even (filter_weights in common.h).
- *   APERTURE_TAPS  of the aperture interpolation a, even; 1: channels are added to one virtual channel each.
- *   GIVEN          1: shifts and phases come from the host (the first stage, whose channels may be
- *                  anything); 0: from the positions of virtual channels.
- *   RAMP           1: phases vary along the lines (with GIVEN only); 0: every ramp is 0.
- *   CHUNK          channels whose weights are kept at a time; sums still open after them are handed on as well,
- *                  and taken up again.
- *   HALF           1: lines are of half in place of float, in and out (common.h).
+ * Build options: WIDTH (vectors.h; lanes are consecutive samples of a line, or consecutive channels), HALF (samples.h, of
+ * lines in and out), PHASE_TERMS (phases.h), and
+ *   TAPS           of the range filter h, even, at most 8.
+ *   APERTURE_TAPS  of the aperture filter a, even; 1: every channel adds to one virtual channel, with weight 1.
+ *   SHIFTS_GIVEN   1: shifts and phases come from the host (the first stage, whose channels may be anywhere); 0: they
+ *                  follow from the positions of virtual channels.
+ *   RAMP           1: phases vary along the lines (only with SHIFTS_GIVEN); 0: every ramp is 0.
+ *   CHUNK          channels whose weights are kept at a time, a multiple of WIDTH. Sums that are still open after a chunk
+ *                  are written, and read again by the next.
  *
- * Buffers
- *   parent      lines of `held`, `parent_pitch` samples each: [...][2][parent_pitch], real parts and
- *               imaginary ones; with WIDTH 1 interleaved.
- *   children    int [roots][children_per_root][5]: the channels [begin, end) that the child uses; what to subtract
- *               from a channel to find its line among the parent's; the child's first virtual channel and how
- *               many it has. The children at work begin at number first_child, with a root.
- *   Per root and channel, [roots][channel_pitch]:
- *   base        int: the first virtual channel it contributes to, never decreasing.
- *   between     float: its place from the middle of the virtual channels it contributes to.
- *   GIVEN only  order (int: its line), start (int: parent sample of tap 0 for k = 0), nu, cycles and, with RAMP,
- *               ramp (float; cycles per sample).
- *   otherwise   parents    int [children_per_root]: which of the parents_per_root each child belongs to; either
- *                          of those at work has lines_per_parent lines.
- *               positions  float [roots][3][channel_pitch]: of channels, m from the root's centre.
- *               offsets    float [roots][children_per_root][6]: the parent's centre from the root's, the
- *                          child's from its parent's, m.
- *               drift      velocity of receivers over the sound speed: what motion in flight adds to the
- *                          range to x is -drift.(x - channel), to first order.
- *               parent_centre: sample of a parent line that is its subimage's centre.
- *   half_length: samples of a line before the one of the child's centre.
- *   filter, aperture_filter: coefficients of h and a (filter_weights in common.h).
- *   lines       [children at work][lines_per_child][2][pitch], samples `guard` to guard + length - 1 written,
- *               `length` a multiple of WIDTH.
+ * parent_lines, parent_pitch  lines of all parents (samples.h).
+ * children       int [roots][children_per_root][5]: the channels [begin, end) that a child uses; the channel of the
+ *                parent's first line; the child's first virtual channel, and how many it has. The children at work begin
+ *                at number first_child, which begins a root.
+ * Per root and channel, [roots][channel_pitch]:
+ * first_virtual  int: the first virtual channel that the channel contributes to, never decreasing.
+ * tap_position   float: aperture coordinate from the middle of the virtual channels it contributes to, in their spacing.
+ * order, start, nu, cycles, ramp  with SHIFTS_GIVEN: the channel's line (int), the parent's sample of tap 0 for k = 0
+ *                (int), and floats as in the equation; `ramp`, in cycles per sample, with RAMP only.
+ * Without SHIFTS_GIVEN:
+ * parents        int [children_per_root]: the parent of each child, of parents_per_root; every parent at work has
+ *                lines_per_parent lines.
+ * positions      float [roots][3][channel_pitch]: of channels, m from the root's centre.
+ * offsets        float [roots][children_per_root][6]: the parent's centre from the root's, the child's from the parent's, m.
+ * drift          velocity of the receivers over the sound speed: to first order, motion during flight adds
+ *                -drift.(x - channel) to the range of x.
+ * samples_per_m, cycles_per_m  of range.
+ * parent_centre  sample of a parent's line that is at the parent's centre.
  *
- * Work-groups (any size along axis 0; 1 with WIDTH > 1) form a child each, or with several groups along axis 1
- * `part_length` samples of it, a multiple of 8 WIDTH.
- * Samples outside the parent's line are never read: the place is moved inside, where the host has put zeros.
+ * half_length    samples of a child's line before the one at the child's centre.
+ * range_filter, aperture_filter  coefficients of h and a (interpolation.h).
+ * phase_polynomials  see phases.h.
+ * child_lines, child_pitch  [children at work][lines_per_child] lines (samples.h), of which the kernel writes samples
+ *                guard to guard + length - 1; `length` is a multiple of WIDTH.
+ *
+ * A work-group (of any size along axis 0, of 1 with WIDTH > 1) forms a child's lines, or with several groups along axis 1
+ * part_length samples of them, a multiple of 8 WIDTH. No samples outside a parent's line are read: positions move inside,
+ * where the host has put zeros.
  */
 
-#define BLOCK (WIDTH > 1 ? (GIVEN ? 16 : 8) * WIDTH : 1) /* long lines are fetched in long pieces */
+#include "geometry.h"
+#include "interpolation.h"
+#include "phases.h"
+#include "samples.h"
 
+/* Samples that are aligned at a time: the first stage's long lines are fetched in long pieces. */
+#define BLOCK (WIDTH > 1 ? (SHIFTS_GIVEN ? 16 : 8) * WIDTH : 1)
+
+/* With WIDTH > 1 a work-group is one work-item, which waits for nobody. */
 #if WIDTH == 1
-#define LOAD_RE(line, k, pitch) LOAD_HELD((line) + 2 * (k))
-#define LOAD_IM(line, k, pitch) LOAD_HELD((line) + 2 * (k) + 1)
-#define STORE_RE(value, line, k, pitch) STORE_HELD(value, (line) + 2 * (k))
-#define STORE_IM(value, line, k, pitch) STORE_HELD(value, (line) + 2 * (k) + 1)
-#define STORE_LOCAL(value, p) (*(p) = (value))
-#define TOGETHER barrier(CLK_LOCAL_MEM_FENCE)
+#define WAIT_FOR_GROUP barrier(CLK_LOCAL_MEM_FENCE)
 #else
-#define LOAD_RE(line, k, pitch) LOAD_HELD((line) + (k))
-#define LOAD_IM(line, k, pitch) LOAD_HELD((line) + (k) + (pitch))
-#define STORE_RE(value, line, k, pitch) STORE_HELD(value, (line) + (k))
-#define STORE_IM(value, line, k, pitch) STORE_HELD(value, (line) + (k) + (pitch))
-#ifdef __clang__
-#define STORE_LOCAL(value, p) (*(__local vfloat_anywhere *)(p) = (value))
-#else
-#define STORE_LOCAL(value, p) JOIN(vstore, WIDTH)(value, 0, p)
-#endif
-#define TOGETHER
+#define WAIT_FOR_GROUP
 #endif
 
-/* sum_t weight[t] line[place + t]: of `low`, the vector at `place`, and `high`, the one after it. Loads that cross
- * cache lines are slow; shuffles by constants are not. */
+/* Lines of different channels lie apart, so a CPU prefetches those of a later channel. Simulators lack the builtin. */
+#if defined(__clang__) && WIDTH > 1 && !defined(NO_PREFETCH)
+#define PREFETCH(p) __builtin_prefetch((const void *)(size_t)(p))
+#define CHANNELS_AHEAD 4
+#endif
+
+/* The lines of a child's parent. */
+typedef struct {
+    __global const sample_t *lines;
+    int pitch;
+#if SHIFTS_GIVEN
+    __global const int *order;
+#else
+    int first_channel;
+#endif
+} Parent;
+
+INLINE __global const sample_t *line_of(const Parent *parent, int channel)
+{
+#if SHIFTS_GIVEN
+    return LINE(parent->lines, parent->order[channel], parent->pitch);
+#else
+    return LINE(parent->lines, channel - parent->first_channel, parent->pitch);
+#endif
+}
+
+/* A child's virtual channels, from `first` to `end` - 1, and their lines without the guard. */
+typedef struct {
+    __global sample_t *lines;
+    int pitch, first, end;
+} Child;
+
+INLINE int is_of(const Child *child, int number)
+{
+    return number >= child->first && number < child->end;
+}
+
+INLINE __global sample_t *virtual_line(const Child *child, int number)
+{
+    return LINE(child->lines, number - child->first, child->pitch);
+}
+
+/* What a chunk of channels is aligned and summed with. */
+typedef struct {
+    float range_weight[TAPS][CHUNK], aperture_weight[APERTURE_TAPS][CHUNK];
+    float cosine[CHUNK], sine[CHUNK]; /* of the phase; with RAMP of its change over WIDTH samples */
+#if RAMP
+    float phase[CHUNK]; /* at the child's centre, cycles */
+#endif
+    int start[CHUNK];
+} Chunk;
+
+/* A chunk's lines over a block of samples, aligned on the child's centre. */
+typedef struct {
+    vfloat re[BLOCK / WIDTH][CHUNK], im[BLOCK / WIDTH][CHUNK];
+} Aligned;
+
+/* How WIDTH channels are aligned: by `start` and `nu` samples, and a phase. */
+typedef struct {
+    vint start;
+    vfloat nu, cycles;
+} Shifts;
+
+#if !SHIFTS_GIVEN
+/* Shifts from the change of range between the parent's centre and the child's. */
+INLINE Shifts shifts_to_child(__global const float *position, int channel_pitch, __global const float *offset, float3 drift,
+                              float samples_per_m, float cycles_per_m, int first_sample)
+{
+    const Vector from_channel = {offset[0] - LOAD(position), offset[1] - LOAD(position + channel_pitch),
+                                 offset[2] - LOAD(position + 2 * channel_pitch)};
+    const float3 move = (float3)(offset[3], offset[4], offset[5]);
+    const float drifted = drift.x * move.x + drift.y * move.y + drift.z * move.z;
+    const vfloat change = distance_change(from_channel, uniform_vector(move)) - drifted;
+    /* Half a sample less makes rounding find the lower of the two middle taps. */
+    const vfloat shift = change * samples_per_m - 0.5f;
+    const vfloat shifted = shift + ROUNDER;
+    return (Shifts){VINT_OF_SHIFTED(shifted) + first_sample, shift - (shifted - ROUNDER), change * cycles_per_m};
+}
+#endif
+
+/* Stores the weights of channels c to c + WIDTH - 1 of a chunk. */
+INLINE void store_weights(__local Chunk *chunk, int c, Shifts shifts, __global const float *range_filter,
+                          __global const float *aperture_filter, vfloat tap_position)
+{
+    for (int lane = 0; lane < WIDTH; lane++)
+        chunk->start[c + lane] = INT_LANE(shifts.start, lane);
+    vfloat weight[TAPS];
+    filter_weights(range_filter, TAPS, shifts.nu, weight);
+#pragma unroll
+    for (int t = 0; t < TAPS; t++)
+        STORE_LOCAL(weight[t], &chunk->range_weight[t][c]);
+#if APERTURE_TAPS > 1
+    vfloat share[APERTURE_TAPS];
+    filter_weights(aperture_filter, APERTURE_TAPS, tap_position, share);
+#else
+    const vfloat share[1] = {1.0f};
+#endif
+#pragma unroll
+    for (int t = 0; t < APERTURE_TAPS; t++)
+        STORE_LOCAL(share[t], &chunk->aperture_weight[t][c]);
+}
+
+/* WIDTH samples of a line, filtered: sum_t weight[t] line[k + t]. */
 #if defined(__clang__) && WIDTH >= 8
+/* The vectors at k, `low`, and after it, `high`, are shuffled by constants: loads that cross cache lines are slower. */
 #define SLIDING
 #if WIDTH == 16
 #define SHIFTED(low, high, t)                                                                          \
@@ -85,7 +180,7 @@
 #endif
 INLINE vfloat filtered(const float *weight, vfloat low, vfloat high)
 {
-    /* One after the other, since a sum of two products is not fused with what it is added to. */
+    /* One product at a time: a compiler does not fuse a sum of two products with what it is added to. */
     vfloat sum = weight[0] * low;
     sum += weight[1] * SHIFTED(low, high, 1);
 #if TAPS > 2
@@ -104,25 +199,106 @@ INLINE vfloat filtered(const float *weight, vfloat low, vfloat high)
 }
 #endif
 
-/* Lines of different channels lie apart: a CPU fetches those of the channel after the next meanwhile. */
-#if defined(__clang__) && WIDTH > 1 && !defined(NO_PREFETCH) /* which simulators do not know */
-#define PREFETCH(p) __builtin_prefetch((const void *)(size_t)(p))
-#define AHEAD 4
+/* Aligns channel c of a chunk, whose line this is, over samples `block` to `end` - 1. `next` is where, less `block`, to
+ * prefetch from. */
+INLINE void align_line(Aligned *aligned, __local const Chunk *chunk, int c, __global const sample_t *line, int pitch,
+                       int block, int end, vfloat phase_re, vfloat phase_im, __global const sample_t *next)
+{
+    float weight[TAPS];
+#pragma unroll
+    for (int t = 0; t < TAPS; t++)
+        weight[t] = chunk->range_weight[t][c];
+#if RAMP
+    const float step_re = chunk->cosine[c], step_im = chunk->sine[c];
 #endif
-
-#if GIVEN
-#define PARENT_LINE(c) (parent + (size_t)order[chunk + (c)] * 2 * parent_pitch)
+    const int start = chunk->start[c];
+#ifdef SLIDING
+    const int before = CLAMP(start + block, 0, pitch - TAPS - WIDTH);
+    vfloat re_low = LOAD_RE(line, before, pitch), im_low = LOAD_IM(line, before, pitch);
+#endif
+    for (int k = block; k < end; k += WIDTH) {
+#ifdef PREFETCH
+        PREFETCH(next + k);
+        PREFETCH(next + k + pitch);
+#endif
+#ifdef SLIDING
+        const int after = CLAMP(start + k + WIDTH, 0, pitch - WIDTH);
+        const vfloat re_high = LOAD_RE(line, after, pitch), im_high = LOAD_IM(line, after, pitch);
+        const vfloat re = filtered(weight, re_low, re_high), im = filtered(weight, im_low, im_high);
+        re_low = re_high;
+        im_low = im_high;
 #else
-#define PARENT_LINE(c) (parent + (size_t)(chunk + (c) - parents_first) * 2 * parent_pitch)
+        const int position = CLAMP(start + k, 0, pitch - TAPS - WIDTH);
+        vfloat re = 0.0f, im = 0.0f;
+#pragma unroll
+        for (int t = 0; t < TAPS; t++) {
+            re += weight[t] * LOAD_RE(line, position + t, pitch);
+            im += weight[t] * LOAD_IM(line, position + t, pitch);
+        }
 #endif
+        aligned->re[(k - block) / WIDTH][c] = re * phase_re - im * phase_im;
+        aligned->im[(k - block) / WIDTH][c] = re * phase_im + im * phase_re;
+#if RAMP
+        const vfloat turned = phase_re * step_re - phase_im * step_im;
+        phase_im = phase_re * step_im + phase_im * step_re;
+        phase_re = turned;
+#endif
+    }
+}
 
-/* The line of virtual channel `node`. */
-#define NODE_LINE(node) (lines + (size_t)((node) - first_node) * 2 * pitch + (WIDTH == 1 ? 2 : 1) * guard)
-#define HAS(node) ((node) >= first_node && (node) < end_node)
+INLINE void store_sum(vfloat re, vfloat im, const Child *child, int number, int k)
+{
+    if (is_of(child, number)) {
+        STORE_RE(re, virtual_line(child, number), k, child->pitch);
+        STORE_IM(im, virtual_line(child, number), k, child->pitch);
+    }
+}
 
-__kernel void stage(__global const held *parent, int parent_pitch, __global const int *children, int first_child,
-                    int children_per_root, __global const int *base, __global const float *between, int channel_pitch,
-#if GIVEN
+/* Adds a chunk's `count` aligned lines, vector `n` of their block, to samples k on of the virtual channels from `number`
+ * on. first_virtual is that of the chunk's channels.
+ *
+ * The sums of the APERTURE_TAPS virtual channels that are open are two arrays of this function: with a structure of arrays
+ * the stage took 1.4 times as long on Intel's runtime, and 1.1 times on PoCL with arrays that other functions are given. */
+INLINE void combine(const Aligned *aligned, int n, __local const Chunk *chunk, int count,
+                    __global const int *first_virtual, int is_first_chunk, const Child *child, int number, int k)
+{
+    vfloat re[APERTURE_TAPS], im[APERTURE_TAPS];
+    /* Earlier chunks have left the sums that are open. */
+#pragma unroll
+    for (int t = 0; t < APERTURE_TAPS; t++) {
+        re[t] = im[t] = 0.0f;
+        if (!is_first_chunk && is_of(child, number + t)) {
+            re[t] = LOAD_RE(virtual_line(child, number + t), k, child->pitch);
+            im[t] = LOAD_IM(virtual_line(child, number + t), k, child->pitch);
+        }
+    }
+    for (int c = 0; c < count; c++) {
+        for (; number < first_virtual[c]; number++) {
+            /* No later channel contributes to the first of them: another one opens after the last. */
+            store_sum(re[0], im[0], child, number, k);
+#pragma unroll
+            for (int t = 0; t + 1 < APERTURE_TAPS; t++) {
+                re[t] = re[t + 1];
+                im[t] = im[t + 1];
+            }
+            re[APERTURE_TAPS - 1] = im[APERTURE_TAPS - 1] = 0.0f;
+        }
+        const vfloat line_re = aligned->re[n][c], line_im = aligned->im[n][c];
+#pragma unroll
+        for (int t = 0; t < APERTURE_TAPS; t++) {
+            re[t] += chunk->aperture_weight[t][c] * line_re;
+            im[t] += chunk->aperture_weight[t][c] * line_im;
+        }
+    }
+#pragma unroll
+    for (int t = 0; t < APERTURE_TAPS; t++)
+        store_sum(re[t], im[t], child, number + t, k);
+}
+
+__kernel void stage(__global const sample_t *parent_lines, int parent_pitch, __global const int *children,
+                    int first_child, int children_per_root, __global const int *first_virtual,
+                    __global const float *tap_position, int channel_pitch,
+#if SHIFTS_GIVEN
                     __global const int *order, __global const int *start, __global const float *nu,
                     __global const float *cycles,
 #if RAMP
@@ -130,37 +306,29 @@ __kernel void stage(__global const held *parent, int parent_pitch, __global cons
 #endif
 #else
                     __global const int *parents, int parents_per_root, int lines_per_parent,
-                    __global const float *positions, __global const float *offsets, float4 drift,
+                    __global const float *positions, __global const float *offsets, float3 drift,
                     float samples_per_m, float cycles_per_m, int parent_centre,
 #endif
-                    int half_length,
-                    __global const float *filter, __global const float *aperture_filter, __global held *lines, int lines_per_child, int pitch,
-                    int length, int part_length, int guard)
+                    int half_length, __global const float *range_filter, __global const float *aperture_filter,
+                    __global const float *phase_polynomials, __global sample_t *child_lines, int child_pitch,
+                    int lines_per_child, int length, int part_length, int guard)
 {
-    __local float taps[TAPS][CHUNK], aperture[APERTURE_TAPS][CHUNK], cosine[CHUNK], sine[CHUNK];
-#if RAMP
-    __local float phase[CHUNK]; /* at the child's centre; cosine and sine are of the turn per WIDTH samples */
-#endif
-    __local int first[CHUNK];
-#if WIDTH > 1
-    vfloat aligned_re[BLOCK / WIDTH][CHUNK], aligned_im[BLOCK / WIDTH][CHUNK];
-#else
-    float aligned_re[1][CHUNK], aligned_im[1][CHUNK];
-#endif
+    __local Chunk chunk;
+    Aligned aligned;
 
     const int item = get_local_id(0), items = get_local_size(0);
     const int from = get_group_id(1) * part_length, to = length - from < part_length ? length : from + part_length;
-    const int root = get_group_id(0) / children_per_root, in_root = get_group_id(0) % children_per_root;
-    const int child = first_child + get_group_id(0);
-    children += 5 * child;
-    const int begin = children[0], end = children[1], parents_first = children[2];
-    const int first_node = children[3], end_node = first_node + children[4];
-    lines += get_group_id(0) * lines_per_child * 2 * pitch;
+    const int root = get_group_id(0) / children_per_root;
+    const int child_number = first_child + get_group_id(0);
+    __global const int *of_child = children + 5 * child_number;
+    const int begin = of_child[0], end = of_child[1];
+    const Child child = {LINE(child_lines, get_group_id(0) * lines_per_child, child_pitch) + (WIDTH == 1 ? 2 : 1) * guard,
+                         child_pitch, of_child[3], of_child[3] + of_child[4]};
     const int row = (first_child / children_per_root + root) * channel_pitch;
-    base += row;
-    between += row;
-#if GIVEN
-    order += row;
+    first_virtual += row;
+    tap_position += row;
+#if SHIFTS_GIVEN
+    const Parent parent = {parent_lines, parent_pitch, order + row};
     start += row;
     nu += row;
     cycles += row;
@@ -168,167 +336,73 @@ __kernel void stage(__global const held *parent, int parent_pitch, __global cons
     ramp += row;
 #endif
 #else
-    parent += (size_t)(root * parents_per_root + parents[in_root]) * lines_per_parent * 2 * parent_pitch;
+    const int parent_number = root * parents_per_root + parents[get_group_id(0) % children_per_root];
+    const Parent parent = {LINE(parent_lines, parent_number * lines_per_parent, parent_pitch), parent_pitch, of_child[2]};
     positions += 3 * row;
-    offsets += 6 * child;
-    const float dx = offsets[3], dy = offsets[4], dz = offsets[5];
-    const float drifted = drift.x * dx + drift.y * dy + drift.z * dz;
+    offsets += 6 * child_number;
+    const int first_sample = parent_centre - half_length + 1 - TAPS / 2;
 #endif
 
-    int chunk_node = first_node - APERTURE_TAPS + 1;
-    for (int chunk = begin; chunk < end; chunk += CHUNK) {
-        const int count = end - chunk < CHUNK ? end - chunk : CHUNK;
-        TOGETHER;
+    int open = child.first - APERTURE_TAPS + 1; /* the first virtual channel that later channels may contribute to */
+    for (int first = begin; first < end; first += CHUNK) {
+        const int count = end - first < CHUNK ? end - first : CHUNK;
+        WAIT_FOR_GROUP;
         for (int c = item * WIDTH; c < count; c += items * WIDTH) {
-#if GIVEN
-            const vfloat away = LOAD(nu + chunk + c), turns = LOAD(cycles + chunk + c);
+            const int channel = first + c;
+#if SHIFTS_GIVEN
+            Shifts shifts;
             for (int lane = 0; lane < WIDTH; lane++)
-                first[c + lane] = start[chunk + c + lane];
+                ((int *)&shifts.start)[lane] = start[channel + lane];
+            shifts.nu = LOAD(nu + channel);
+            shifts.cycles = LOAD(cycles + channel);
 #else
-            /* The change of range from the parent's centre to the child's, without cancellation. */
-            __global const float *position = positions + chunk + c;
-            const vfloat x = offsets[0] - LOAD(position);
-            const vfloat y = offsets[1] - LOAD(position + channel_pitch);
-            const vfloat z = offsets[2] - LOAD(position + 2 * channel_pitch);
-            const vfloat square = x * x + y * y + z * z;
-            const vfloat more = dx * (2.0f * x + dx) + dy * (2.0f * y + dy) + dz * (2.0f * z + dz);
-            const vfloat change =
-                more / (sqrt(max(square + more, 0.0f)) + sqrt(square) + FLT_MIN) - drifted;
-            const vfloat turns = change * cycles_per_m;
-            const vfloat shift = change * samples_per_m - 0.5f;
-            const vfloat shifted = shift + ROUNDER;
-            const vfloat away = shift - (shifted - ROUNDER);
-            const vint whole = ROUNDED_VINT(shifted) + (parent_centre - half_length + 1 - TAPS / 2);
-            for (int lane = 0; lane < WIDTH; lane++)
-                first[c + lane] = ((const int *)&whole)[lane];
+            const Shifts shifts = shifts_to_child(positions + channel, channel_pitch, offsets, drift, samples_per_m,
+                                                  cycles_per_m, first_sample);
 #endif
-            vfloat weight[TAPS], s, co;
-            filter_weights(filter, TAPS, away, weight);
+            store_weights(&chunk, c, shifts, range_filter, aperture_filter, LOAD(tap_position + channel));
+            vfloat sine, cosine;
 #if RAMP
-            STORE_LOCAL(turns, phase + c);
-            sincos_cycles(WIDTH * LOAD(ramp + chunk + c), &s, &co);
+            STORE_LOCAL(shifts.cycles, &chunk.phase[c]);
+            sine_and_cosine(WIDTH * LOAD(ramp + channel), phase_polynomials, &sine, &cosine);
 #else
-            sincos_cycles(turns, &s, &co);
+            sine_and_cosine(shifts.cycles, phase_polynomials, &sine, &cosine);
 #endif
-#pragma unroll
-            for (int t = 0; t < TAPS; t++)
-                STORE_LOCAL(weight[t], taps[t] + c);
-#if APERTURE_TAPS > 1
-            vfloat share[APERTURE_TAPS];
-            filter_weights(aperture_filter, APERTURE_TAPS, LOAD(between + chunk + c), share);
-#else
-            const vfloat share[1] = {1.0f};
-#endif
-#pragma unroll
-            for (int t = 0; t < APERTURE_TAPS; t++)
-                STORE_LOCAL(share[t], aperture[t] + c);
-            STORE_LOCAL(co, cosine + c);
-            STORE_LOCAL(s, sine + c);
+            STORE_LOCAL(cosine, &chunk.cosine[c]);
+            STORE_LOCAL(sine, &chunk.sine[c]);
         }
-        TOGETHER;
-        int node = chunk_node;
+        WAIT_FOR_GROUP;
         for (int block = from + item * BLOCK; block < to; block += items * BLOCK) {
             const int block_end = to - block < BLOCK ? to : block + BLOCK;
             for (int c = 0; c < count; c++) {
-                __global const held *line = PARENT_LINE(c);
 #ifdef PREFETCH
-                const int ahead = c + AHEAD < count ? c + AHEAD : count - 1;
-                __global const held *next =
-                    PARENT_LINE(ahead) + KEEP(first[ahead] + block, 0, parent_pitch - BLOCK - WIDTH) - block;
-#endif
-                float weight[TAPS];
-#pragma unroll
-                for (int t = 0; t < TAPS; t++)
-                    weight[t] = taps[t][c];
-#if RAMP
-                const float step_re = cosine[c], step_im = sine[c];
-                vfloat turn_re, turn_im;
-                sincos_cycles(phase[c] + ramp[chunk + c] * (LANES + (float)(block - half_length)), &turn_im, &turn_re);
+                const int ahead = c + CHANNELS_AHEAD < count ? c + CHANNELS_AHEAD : count - 1;
+                __global const sample_t *next = line_of(&parent, first + ahead)
+                    + CLAMP(chunk.start[ahead] + block, 0, parent_pitch - BLOCK - WIDTH) - block;
 #else
-                const float turn_re = cosine[c], turn_im = sine[c];
+                __global const sample_t *next = 0;
 #endif
-                const int start = first[c];
-#ifdef SLIDING
-                const int before = KEEP(start + block, 0, parent_pitch - TAPS - WIDTH);
-                vfloat re_low = LOAD_RE(line, before, parent_pitch), im_low = LOAD_IM(line, before, parent_pitch);
-#endif
-                for (int k = block; k < block_end; k += WIDTH) {
-#ifdef PREFETCH
-                    PREFETCH(next + k);
-                    PREFETCH(next + k + parent_pitch);
-#endif
-#ifdef SLIDING
-                    const int after = KEEP(start + k + WIDTH, 0, parent_pitch - WIDTH);
-                    const vfloat re_high = LOAD_RE(line, after, parent_pitch), im_high = LOAD_IM(line, after, parent_pitch);
-                    const vfloat a = filtered(weight, re_low, re_high), b = filtered(weight, im_low, im_high);
-                    re_low = re_high;
-                    im_low = im_high;
-#else
-                    const int place = KEEP(start + k, 0, parent_pitch - TAPS - WIDTH);
-                    vfloat a = 0.0f, b = 0.0f;
-#pragma unroll
-                    for (int t = 0; t < TAPS; t++) {
-                        a += weight[t] * LOAD_RE(line, place + t, parent_pitch);
-                        b += weight[t] * LOAD_IM(line, place + t, parent_pitch);
-                    }
-#endif
-                    aligned_re[(k - block) / WIDTH][c] = a * turn_re - b * turn_im;
-                    aligned_im[(k - block) / WIDTH][c] = a * turn_im + b * turn_re;
 #if RAMP
-                    const vfloat turned = turn_re * step_re - turn_im * step_im;
-                    turn_im = turn_re * step_im + turn_im * step_re;
-                    turn_re = turned;
+                vfloat phase_re, phase_im;
+                sine_and_cosine(chunk.phase[c] + ramp[first + c] * (LANES + (float)(block - half_length)),
+                                phase_polynomials, &phase_im, &phase_re);
+#else
+                const float phase_re = chunk.cosine[c], phase_im = chunk.sine[c];
 #endif
-                }
+                align_line(&aligned, &chunk, c, line_of(&parent, first + c), parent_pitch, block, block_end, phase_re,
+                           phase_im, next);
             }
-            for (int k = block; k < block_end; k += WIDTH) {
-                vfloat re[APERTURE_TAPS], im[APERTURE_TAPS];
-                node = chunk_node;
-#pragma unroll
-                for (int t = 0; t < APERTURE_TAPS; t++) {
-                    re[t] = im[t] = 0.0f;
-                    if (chunk > begin && HAS(node + t)) {
-                        re[t] = LOAD_RE(NODE_LINE(node + t), k, pitch);
-                        im[t] = LOAD_IM(NODE_LINE(node + t), k, pitch);
-                    }
-                }
-                for (int c = 0; c < count; c++) {
-                    const int channel = chunk + c;
-                    for (; node < base[channel]; node++) {
-                        /* No later channel reaches this virtual channel. */
-                        if (HAS(node)) {
-                            STORE_RE(re[0], NODE_LINE(node), k, pitch);
-                            STORE_IM(im[0], NODE_LINE(node), k, pitch);
-                        }
-#pragma unroll
-                        for (int t = 0; t + 1 < APERTURE_TAPS; t++) {
-                            re[t] = re[t + 1];
-                            im[t] = im[t + 1];
-                        }
-                        re[APERTURE_TAPS - 1] = im[APERTURE_TAPS - 1] = 0.0f;
-                    }
-                    const vfloat a = aligned_re[(k - block) / WIDTH][c], b = aligned_im[(k - block) / WIDTH][c];
-#pragma unroll
-                    for (int t = 0; t < APERTURE_TAPS; t++) {
-                        re[t] += aperture[t][c] * a;
-                        im[t] += aperture[t][c] * b;
-                    }
-                }
-#pragma unroll
-                for (int t = 0; t < APERTURE_TAPS; t++)
-                    if (HAS(node + t)) {
-                        STORE_RE(re[t], NODE_LINE(node + t), k, pitch);
-                        STORE_IM(im[t], NODE_LINE(node + t), k, pitch);
-                    }
-            }
+            for (int k = block; k < block_end; k += WIDTH)
+                combine(&aligned, (k - block) / WIDTH, &chunk, count, first_virtual + first, first == begin, &child, open,
+                        k);
         }
-        /* Where this work-item had no samples it passed no channel. */
-        chunk_node = max(chunk_node, base[chunk + count - 1]);
+        /* A work-item without samples has passed no channel, so this does not rely on combine(). */
+        open = max(open, first_virtual[first + count - 1]);
     }
-    /* Virtual channels beyond the last that any channel reaches. */
-    for (int node = end > begin ? max(chunk_node + APERTURE_TAPS, first_node) : first_node; node < end_node; node++)
+    /* Virtual channels beyond the last that any channel contributes to. */
+    const int beyond = end > begin ? max(open + APERTURE_TAPS, child.first) : child.first;
+    for (int number = beyond; number < child.end; number++)
         for (int k = from + item * WIDTH; k < to; k += items * WIDTH) {
-            STORE_RE(0.0f, NODE_LINE(node), k, pitch);
-            STORE_IM(0.0f, NODE_LINE(node), k, pitch);
+            STORE_RE(0.0f, virtual_line(&child, number), k, child.pitch);
+            STORE_IM(0.0f, virtual_line(&child, number), k, child.pitch);
         }
 }

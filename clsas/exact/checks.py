@@ -17,7 +17,7 @@ _SMALLEST_STEP_M = 1e-9
 _MOST_CYCLES = 1e10  # float64 leaves 1e-6 of a cycle
 _LARGEST_SUM = 1e37
 _LOOKED_AT = 1 << 18  # numbers of lines at a time
-_FASTEST = 0.05  # of a receiver, in sound speeds: cl/backproject.cl iterates on it
+_FASTEST = 0.05  # of a receiver, in sound speeds: cl/antennas.h iterates on it
 
 
 def check_accumulate(image: Image, grid: Grid, beam: BeamWindow | None) -> None:

@@ -20,7 +20,7 @@ def most_upsampling(device: Device, lines: RangeLines, lookup_radius_m: float) -
 def lookup_options(
     device: Device, layout: Tiles | Groups, lines: RangeLines, samples_per_m: float, taps: int
 ) -> dict[str, int]:
-    """Return the build options that say how samples are looked up (cl/backproject.cl)."""
+    """Return the build options that say how samples are looked up (cl/lookup.h)."""
     # Ranges to receivers that move change a little faster than pixels' places.
     reach_m = lookup_room(taps, device.info.width) / samples_per_m / (1 + 2 * fastest(lines))
     windows = layout.windows(reach_m) if device.info.permute else 0

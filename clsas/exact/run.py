@@ -21,11 +21,13 @@ from clsas.exact.preparation import Preparation
 from clsas.exact.tiles import STACK, Tiles
 from clsas.opencl.buffers import (
     VECTOR_ROOM,
-    beam_arguments,
+    beam_table,
     channel_pitch,
+    expansion_kernel,
     expansion_terms,
+    filter_table,
     float_pairs,
-    lookup_weights,
+    phase_polynomials,
     round_up,
     slices,
     upsampled_lines,
@@ -62,13 +64,14 @@ def execute(
         at_once = band_parts(device, layout.part_pixels, layout.across, normalise)
         for band in slices(slice(0, layout.parts), at_once):
             part = slice(band.start * layout.part_pixels, band.stop * layout.part_pixels)
-            on_device = [device.zeros(pixels[part].nbytes) for _ in range(1 + normalise)]
+            names = ["pixels", "weight_sums"] if normalise else ["pixels"]
+            on_device = {name: device.zeros(pixels[part].nbytes) for name in names}
             for channels in slices(slice(0, p.lines.channels), run.channels_at_once):
                 run.add(channels, band, on_device)
-            cl.enqueue_copy(device.queue, pixels[part], on_device[0])
+            cl.enqueue_copy(device.queue, pixels[part], on_device["pixels"])
             if normalise:
                 sums = np.empty_like(pixels[part])
-                cl.enqueue_copy(device.queue, sums, on_device[1])
+                cl.enqueue_copy(device.queue, sums, on_device["weight_sums"])
                 pixels[part] *= normalising(sums.real, p.lines.channels)
     finally:
         device.finish()  # an interrupted run leaves nothing in use
@@ -178,32 +181,31 @@ class _Run:
         options = {
             "WIDTH": device.info.width,
             "TAPS": p.interpolator.taps,
-            "TILE_ROWS": layout.side if self.tiled else 16,
-            "TILE_COLUMNS": layout.side if self.tiled else 16,
-            "BISTATIC": int(self.bistatic),
-            "MOVING": int(self.moving),
             "BEAM": 0 if p.beam is None else INTERVALS,
             "ONE_CUBIC": int(p.one_cubic),
             "NORMALISE": int(p.beam is not None and p.beam.normalise),
-            "ALONE": 0,
-            "CENTRED": 0,
             "PHASE_TERMS": p.phase_terms,
         }
         options |= lookup_options(device, layout, p.lines, p.samples_per_m, p.interpolator.taps)
-        name = "backproject_tiles" if self.tiled else "backproject_points"
-        self.kernel = device.kernel("backproject", name, **options)
-        self.expand = device.kernel("backproject", "expand_tiles", **options)
+        paths = {"BISTATIC": int(self.bistatic), "MOVING": int(self.moving)}
+        if self.tiled:
+            self.expand = expansion_kernel(device, p.beam, **paths)
+            tile = {"TILE_ROWS": layout.side, "TILE_COLUMNS": layout.side}
+            self.kernel = device.kernel("backproject_tiles", **options, **tile)
+        else:
+            self.kernel = device.kernel("backproject_points", **options, **paths)
 
         # While one set of buffers is in use on the device, the other is filled.
         self.line_slots = itertools.cycle([Slot(device), Slot(device)])
         self.part_slots = itertools.cycle([Slot(device), Slot(device)])
-        self.weights = device.upload(lookup_weights(p.interpolator.coefficients, p.phase_terms))
-        self.per_sine, self.beam = beam_arguments(device, p.beam, p.lines)
+        self.filter = filter_table(device, p.interpolator.coefficients)
+        self.phase_polynomials = phase_polynomials(device, p.phase_terms)
+        self.beam = beam_table(device, p.beam, p.lines)
         self.corner = device.upload(np.zeros(2, np.int32))
         self.progress = progress
         self.done = 0
 
-    def add(self, channels: slice, band: slice, pixels: list[cl.Buffer]) -> None:
+    def add(self, channels: slice, band: slice, pixels: dict[str, cl.Buffer]) -> None:
         """Add some channels to the pixels of a band of parts, and to the sums of their weights."""
         ranges = self._ranges(channels, band)
         seen = ranges[:, 1] > ranges[:, 0]
@@ -262,7 +264,7 @@ class _Run:
         parts: slice,
         pitches: tuple[int, int],
         first_part: int,
-        pixels: list[cl.Buffer],
+        pixels: dict[str, cl.Buffer],
     ) -> cl.Event:
         """Run the kernels of one job on buffers that are being filled.
 
@@ -271,58 +273,61 @@ class _Run:
         p, device, layout = self.p, self.p.device, self.p.layout
         count = parts.stop - parts.start
         pitch, geometry_pitch = pitches
+        geometry = {
+            "geometry": line_slot["geometry"],
+            "geometry_pitch": geometry_pitch,
+            "centres": slot["centres"],
+            "samples_per_m": p.samples_per_m,
+        }
+        ranges = {"ranges": slot["ranges"], "first_range": 0}
         if self.tiled:
-            geometry = slot.buffer("expansion", 4 * self.terms * count * pitch)
-            steps_m = (p.grid.column_step_m, p.grid.row_step_m)
+            expansions = slot.buffer("expansions", 4 * self.terms * count * pitch)
             device.run(
                 self.expand,
                 (pitch // device.info.width, count),
-                line_slot["geometry"],
-                pitch,
-                geometry_pitch,
-                slot["ranges"],
-                0,
-                slot["centres"],
-                *(np.append(step, 0).astype(np.float32) for step in steps_m),
-                p.samples_per_m,
-                np.zeros(2, np.float32),
-                geometry,
-                *self.beam[1:2],
+                **geometry,
+                **ranges,
+                column_step=p.grid.column_step_m,
+                row_step=p.grid.row_step_m,
+                drift=(0.0, 0.0),
+                **self.beam.origin,
+                expansions=expansions,
+                channel_pitch=pitch,
                 wait_for=line_slot.filled + slot.filled,
             )
             size = (layout.part_pixels // (device.info.width * STACK), count)
-            pitches, ranges = (pitch,), (slot["ranges"], 0)
-            rest = (
-                layout.across * layout.side,
-                self.corner,
-                layout.down,
-                layout.across,
-                first_part,
-            )
+            positions = {
+                "expansions": expansions,
+                "columns": layout.across * layout.side,
+                "corners": self.corner,
+                "tiles_down": layout.down,
+                "tiles_across": layout.across,
+                "first_tile": first_part,
+            }
         else:
-            geometry = line_slot["geometry"]
             slot.fill("offsets", layout.offset_m[parts].reshape(-1, 3).T)
             size = (count,)
-            pitches, ranges = (geometry_pitch, pitch), (slot["ranges"], 0)
-            points = count * layout.part_pixels
-            rest = (first_part, slot["centres"], slot["offsets"], points, p.samples_per_m)
+            positions = geometry | {
+                "offsets": slot["offsets"],
+                "points": count * layout.part_pixels,
+                "first_group": first_part,
+            }
         return device.run(
             self.kernel,
             size,
-            line_slot["samples"],
-            self.pitch,
-            slot["sample"],
-            slot["fraction"],
-            slot["phase"],
-            geometry,
-            *pitches,
-            *ranges,
-            p.cycles_per_m / p.samples_per_m,
-            self.weights,
-            pixels[0],
-            *rest,
-            *self.beam,
-            *pixels[1:],
+            lines=line_slot["samples"],
+            line_pitch=self.pitch,
+            **ranges,
+            reference_sample=slot["sample"],
+            reference_fraction=slot["fraction"],
+            reference_phase=slot["phase"],
+            channel_pitch=pitch,
+            cycles_per_sample=p.cycles_per_m / p.samples_per_m,
+            filter=self.filter,
+            phase_polynomials=self.phase_polynomials,
+            **positions,
+            **self.beam.arguments,
+            **pixels,
             wait_for=line_slot.filled + slot.filled,
         )
 
@@ -337,7 +342,7 @@ class _Run:
         if self.moving:
             rows.append((lines.rx_velocity_m_s / lines.sound_speed_m_s).astype(np.float32))
         if self.p.beam is not None:
-            rows.append((self.p.along[channels] * self.per_sine).astype(np.float32))
+            rows.append((self.p.along[channels] * self.beam.per_sine).astype(np.float32))
         pitch = channel_pitch(lines.channels) + VECTOR_ROOM
         geometry = np.concatenate(rows, axis=1).T
         return np.pad(geometry, ((0, 0), (0, pitch - lines.channels)), mode="edge")

@@ -18,7 +18,7 @@ from clsas.core.grid import Grid
 from clsas.sonar.beam import BeamWindow
 
 STACK = 4
-"""Blocks per work-item, one below the other (cl/backproject.cl)."""
+"""Blocks per work-item, one below the other (cl/pixels.h)."""
 
 BLOCKS = {16: (4, 4), 8: (2, 4), 4: (2, 2), 1: (1, 1)}
 """Rows and columns of a block, by float lanes."""
@@ -205,7 +205,7 @@ class Groups:
         """Largest distance of a pixel from the one in the middle of its work-item's block."""
         blocks = self.offset_m.reshape(-1, self.width, 3)
         rows, columns = BLOCKS[self.width]
-        middle = (rows - 1) // 2 * columns + (columns - 1) // 2  # MIDDLE in cl/backproject.cl
+        middle = (rows - 1) // 2 * columns + (columns - 1) // 2  # MIDDLE in cl/pixels.h
         return _longest(blocks - blocks[:, middle, None])
 
     @property

@@ -22,11 +22,13 @@ from clsas.factorized.tree import Division
 from clsas.opencl.buffers import (
     GUARD,
     VECTOR_ROOM,
-    beam_arguments,
+    beam_table,
     channel_pitch,
+    expansion_kernel,
     expansion_terms,
+    filter_table,
     float_pairs,
-    lookup_weights,
+    phase_polynomials,
 )
 from clsas.opencl.device import Device, Slot
 from clsas.sonar.beam import INTERVALS
@@ -77,13 +79,16 @@ class Leaves:
         self.lines, self.geometry, self.level, self.device = lines, geometry, level, device
         self.plan, self.surface, self.width = chosen, geometry.surface, device.info.width
         self.normalise = chosen.beam is not None and chosen.beam.normalise
-        self.per_sine, self.beam = beam_arguments(device, chosen.beam, lines)
-        self.weights = device.upload(
-            lookup_weights(chosen.final.coefficients / gain, chosen.phase_terms)
-        )
+        self.beam = beam_table(device, chosen.beam, lines)
+        self.arguments = {
+            "cycles_per_sample": geometry.cycles_per_m / geometry.samples_per_m,
+            "filter": filter_table(device, chosen.final.coefficients / gain),
+            "phase_polynomials": phase_polynomials(device, chosen.phase_terms),
+            "line_pitch": level.pitch,
+            **self.beam.arguments,
+        }
         # Where tile and leaf are one, every line is aligned on its centre.
-        self.centred = chosen.tile == chosen.sides[-1]
-        self.per_sample = geometry.cycles_per_m / geometry.samples_per_m
+        self.aligned = chosen.tile == chosen.sides[-1]
         self.slot, self.image, self.half_precision = Slot(device), image, half_precision
         self._prepare()
 
@@ -108,15 +113,11 @@ class Leaves:
         return {
             "WIDTH": self.width,
             "TAPS": chosen.final.taps,
-            "TILE_ROWS": chosen.tile[0],
-            "TILE_COLUMNS": chosen.tile[1],
-            "BISTATIC": 0,
-            "MOVING": 0,
             "BEAM": 0 if chosen.beam is None else INTERVALS,
             "ONE_CUBIC": int(one_cubic),
             "NORMALISE": int(self.normalise),
-            "ALONE": 1,
-            "CENTRED": int(self.centred),
+            "OVERWRITE": 1,
+            "ALIGNED": int(self.aligned),
             "HALF": int(self.half_precision),
             "PHASE_TERMS": chosen.phase_terms,
         } | lookup_options(
@@ -131,10 +132,10 @@ class Leaves:
             along = tree.interpolated_directions(
                 self.geometry.track.samples, self.geometry.along, sector.nodes[-1].place
             )
-            rows.append((along * self.per_sine).astype(np.float32).reshape(-1, 3))
+            rows.append((along * self.beam.per_sine).astype(np.float32).reshape(-1, 3))
         slot.fill("geometry", _padded(np.concatenate(rows, axis=1).T))
         if self.normalise:
-            slot.fill("shares", _padded(_shares(sector).reshape(1, -1)))
+            slot.fill("represented", _padded(_represented(sector).reshape(1, -1)))
         self._fill(slot, sector)
 
     def form(self, tables: Slot, sector: Sector, batch: slice, samples: cl.Buffer) -> Finish:
@@ -176,11 +177,12 @@ class Leaves:
         ]
         return np.stack(np.broadcast_arrays(*ranges), axis=-1).astype(np.int32)
 
-    def _sums(self, tables: Slot, pixels: int) -> list[cl.Buffer]:
-        """Return what kernels take that normalise, beside the beam."""
+    def _weight_sums(self, tables: Slot, pixels: int) -> dict[str, cl.Buffer]:
+        """Return the arguments of kernels that sum weights, for a number of pixels."""
         if not self.normalise:
-            return []
-        return [self.slot.buffer("sums", 8 * pixels), tables["shares"]]
+            return {}
+        sums = {"weight_sums": self.slot.buffer("weight_sums", 8 * pixels)}
+        return sums | ({"represented": tables["represented"]} if self.aligned else {})
 
 
 class PlaneLeaves(Leaves):
@@ -194,8 +196,9 @@ class PlaneLeaves(Leaves):
         self.shared = device.share(image) if on_cpu else None
         layout = Tiles(plane, chosen.tile[0], self.width)
         options = self._options(layout)
-        self.expand = device.kernel("backproject", "expand_tiles", **options)
-        self.backproject = device.kernel("backproject", "backproject_tiles", **options)
+        tile = {"TILE_ROWS": chosen.tile[0], "TILE_COLUMNS": chosen.tile[1]}
+        self.expand = expansion_kernel(device, chosen.beam)
+        self.backproject = device.kernel("backproject_tiles", **options, **tile)
         self.tiles = Division(self.surface, (chosen.sides[0], chosen.sides[-1], chosen.tile))
         self.per_root, self.leaf_of = self.tiles.per_root(2), self.tiles.parents(2)
         first = np.zeros((1, 2), np.int64)
@@ -213,64 +216,60 @@ class PlaneLeaves(Leaves):
         parts = [self._part(root) for root in sector.roots[batch]]
         tiles, first_tile = len(parts) * self.per_root, batch.start * self.per_root
         pitch = channel_pitch(sector.stride(-1))
-        if self.centred:
-            references = [level.centre]
+        if self.aligned:
+            references = {"centre_sample": level.centre}
         else:
             slot.wait()
-            values = self._references(sector, batch, pitch)
-            for name, each in values.items():
-                slot.fill(name, each)
-            references = [slot[name] for name in values]
+            references = {}
+            for name, values in self._references(sector, batch, pitch).items():
+                slot.fill(name, values)
+                references[f"reference_{name}"] = slot[name]
         plane, samples_per_m = self.surface.plane, self.geometry.samples_per_m
         steps_m = (plane.column_step_m, plane.row_step_m)
-        drift = [self.geometry.drift @ step * samples_per_m for step in steps_m]
         terms = expansion_terms(chosen.beam)
         most = max(pitch, channel_pitch(chosen.most_channels[-1]))
-        expansion = slot.buffer("expansion", 4 * terms * tiles * most)
+        expanded = {
+            "ranges": tables["ranges"],
+            "first_range": first_tile,
+            "expansions": slot.buffer("expansions", 4 * terms * tiles * most),
+            "channel_pitch": pitch,
+        }
         device.run(
             self.expand,
             (pitch // self.width, tiles),
-            tables["geometry"],
-            pitch,
-            sector.nodes[-1].place.size + VECTOR_ROOM,
-            tables["ranges"],
-            first_tile,
-            self.centres,
-            *(np.append(step, 0).astype(np.float32) for step in steps_m),
-            samples_per_m,
-            np.array(drift, np.float32),
-            expansion,
-            *self.beam[1:2],
+            **expanded,
+            geometry=tables["geometry"],
+            geometry_pitch=sector.nodes[-1].place.size + VECTOR_ROOM,
+            centres=self.centres,
+            column_step=steps_m[0],
+            row_step=steps_m[1],
+            samples_per_m=samples_per_m,
+            drift=[self.geometry.drift @ step * samples_per_m for step in steps_m],
+            **self.beam.origin,
             wait_for=tables.filled,
         )
         (height, width), corners = chosen.sides[0], sector.roots[batch]
         direct = self.shared is not None and bool(np.all(corners + (height, width) <= plane.shape))
         if direct:
-            pixels, columns, sums = self.shared, plane.shape[1], []
+            pixels, columns, sums = self.shared, plane.shape[1], {}
         else:
             corners = np.arange(len(parts))[:, None] * [height, 0]
             pixels, columns = slot.buffer("pixels", 8 * len(parts) * height * width), width
-            sums = self._sums(tables, len(parts) * height * width)
+            sums = self._weight_sums(tables, len(parts) * height * width)
         event = device.run(
             self.backproject,
             (chosen.tile[0] * chosen.tile[1] // (self.width * STACK), tiles),
-            samples,
-            level.pitch,
-            *references,
-            expansion,
-            pitch,
-            tables["ranges"],
-            first_tile,
-            self.per_sample,
-            self.weights,
-            pixels,
-            columns,
-            device.upload(corners.astype(np.int32)),
-            height // chosen.tile[0],
-            width // chosen.tile[1],
-            0,
-            *self.beam,
-            *sums,
+            lines=samples,
+            **expanded,
+            **references,
+            **self.arguments,
+            **sums,
+            pixels=pixels,
+            columns=columns,
+            corners=device.upload(corners.astype(np.int32)),
+            tiles_down=height // chosen.tile[0],
+            tiles_across=width // chosen.tile[1],
+            first_tile=0,
             wait_for=slot.filled,
         )
         ready, weights = [event], []
@@ -279,7 +278,10 @@ class PlaneLeaves(Leaves):
         if sums:
             weights = [np.empty(self.image[part].shape, np.complex64) for part in parts]
             everything = (slice(None), slice(None))
-            ready += [self._read(sums[0], n, each, everything) for n, each in enumerate(weights)]
+            ready += [
+                self._read(sums["weight_sums"], n, each, everything)
+                for n, each in enumerate(weights)
+            ]
         slot.busy = ready[-1]
         device.queue.flush()
 
@@ -382,7 +384,7 @@ class SurfaceLeaves(Leaves):
         self.ends = np.searchsorted(self.leaf, np.arange(len(roots) + 1) * corners.shape[1])
         self.pixels_before = np.concatenate([[0], np.cumsum(held)])
         options = self._options(self.groups)
-        self.backproject = device.kernel("backproject", "backproject_points", **options)
+        self.backproject = device.kernel("backproject_points", **options)
 
     def _cells(self, corners: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Return of every cell, [rows, columns], which leaf holds it and where there it lies.
@@ -430,32 +432,29 @@ class SurfaceLeaves(Leaves):
         formed = [np.empty((count, size), np.complex64) for _ in range(1 + self.normalise)]
         ready = []
         if count:
-            buffers = [self.slot.buffer("pixels", 8 * count * size)]
-            buffers += self._sums(tables, count * size)
+            pixels = self.slot.buffer("pixels", 8 * count * size)
+            sums = self._weight_sums(tables, count * size)
             self.device.run(
                 self.backproject,
                 (count,),
-                samples,
-                self.level.pitch,
-                self.level.centre,
-                np.append(self.geometry.drift, 0).astype(np.float32),
-                tables["geometry"],
-                sector.nodes[-1].place.size + VECTOR_ROOM,
-                0,
-                tables["ranges"],
-                groups.start - first,
-                self.per_sample,
-                self.weights,
-                buffers[0],
-                0,
-                tables["centres"],
-                tables["offsets"],
-                size * (self._groups(self._roots(sector)).stop - first),
-                self.geometry.samples_per_m,
-                *self.beam,
-                *buffers[1:],
+                lines=samples,
+                ranges=tables["ranges"],
+                first_range=groups.start - first,
+                centre_sample=self.level.centre,
+                drift=self.geometry.drift,
+                geometry=tables["geometry"],
+                geometry_pitch=sector.nodes[-1].place.size + VECTOR_ROOM,
+                centres=tables["centres"],
+                offsets=tables["offsets"],
+                points=size * (self._groups(self._roots(sector)).stop - first),
+                samples_per_m=self.geometry.samples_per_m,
+                **self.arguments,
+                **sums,
+                pixels=pixels,
+                first_group=0,
                 wait_for=tables.filled,
             )
+            buffers = [pixels, *([sums["weight_sums"]] if sums else [])]
             ready = [
                 cl.enqueue_copy(self.device.queue, each, buffer, is_blocking=False)
                 for each, buffer in zip(formed, buffers, strict=False)
@@ -482,7 +481,7 @@ class SurfaceLeaves(Leaves):
         return int(self.pixels_before[roots.stop] - self.pixels_before[roots.start])
 
 
-def _shares(sector: Sector) -> NDArray[np.float32]:
+def _represented(sector: Sector) -> NDArray[np.float32]:
     """Return how many raw channels each of the last stage's virtual ones stands for, [roots, n].
 
     Their weights by the beam, a smooth function along the track, are interpolated by cubics: the

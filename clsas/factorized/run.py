@@ -23,12 +23,15 @@ from clsas.factorized.leaves import Finish, Level, PlaneLeaves, SurfaceLeaves
 from clsas.factorized.plan import CHUNK, Plan
 from clsas.factorized.sector import Geometry, Sector
 from clsas.factorized.surface import surface_of
+from clsas.opencl import phases
 from clsas.opencl.buffers import (
     GUARD,
     MARGIN,
     VECTOR_ROOM,
     channel_pitch,
+    filter_table,
     padded_length,
+    phase_polynomials,
     sample_bytes,
     upsampled_lines,
 )
@@ -135,15 +138,16 @@ class _Run:
             for half in chosen.half_lengths
         ]
         self.filters = {
-            name: device.upload(getattr(chosen, name).coefficients.astype(np.float32))
-            for name in ("align", "aperture")
+            "range_filter": filter_table(device, chosen.align.coefficients),
+            "aperture_filter": filter_table(device, chosen.aperture.coefficients),
+            "phase_polynomials": phase_polynomials(device, phases.PRECISE_TERMS),
         }
         options = {"WIDTH": self.width, "TAPS": chosen.align.taps}
         options |= {"APERTURE_TAPS": chosen.aperture.taps, "HALF": int(self.half_precision)}
-        options["CHUNK"] = CHUNK
+        options |= {"CHUNK": CHUNK, "PHASE_TERMS": phases.PRECISE_TERMS}
         ramp = int(self.geometry.ramps)
-        self.first_stage = device.kernel("stage", "stage", GIVEN=1, RAMP=ramp, **options)
-        self.later_stage = device.kernel("stage", "stage", GIVEN=0, RAMP=0, **options)
+        self.first_stage = device.kernel("stage", SHIFTS_GIVEN=1, RAMP=ramp, **options)
+        self.later_stage = device.kernel("stage", SHIFTS_GIVEN=0, RAMP=0, **options)
         kind = PlaneLeaves if self.geometry.surface.is_plane else SurfaceLeaves
         self.leaves = kind(
             lines, self.geometry, self.levels[-1], device, pixels, self.half_precision, self.gain
@@ -263,21 +267,21 @@ class _Run:
         if level == 0:
             kernel, parent, parent_pitch = self.first_stage, self.samples, self.pitch
             names = ("order", "start", "nu", "cycles", *(["ramp"] if self.geometry.ramps else []))
-            geometry = [table[name] for name in names]
+            shifts = {name: table[name] for name in names}
         else:
             kernel, before = self.later_stage, self.levels[level - 1]
             parent, parent_pitch = self.slot[f"lines{level - 1}"], before.pitch
-            geometry = [
-                self.parents[level],
-                self.division.per_root(level - 1),
-                tables.strides[level - 1],
-                table[f"positions{level}"],
-                table[f"offsets{level}"],
-                np.append(self.geometry.drift, 0).astype(np.float32),
-                self.geometry.samples_per_m,
-                self.geometry.cycles_per_m,
-                before.centre,
-            ]
+            shifts = {
+                "parents": self.parents[level],
+                "parents_per_root": self.division.per_root(level - 1),
+                "lines_per_parent": tables.strides[level - 1],
+                "positions": table[f"positions{level}"],
+                "offsets": table[f"offsets{level}"],
+                "drift": self.geometry.drift,
+                "samples_per_m": self.geometry.samples_per_m,
+                "cycles_per_m": self.geometry.cycles_per_m,
+                "parent_centre": before.centre,
+            }
         items = _GROUP if self.width == 1 else 1
         # Few children are divided, so that there is work for all.
         step = _GROUP if self.width == 1 else 8 * self.width
@@ -286,27 +290,26 @@ class _Run:
         device.run(
             kernel,
             (children * items, -(-shape.length // part_length)),
-            parent,
-            parent_pitch,
-            table[f"children{level}"],
-            batch.start * per_root,
-            per_root,
-            table[f"base{level}"],
-            table[f"between{level}"],
-            tables.pitches[level],
-            *geometry,
-            shape.half,
-            self.filters["align"],
-            self.filters["aperture"],
-            self.slot.zeros(
+            parent_lines=parent,
+            parent_pitch=parent_pitch,
+            children=table[f"children{level}"],
+            first_child=batch.start * per_root,
+            children_per_root=per_root,
+            first_virtual=table[f"base{level}"],
+            tap_position=table[f"between{level}"],
+            channel_pitch=tables.pitches[level],
+            **shifts,
+            half_length=shape.half,
+            **self.filters,
+            child_lines=self.slot.zeros(
                 f"lines{level}",
                 sample_bytes(self.half_precision) * children * lines_each * shape.pitch,
             ),
-            stride,
-            shape.pitch,
-            shape.length,
-            part_length,
-            GUARD,
+            lines_per_child=stride,
+            child_pitch=shape.pitch,
+            length=shape.length,
+            part_length=part_length,
+            guard=GUARD,
             wait_for=table.filled,
             local=(items, 1),
         )

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 
 import numpy as np
+import pyopencl as cl
 from numpy.typing import NDArray
 
 from clsas.core.lines import RangeLines, wavelength_m
 from clsas.core.threads import in_threads
 from clsas.opencl import phases
 from clsas.opencl.device import Device, aligned
+from clsas.opencl.kernels import Kernel
 from clsas.signal.interpolation import (
     Gain,
     Resampling,
@@ -30,17 +33,44 @@ GUARD = 16
 """Zeros on either side of a virtual channel's line, which the last stage's lookup may touch."""
 
 
-def beam_arguments(
-    device: Device, beam: BeamWindow | None, lines: RangeLines
-) -> tuple[float, tuple[object, ...]]:
-    """Return table intervals per sine, and what kernels with BEAM take at their ends."""
+@dataclass(frozen=True, eq=False)
+class BeamTable:
+    """A beam's weights on a device, tabulated over the sine of the aspect angle.
+
+    Attributes
+    ----------
+    per_sine : float
+        Intervals of the table per sine. Kernels take track directions times this.
+    arguments : dict of str to Buffer or float
+        What the kernels take, by name (`cl/beam.h`).
+    """
+
+    per_sine: float
+    arguments: dict[str, object]
+
+    @property
+    def origin(self) -> dict[str, object]:
+        """What `expand_tiles` takes of them."""
+        name = "beam_origin"
+        return {name: self.arguments[name]} if self.arguments else {}
+
+
+def beam_table(device: Device, beam: BeamWindow | None, lines: RangeLines) -> BeamTable:
+    """Upload a beam's weights; without a beam, kernels take no arguments for it."""
     if beam is None:
-        return 0.0, ()
+        return BeamTable(0.0, {})
     low, high = (float(limit) for limit in beam.limits)
     lowest, highest = max(low, -1.0), min(high, 1.0)
     per_sine = INTERVALS / (highest - lowest)
-    places = (lowest * per_sine, (low - lowest) * per_sine, (high - lowest) * per_sine)
-    return per_sine, (device.upload(beam.table(wavelength_m(lines))), *places)
+    return BeamTable(
+        per_sine,
+        {
+            "beam_table": device.upload(beam.table(wavelength_m(lines))),
+            "beam_origin": lowest * per_sine,
+            "beam_low": (low - lowest) * per_sine,
+            "beam_high": (high - lowest) * per_sine,
+        },
+    )
 
 
 def upsampled_lines(
@@ -81,15 +111,25 @@ def float_pairs(positions_m: NDArray[np.float64]) -> NDArray[np.float32]:
     return np.concatenate([nearest, (positions_m - nearest).astype(np.float32)], axis=1)
 
 
-def lookup_weights(coefficients: NDArray[np.float64], terms: int) -> NDArray[np.float32]:
-    """Return what the kernels take as weights: an interpolator's, and polynomials for phases."""
-    polynomials = phases.polynomials(terms).ravel()
-    return np.concatenate([coefficients.ravel().astype(np.float32), polynomials])
+def filter_table(device: Device, coefficients: NDArray[np.floating]) -> cl.Buffer:
+    """Upload the coefficients of an interpolation filter as kernels take them."""
+    return device.upload(coefficients.astype(np.float32))
+
+
+def phase_polynomials(device: Device, terms: int) -> cl.Buffer:
+    """Upload the polynomials for sine and cosine of phases."""
+    return device.upload(phases.polynomials(terms))
 
 
 def expansion_terms(beam: BeamWindow | None) -> int:
     """Return how many numbers `expand_tiles` finds per tile and channel."""
     return 9 if beam is None else 19
+
+
+def expansion_kernel(device: Device, beam: BeamWindow | None, **paths: int) -> Kernel:
+    """Return `expand_tiles`; `paths` are its options BISTATIC and MOVING."""
+    intervals = 0 if beam is None else INTERVALS
+    return device.kernel("expand_tiles", WIDTH=device.info.width, BEAM=intervals, **paths)
 
 
 def channel_pitch(channels: int) -> int:

@@ -13,7 +13,6 @@ import warnings
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +22,7 @@ from numpy.typing import DTypeLike
 
 from clsas.core import reprs
 from clsas.core.extras import install_command
+from clsas.opencl.kernels import Kernel, kernel_parameters, kernel_source, whole_source
 
 ENVIRONMENT_VARIABLE = "CLSAS_DEVICE"
 KINDS = ("gpu", "cpu", "accelerator")
@@ -30,10 +30,9 @@ KINDS = ("gpu", "cpu", "accelerator")
 _PLATFORMS = {"pocl": "portable computing language"}
 """Names of platforms that people use and that are no part of the full one, in lower case."""
 _ALIGNMENT = 4096  # bytes: of pages
-# Programs that a device keeps built: 0.6 MiB each with PoCL, 4 MiB with Intel's runtime. An image
-# takes 1 to 4 of them.
-_MOST_PROGRAMS = 32
-_TYPED = "_clsas_typed"  # attribute of kernels whose arguments' types are known
+# Kernels that a device keeps built: up to 0.6 MiB each with PoCL, 4 MiB with Intel's runtime. An
+# image takes 1 to 5 of them.
+_MOST_KERNELS = 32
 
 _HOW_TO_GET_A_DEVICE = """\
 No OpenCL device was found. Any one of these gives one:
@@ -114,20 +113,6 @@ class KernelTimes:
 
 
 @dataclass(eq=False)
-class _Program:
-    """A built program and those of its kernels that were asked for."""
-
-    program: cl.Program
-    kernels: dict[str, cl.Kernel] = field(default_factory=dict)
-
-    def kernel(self, name: str) -> cl.Kernel:
-        # Not Program.all_kernels: PyOpenCL never releases what that returns.
-        if name not in self.kernels:
-            self.kernels[name] = cl.Kernel(self.program, name)
-        return self.kernels[name]
-
-
-@dataclass(eq=False)
 class Device:
     """An opened device: its context, its queues and the kernels built so far.
 
@@ -139,8 +124,8 @@ class Device:
     context: cl.Context
     queue: cl.CommandQueue
     uploads: cl.CommandQueue
-    # By source and options; the program used last is the last one.
-    _kernels: dict[tuple, _Program] = field(default_factory=dict, repr=False)
+    # By name and options; the kernel used last is the last one.
+    _kernels: dict[tuple, Kernel] = field(default_factory=dict, repr=False)
     _events: list[tuple[str, cl.Event]] | None = field(default=None, repr=False)
 
     def __repr__(self) -> str:
@@ -154,18 +139,16 @@ class Device:
     # A kernel holds its arguments from when they are set until it is enqueued.
     _lock: threading.RLock = field(default_factory=threading.RLock, repr=False)
 
-    def kernel(self, source: str, name: str, **options: int) -> cl.Kernel:
-        """Return kernel `name` of `cl/<source>.cl`, built once per set of options.
+    def kernel(self, name: str, **options: int) -> Kernel:
+        """Return the kernel of `cl/<name>.cl`, built once per set of options.
 
-        The device keeps the 32 programs that were used last. A program used again after that is
+        The device keeps the 32 kernels that were used last. A kernel used again after that is
         built again, which is a lookup in the driver's cache on disk.
 
         Parameters
         ----------
-        source : str
-            File name in `cl/` without its ending; `common.h` is put before it.
         name : str
-            Kernel in that file.
+            The kernel, which has a file of its own.
         **options : int
             Preprocessor definitions.
 
@@ -174,51 +157,70 @@ class Device:
         DeviceError
             If the driver's compiler refuses it; the message holds the compiler's log.
         """
-        key = (source, *sorted(options.items()))
+        key = (name, *sorted(options.items()))
         with self._lock:
-            program = self._kernels.pop(key, None) or self._build(source, options)
-            self._kernels[key] = program
-            while len(self._kernels) > _MOST_PROGRAMS:
+            kernel = self._kernels.pop(key, None) or self._build(name, options)
+            self._kernels[key] = kernel
+            while len(self._kernels) > _MOST_KERNELS:
                 # Runs hold the kernels they use, and the driver those it was given.
                 del self._kernels[next(iter(self._kernels))]
-            return program.kernel(name)
+            return kernel
 
-    def _build(self, source: str, options: dict[str, int]) -> _Program:
+    def _build(self, name: str, options: dict[str, int]) -> Kernel:
         definitions = [f"-D{option}={value}" for option, value in sorted(options.items())]
-        text = kernel_source("common.h") + kernel_source(f"{source}.cl")
+        text = whole_source(f"{name}.cl")
+        parameters = kernel_parameters(text, name, options)
         try:
-            return _Program(_built(self.context, text, ["-cl-mad-enable", *definitions]))
+            program = _built(self.context, text, ["-cl-mad-enable", *definitions])
         except cl.RuntimeError as error:
             raise DeviceError(
-                f"{self.info.label} could not build {source}.cl with "
+                f"{self.info.label} could not build {name}.cl with "
                 f"{' '.join(definitions)}:\n{error}"
             ) from error
+        # Not Program.all_kernels: PyOpenCL never releases what that returns.
+        return Kernel(name, parameters, cl.Kernel(program, name))
 
     def run(
         self,
-        kernel: cl.Kernel,
+        kernel: Kernel,
         size: tuple[int, ...],
-        *arguments: Any,
+        /,
+        *,
         wait_for: Sequence[cl.Event] = (),
         local: tuple[int, ...] | None = None,
+        **arguments: Any,
     ) -> cl.Event:
-        """Enqueue a kernel over `size` work-items; ints and floats become 32-bit.
-
-        An argument is a number of the same kind, or not one, whenever a kernel is run.
+        """Enqueue a kernel over `size` work-items, with an argument for each of its parameters.
 
         Unless `local` says otherwise, work-items that hold vectors are work-groups of their own
         (PoCL compiles a kernel anew for every local size), and else the driver chooses.
+
+        Parameters
+        ----------
+        kernel : Kernel
+            From `Device.kernel`.
+        size : tuple of int
+            Work-items along each axis.
+        wait_for : sequence of Event, optional
+            What the kernel starts after, beside what is on the queue.
+        local : tuple of int, optional
+            Work-items of a work-group along each axis.
+        **arguments : Buffer, int, float or array
+            By the names of the kernel's parameters: a buffer for every pointer; numbers, converted
+            to 32 bits; for `float2` to `float4` as many numbers.
+
+        Raises
+        ------
+        TypeError
+            If an argument is missing, unknown, or does not fit its parameter.
         """
         if local is None and self.info.width > 1:
             local = (1,) * len(size)
+        ordered = kernel.ordered(arguments)
         with self._lock:
-            if not hasattr(kernel, _TYPED):
-                # Numbers of known types are handed over ten times as fast.
-                kernel.set_scalar_arg_dtypes([_scalar_type(each) for each in arguments])
-                setattr(kernel, _TYPED, True)
-            event = kernel(self.queue, size, local, *arguments, wait_for=wait_for)
+            event = kernel.compiled(self.queue, size, local, *ordered, wait_for=wait_for)
             if self._events is not None:
-                self._events.append((kernel.function_name, event))
+                self._events.append((kernel.name, event))
         return event
 
     @contextlib.contextmanager
@@ -339,20 +341,6 @@ def aligned(make: Callable[..., np.ndarray], shape: tuple[int, ...], kind: DType
     return memory[start : start + count].view(kind).reshape(shape)
 
 
-def _scalar_type(value: object) -> type | None:
-    if isinstance(value, (int, np.integer)):
-        return np.int32
-    return np.float32 if isinstance(value, (float, np.floating)) else None
-
-
-def kernel_source(name: str) -> str:
-    """Return the text of a file of `cl/`."""
-    installed = files("clsas") / "cl" / name
-    if installed.is_file():
-        return installed.read_text()
-    return (Path(__file__).parents[2] / "cl" / name).read_text()  # a source checkout
-
-
 def _built(context: cl.Context, text: str, options: Sequence[str] = ()) -> cl.Program:
     """Return a built program."""
     with warnings.catch_warnings():
@@ -389,7 +377,7 @@ def _compiled_vectors(device: cl.Device) -> tuple[int, bool]:
     """Return the floats of a vector as a CPU's compiler has them, and whether it permutes them."""
     try:
         context = cl.Context([device])
-        kernel = cl.Kernel(_built(context, kernel_source("lanes.cl")), "lanes")
+        kernel = cl.Kernel(_built(context, kernel_source("vector_size.cl")), "vector_size")
         size = kernel.get_work_group_info(cl.kernel_work_group_info.COMPILE_WORK_GROUP_SIZE, device)
     except cl.Error:  # whatever is wrong is told where there is work to do
         return 4, False

@@ -9,6 +9,9 @@ from numpy.typing import NDArray
 
 TERMS = (4, 5, 6)
 """Of a polynomial: relative rms errors of -61, -92 and -126 dB."""
+PRECISE_TERMS = 7
+"""Of a polynomial that errs by no more than single precision, for phases on which images depend
+more than once: those of upsampling and of stages."""
 
 _SHARE = 0.03  # of an image's error, as power
 _PHASES = (np.arange(2000) + 0.5) / 2000 - 0.5  # cycles

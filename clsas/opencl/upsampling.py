@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pyopencl as cl
 from numpy.typing import NDArray
 
-from clsas.opencl.buffers import GIVEN_BYTES, MARGIN, sample_bytes
+from clsas.opencl import phases
+from clsas.opencl.buffers import GIVEN_BYTES, MARGIN, phase_polynomials, sample_bytes
 from clsas.opencl.device import Device
 from clsas.signal.interpolation import PHASES, Resampling, Upsampler
 
@@ -31,40 +34,44 @@ def upsample(
     `half_precision` held so.
     """
     width, taps, step = device.info.width, upsampler.taps, upsampler.step
+    shifted = resampling.shift != 0
     kernel = device.kernel(
-        "upsample",
         "upsample_lines",
         WIDTH=width,
         TAPS=taps,
         PHASES=PHASES,
         PERMUTE=int(device.info.permute),
-        TURN=int(resampling.shift != 0),
+        FREQUENCY_SHIFT=int(shifted),
         HALF=int(half_precision),
+        PHASE_TERMS=phases.PRECISE_TERMS,
     )
     phase = (resampling.first + np.arange(PHASES)) * step % PHASES
     coefficients = upsampler.coefficients[phase].reshape(-1, width, taps).swapaxes(1, 2)
     filters = device.upload((gain * coefficients).astype(np.float32))
-    turn = int(np.int32(np.uint32(round(resampling.centre_cycles_per_sample * 2**32) % 2**32)))
+    shift: dict[str, Any] = {}
+    if shifted:
+        cycles = round(resampling.centre_cycles_per_sample * 2**32) % 2**32
+        shift["frequency"] = np.uint32(cycles).astype(np.int32)
+        shift["phase_polynomials"] = phase_polynomials(device, phases.PRECISE_TERMS)
     channels, count = samples.shape
     lines = device.buffer(sample_bytes(half_precision) * channels * pitch)
     at_once = max(GIVEN_BYTES // (8 * count), 1)
     for start in range(0, channels, at_once):
         some = samples[start : start + at_once]
-        given = device.share(some)
         event = device.run(
             kernel,
             (1 if width > 1 else _GROUP, len(some)),
-            given,
-            count,
-            filters,
-            resampling.first,
-            step,
-            turn,
-            lines,
-            start,
-            pitch,
-            MARGIN,
-            resampling.length,
+            samples=device.share(some),
+            count=count,
+            filters=filters,
+            first=resampling.first,
+            step=step,
+            **shift,
+            lines=lines,
+            first_line=start,
+            pitch=pitch,
+            margin=MARGIN,
+            length=resampling.length,
         )
         if start + at_once < channels:
             event.wait()

@@ -322,7 +322,7 @@ def _statistics(seconds: list[float]) -> dict[str, float]:
 
 
 def flops_per_pair(taps: int, phase_terms: int) -> int:
-    """Return the floating-point operations of cl/backproject.cl per pixel and channel.
+    """Return the floating-point operations of cl/backproject_tiles.cl per pixel and channel.
 
     The source has 13 operations for the position, 7 + 4 (phase_terms - 1) for sine and cosine, and
     8 to apply the phase and add. Each pair of taps has 4 (taps/2 - 1) + 4 for the weights and 8 to
@@ -336,9 +336,9 @@ def peak_flops(device: Device) -> float:
     """Return a device's rate of independent multiply-adds, flop/s (cl/peak.cl)."""
     width = device.info.width
     items, steps = 1 << 14, 1 << 12
-    kernel = device.kernel("peak", "peak", WIDTH=width)
+    kernel = device.kernel("peak", WIDTH=width)
     result = device.buffer(4 * items)
     with device.profile() as times:
         for _ in range(6):
-            device.run(kernel, (items,), steps, 0.5, result)
+            device.run(kernel, (items,), steps=steps, factor=0.5, result=result)
     return items * steps * 16 * width * 2 / times["peak"].minimum_s

@@ -2,24 +2,22 @@ import dataclasses
 import re
 import time
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 
 import numpy as np
 import pyopencl as cl
 import pytest
 
 from clsas.opencl import device as module
+from clsas.opencl import kernels
 from clsas.opencl.device import (
     ENVIRONMENT_VARIABLE,
     DeviceError,
     choose,
-    kernel_source,
     list_devices,
     open_device,
 )
+from clsas.opencl.kernels import Kernel
 
-FOLDERS = (Path(module.__file__).parents[1] / "cl", Path(module.__file__).parents[2] / "cl")
-SOURCES = sorted(path.name for folder in FOLDERS for path in folder.glob("*.*"))
 OPTIONS = {
     "WIDTH": 1,
     "TAPS": 4,
@@ -158,7 +156,7 @@ def test_threads_do_not_set_each_others_arguments(platform):
     entered, most = 0, 0
 
     class Slow:
-        function_name = "slow"
+        num_args = 1
 
         def set_scalar_arg_dtypes(self, kinds):
             pass
@@ -170,9 +168,9 @@ def test_threads_do_not_set_each_others_arguments(platform):
             time.sleep(0.01)
             entered -= 1
 
-    slow = Slow()
+    slow = Kernel("slow", {"n": "int"}, Slow())
     with ThreadPoolExecutor(4) as threads:
-        for done in [threads.submit(platform.run, slow, (1,), n) for n in range(8)]:
+        for done in [threads.submit(platform.run, slow, (1,), n=n) for n in range(8)]:
             done.result()
     assert most == 1
 
@@ -248,110 +246,66 @@ def test_opened_once():
 
 @pytest.mark.slow
 def test_kernels_are_built_once(platform):
-    kernel = platform.kernel("backproject", "backproject_tiles", **OPTIONS)
-    assert platform.kernel("backproject", "backproject_tiles", **OPTIONS) is kernel
+    kernel = platform.kernel("backproject_tiles", **OPTIONS)
+    assert platform.kernel("backproject_tiles", **OPTIONS) is kernel
     reordered = dict(reversed(OPTIONS.items()))
-    assert platform.kernel("backproject", "backproject_tiles", **reordered) is kernel
-    other = platform.kernel("backproject", "backproject_tiles", **(OPTIONS | {"TAPS": 2}))
+    assert platform.kernel("backproject_tiles", **reordered) is kernel
+    other = platform.kernel("backproject_tiles", **(OPTIONS | {"TAPS": 2}))
     assert other is not kernel
 
 
-def test_a_program_is_built_once_for_all_its_kernels(platform, monkeypatch):
+def test_nothing_is_built_for_a_kernel_that_is_there(platform, monkeypatch):
     options = OPTIONS | {"TAPS": 6}
-    platform.kernel("backproject", "backproject_tiles", **options)
+    names = ("backproject_tiles", "expand_tiles", "backproject_points")
+    built = [platform.kernel(name, **options) for name in names]
     monkeypatch.setattr(cl, "Program", None)  # nothing more may be built
-    assert platform.kernel("backproject", "expand_tiles", **options)
-    assert platform.kernel("backproject", "backproject_points", **options)
+    assert [platform.kernel(name, **options) for name in names] == built
 
 
 @pytest.mark.slow
-def test_only_the_programs_used_last_are_kept(platform, monkeypatch):
-    monkeypatch.setattr(module, "_MOST_PROGRAMS", 3)
+def test_only_the_kernels_used_last_are_kept(platform, monkeypatch):
+    monkeypatch.setattr(module, "_MOST_KERNELS", 3)
     device = dataclasses.replace(platform, _kernels={})
-    first = device.kernel("peak", "peak", WIDTH=1)
+    first = device.kernel("peak", WIDTH=1)
     for unused in range(5):
-        assert device.kernel("peak", "peak", WIDTH=1) is first  # used again and again
-        device.kernel("peak", "peak", WIDTH=1, UNUSED=unused)
+        assert device.kernel("peak", WIDTH=1) is first  # used again and again
+        device.kernel("peak", WIDTH=1, UNUSED=unused)
     assert len(device._kernels) == 3
     for unused in range(3):
-        device.kernel("peak", "peak", WIDTH=1, UNUSED=unused)
+        device.kernel("peak", WIDTH=1, UNUSED=unused)
     assert len(device._kernels) == 3
-    again = device.kernel("peak", "peak", WIDTH=1)
+    again = device.kernel("peak", WIDTH=1)
     assert again is not first
-    assert first.function_name == again.function_name  # what a run holds goes on living
+    assert first.compiled.function_name == again.name  # what a run holds goes on living
 
 
 def test_kernels_are_released_with_the_last_that_holds_them(platform):
     """Those of Program.all_kernels have a reference too many, and never are."""
-    kernel = platform.kernel("backproject", "backproject_tiles", **OPTIONS)
-    assert kernel.reference_count == 1
+    kernel = platform.kernel("backproject_tiles", **OPTIONS)
+    assert kernel.compiled.reference_count == 1
 
 
 def test_a_failed_build_shows_the_compilers_log(platform, monkeypatch):
     broken = "__kernel void broken(__global float *x) { x[0] = no_such_variable; }"
-    monkeypatch.setattr(module, "kernel_source", lambda name: broken * name.endswith(".cl"))
+    monkeypatch.setattr(kernels, "kernel_source", lambda name: broken)
     with pytest.raises(DeviceError) as error:
-        platform.kernel("some_file", "broken", WIDTH=1)
+        platform.kernel("broken", WIDTH=1)
     message = str(error.value)
     assert "no_such_variable" in message
-    assert "some_file.cl" in message
+    assert "broken.cl" in message
     assert "-DWIDTH=1" in message
     assert platform.info.label in message
 
 
-@pytest.mark.filterwarnings("ignore::pyopencl.CompilerWarning")
-def test_the_vector_widths_give_their_values(device):
-    """Uploads, a build and a run: the smallest job, through the header all kernels share."""
-    width = device.info.width
-    source = (
-        kernel_source("common.h")
-        + """
-        __kernel void turn(__global const float *t, __global float *sine, __global float *cosine)
-        {
-            const int i = get_global_id(0) * WIDTH;
-            vfloat s, c;
-            sincos_cycles(LOAD(t + i), &s, &c);
-            STORE(s, sine + i);
-            STORE(c, cosine + i);
-        }"""
-    )
-    program = cl.Program(device.context, source).build([f"-DWIDTH={width}"])
-    rng = np.random.default_rng(1)
-    t = np.concatenate([rng.uniform(-0.5, 0.5, 3000), rng.uniform(-3e3, 3e3, 1000), np.zeros(96)])
-    t = t.astype(np.float32)
-    t[-9:] = np.arange(-4, 5) / 4
-    sine, cosine = np.empty_like(t), np.empty_like(t)
-    buffers = [device.upload(t), device.buffer(t.nbytes), device.buffer(t.nbytes)]
-    device.run(cl.Kernel(program, "turn"), (len(t) // width,), *buffers)
-    cl.enqueue_copy(device.queue, sine, buffers[1])
-    cl.enqueue_copy(device.queue, cosine, buffers[2])
-    angle = 2 * np.pi * t.astype(np.float64)
-    assert np.abs(sine - np.sin(angle)).max() <= 2e-6
-    assert np.abs(cosine - np.cos(angle)).max() <= 2e-6
-
-
 def test_a_profile_counts_and_times_what_runs_within(platform):
-    kernel = platform.kernel("peak", "peak", WIDTH=platform.info.width)
+    kernel = platform.kernel("peak", WIDTH=platform.info.width)
     result = platform.buffer(4 * 64)
-    platform.run(kernel, (64,), 1, 0.5, result)
+    platform.run(kernel, (64,), steps=1, factor=0.5, result=result)
     with platform.profile() as times:
         for steps in (1, 10000, 10000):
-            platform.run(kernel, (64,), steps, 0.5, result)
+            platform.run(kernel, (64,), steps=steps, factor=0.5, result=result)
     peak = times.pop("peak")
     assert peak.count == 3
     assert 0 < peak.minimum_s < peak.median_s <= peak.maximum_s
     assert peak.total_s == pytest.approx(peak.minimum_s + peak.median_s + peak.maximum_s)
     assert not times
-
-
-def test_the_sources_are_found():
-    assert {"common.h", "backproject.cl"} <= set(SOURCES)
-
-
-@pytest.mark.parametrize("name", SOURCES)
-def test_no_kernel_needs_double_precision(name):
-    code = re.sub(r"/\*.*?\*/|//[^\n]*", "", kernel_source(name), flags=re.DOTALL)
-    assert "__kernel" in code or "vfloat" in code
-    assert not re.search(r"\b(double\d*|cl_khr_fp64|as_double\d*|convert_double\d*)\b", code)
-    # A literal without its f is a double.
-    assert not re.findall(r"(?<![\w.])(?:\d+\.\d*|\.\d+|\d+[eE])(?:[eE]?[+-]?\d+)?(?![\w.])", code)

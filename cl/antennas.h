@@ -1,0 +1,62 @@
+/* Where antennas are, seen from the centres of tiles or groups of points.
+ *
+ * Positions are float32 differences from an origin near them, and the host splits each into the nearest float32 number
+ * and its remainder: so a short distance between two far points stays exact.
+ *
+ * Build options
+ *   BISTATIC  1: receivers have positions of their own; 0: they are the transmitters.
+ *   MOVING    1: receivers move during the echo's flight.
+ *   BEAM      not 0: the track's direction is needed (beam.h).
+ * A kernel defines CHANNEL_VALUES(p) before it includes this file: the lanes' values of the channels from pointer p on.
+ *
+ * geometry: float [rows][geometry_pitch], a column per channel. The rows: transmitter x y z, then their remainders (m,
+ * from the origin); with BISTATIC the receiver's likewise; with MOVING the receiver's velocity x y z over the sound
+ * speed; with BEAM the track's direction x y z, times intervals of the beam's table.
+ * centres: float [parts][6], x y z of tiles or groups and their remainders (m, from the origin).
+ */
+
+#include "geometry.h"
+
+#define TRANSMITTER 0
+#define RECEIVER 6
+#define VELOCITY 12
+#if MOVING
+#define ALONG 15
+#elif BISTATIC
+#define ALONG 12
+#else
+#define ALONG 6
+#endif
+
+/* Three rows of the geometry. */
+INLINE Vector channel_vector(__global const float *geometry, int geometry_pitch, int row, int channel)
+{
+    __global const float *p = geometry + row * geometry_pitch + channel;
+    return (Vector){CHANNEL_VALUES(p), CHANNEL_VALUES(p + geometry_pitch), CHANNEL_VALUES(p + 2 * geometry_pitch)};
+}
+
+/* The vector from an antenna to a centre. */
+INLINE Vector to_centre(__global const float *geometry, int geometry_pitch, int row, int channel,
+                        __global const float *centre)
+{
+    const Vector antenna = channel_vector(geometry, geometry_pitch, row, channel);
+    const Vector remainder = channel_vector(geometry, geometry_pitch, row + 3, channel);
+    return (Vector){(centre[0] - antenna.x) + (centre[3] - remainder.x),
+                    (centre[1] - antenna.y) + (centre[4] - remainder.y),
+                    (centre[2] - antenna.z) + (centre[5] - remainder.z)};
+}
+
+/* Fixed-point passes that find where a moving receiver is when the echo arrives. Each pass gains a factor of the
+ * velocity over the sound speed: 0.003 for a sonar at 5 m/s; the host allows up to 0.05. */
+#define PASSES 4
+
+/* The vector from a moving receiver, at the time that the echo of a point arrives there, to that point: from the vectors
+ * from the transmitter and from the receiver at the time of transmission. */
+INLINE Vector from_receiver_at_arrival(Vector transmitter, Vector receiver, Vector velocity)
+{
+    const vfloat out = magnitude(transmitter);
+    Vector arrival = receiver;
+    for (int pass = 0; pass < PASSES; pass++)
+        arrival = sum_of(receiver, -(out + magnitude(arrival)), velocity);
+    return arrival;
+}

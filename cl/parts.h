@@ -1,0 +1,37 @@
+/* The parts of an image that have a centre of their own, tiles or groups of points, and what they need of the lines.
+ *
+ * No absolute range enters a kernel: the host refers every (part, channel) pair, in float64, to the part's centre, and
+ * kernels add the difference in range between a pixel and that centre.
+ *
+ * Build options
+ *   ALIGNED  1: the host's earlier stages have aligned every line on its part's centre, at the same sample and at phase
+ *            0; 0: sample and phase of the centre come per (part, channel).
+ *
+ * ranges: int [parts][3], the channels that a part receives from: the first one, the one after the last, and the line of
+ * the first one; the lines of the others follow. What is held per (part, channel) begins with the part's first channel,
+ * [parts][channel_pitch]. The parts at work begin at number first_range of `ranges`.
+ *
+ * reference_sample: int, the sample nearest to the centre's echo, counted from the line's first sample.
+ * reference_fraction: float, from there to the centre's echo, samples.
+ * reference_phase: float, of the centre's echo, cycles in [-0.5, 0.5).
+ * centre_sample: with ALIGNED, the sample of the centre in every line.
+ */
+
+#include "samples.h"
+
+typedef struct {
+    int begin, end;
+    __global const sample_t *lines;
+} Part;
+
+INLINE Part part_at(__global const int *ranges, int number, __global const sample_t *lines, int line_pitch)
+{
+    __global const int *range = ranges + 3 * number;
+    return (Part){range[0], range[1], LINE(lines, range[2], line_pitch)};
+}
+
+/* Where the centre's echo lies in one line, and its phase. */
+typedef struct {
+    int sample;
+    float fraction, phase;
+} Reference;

@@ -1,0 +1,101 @@
+/* The pixels of a work-item, and their sums over channels.
+ *
+ * The lanes of a vector form a block of BLOCK_COLUMNS x BLOCK_ROWS pixels. A work-item computes STACK blocks, one below
+ * the other.
+ *
+ * Build options
+ *   OVERWRITE  1: sums replace pixels; 0: they are added to them.
+ *   BEAM, NORMALISE  as in beam.h; with both, weights are summed beside the echoes.
+ */
+
+#include "lookup.h"
+#include "phases.h"
+
+/* LANE_COLUMNS and LANE_ROWS: positions of the lanes from their block's centre, pixels. */
+#if WIDTH == 16
+#define BLOCK_COLUMNS 4
+#define BLOCK_ROWS 4
+#define LANE_COLUMNS (vfloat)(-1.5f, -.5f, .5f, 1.5f, -1.5f, -.5f, .5f, 1.5f, -1.5f, -.5f, .5f, 1.5f, -1.5f, -.5f, .5f, 1.5f)
+#define LANE_ROWS (vfloat)(-1.5f, -1.5f, -1.5f, -1.5f, -.5f, -.5f, -.5f, -.5f, .5f, .5f, .5f, .5f, 1.5f, 1.5f, 1.5f, 1.5f)
+#elif WIDTH == 8
+#define BLOCK_COLUMNS 4
+#define BLOCK_ROWS 2
+#define LANE_COLUMNS (vfloat)(-1.5f, -.5f, .5f, 1.5f, -1.5f, -.5f, .5f, 1.5f)
+#define LANE_ROWS (vfloat)(-.5f, -.5f, -.5f, -.5f, .5f, .5f, .5f, .5f)
+#elif WIDTH == 4
+#define BLOCK_COLUMNS 2
+#define BLOCK_ROWS 2
+#define LANE_COLUMNS (vfloat)(-.5f, .5f, -.5f, .5f)
+#define LANE_ROWS (vfloat)(-.5f, -.5f, .5f, .5f)
+#else
+#define BLOCK_COLUMNS 1
+#define BLOCK_ROWS 1
+#define LANE_COLUMNS 0.0f
+#define LANE_ROWS 0.0f
+#endif
+#define STACK 4
+#define ITEM_ROWS (BLOCK_ROWS * STACK)
+
+/* A lane in a block's middle column, and one in its middle. */
+#define MIDDLE_COLUMN ((BLOCK_COLUMNS - 1) / 2)
+#define MIDDLE ((BLOCK_ROWS - 1) / 2 * BLOCK_COLUMNS + MIDDLE_COLUMN)
+
+/* Sums over channels, block by block. */
+typedef struct {
+    vfloat re[STACK], im[STACK];
+#if BEAM && NORMALISE
+    vfloat weight[STACK];
+#endif
+} Sums;
+
+INLINE void clear_sums(Sums *sums)
+{
+#pragma unroll
+    for (int block = 0; block < STACK; block++) {
+        sums->re[block] = sums->im[block] = 0.0f;
+#if BEAM && NORMALISE
+        sums->weight[block] = 0.0f;
+#endif
+    }
+}
+
+/* Adds the echoes of one channel to a block: its line at t + 0.5 samples from the lookup's reference sample, rotated by
+ * `cycles`. With BEAM they are weighted, and each weight counts for so many channels. */
+INLINE void add_echoes(Sums *sums, int block, const Lookup *lookup, vfloat t, __global const float *filter, vfloat cycles,
+                       __global const float *phase_polynomials, vfloat weight, float channels)
+{
+    vfloat re, im, sine, cosine;
+    interpolate(lookup, t, filter, &re, &im);
+    sine_and_cosine(cycles, phase_polynomials, &sine, &cosine);
+#if BEAM
+    sine *= weight;
+    cosine *= weight;
+#if NORMALISE
+    sums->weight[block] += channels * weight;
+#endif
+#endif
+    sums->re[block] += re * cosine - im * sine;
+    sums->im[block] += re * sine + im * cosine;
+}
+
+#if OVERWRITE
+#define PUT =
+#else
+#define PUT +=
+#endif
+
+/* Puts a work-item's blocks into the pixels from (row, column) on, of an image whose rows hold `columns`. */
+INLINE void put_blocks(const vfloat *re, const vfloat *im, __global float2 *pixels, int columns, int row, int column)
+{
+#pragma unroll
+    for (int block = 0; block < STACK; block++) {
+        __global float2 *corner = pixels + (size_t)(row + block * BLOCK_ROWS) * columns + column;
+#if WIDTH == 1
+        *corner PUT (float2)(re[block], im[block]);
+#else
+        for (int lane = 0; lane < WIDTH; lane++)
+            corner[(size_t)(lane / BLOCK_COLUMNS) * columns + lane % BLOCK_COLUMNS] PUT
+                (float2)(LANE(re[block], lane), LANE(im[block], lane));
+#endif
+    }
+}

@@ -1,0 +1,214 @@
+"""Kernels of `cl/`: their sources, and how they take their arguments by name."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyopencl as cl
+
+_INCLUDE = re.compile(r'#include "(?P<name>\w+\.h)"')
+_COMMENT = re.compile(r"/\*.*?\*/|//[^\n]*", re.DOTALL)
+_PARAMETER = re.compile(r"(?P<type>.*?)(?P<name>\w+)", re.DOTALL)
+_TERM = re.compile(r"(?P<negated>!?)(?P<option>[A-Za-z_]\w*)")
+_LEAST_INT, _LARGEST_INT = -(2**31), 2**31 - 1
+_SCALARS = {"int": np.int32, "float": np.float32}
+
+
+def kernel_source(name: str) -> str:
+    """Return the text of a file of `cl/`."""
+    installed = files("clsas") / "cl" / name
+    if installed.is_file():
+        return installed.read_text()
+    return (Path(__file__).parents[2] / "cl" / name).read_text()  # a source checkout
+
+
+def whole_source(name: str) -> str:
+    """Return the text of a file of `cl/` with the headers that it includes in place, each once.
+
+    Headers are put in here, not found by the driver, because some drivers cannot read paths with
+    spaces, or keep what they built from a header that has changed since. The compiler's messages
+    name the files nevertheless.
+    """
+    return "\n".join(_with_headers(name, set()))
+
+
+def _with_headers(name: str, included: set[str]) -> list[str]:
+    text = [f'#line 1 "{name}"']
+    for number, line in enumerate(kernel_source(name).splitlines(), start=1):
+        include = _INCLUDE.fullmatch(line.strip())
+        if include is None:
+            text.append(line)
+            continue
+        if include["name"] not in included:
+            included.add(include["name"])
+            text += _with_headers(include["name"], included)
+        text.append(f'#line {number + 1} "{name}"')
+    return text
+
+
+def kernel_parameters(text: str, name: str, options: Mapping[str, int]) -> dict[str, str]:
+    """Return the parameters of a kernel, in order: their types by their names.
+
+    They are read from the source because drivers' own answers cannot be relied on: Intel's has
+    none for a program from a cache, and PoCL renames parameters that are called like one of
+    OpenCL's functions. The list may hold `#if`, `#else` and `#endif`, with build options, `!` and
+    `&&` as conditions.
+
+    Parameters
+    ----------
+    text : str
+        Source of the program.
+    name : str
+        The kernel.
+    options : mapping of str to int
+        Build options. One that is missing is 0, as it is to the compiler.
+
+    Returns
+    -------
+    dict of str to str
+        A type is "buffer", or that of a number or vector, as in "int" or "float4".
+    """
+    text = _COMMENT.sub("", text)
+    found = re.search(rf"__kernel\s+void\s+{name}\s*\(([^)]*)\)", text)
+    if found is None:
+        raise ValueError(f"the source of kernel {name} does not declare it")
+    declarations = " ".join(_compiled_lines(found[1].splitlines(), options))
+    parameters = {}
+    for declaration in declarations.split(","):
+        parameter = _PARAMETER.fullmatch(declaration.strip())
+        if parameter is None:
+            raise ValueError(f"parameter {declaration.strip()!r} of kernel {name} has no name")
+        type_ = parameter["type"].strip()
+        parameters[parameter["name"]] = "buffer" if type_.endswith("*") else type_
+    return parameters
+
+
+def _compiled_lines(lines: Sequence[str], options: Mapping[str, int]) -> list[str]:
+    """Return the lines that the preprocessor leaves."""
+    left, conditions = [], []
+    for line in lines:
+        directive, _, condition = line.strip().partition(" ")
+        if directive == "#if":
+            conditions.append(_is_true(condition, options))
+        elif directive == "#else":
+            conditions[-1] = not conditions[-1]
+        elif directive == "#endif":
+            conditions.pop()
+        elif directive.startswith("#"):
+            raise ValueError(f"parameters of kernels take #if, #else and #endif, not {line!r}")
+        elif all(conditions):
+            left.append(line)
+    return left
+
+
+def _is_true(condition: str, options: Mapping[str, int]) -> bool:
+    for term in condition.split("&&"):
+        found = _TERM.fullmatch(term.strip())
+        if found is None:
+            raise ValueError(f"parameters of kernels cannot depend on {condition!r}")
+        if bool(options.get(found["option"], 0)) == bool(found["negated"]):
+            return False
+    return True
+
+
+@dataclass(eq=False)
+class Kernel:
+    """A built kernel, whose arguments are given by the names of its parameters.
+
+    Attributes
+    ----------
+    name : str
+    parameters : dict of str to str
+        Types by names, in order; see `kernel_parameters`.
+    compiled : pyopencl.Kernel
+    """
+
+    name: str
+    parameters: dict[str, str]
+    compiled: cl.Kernel
+
+    def __post_init__(self) -> None:
+        """Tell the driver the types; refuse a source that does not fit what was built."""
+        self._converters = {
+            parameter: _converter(type_) for parameter, type_ in self.parameters.items()
+        }
+        if self.compiled.num_args != len(self.parameters):
+            raise ValueError(
+                f"kernel {self.name} was built with {self.compiled.num_args} parameters, but its "
+                f"source declares {len(self.parameters)}: {', '.join(self.parameters)}"
+            )
+        # PyOpenCL hands numbers of known types over ten times as fast.
+        self.compiled.set_scalar_arg_dtypes(
+            [_SCALARS.get(type_) for type_ in self.parameters.values()]
+        )
+
+    def ordered(self, arguments: Mapping[str, object]) -> list[Any]:
+        """Return arguments in the order of the parameters, converted to their types.
+
+        Raises
+        ------
+        TypeError
+            If an argument is missing or unknown, or does not fit its parameter.
+        """
+        if arguments.keys() != self.parameters.keys():
+            missing = [name for name in self.parameters if name not in arguments]
+            unknown = [name for name in arguments if name not in self.parameters]
+            problems = [f"needs {', '.join(missing)}"] if missing else []
+            problems += [f"does not take {', '.join(unknown)}"] if unknown else []
+            raise TypeError(f"kernel {self.name} {' and '.join(problems)}")
+        ordered = []
+        for name, convert in self._converters.items():
+            try:
+                ordered.append(convert(arguments[name]))
+            except (TypeError, ValueError) as error:
+                raise TypeError(
+                    f"argument {name} of kernel {self.name} must be {error}, "
+                    f"got {arguments[name]!r}"
+                ) from None
+        return ordered
+
+
+def _converter(type_: str) -> Callable[[object], object]:
+    """Return a function that converts a value to a parameter's type, or says what must be given."""
+    scalars = {"buffer": _buffer, "int": _int, "float": _float}
+    if type_ in scalars:
+        return scalars[type_]
+    vector = re.fullmatch(r"float([234])", type_)
+    if vector is None:
+        raise ValueError(f"kernels with parameters of type {type_!r} cannot be run")
+    return partial(_vector, int(vector[1]))
+
+
+def _buffer(value: object) -> object:
+    if not isinstance(value, cl.MemoryObjectHolder):
+        raise TypeError("a buffer")
+    return value
+
+
+def _int(value: object) -> int:
+    if not isinstance(value, (int, np.integer)) or not _LEAST_INT <= value <= _LARGEST_INT:
+        raise TypeError("an int of 32 bits")
+    return int(value)
+
+
+def _float(value: object) -> float:
+    if not isinstance(value, (int, float, np.integer, np.floating)):
+        raise TypeError("a number")
+    return float(value)
+
+
+def _vector(length: int, value: object) -> np.ndarray:
+    vector = np.asarray(value)
+    if vector.shape != (length,) or vector.dtype.kind not in "iuf":
+        raise TypeError(f"{length} numbers")
+    # A vector of three takes the room of four.
+    converted = np.zeros(4 if length == 3 else length, np.float32)
+    converted[:length] = vector
+    return converted
