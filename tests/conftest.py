@@ -1,46 +1,10 @@
-"""Every OpenCL platform here, and every way in which a CPU's kernels can be built."""
-
-from functools import cache
+"""The devices that tests run on, and what they allocate there."""
 
 import pytest
+from variants import DEFAULT, EVERY_VARIANT, OTHERS, OWN, is_repeated, variant
 
-from clsas.opencl.device import Device, list_devices, open_device
-from clsas.trials.selftest import driven, other_builds
+from clsas.opencl.device import Device
 
-
-def _named(ways, infos):
-    return {
-        f"{infos[index].platform.replace('(', ' ').split()[0]}-{width}{'-permute' * permute}": (
-            index,
-            width,
-            permute,
-        )
-        for index, width, permute in ways
-    }
-
-
-def _variants():
-    """(index, lanes, permute) of one device per platform, and of one CPU driven in every way."""
-    infos = list_devices()
-    first = {info.platform: info for info in reversed(infos)}.values()
-    own = _named([(info.index, info.width, info.permute) for info in first], infos)
-    # Of the CPUs' compilers PoCL's is the fastest.
-    cpus = sorted((info for info in first if info.kind == "cpu"), key=lambda i: i.platform)[-1:]
-    forced = _named(
-        [(info.index, *build) for info in cpus for build in other_builds(info)],
-        infos,
-    )
-    # Without any device the tests fail, with the message that says how to get one.
-    return own or {"none": (None, None, None)}, forced
-
-
-@cache
-def variant(index, width, permute):
-    """A device that is driven in a given way; its kernels are built once."""
-    return driven(open_device(index), width, permute)
-
-
-OWN, OTHERS = _variants()
 _ALL = OWN | OTHERS
 
 
@@ -54,6 +18,35 @@ def platform(request):
 def device(request):
     """Every platform's first device, and a CPU also with other vector widths."""
     return variant(*request.param)
+
+
+def pytest_collection_modifyitems(config, items):
+    """Leave out cases that are not worth repeating on another device; repeated ones are slow."""
+    kept, left_out = [], []
+    for item in items:
+        name = _device_of(item)
+        test = f"{item.path.name}::{item.originalname}"
+        if "device" in item.fixturenames and test not in EVERY_VARIANT and name:
+            raise pytest.UsageError(f"{test} takes `device`: say in tests/variants.py which cases")
+        if name in (None, DEFAULT):
+            kept.append(item)
+        elif is_repeated(test, item.name, name):
+            item.add_marker(pytest.mark.slow)
+            kept.append(item)
+        else:
+            left_out.append(item)
+    config.hook.pytest_deselected(items=left_out)
+    items[:] = kept
+
+
+def _device_of(item):
+    """Name of the device that a test runs on by its fixture `platform` or `device`, or None."""
+    parameters = getattr(item, "callspec", None)
+    for fixture in ("platform", "device"):
+        if parameters and fixture in parameters.params:
+            way = parameters.params[fixture]
+            return next((name for name, each in _ALL.items() if each == way), None)
+    return None
 
 
 @pytest.fixture

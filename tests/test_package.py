@@ -36,6 +36,7 @@ def test_help_and_version_import_nothing_slow(option):
     assert imported(f"from clsas.cli import main\n{command}") == set()
 
 
+@pytest.mark.slow
 def test_the_imagers_do_without_slow_parts_of_scipy():
     used = imported("import clsas; clsas.backproject, clsas.plan, clsas.factorize, clsas.compress")
     assert "scipy" in used
@@ -54,6 +55,7 @@ def test_every_public_name_is_there_and_known_to_type_checkers():
         _ = clsas.imag
 
 
+@pytest.mark.slow
 def test_functions_keep_their_names_when_modules_of_these_are_imported():
     program = """
 import clsas

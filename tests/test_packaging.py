@@ -29,6 +29,7 @@ def wheel(tmp_path_factory):
     return folder / "installed"
 
 
+@pytest.mark.slow
 def test_kernels_scenes_and_types_travel_in_the_wheel(wheel):
     assert {path.name for path in (wheel / "clsas" / "cl").iterdir()} == {
         path.name for path in (ROOT / "cl").iterdir()
@@ -38,6 +39,7 @@ def test_kernels_scenes_and_types_travel_in_the_wheel(wheel):
     assert not (wheel / "tests").exists()
 
 
+@pytest.mark.slow
 def test_the_wheel_images_on_its_own(wheel, tmp_path):
     program = """
 import sys, clsas

@@ -30,6 +30,7 @@ def test_every_script_is_known():
     assert sorted(COLUMNS) == SCRIPTS
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("script", SCRIPTS)
 def test_script_runs(script, tmp_path):
     options = ["--out", tmp_path, "--pixels", "64"]

@@ -105,7 +105,7 @@ class Grid:
             raise ValueError(f"shape of a plane must be (rows, columns), got {shape}")
         for name in plane:
             put(name, (3,))
-        _check_steps(self.row_step_m, self.column_step_m, shape)
+        _check_steps(*self.vectors_m[1:], shape)
         if self.height_m is not None:
             put("height_m", shape)
 
@@ -207,11 +207,9 @@ class Grid:
         if self.points_m is not None:
             places_m = self.points_m.reshape(-1, 3)
             return places_m.min(axis=0), places_m.max(axis=0)
-        down_m, right_m = (
-            step * (n - 1)
-            for step, n in zip((self.row_step_m, self.column_step_m), self.shape, strict=True)
-        )
-        corners_m = self.origin_m + [0 * down_m, down_m, right_m, down_m + right_m]
+        origin_m, *steps_m = self.vectors_m
+        down_m, right_m = (step * (n - 1) for step, n in zip(steps_m, self.shape, strict=True))
+        corners_m = origin_m + np.stack([0 * down_m, down_m, right_m, down_m + right_m])
         low_m, high_m = corners_m.min(axis=0), corners_m.max(axis=0)
         if self.height_m is not None:
             low_m[2] += self.height_m.min()
@@ -229,11 +227,25 @@ class Grid:
         return math.prod(self.shape)
 
     @property
+    def vectors_m(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """Origin, row step and column step of a plane or height map, metres.
+
+        Raises
+        ------
+        ValueError
+            If the grid holds arbitrary points.
+        """
+        if self.origin_m is None or self.row_step_m is None or self.column_step_m is None:
+            raise ValueError("grid must be a plane or height map to have steps, got points")
+        return self.origin_m, self.row_step_m, self.column_step_m
+
+    @property
     def has_axes(self) -> bool:
         """Whether columns run along x and rows along y, so that the grid has `axes_m`."""
         if self.points_m is not None:
             return False
-        return not (np.any(self.column_step_m[1:]) or np.any(self.row_step_m[[0, 2]]))
+        _, row_step_m, column_step_m = self.vectors_m
+        return not (np.any(column_step_m[1:]) or np.any(row_step_m[[0, 2]]))
 
     @property
     def axes_m(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -247,9 +259,10 @@ class Grid:
         if not self.has_axes:
             raise ValueError("the grid's columns must run along x and its rows along y for axes_m")
         rows, columns = self.shape
+        origin_m, row_step_m, column_step_m = self.vectors_m
         return (
-            self.origin_m[0] + np.arange(columns) * self.column_step_m[0],
-            self.origin_m[1] + np.arange(rows) * self.row_step_m[1],
+            origin_m[0] + np.arange(columns) * column_step_m[0],
+            origin_m[1] + np.arange(rows) * row_step_m[1],
         )
 
     @property
@@ -264,18 +277,20 @@ class Grid:
         if self.points_m is not None:
             raise ValueError("grid must be a plane or height map to have axes, got points")
         rows, columns = self.shape
-        across = self._side("along columns", self.column_step_m, columns, free="xyz")
+        _, row_step_m, column_step_m = self.vectors_m
+        across = self._side("along columns", column_step_m, columns, free="xyz")
         taken = across.name if len(across.name) == 1 else ""
         free = [name for name in "yxz" if name != taken]
-        return across, self._side("along rows", self.row_step_m, rows, free="".join(free))
+        return across, self._side("along rows", row_step_m, rows, free="".join(free))
 
     def _side(self, name: str, step_m: NDArray[np.float64], count: int, free: str) -> Axis:
         """Return the axis of one side; if its step is zero, along the first `free` coordinate."""
         along = np.flatnonzero(np.abs(step_m) > _PARALLEL * np.abs(step_m).max())
         if len(along) > 1:
-            return Axis(name, np.arange(count) * float(np.linalg.norm(step_m)))
+            return Axis(name, np.arange(count) * np.float64(np.linalg.norm(step_m)))
         index = along[0] if len(along) else "xyz".index(free[0])
-        return Axis("xyz"[index], self.origin_m[index] + np.arange(count) * step_m[index])
+        first_m = self.vectors_m[0][index]
+        return Axis("xyz"[index], first_m + np.arange(count) * step_m[index])
 
     def positions_m(self, rows: slice = _ALL, columns: slice = _ALL) -> NDArray[np.float64]:
         """Return pixel positions, float64 [..., 3], metres.
@@ -287,9 +302,10 @@ class Grid:
         """
         if self.points_m is not None:
             return self.points_m[self._index(rows, columns)].copy()
+        origin_m, row_step_m, column_step_m = self.vectors_m
         row = np.arange(self.shape[0])[rows, None, None]
         column = np.arange(self.shape[1])[None, columns, None]
-        positions = self.origin_m + row * self.row_step_m + column * self.column_step_m
+        positions = origin_m + row * row_step_m + column * column_step_m
         if self.height_m is not None:
             positions[..., 2] += self.height_m[rows, columns]
         return positions
@@ -298,8 +314,9 @@ class Grid:
         """Return the positions of pixels with row-major indices, float64 [..., 3], metres."""
         if self.points_m is not None:
             return self.points_m.reshape(-1, 3)[index]
+        origin_m, row_step_m, column_step_m = self.vectors_m
         row, column = np.divmod(index[..., None], self.shape[1])
-        positions = self.origin_m + row * self.row_step_m + column * self.column_step_m
+        positions = origin_m + row * row_step_m + column * column_step_m
         if self.height_m is not None:
             positions[..., 2] += self.height_m.reshape(-1)[index]
         return positions
@@ -332,10 +349,11 @@ class Grid:
             raise ValueError(f"window must hold a pixel, got rows {rows} and columns {columns}")
         if (row, column) == tuple(map(range, self.shape)):
             return self
+        origin_m, row_step_m, column_step_m = self.vectors_m
         return type(self)(
-            self.origin_m + row[0] * self.row_step_m + column[0] * self.column_step_m,
-            self.row_step_m * row.step,
-            self.column_step_m * column.step,
+            origin_m + row[0] * row_step_m + column[0] * column_step_m,
+            row_step_m * row.step,
+            column_step_m * column.step,
             (len(row), len(column)),
             height_m=None if self.height_m is None else self.height_m[rows, columns],
         )

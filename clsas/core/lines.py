@@ -90,7 +90,7 @@ class RangeLines:
             object.__setattr__(self, name, value)
 
         put("samples", validate.array("samples", self.samples, np.complex64, (None, None)))
-        per_channel = {"first_range_m": (self.channels,)}
+        per_channel: dict[str, tuple[int, ...]] = {"first_range_m": (self.channels,)}
         per_channel |= dict.fromkeys(("tx_m", "rx_m"), (self.channels, 3))
         if self.rx_velocity_m_s is not None:
             per_channel["rx_velocity_m_s"] = (self.channels, 3)
@@ -169,8 +169,10 @@ class RangeLines:
         ValueError
             If nothing is selected.
         """
-        index = channels
-        if not isinstance(channels, slice):
+        index: slice | NDArray[np.int64]
+        if isinstance(channels, slice):
+            index = channels
+        else:
             index = np.atleast_1d(channels)
             if index.size == 0:
                 raise ValueError("channels must select at least one line, got none")

@@ -14,6 +14,7 @@ import warnings
 from collections.abc import Sequence
 from numbers import Real
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
@@ -62,14 +63,16 @@ def number(
     ValueError
         If it is not finite, or not above `above` and below `below`, or outside [`least`, `most`].
     """
-    scalar = value[()] if getattr(value, "ndim", None) == 0 else value
+    scalar: Any = value
+    if getattr(value, "ndim", None) == 0:
+        scalar = scalar[()]
     if isinstance(scalar, bool) or not isinstance(scalar, Real) or np.ma.is_masked(value):
         kind = f"number in {unit}" if unit else "number"
         raise TypeError(f"{name} must be one real {kind}, got {shown(value)}")
     try:
         result = float(scalar)
     except OverflowError:  # a whole number or fraction beyond float64
-        result = math.inf if scalar > 0 else -math.inf
+        result = math.inf if scalar > 0 else -math.inf  # type: ignore[operator]
     limits = []
     if above is not None:
         limits.append(f"> {above:g}")
@@ -260,7 +263,7 @@ def array(
         masked = np.ma.count_masked(value)
         raise ValueError(f"{name} must hold no masked value, got {masked} of {given.size}")
     if broadcast and given.shape == shape[1:]:
-        given = np.broadcast_to(given, shape)
+        given = np.broadcast_to(given, (shape[0] or 1, *given.shape))
     fits = given.ndim == len(shape) and all(
         have == want or (want is None and have > 0)
         for have, want in zip(given.shape, shape, strict=False)

@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from importlib.resources import files
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyopencl as cl
@@ -197,7 +198,7 @@ class Device:
         self,
         kernel: cl.Kernel,
         size: tuple[int, ...],
-        *arguments: object,
+        *arguments: Any,
         wait_for: Sequence[cl.Event] = (),
         local: tuple[int, ...] | None = None,
     ) -> cl.Event:
@@ -273,7 +274,7 @@ class Device:
         if self.info.kind == "cpu":
             return self.share(aligned(np.zeros, (max(int(bytes_), 4),), np.uint8))
         buffer = self.buffer(bytes_)
-        cl.enqueue_fill_buffer(self.queue, buffer, np.uint32(0), 0, buffer.size)
+        cl.enqueue_fill_buffer(self.queue, buffer, np.zeros(1, np.uint32), 0, buffer.size)
         return buffer
 
 

@@ -42,8 +42,8 @@ def upsample(
         HALF=int(half_precision),
     )
     phase = (resampling.first + np.arange(PHASES)) * step % PHASES
-    filters = upsampler.coefficients[phase].reshape(-1, width, taps).swapaxes(1, 2)
-    filters = device.upload((gain * filters).astype(np.float32))
+    coefficients = upsampler.coefficients[phase].reshape(-1, width, taps).swapaxes(1, 2)
+    filters = device.upload((gain * coefficients).astype(np.float32))
     turn = int(np.int32(np.uint32(round(resampling.centre_cycles_per_sample * 2**32) % 2**32)))
     channels, count = samples.shape
     lines = device.buffer(sample_bytes(half_precision) * channels * pitch)

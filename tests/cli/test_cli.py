@@ -63,6 +63,7 @@ def made(tmp_path_factory):
     return folder, results
 
 
+@pytest.mark.slow
 def test_commands_do_what_the_library_does(made):
     folder, _ = made
     scene = read_scene(folder / "scene.toml")
@@ -76,6 +77,7 @@ def test_commands_do_what_the_library_does(made):
         assert (folder / f"{name}.png").read_bytes().startswith(b"\x89PNG")
 
 
+@pytest.mark.slow
 def test_results_in_json(made):
     folder, (simulated, compressed, imaged, measured) = made
     assert simulated["file"] == str(folder / "echoes.h5")
@@ -95,6 +97,7 @@ def test_results_in_json(made):
     assert point["range"]["resolution_m"] == pytest.approx(1.3 * 0.0125, rel=0.1)
 
 
+@pytest.mark.slow
 def test_results_as_text(made, tmp_path):
     folder, _ = made
     stdout, _ = run("simulate", folder / "scene.toml", "-o", tmp_path / "echoes.h5")
@@ -110,6 +113,7 @@ def test_results_as_text(made, tmp_path):
     assert stdout.count("PSLR nearest") == 2
 
 
+@pytest.mark.slow
 def test_options_go_before_the_scene_file(made, tmp_path):
     folder, _ = made
     scene = ("--scene", folder / "scene.toml")
@@ -134,6 +138,7 @@ def image_of(made, tmp_path, *args):
     return result, clsas.load(output)
 
 
+@pytest.mark.slow
 def test_the_dial(made, tmp_path):
     """Images to a tolerance, in wavelengths, in the thesis's stages and exactly."""
     exact = clsas.load(made[0] / "image.h5")
@@ -172,6 +177,7 @@ def test_a_plan_that_is_exact_is_as_accurate_as_asked_for(made, tmp_path):
     assert "(exact: nothing faster within -70 dB; " in text
 
 
+@pytest.mark.slow
 def test_stages_that_leave_no_image_are_a_warning(made, tmp_path):
     scene = ("--scene", made[0] / "scene.toml")
     for command in (("image", "-o", tmp_path / "image.h5"), ("plan",)):
@@ -183,6 +189,7 @@ def test_stages_that_leave_no_image_are_a_warning(made, tmp_path):
         assert run(*args, "--stages", "2x16")[1] == ""
 
 
+@pytest.mark.slow
 def test_an_element_for_the_inverse_beam(made, tmp_path):
     """Options make the window that the library makes of them."""
     exact = clsas.load(made[0] / "image.h5")
@@ -193,6 +200,7 @@ def test_an_element_for_the_inverse_beam(made, tmp_path):
     assert clsas.relative_error_db(image, expected) < -100
 
 
+@pytest.mark.slow
 def test_a_beam_from_the_command_line(made, tmp_path):
     exact = clsas.load(made[0] / "image.h5")
     lines = clsas.load(made[0] / "lines.h5")
@@ -205,6 +213,7 @@ def test_a_beam_from_the_command_line(made, tmp_path):
     assert clsas.relative_error_db(image, expected) < -38
 
 
+@pytest.mark.slow
 def test_dial_and_beam_of_a_scene_file(made, tmp_path):
     """The scene's are used, and give way to options."""
     grid = EXAMPLE[EXAMPLE.index("[grid]") : EXAMPLE.index("[image]")]
@@ -240,6 +249,7 @@ def test_plan(made):
     assert not (made[0] / "plan.json").exists()
 
 
+@pytest.mark.slow
 def test_tradeoff(made, tmp_path):
     table, png = tmp_path / "t.csv", tmp_path / "t.png"
     ways = ("--tolerance-db", -30, "--stages", "2x2,2x2", "--repeats", 1)
@@ -335,6 +345,7 @@ def test_without_a_device_the_message_says_how_to_get_one(made, tmp_path, monkey
     assert not any(tmp_path.iterdir())
 
 
+@pytest.mark.slow
 def test_a_broken_sampling_limit_is_a_warning(made, tmp_path):
     sparse = tmp_path / "sparse.toml"
     sparse.write_text(EXAMPLE.replace("spacing_m = 0.02", "spacing_m = 0.04"))
@@ -349,6 +360,7 @@ def test_a_broken_sampling_limit_is_a_warning(made, tmp_path):
     assert stderr.startswith("Warning: phase centres are up to 0.02")
 
 
+@pytest.mark.slow
 def test_a_grid_that_no_line_reaches_is_a_warning(made, tmp_path):
     grid = ("--x", "0:1:4", "--y", "500:501:4")
     _, stderr = run("image", made[0] / "lines.h5", *grid, "-o", tmp_path / "image.h5")
@@ -604,6 +616,7 @@ def test_help_shows_an_example_that_parses(monkeypatch):
     assert run("--version")[0] == f"clsas, version {clsas.__version__}\n"
 
 
+@pytest.mark.slow
 def test_bench(monkeypatch):
     monkeypatch.setattr(cases, "EXACT_CASES", {"one": SMALL, "two": SMALL})
     monkeypatch.setattr(cases, "FACTORIZED_CASES", {"fast": SMALL})
@@ -626,6 +639,7 @@ def test_bench(monkeypatch):
     assert "'one' or 'two'" not in text
 
 
+@pytest.mark.slow
 def test_demo_in_json(tmp_path, monkeypatch):
     small = built_in_scene("thesis_wide_beam").replace(b"count = 1024", b"count = 64")
     monkeypatch.setattr(demo, "built_in_scene", lambda name: small)
@@ -644,6 +658,7 @@ def test_demo_in_json(tmp_path, monkeypatch):
     assert max(point["azimuth"]["pslr_db"]) < -20
 
 
+@pytest.mark.slow
 def test_demo_writes_over_no_other_files(tmp_path, monkeypatch):
     small = built_in_scene("thesis_wide_beam").replace(b"count = 1024", b"count = 64")
     monkeypatch.setattr(demo, "built_in_scene", lambda name: small)
@@ -661,6 +676,7 @@ def test_demo_writes_over_no_other_files(tmp_path, monkeypatch):
     assert {file: file.read_bytes() for file in out.iterdir()} == before
 
 
+@pytest.mark.slow
 def test_expected_resolution_of_a_plain_aperture():
     """Without beams and far off, lambda R/(2 L) and c/(2 B), 0.886 of them at -3 dB."""
     pulse = clsas.Pulse(carrier_hz=1e5, bandwidth_hz=5e3, duration_s=0.1)
@@ -671,6 +687,7 @@ def test_expected_resolution_of_a_plain_aperture():
     assert range_m == pytest.approx(0.8859 * 1500 / (2 * 5e3), rel=0.02)
 
 
+@pytest.mark.slow
 def test_ctrl_c_ends_with_130_and_leaves_no_file(tmp_path):
     """Interrupted once the warning of a sparse array says that work begins."""
     points = "".join(f"[[targets]]\nposition_m = [0, {20 + n / 1e3}, 0]\n" for n in range(2000))
@@ -686,6 +703,7 @@ def test_ctrl_c_ends_with_130_and_leaves_no_file(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["scene.toml"]
 
 
+@pytest.mark.slow
 def test_progress_is_shown_on_a_terminal(made, tmp_path):
     ours, theirs = pty.openpty()
     command = [sys.executable, "-m", "clsas", "compress", str(made[0] / "echoes.h5"), "-o", "l.h5"]
@@ -705,6 +723,7 @@ def test_progress_is_shown_on_a_terminal(made, tmp_path):
     assert (tmp_path / "l.h5").exists()
 
 
+@pytest.mark.slow
 def test_readme_tour(tmp_path, monkeypatch):
     """Every command of the README's tour does what it says, in its order."""
     monkeypatch.chdir(tmp_path)

@@ -71,6 +71,7 @@ def made(tmp_path_factory):
     return folder, run("mosaic", folder / "scene.toml", "--png", folder / "image.png")
 
 
+@pytest.mark.slow
 def test_a_scene_is_all_it_needs(made):
     folder, (stdout, stderr) = made
     assert "2 x 2 patches of 50 x 40 pixels, 4 formed in" in stdout
@@ -85,6 +86,7 @@ def test_a_scene_is_all_it_needs(made):
     assert clsas.relative_error_db(image, exact) <= -40
 
 
+@pytest.mark.slow
 def test_the_same_command_goes_on(made):
     folder, _ = made
     shutil.rmtree(folder / "scene.zarr" / "patches" / "1.0")
@@ -99,6 +101,7 @@ def test_the_same_command_goes_on(made):
     assert result["predicted_error_db"] <= -40
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("workers", [(), ("--workers", "2")], ids=["alone", "workers"])
 def test_ctrl_c_keeps_what_is_finished(made, tmp_path, workers):
     """It ends with 130, and the same command goes on."""
@@ -114,6 +117,7 @@ def test_ctrl_c_keeps_what_is_finished(made, tmp_path, workers):
     assert f"{80 - there} formed in" in stdout
 
 
+@pytest.mark.slow
 def test_another_scene_has_other_lines(made, tmp_path):
     """Whatever the files' times; what lies beside the store counts only if it is of the scene."""
     text = (made[0] / "scene.toml").read_text()
@@ -129,6 +133,7 @@ def test_another_scene_has_other_lines(made, tmp_path):
     assert "simulated before" in stderr  # the grid is no part of them
 
 
+@pytest.mark.slow
 def test_lines_grid_and_beam_from_the_command_line(made, tmp_path):
     (tmp_path / "empty.toml").write_text("")
     stdout, _ = run(
@@ -143,6 +148,7 @@ def test_lines_grid_and_beam_from_the_command_line(made, tmp_path):
     assert clsas.relative_error_db(image, other) < -37
 
 
+@pytest.mark.slow
 def test_processes_of_this_machine(made, tmp_path):
     pytest.importorskip("distributed")
     stdout, stderr = run(
@@ -179,6 +185,7 @@ def test_flags_are_told(made, tmp_path):
     assert "  patch 0,0; 0,1; 1,0 and 1 more: empty: in no channel's beam and range" in stdout
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("args", "code", "message"),
     [

@@ -108,6 +108,7 @@ def test_an_interpolator_holds_nothing_beyond_a_filter():
     assert not same_interpolator(preparation, points).any()
 
 
+@pytest.mark.slow
 def test_padding_does_not_matter_for_lines_that_fade():
     lines, grid = made(bistatic)
     points = grid.positions_m()[::7, ::7]

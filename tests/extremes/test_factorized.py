@@ -7,23 +7,12 @@ import pytest
 from cases import along_x
 from factorizing import EXACT_IS_SLOW, around, exact, made, over, planned, swaying
 
-from clsas.core.grid import Grid
 from clsas.core.image_error import relative_error_db
 from clsas.exact.backprojection import backproject
 from clsas.planning.factorize import factorize
 from clsas.planning.planner import plan
 
 FAR = np.array([1e7, -1e7, 1e7])
-
-
-def test_the_origin_of_coordinates_does_not_matter(platform):
-    lines, grid = made(swaying)
-    lines = dataclasses.replace(lines, tx_m=lines.tx_m + FAR, rx_m=lines.rx_m + FAR)
-    there = Grid.oriented(grid.origin_m + FAR, grid.row_step_m, grid.column_step_m, grid.shape)
-    chosen = plan(lines, there, tolerance_db=-60, costs=EXACT_IS_SLOW)
-    assert not chosen.is_exact
-    image = factorize(lines, there, chosen, device=platform)
-    assert relative_error_db(image.pixels, exact(swaying).pixels) <= -60
 
 
 def at_300_m():
@@ -37,6 +26,7 @@ def large_image():
     return over(grid, along_x(300, 0.02), carrier_hz=1e6, band=0.1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", [at_300_m, large_image], ids=lambda case: case.__name__)
 def test_rounding_is_part_of_what_is_predicted(case, platform):
     lines, grid = case()
@@ -56,6 +46,7 @@ def small(platform):
     return dataclasses.replace(platform, info=info)
 
 
+@pytest.mark.slow
 def test_a_small_device_is_enough(small, buffer_bytes):
     lines, grid = made(swaying)
     chosen = plan(lines, grid, tolerance_db=-40, device=small, costs=EXACT_IS_SLOW)
@@ -70,12 +61,3 @@ def test_a_device_too_small_is_named(small):
     tiny = dataclasses.replace(small, info=info)
     with pytest.raises(ValueError, match=r"MiB"):
         factorize(*made(swaying), planned(swaying, -40), device=tiny)
-
-
-@pytest.mark.parametrize("scale", [1e-30, 1e-10, 1e10, 1e30])
-def test_the_unit_of_the_samples_does_not_matter(scale):
-    lines, grid = made(swaying)
-    scaled = dataclasses.replace(lines, samples=lines.samples * np.complex128(scale))
-    chosen = plan(scaled, grid, tolerance_db=-50, costs=EXACT_IS_SLOW)
-    pixels = factorize(scaled, grid, chosen).pixels.astype(np.complex128)
-    assert relative_error_db(pixels / scale, exact(swaying).pixels) <= -50

@@ -26,6 +26,7 @@ def small(platform):
     return limited
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["plane", "points"])
 def test_an_image_in_bands_is_the_same_bit_for_bit(platform, small, kind):
     grid = patch(1.3, 42, 100, 90)
@@ -42,6 +43,7 @@ def test_an_image_in_bands_is_the_same_bit_for_bit(platform, small, kind):
     np.testing.assert_array_equal(banded.pixels, whole.pixels)
 
 
+@pytest.mark.slow
 def test_one_channel_over_many_points_stays_within_the_device(small, buffer_bytes):
     grid = Grid.points(patch(-1, 42, 400, 400).positions_m())
     track = along_x(1, 1.0)
@@ -50,6 +52,7 @@ def test_one_channel_over_many_points_stays_within_the_device(small, buffer_byte
     assert max(buffer_bytes) <= 1 << 18
 
 
+@pytest.mark.slow
 def test_long_lines_stay_within_the_device(small, buffer_bytes):
     """Lines of 4000 samples: 512 of them do not fit at once."""
     grid = patch(1.3, 42, 5, 5)

@@ -144,11 +144,13 @@ EXTREME = (
 )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", FAR_AWAY, ids=lambda case: case.__name__)
 def test_the_origin_of_coordinates_does_not_matter(case, platform):
     assert rounding_error_db(case, platform) <= -80
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", EXTREME, ids=lambda case: case.__name__)
 def test_rounding_stays_below_80_db(case, device):
     assert rounding_error_db(case, device) <= -80
@@ -244,6 +246,7 @@ def test_samples_whose_sum_overflows_are_refused():
         backproject(huge, grid)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("step_m", [0.0065, 0.02, 0.22])
 @pytest.mark.parametrize("bearing_rad", [0.0, 1.57])
 def test_one_channel_rounds_no_more_than_many(device, bearing_rad, step_m):

@@ -224,6 +224,7 @@ def test_plain_backprojection_says_so(exact):
     assert "nearest beam" not in exact.describe()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("beam", [None, BeamWindow(8, "hann", normalise=True)], ids=str)
 @pytest.mark.parametrize("case", [straight, moving_array, "points", "one pixel", "few channels"])
 def test_device_memory_of_plain_backprojection(monkeypatch, case, beam):

@@ -2,7 +2,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from cases import along_x, beside, noise, patch, thesis_lines
+from cases import along_x, beside, noise
 from factorizing import (
     BAND,
     BEAMS,
@@ -31,7 +31,6 @@ from factorizing import (
 from clsas import plan
 from clsas.core.decibels import in_db
 from clsas.core.grid import Grid
-from clsas.core.image import Image
 from clsas.core.image_error import relative_error_db
 from clsas.core.lines import RangeLines, some_channels
 from clsas.core.validate import ClsasWarning
@@ -184,11 +183,13 @@ def check(case, tolerance_db, device, beam=None):
 # The promise
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tolerance_db", [-20, -40, -60, -75])
 def test_the_error_is_what_was_asked_for(device, tolerance_db):
     check(swaying, tolerance_db, device)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tolerance_db", [-10, -50, -65])
 @pytest.mark.parametrize("case", CASES, ids=name_of)
 def test_whatever_the_track_and_the_grid(case, tolerance_db):
@@ -202,11 +203,13 @@ def test_the_tightest_tolerance(case):
     check(case, -75, None)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", [bistatic_array, moving_array, arc, hills, scattered], ids=name_of)
 def test_on_every_platform(case, platform):
     check(case, -50, platform)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tolerance_db", [-30, -50])
 @pytest.mark.parametrize("band", [0.05, 0.3])
 def test_a_point_where_subimages_of_all_sizes_meet(band, tolerance_db):
@@ -227,6 +230,7 @@ def test_a_point_where_subimages_of_all_sizes_meet(band, tolerance_db):
     assert relative_error_db(formed, form_exactly(lines, grid, accuracy_db=-80)) <= tolerance_db
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tolerance_db", [-20, -40])
 def test_pixels_much_coarser_than_the_resolution(device, tolerance_db):
     check(coarse_pixels, tolerance_db, device)
@@ -247,6 +251,7 @@ def few_arrays():
     return over(around(0, 40), tx, tx + along * np.tile(0.1 * np.arange(4), 42)[:, None])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tolerance_db", [-30, -50])
 def test_a_beam_that_hides_most_of_the_image(tolerance_db):
     lines, grid = made(wide_image)
@@ -255,6 +260,7 @@ def test_a_beam_that_hides_most_of_the_image(tolerance_db):
     assert relative_error_db(image, exact(wide_image, beam)) <= tolerance_db
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tolerance_db", [-20, -35, -50])
 def test_arrays_whose_channels_come_in_regular_steps(tolerance_db):
     lines, grid = made(few_arrays)
@@ -265,12 +271,14 @@ def test_arrays_whose_channels_come_in_regular_steps(tolerance_db):
 KINKED = BeamWindow(8, "tukey", squint_deg=2.0, taper=0.2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tolerance_db", [-20, -50, -65])
 @pytest.mark.parametrize("beam", BEAMS, ids=["hann", "wide", "squint"])
 def test_with_a_beam(beam, tolerance_db):
     check(near, tolerance_db, None, beam)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tolerance_db", [-20, -50, -65])
 @pytest.mark.parametrize(
     "beam", [KINKED, BeamWindow(12, "tukey"), BeamWindow(12, "hamming"), BeamWindow(12, "taylor")]
@@ -294,6 +302,7 @@ def jittery_and_few(off_m):
     return few_seen(110, 315, 0.457, pixel_m=(0.006, 0.004), off_m=off_m)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("costs", [EXACT_IS_SLOW, None], ids=["forced", "as they are"])
 @pytest.mark.parametrize(
     ("case", "beam", "tolerance_db"),
@@ -319,6 +328,7 @@ def test_edges_of_a_beam_that_few_channels_see(case, beam, tolerance_db, costs):
     assert relative_error_db(factorize(lines, grid, chosen), exact) <= tolerance_db
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tolerance_db", [-25, -40])
 def test_a_track_that_turns_back_within_a_few_channels(tolerance_db):
     """These are further off the mean track than all others."""
@@ -330,6 +340,7 @@ def test_a_track_that_turns_back_within_a_few_channels(tolerance_db):
     assert relative_error_db(factorize(lines, grid, chosen), exact) <= tolerance_db
 
 
+@pytest.mark.slow
 def test_a_beam_on_every_platform(platform):
     check(near, -40, platform, HANN)
 
@@ -337,17 +348,20 @@ def test_a_beam_on_every_platform(platform):
 NORMALISED = dataclasses.replace(HANN, normalise=True)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tolerance_db", [-30, -50])
 @pytest.mark.parametrize("case", [near, arc, bistatic_array, hills], ids=name_of)
 def test_a_normalised_image(case, tolerance_db):
     check(case, tolerance_db, None, NORMALISED)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", [near, hills], ids=name_of)
 def test_a_normalised_image_on_every_platform(case, platform):
     check(case, -40, platform, NORMALISED)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tolerance_db", [-25, -55])
 @pytest.mark.parametrize("case", [hills, scattered, section], ids=name_of)
 def test_off_a_plane_with_a_beam(case, tolerance_db):
@@ -366,6 +380,7 @@ def off_track():
     return (TRACK + 0.1 * np.stack([0 * turn, np.sin(turn), 0.5 * np.cos(turn)], axis=1),)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "wild",
     [
@@ -407,6 +422,7 @@ def test_a_flat_height_map_is_a_plane(platform):
     assert relative_error_db(image.pixels, exact(straight).pixels) <= -60
 
 
+@pytest.mark.slow
 def test_a_beam_with_edges_is_worth_no_more_channels_than_there_are():
     """A rectangular window has no band: denser channels help little."""
     chosen = planned(near, -30, BeamWindow(12))
@@ -415,6 +431,7 @@ def test_a_beam_with_edges_is_worth_no_more_channels_than_there_are():
     assert relative_error_db(image, exact(near, BeamWindow(12))) <= -30
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stages", [[(4, 2)], [(4, 2), (4, 2)], [(2, 1)], [(2, 3), (3, 2)]])
 def test_given_stages_err_less_than_predicted(platform, stages):
     lines, grid = made(high_frequency)
@@ -436,21 +453,7 @@ def test_no_stages_are_plain_backprojection(platform):
 # Physics
 
 
-@pytest.mark.parametrize("amplitude", [1, -2j])
-def test_a_point_keeps_its_amplitude_and_phase(platform, amplitude):
-    target = [0.3, 40.6, -3.0]
-    lines = simulate_lines(
-        TRACK, beside(TRACK, 0.05, 0, 0), PointTargets([target], [amplitude]),
-        carrier_hz=CARRIER, bandwidth_hz=BAND * CARRIER,
-    )  # fmt: skip
-    grid = around(0.3, 40.6, shape=(65, 65), z=-3.0)
-    chosen = plan(lines, grid, tolerance_db=-55, costs=EXACT_IS_SLOW)
-    assert not chosen.is_exact
-    pixel = factorize(lines, grid, chosen, device=platform).pixels[32, 32]
-    # The rms error is over the whole image, where all other pixels are small.
-    assert abs(pixel / (len(TRACK) * amplitude) - 1) <= 3e-3
-
-
+@pytest.mark.slow
 def test_a_point_on_a_hill_keeps_its_amplitude_and_phase(platform):
     """Only where the height map has it does every line agree on it."""
     row, column = np.indices((65, 65))
@@ -468,47 +471,7 @@ def test_a_point_on_a_hill_keeps_its_amplitude_and_phase(platform):
     assert np.unravel_index(np.abs(pixels).argmax(), pixels.shape) == (32, 32)
 
 
-@pytest.mark.parametrize(("half", "to_db"), [(False, -85), (True, -62)])
-def test_it_is_linear(half, to_db, platform):
-    """But for what is rounded: three images, to half precision four times each."""
-    one, grid = made(straight)
-    chosen = dataclasses.replace(planned(straight, -50), half_precision=half)
-    other = dataclasses.replace(one, samples=noise(one.channels, one.length, seed=9))
-    a, b = 0.3 - 2j, 1.5j
-    both = dataclasses.replace(one, samples=a * one.samples + b * other.samples)
-    image, of_one, of_other = (
-        factorize(lines, grid, chosen, device=platform).pixels for lines in (both, one, other)
-    )
-    assert relative_error_db(image, a * of_one + b * of_other) <= to_db
-
-
-def test_it_gives_the_same_twice(platform):
-    first, second = (
-        factorize(*made(arc), planned(arc, -50), device=platform).pixels for _ in range(2)
-    )
-    np.testing.assert_array_equal(first, second)
-
-
-@pytest.mark.parametrize("motion", ["shift", "rotation"])
-def test_where_the_scene_lies_does_not_matter(motion):
-    lines, grid = made(bistatic_array)
-    turn, shift = np.eye(3), np.zeros(3)
-    if motion == "shift":
-        shift = np.array([1e6, -2e6, 1e4])
-    else:
-        turn = np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0]
-    lines = dataclasses.replace(
-        lines, tx_m=lines.tx_m @ turn.T + shift, rx_m=lines.rx_m @ turn.T + shift
-    )
-    grid = Grid.oriented(
-        turn @ grid.origin_m + shift, turn @ grid.row_step_m, turn @ grid.column_step_m, grid.shape
-    )
-    chosen = plan(lines, grid, tolerance_db=-50, costs=EXACT_IS_SLOW)
-    assert not chosen.is_exact
-    image = factorize(lines, grid, chosen)
-    assert relative_error_db(image.pixels, exact(bistatic_array).pixels) <= -50
-
-
+@pytest.mark.slow
 def test_pixels_outside_the_beam_of_every_channel_are_zero(platform):
     grid = around(14, 40, shape=(20, 400), pixel_m=(0.015, 0.06))
     lines, _ = over(grid)
@@ -530,6 +493,7 @@ def test_pixels_outside_the_beam_of_every_channel_are_zero(platform):
 SHAPES = [(1, 160), (160, 1), (2, 90), (90, 2), (17, 33), (67, 131), (300, 20)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shape", SHAPES)
 def test_any_shape_of_grid(shape):
     grid = around(0, 40, shape=shape)
@@ -540,6 +504,7 @@ def test_any_shape_of_grid(shape):
     assert relative_error_db(image, backproject(lines, grid, accuracy_db=-85)) <= -50
 
 
+@pytest.mark.slow
 def test_a_line_of_pixels_needs_no_second_step(platform):
     """`Grid.plane` makes one column with a step of zero."""
     grid = Grid.plane((0.3, 0.3, 1), (39, 41, 60))
@@ -549,6 +514,7 @@ def test_a_line_of_pixels_needs_no_second_step(platform):
     assert relative_error_db(image, backproject(lines, grid, accuracy_db=-85)) <= -50
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("spacing_m", [0.005, 0.2])
 @pytest.mark.parametrize("channels", [1, 2, 3, 5, 17])
 def test_any_number_of_channels(channels, spacing_m):
@@ -566,6 +532,7 @@ def test_one_pixel():
     assert relative_error_db(image, backproject(lines, grid, accuracy_db=-85)) <= -50
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("places", [1, 2, 5])
 def test_channels_that_share_places(places):
     grid = around(0, 40, shape=(70, 60))
@@ -575,6 +542,7 @@ def test_channels_that_share_places(places):
     assert relative_error_db(image, backproject(lines, grid, accuracy_db=-85)) <= -50
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "grid",
     [
@@ -592,13 +560,7 @@ def test_pixels_near_the_aperture(grid):
     assert relative_error_db(image, backproject(lines, grid, accuracy_db=-85)) <= -45
 
 
-def test_lines_of_zeros_give_zeros(platform):
-    lines, grid = made(straight)
-    nothing = dataclasses.replace(lines, samples=np.zeros_like(lines.samples))
-    chosen = plan(nothing, grid, tolerance_db=-40, costs=EXACT_IS_SLOW)
-    assert not factorize(nothing, grid, chosen, device=platform).pixels.any()
-
-
+@pytest.mark.slow
 def test_a_grid_that_no_line_reaches_warns_and_is_zero():
     lines, _ = made(straight)
     grid = around(0, 400)
@@ -626,6 +588,7 @@ def test_half_precision_adds_what_is_predicted(device):
     assert expected_db - 3 <= relative_error_db(image, better) <= expected_db
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tolerance_db", [-50, -56])
 @pytest.mark.parametrize("length_m", [1.0, 0.3])
 def test_dense_channels_keep_the_promise(length_m, tolerance_db):
@@ -708,6 +671,7 @@ def test_a_plan_holds_its_beam():
     assert relative_error_db(image, reference) <= -40
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tolerance_db", [-50, -75])
 def test_a_noise_floor_far_above_the_band(tolerance_db):
     """Sampled at 96 kHz, carrier kept, a sonar of 15 to 25 kHz; noise of -26 dB up to 48 kHz."""
@@ -793,6 +757,7 @@ def test_a_beam_beside_a_plan_is_refused():
 # Progress and interruption
 
 
+@pytest.mark.slow
 def test_progress_counts_pixels(platform):
     lines, grid = made(coarse_pixels)
     calls = []
@@ -804,63 +769,10 @@ def test_progress_counts_pixels(platform):
     assert sorted(set(done)) == list(done)
 
 
-def test_an_interrupted_run_leaves_the_device_usable(platform):
-    def interrupt(done, total):
-        raise KeyboardInterrupt
-
-    chosen = planned(swaying, -40)
-    with pytest.raises(KeyboardInterrupt):
-        factorize(*made(swaying), chosen, device=platform, progress=interrupt)
-    image = factorize(*made(swaying), chosen, device=platform)
-    assert relative_error_db(image, exact(swaying)) <= -40
+# At the edges of grids, tracks and beams
 
 
-# Bad input
-
-
-@pytest.fixture(scope="module")
-def good():
-    grid = patch(1.3, 42, 9, 8)
-    lines = thesis_lines(grid, along_x(20, 0.01))
-    return {"lines": lines, "grid": grid, "plan_or_tolerance": -40}
-
-
-@pytest.mark.parametrize(
-    ("argument", "value", "error", "says"),
-    [
-        ("lines", np.zeros((2, 3), complex), TypeError, "lines must be .*RangeLines.*ndarray"),
-        ("grid", (5, 5), TypeError, "grid must be .*Grid.*tuple"),
-        (
-            "grid",
-            Grid.plane((-1, 1, 10**6), (30, 31, 10**6)),
-            ValueError,
-            "grid must ask for at most .* GiB",
-        ),
-        ("plan_or_tolerance", -76, ValueError, r"tolerance.* must be .*>= -75 .*dB.*got -76"),
-        ("plan_or_tolerance", 0, ValueError, r"tolerance.* must be .*<= -10 dB.*got 0"),
-        ("plan_or_tolerance", np.nan, ValueError, "tolerance.* must be finite.*nan"),
-        ("plan_or_tolerance", "-40 dB", TypeError, "plan_or_tolerance must be .*-40 dB"),
-        ("plan_or_tolerance", None, TypeError, "plan_or_tolerance must be .*None"),
-        ("plan_or_tolerance", [(2, 2)], TypeError, r"plan_or_tolerance must be .*\(2, 2\)"),
-        ("beam", 20.0, TypeError, "beam must be .*BeamWindow.*float"),
-        ("device", 1.5, TypeError, "device must be .*1.5"),
-        ("progress", 5, TypeError, "progress must be a function"),
-    ],
-)
-def test_bad_arguments_are_named(good, argument, value, error, says):
-    with pytest.raises(error, match=says):
-        factorize(**(good | {argument: value}))
-
-
-def test_samples_whose_sum_overflows_are_refused(good):
-    """As by backprojection: float32 cannot hold the pixels."""
-    lines = good["lines"]
-    huge = dataclasses.replace(lines, samples=np.full_like(lines.samples, 2e37))
-    chosen = plan(huge, good["grid"], tolerance_db=-40, costs=EXACT_IS_SLOW)
-    with pytest.raises(ValueError, match="samples must be at most"):
-        factorize(huge, good["grid"], chosen)
-
-
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [2, 5])
 def test_roots_that_overhang_the_grid_keep_the_tolerance(seed):
     """Pixels of a root of 512 rows on a grid of 257 lie further from its middle than half of it."""
@@ -873,6 +785,7 @@ def test_roots_that_overhang_the_grid_keep_the_tolerance(seed):
     assert relative_error_db(factorize(lines, grid, chosen), exact) <= -55
 
 
+@pytest.mark.slow
 def test_a_gap_in_the_track_stays_empty(platform):
     """No channel sees the pixels beside it, though virtual channels lie there."""
     x = np.arange(-14, 14, 0.02)
@@ -893,6 +806,7 @@ def test_a_gap_in_the_track_stays_empty(platform):
     assert np.abs(image.pixels[unseen]).max() <= 0.01 * np.abs(exact.pixels).max()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("x", "beam", "tolerance_db"),
     [
@@ -910,6 +824,7 @@ def test_steps_of_a_beam_beside_a_gap_keep_the_promise(x, beam, tolerance_db):
     assert relative_error_db(factorize(lines, grid, chosen), exact) <= tolerance_db
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tolerance_db", [-20, -40])
 @pytest.mark.parametrize("gap_m", [2, 3, 4])
 @pytest.mark.parametrize(
@@ -924,6 +839,7 @@ def test_pixels_that_see_the_ends_of_a_gap_keep_the_promise(beam, gap_m, toleran
     assert relative_error_db(factorize(lines, grid, chosen), exact) <= tolerance_db
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("shape", "squint_deg", "tolerance_db"),
     [
@@ -948,6 +864,7 @@ def test_an_edge_of_the_beam_that_crosses_the_image(shape, squint_deg, tolerance
 # Memory
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("share", [1.0, 0.7])
 @pytest.mark.parametrize("relief_m", [None, 0.0, 0.2])
 @pytest.mark.parametrize("beam", [None, BeamWindow(20, "hann"), BeamWindow(3, "hann")])
@@ -966,6 +883,7 @@ def test_device_memory_is_as_planned(monkeypatch, beam, tolerance_db, relief_m, 
     assert peak <= 1.1 * chosen.memory_bytes
 
 
+@pytest.mark.slow
 def test_little_memory_makes_small_roots_or_is_refused():
     lines, grid = over(around(0, 40, shape=(600, 700)))
     wish = {"tolerance_db": -40, "costs": EXACT_IS_SLOW}
@@ -981,6 +899,7 @@ def test_little_memory_makes_small_roots_or_is_refused():
 # The thesis's method
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("width_deg", [3, 8, 30])
 def test_given_stages_with_a_beam(width_deg):
     """Leaves of many tiles, each of which sees other channels."""
@@ -1009,6 +928,7 @@ def array_pings(sway_m, period_m):
     return np.repeat(ping_m, 6, axis=0), rx_m.reshape(-1, 3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("beam", [None, BeamWindow(6.0, "hann")], ids=["all", "beam"])
 @pytest.mark.parametrize("tolerance_db", [-25, -45])
 def test_overlapping_pings_of_a_swaying_array(device, beam, tolerance_db):
@@ -1034,6 +954,7 @@ def test_a_beam_that_swings_with_the_track_is_not_factorized():
     assert not plan(lines, grid, tolerance_db=-30, costs=EXACT_IS_SLOW).is_exact
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("costs", [EXACT_IS_SLOW, Costs(call_ns=1e12)], ids=["stages", "exact"])
 def test_data_may_arrive_in_pieces(costs, platform):
     """Images of parts of the lines add up, also where one is backprojected."""
@@ -1046,16 +967,3 @@ def test_data_may_arrive_in_pieces(costs, platform):
         assert chosen.is_exact == (costs is not EXACT_IS_SLOW)
         image = factorize(some, grid, chosen, device=platform, accumulate=image)
     assert relative_error_db(image, whole) < -42
-
-
-def test_what_cannot_be_added_to_is_refused(platform):
-    lines, grid = made(straight)
-    other = Image(np.zeros((4, 4), complex), Grid.plane((0, 1, 4), (0, 1, 4)))
-    with pytest.raises(ValueError, match="accumulate must be an image on the same grid"):
-        factorize(lines, grid, -40, accumulate=other, device=platform)
-    with pytest.raises(TypeError, match="accumulate must be of type Image"):
-        factorize(lines, grid, -40, accumulate=np.zeros(grid.shape, complex), device=platform)
-    zero = Image(np.zeros(grid.shape, complex), grid)
-    beam = BeamWindow(60, "hann", normalise=True)
-    with pytest.raises(ValueError, match="accumulate must be None with a beam that normalises"):
-        factorize(lines, grid, -40, accumulate=zero, beam=beam, device=platform)

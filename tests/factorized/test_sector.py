@@ -44,6 +44,7 @@ def any_track(request, wide):
 # What is formed
 
 
+@pytest.mark.slow
 def test_what_is_formed_is_what_was_planned(wide):
     sector = wide.sector(wide.division.roots)
     for level, (need, stage) in enumerate(zip(sector.needs, wide.plan.stages, strict=False)):
@@ -53,6 +54,7 @@ def test_what_is_formed_is_what_was_planned(wide):
     assert 0.75 <= pixels / wide.plan.stages[-1].operations <= 1.35
 
 
+@pytest.mark.slow
 def test_both_ends_of_the_track_are_alike(wide):
     sector = wide.sector(wide.division.roots)
     need = sector.needs[-1]
@@ -71,6 +73,7 @@ def test_nothing_is_formed_that_no_channel_reaches(wide):
         assert (need.last <= counts[:, None]).all()
 
 
+@pytest.mark.slow
 def test_subimages_use_what_their_parents_have(any_track):
     wide = any_track
     sector = wide.sector(wide.division.roots)

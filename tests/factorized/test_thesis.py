@@ -105,6 +105,7 @@ def test_the_formula_does_not_bound_oblique_squares(squint_deg):
 STAGES = [[(2, 2)], [(3, 8)], [(8, 2)], [(2, 2)] * 3, [(4, 8), (2, 2)]]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stages", STAGES)
 @pytest.mark.parametrize("bistatic", [False, True])
 def test_errors_of_a_plan(stages, bistatic):

@@ -102,6 +102,7 @@ def interpolation_error_db(case, side, aperture, root=(128, 128)):
     return 10 * np.log10(wrong / total)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("taps", "density"), [(4, 1.48), (6, 2.07), (8, 2.16)])
 @pytest.mark.parametrize("side", [(64, 64), (16, 16), (64, 8)])
 @pytest.mark.parametrize("case", [straight, near, swaying, arc], ids=lambda case: case.__name__)
@@ -179,6 +180,7 @@ def everything(monkeypatch):
     monkeypatch.setattr(importlib.import_module("clsas.factorized.sector").tree, "ranges", widened)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("beam", BEAMS, ids=["hann", "wide", "squint"])
 def test_leaves_have_all_the_nodes_they_need(beam, everything, monkeypatch):
     """What lies outside a beam weighs nothing: leaving it out makes nothing worse."""
@@ -194,6 +196,7 @@ def test_leaves_have_all_the_nodes_they_need(beam, everything, monkeypatch):
     assert relative_error_db(image, exact) <= relative_error_db(whole, exact) + 0.5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shape", [(33, 65), (70, 129)])
 def test_subimages_beyond_the_grid_are_not_missed(shape, everything, monkeypatch):
     grid = around(0, 40, shape=shape)
@@ -225,6 +228,7 @@ def test_places_from_where_leaves_are_seen_hold_all_that_weigh():
             assert ((weighs >= first) & (weighs <= last)).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("range_m", [3, 40])
 @pytest.mark.parametrize("beam", [BeamWindow(1), BeamWindow(8), BeamWindow(60, squint_deg=20)])
 def test_boxes_are_seen_from_where_they_are_and_from_hardly_more(beam, range_m):

@@ -82,6 +82,7 @@ def test_round_trip_keeps_every_bit(obj, tmp_path):
     assert os.listdir(tmp_path) == ["file.h5"]
 
 
+@pytest.mark.slow
 def test_another_process_reads_every_bit(tmp_path):
     paths = [str(tmp_path / f"{name}.h5") for name in OBJECTS]
     for path, obj in zip(paths, OBJECTS.values(), strict=True):
@@ -361,6 +362,7 @@ def test_truncated_files_are_refused(tmp_path):
             load(path)
 
 
+@pytest.mark.slow
 def test_damaged_bytes_never_become_data(tmp_path):
     save(tmp_path / "whole.h5", OBJECTS["lines"])
     whole = (tmp_path / "whole.h5").read_bytes()

@@ -49,6 +49,7 @@ def file(tmp_path):
     return tmp_path / "lines.h5"
 
 
+@pytest.mark.slow
 def test_patches_make_the_image(platform, exact):
     image = clsas.mosaic(LINES, GRID, **REQUEST, device=platform).image()
     assert image.grid is GRID
@@ -82,6 +83,7 @@ def test_a_store_holds_pixels_and_records(file, tmp_path, exact):
         assert record.seconds > 0
 
 
+@pytest.mark.slow
 def test_a_store_opens_in_xarray(file, tmp_path, exact):
     xarray = pytest.importorskip("xarray")
     for _ in clsas.mosaic(file, GRID, tmp_path / "image.zarr", **REQUEST):
@@ -139,6 +141,7 @@ class TestFactorized:
             patch.setattr(planner, "_SEARCH_S", 0.0)
             return mosaic.image(patches.append), patches
 
+    @pytest.mark.slow
     def test_every_patch_is_as_good_as_predicted(self, scene, formed):
         for patch in formed[1]:
             assert patch.record.plan["sides"]  # not plain backprojection
@@ -146,6 +149,7 @@ class TestFactorized:
             measured = relative_error_db(patch.image, exact)
             assert measured <= patch.record.predicted_error_db <= self.TOLERANCE_DB
 
+    @pytest.mark.slow
     def test_there_are_no_seams(self, scene, formed):
         """Along borders the error is what it is elsewhere, and neighbours agree."""
         image, exact = formed[0].pixels, scene[1].pixels
@@ -193,54 +197,18 @@ def test_an_image_larger_than_memory_is_refused():
         clsas.mosaic(LINES, grid, beam=BEAM).image()
 
 
+@pytest.mark.slow
 def test_the_thesis_stages_work_in_patches():
     patches = list(clsas.mosaic(LINES, GRID, stages=[(2, 2), (2, 2)], beam=BEAM, patches=(2, 2)))
     assert [len(patch.record.plan["nearest"]) for patch in patches] == [2] * 4
 
 
+@pytest.mark.slow
 def test_patches_that_do_not_divide_the_grid(exact):
     patches = []
     image = clsas.mosaic(LINES, GRID, **(REQUEST | {"patches": (7, 3)})).image(patches.append)
     assert {patch.image.grid.shape for patch in patches} == {(9, 27), (9, 26), (6, 27), (6, 26)}
     assert relative_error_db(image, exact) < -65
-
-
-@pytest.mark.parametrize(
-    ("wrong", "message"),
-    [
-        ({"patches": (50, 4)}, "patches must leave each some of 60 pixels: 50 patches of 2"),
-        ({"patches": (61, 4)}, "patches must leave each some of 60 pixels"),
-        ({"patches": (0, 4)}, "every entry of patches must be .* got 0"),
-        ({"patches": 4}, r"patches must be \(rows, columns\) of patches, got 4"),
-        ({"patches": (1, 2, 3)}, r"patches must be \(rows, columns\) of patches"),
-        ({"tolerance_db": -40}, "at most one of tolerance_db, .* must be given"),
-        ({"accuracy_db": 3}, "accuracy_db must be .* dB, got 3"),
-        ({"memory_bytes": -1}, "memory_bytes must be"),
-        ({"patches": None, "memory_bytes": 1000}, "memory_bytes must be at least .* MiB"),
-        ({"beam": 8.0}, "beam must be"),
-        ({"device": []}, "device must name at least one device"),
-        ({"follow_s": 1.0}, "source must be a folder where follow_s is given"),
-    ],
-)
-def test_bad_arguments(wrong, message):
-    with pytest.raises((TypeError, ValueError), match=message):
-        clsas.mosaic(LINES, GRID, **(REQUEST | wrong))
-
-
-def test_bad_grids():
-    with pytest.raises(ValueError, match="grid must have two axes"):
-        clsas.mosaic(LINES, Grid.points([[0.0, 30.0, 0.0]]))
-    with pytest.raises(TypeError, match="grid must be"):
-        clsas.mosaic(LINES, (3, 4))
-
-
-def test_a_request_is_checked_before_any_patch():
-    with pytest.raises(ValueError, match=r"tolerance_db must be .* got -200"):
-        clsas.mosaic(LINES, GRID, tolerance_db=-200)
-    with pytest.raises(ValueError, match="tolerance_wavelengths must be"):
-        clsas.mosaic(LINES, GRID, tolerance_wavelengths=-1)
-    with pytest.raises(TypeError, match="stages must be"):
-        clsas.mosaic(LINES, GRID, stages=3)
 
 
 def test_a_patch_that_no_channel_sees_is_empty_and_flagged(tmp_path):
@@ -277,6 +245,7 @@ def test_missing_samples_are_flagged(file, tmp_path):
     assert "a gap of 0.25 m" in flagged[0].record.flags[1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("wish", [{}, {"accuracy_db": None, "tolerance_db": -65}])
 def test_missing_channels_weigh_nothing(file, wish, monkeypatch):
     """Neither with a beam that divides by what channels weigh, nor in a plan."""
@@ -377,6 +346,7 @@ class TestResuming:
         assert len(there.finished) == 8
         np.testing.assert_array_equal(there.image().pixels, before.pixels)
 
+    @pytest.mark.slow
     def test_after_kill(self, file, tmp_path, exact):
         """Kill -9 in the middle, again and again."""
         program = f"""
@@ -439,6 +409,7 @@ class TestResuming:
         shutil.rmtree(path)
         assert len(list(clsas.mosaic(LINES, GRID, path, **other))) == 12
 
+    @pytest.mark.slow
     @pytest.mark.parametrize(
         ("name", "value"),
         [
@@ -499,6 +470,7 @@ class TestResuming:
         with pytest.raises(ValueError, match=r"a.zarr (is damaged|exists and is not|is a mosaic)"):
             clsas.mosaic(LINES, GRID, tmp_path / "a.zarr", **REQUEST)
 
+    @pytest.mark.slow
     def test_a_file_written_anew_is_read_anew(self, file, tmp_path):
         clsas.mosaic(file, GRID, **REQUEST).image()
         moved = dataclasses.replace(LINES, tx_m=LINES.tx_m + 0.3, rx_m=LINES.rx_m + 0.3)
@@ -522,6 +494,7 @@ class TestResuming:
         assert [(patch.row, patch.column) for patch in again] == [(1, 2)]
 
 
+@pytest.mark.slow
 def test_a_full_disk_keeps_what_is_finished(file, tmp_path):
     program = """
         import clsas, pickle, resource, signal, sys
@@ -568,6 +541,7 @@ def test_a_store_that_is_read_only(tmp_path):
         clsas.mosaic(LINES, GRID, tmp_path / "a.zarr", **REQUEST)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(len(list_devices()) < 2, reason="one OpenCL device only")
 def test_devices_side_by_side(exact):
     infos = list_devices()[:2]
@@ -580,6 +554,7 @@ def test_devices_side_by_side(exact):
 
 
 class TestDistributed:
+    @pytest.mark.slow
     def test_a_worker_that_dies_is_made_up_for(self, file, tmp_path):
         distributed = pytest.importorskip("distributed")
         for _ in clsas.mosaic(file, GRID, tmp_path / "local.zarr", **REQUEST):
@@ -645,6 +620,7 @@ class TestFollowing:
 
         return folder, add
 
+    @pytest.mark.slow
     def test_patches_are_formed_while_files_arrive(self, lines, record, tmp_path):
         folder, add = record
         beam = dataclasses.replace(BEAM, track_pings=101)
@@ -693,6 +669,7 @@ class TestFollowing:
         assert last < 1000
         assert passed[np.searchsorted(counts, last + 200)]  # and soon
 
+    @pytest.mark.slow
     def test_a_survey_is_followed_once_more(self, record, tmp_path):
         """Files are in the store's inputs once, whoever looked when they came."""
         folder, add = record
@@ -706,6 +683,7 @@ class TestFollowing:
         again = clsas.mosaic(folder, self.GRID, tmp_path / "a.zarr", **self.REQUEST, follow_s=1)
         assert len(again.finished) == 10
 
+    @pytest.mark.slow
     def test_a_survey_that_grew_twice_goes_on(self, record, tmp_path):
         """The store's inputs hold every file in its order."""
         folder, add = record
@@ -720,6 +698,7 @@ class TestFollowing:
         assert len(read_document(path)["inputs"]["parts"]) == 4
         assert len(clsas.mosaic(folder, self.GRID, path, **self.REQUEST).finished) == 10
 
+    @pytest.mark.slow
     def test_later_channels_make_a_patch_anew(self, lines, record, tmp_path):
         folder, add = record
         add(range(4))
@@ -733,6 +712,7 @@ class TestFollowing:
         reference = clsas.backproject(lines, self.GRID, beam=beam, accuracy_db=-80)
         assert relative_error_db(Store.opened(path).image(), reference) < -65
 
+    @pytest.mark.slow
     def test_a_second_leg_while_following_again(self, lines, record, tmp_path):
         """Patches finished in an earlier run, and those begun as the last file came, too."""
         folder, add = record
@@ -785,6 +765,7 @@ class TestFollowing:
             clsas.mosaic(tmp_path / "none", self.GRID, **self.REQUEST, follow_s=0.1)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not os.path.exists("/proc/self/status"), reason="Linux tells the most memory")
 def test_lines_larger_than_memory_are_read_in_parts(tmp_path):
     """200 km of track, 30 GB of samples, of which next to nothing is on the disk."""

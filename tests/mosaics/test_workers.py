@@ -31,6 +31,7 @@ def new_ports(attack, before):
     return [address for address in attack.listening(os.getpid()) if address not in before]
 
 
+@pytest.mark.slow
 def test_workers_answer_only_their_own_run(attack):
     from clsas.mosaics.workers import local_client
 
@@ -65,6 +66,7 @@ def run_with_workers(folder):
     return result.stderr.splitlines()
 
 
+@pytest.mark.slow
 def test_a_worker_that_raises_at_start_is_one_line(tmp_path):
     import dask
 

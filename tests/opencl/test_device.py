@@ -66,6 +66,7 @@ VECTORS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("macros", "most"), VECTORS.values(), ids=VECTORS)
 def test_vectors_are_no_wider_than_the_compilers(macros, most, monkeypatch):
     before = list_devices()
@@ -245,6 +246,7 @@ def test_opened_once():
     assert open_device(device.info.platform).info.platform == device.info.platform
 
 
+@pytest.mark.slow
 def test_kernels_are_built_once(platform):
     kernel = platform.kernel("backproject", "backproject_tiles", **OPTIONS)
     assert platform.kernel("backproject", "backproject_tiles", **OPTIONS) is kernel
@@ -262,6 +264,7 @@ def test_a_program_is_built_once_for_all_its_kernels(platform, monkeypatch):
     assert platform.kernel("backproject", "backproject_points", **options)
 
 
+@pytest.mark.slow
 def test_only_the_programs_used_last_are_kept(platform, monkeypatch):
     monkeypatch.setattr(module, "_MOST_PROGRAMS", 3)
     device = dataclasses.replace(platform, _kernels={})

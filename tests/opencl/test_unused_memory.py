@@ -45,6 +45,7 @@ def poison(monkeypatch):
     return switch_on
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("imager", "asked_db"), REQUESTS)
 @pytest.mark.parametrize("name", SCENES)
 def test_what_unused_memory_holds_does_not_matter(name, imager, asked_db, device, poison):

@@ -55,6 +55,7 @@ def test_upsampling_gives_the_closed_form(platform, centre, step):
     assert not outside.any()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("most_db", [-40, -60, -80])
 def test_the_error_is_as_predicted(device, most_db):
     """Against the sum of band-limited noise at exact places, away from the lines' ends."""
@@ -101,6 +102,7 @@ def test_lines_that_come_in_parts(platform, monkeypatch):
     np.testing.assert_array_equal(whole, parts)
 
 
+@pytest.mark.slow
 def test_no_short_filter_upsamples_a_full_band():
     assert upsampler(flat(1.0), 20, even, -50) is None
     assert upsampler(flat(0.8), 20, even, -50).taps < upsampler(flat(0.9), 20, even, -50).taps

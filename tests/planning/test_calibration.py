@@ -41,6 +41,7 @@ def disturbed(monkeypatch):
     return disturb
 
 
+@pytest.mark.slow
 def test_what_is_measured_is_stored(cache, small, monkeypatch):
     # Whatever else this machine does.
     monkeypatch.setattr(module, "_MOST_SCATTER", 100.0)
@@ -54,6 +55,7 @@ def test_what_is_measured_is_stored(cache, small, monkeypatch):
     assert found.sample_ns + found.sample_tap_ns > 0
 
 
+@pytest.mark.slow
 def test_first_images_of_plans_are_measured(cache, small, monkeypatch):
     """Others find the geometry that the first has left."""
     form, kept = module.factorize, []
@@ -69,6 +71,7 @@ def test_first_images_of_plans_are_measured(cache, small, monkeypatch):
     assert not any(kept)
 
 
+@pytest.mark.slow
 def test_measurements_of_a_busy_machine_are_not_stored(cache, small, disturbed):
     """What else there is to do comes and goes: every other run takes half a second more."""
     disturbed(lambda image, seconds: seconds + 0.5 * (len(image.seconds) % 2))
@@ -79,6 +82,7 @@ def test_measurements_of_a_busy_machine_are_not_stored(cache, small, disturbed):
     assert costs.load(open_device()) == before != found
 
 
+@pytest.mark.slow
 def test_times_that_no_costs_explain_are_not_stored(cache, small, disturbed):
     """Small images take a thousand times as long as large ones."""
     disturbed(lambda image, seconds: 1e6 / image.pixel_work)

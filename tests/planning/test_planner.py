@@ -43,6 +43,7 @@ def test_a_small_image_is_backprojected():
     assert chosen.predicted_error_db <= -50
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tolerance_db", [-10, -50, -75])
 def test_a_large_image_is_factorized(tolerance_db):
     """A million pixels from 2000 channels."""
@@ -294,6 +295,7 @@ def test_next_to_nothing_of_a_beam_is_left_out(beam_deg, share):
 # Memory
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("costs", [EXACT_IS_SLOW, Costs(pixel_ns=1e-3, part_ns=0.0)])
 @pytest.mark.parametrize("beam", [None, BEAMS[0]], ids=["all", "beam"])
 def test_memory_decides_whatever_things_cost(costs, beam):

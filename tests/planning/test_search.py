@@ -49,6 +49,7 @@ def cost_of(tree, view, filters_db, most, leaf_pixels, beam_cycles, device, cost
     return total + option.channels(view, turned) * option.leaves_s[leaf]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("filters_db", [-20.0, -55.0])
 @pytest.mark.parametrize("costs", [Costs(), Costs(leaf_ns=50.0), Costs(reference_ns=1e5)])
 def test_nothing_is_faster_than_what_is_found(view, filters_db, costs):

@@ -106,6 +106,7 @@ def test_an_array_is_no_sway():
         assert least <= np.abs(off_m).max() <= most
 
 
+@pytest.mark.slow
 def test_element_patterns_are_those_of_the_simulator():
     """Images of points all over the grid, with and without patterns."""
     sonar = clsas.Sonar(
@@ -158,6 +159,7 @@ def test_effects_that_are_not_there_do_nothing():
     assert [effect.name for effect in found.effects] == list(KEYS)
 
 
+@pytest.mark.slow
 def test_imagers_leave_out_what_the_table_says():
     grid = Grid.plane((-0.9, 0.9, 512), (20.0, 21.8, 512))
     lines = lines_on(grid, APERTURE, beside(APERTURE, 0.01, 0, 0))
@@ -172,6 +174,7 @@ def test_imagers_leave_out_what_the_table_says():
     assert clsas.plan(lines, grid, tolerance_db=-40).left_out == (APART,)
 
 
+@pytest.mark.slow
 def test_half_precision_is_told_of(platform):
     grid = Grid.plane((-0.9, 0.9, 512), (20.0, 21.8, 512))
     lines = lines_on(grid, APERTURE.repeat(4, axis=0) + along_x(4 * CHANNELS, 0.005))
@@ -210,6 +213,7 @@ def test_wrong_arguments_are_named(change, error, says):
         assess(**given)
 
 
+@pytest.mark.slow
 def test_lines_of_a_survey_have_its_geometry_and_band():
     scene = config.parse_scene(config.built_in_scene("thesis_wide_beam"), name="", folder=None)
     lines = survey_lines(scene.sonar, scene.track, scene.grid, motion_in_flight=True)
@@ -277,6 +281,7 @@ def scene(tmp_path):
     return write
 
 
+@pytest.mark.slow
 def test_a_scene_is_assessed_before_it_is_simulated(scene):
     found, effects = table(scene())
     assert found["tolerance_db"] == -30
@@ -293,6 +298,7 @@ def test_a_scene_is_assessed_before_it_is_simulated(scene):
         assert name in text
 
 
+@pytest.mark.slow
 def test_what_a_scene_may_leave_out_is_told_with_the_key(scene):
     """And leaving it out, the scene images the same within the tolerance."""
     slow = {
@@ -328,6 +334,7 @@ def test_what_a_scene_may_leave_out_is_told_with_the_key(scene):
     assert relative_error_db(images[1].pixels, images[0].pixels) < -10
 
 
+@pytest.mark.slow
 def test_lines_are_assessed_with_the_scene_that_made_them(scene, tmp_path):
     path, echoes, lines = scene(), tmp_path / "echoes.h5", tmp_path / "lines.h5"
     assert run("simulate", path, "-o", echoes).exit_code == 0

@@ -177,6 +177,7 @@ def test_pictures_are_written_whole_or_not_at_all(tmp_path, monkeypatch):
     assert (tmp_path / "image.png").read_bytes() == content
 
 
+@pytest.mark.slow
 def test_every_figure_is_drawn_without_a_warning(tmp_path, recwarn):
     data = lines(np.ones((10, 4), complex))
     response = measure_point(IMAGE, (X[80], Y[60]))
@@ -193,6 +194,7 @@ def test_every_figure_is_drawn_without_a_warning(tmp_path, recwarn):
     assert not recwarn.list
 
 
+@pytest.mark.slow
 def test_no_global_state_is_touched():
     code = (
         "import sys, numpy as np; from clsas import plot; from clsas.core.grid import Grid; "

@@ -67,6 +67,7 @@ def test_closed_forms_are_those_of_the_books():
     assert highest == pytest.approx(-42.68, abs=0.01)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("carriers", [(0, 0), (0, 8377.6), (-411.0, 1234.5)])
 @pytest.mark.parametrize("oversampling", [1.2, 1.5, 3.0])
 @pytest.mark.parametrize("window", PEDESTALS)
@@ -86,6 +87,7 @@ def test_measures_the_closed_form(window, oversampling, carriers):
         assert cut.lobes == (10, 10)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("window", PEDESTALS)
 @pytest.mark.parametrize("carriers", [(0, 0), (300.0, 8377.6)])
 @pytest.mark.parametrize("shift", [-0.5, -0.2, 0.0, 0.1, 0.49])

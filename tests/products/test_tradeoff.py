@@ -44,6 +44,7 @@ def lines():
     return clsas.simulate_lines(along, along, TARGETS, carrier_hz=1e6, bandwidth_hz=1e5)
 
 
+@pytest.mark.slow
 def test_every_way_is_measured_against_the_exact_image(lines):
     seen = []
     measured = clsas.tradeoff(
@@ -71,6 +72,7 @@ def test_every_way_is_measured_against_the_exact_image(lines):
     assert exact.azimuth.resolution_m == pytest.approx(0.443 * 1.5e-3 * 40.3 / 1.65, rel=0.03)
 
 
+@pytest.mark.slow
 def test_a_study_sweeps_what_the_planner_chooses_from(lines):
     measured = clsas.tradeoff(lines, GRID, tolerances_db=(-40,), stages=(), repeats=1, study=True)
     studied = [row for row in measured.rows if row.method == "study"]
@@ -83,6 +85,7 @@ def test_a_study_sweeps_what_the_planner_chooses_from(lines):
     assert any("8 taps in range" in row.plan and "6 along" in row.plan for row in studied)
 
 
+@pytest.mark.slow
 def test_a_beam_counts_in_every_image(lines):
     beam = clsas.BeamWindow(1.0, "hann")
     narrow = clsas.tradeoff(lines, GRID, tolerances_db=(-40,), stages=(), beam=beam, repeats=1)
@@ -171,6 +174,7 @@ def test_csv(tmp_path):
         MADE.save_csv(tmp_path / "none" / "t.csv")
 
 
+@pytest.mark.slow
 def test_picture(tmp_path):
     pytest.importorskip("matplotlib")
     from clsas import plot

@@ -105,6 +105,7 @@ def four_points():
     return echoes, grid, execute(prepare(lines, grid, accuracy_db=-85))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("oversampling", [2.0, 1.4, 1.25, 1.1, 1.06])
 def test_thin_guard_bands_keep_what_is_asked(four_points, oversampling):
     echoes, grid, exact = four_points

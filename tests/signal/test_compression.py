@@ -48,6 +48,7 @@ def response(pulse, window, delay):
     return np.exp(2j * np.pi * np.multiply.outer(delay, f)) @ power / power.sum()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("window", ["none", "hamming"])
 @pytest.mark.parametrize("oversampling", [1.0, 1.3, 3.0])
 @pytest.mark.parametrize("name", PULSES)
@@ -66,6 +67,7 @@ def test_compressed_line_is_the_closed_form(name, oversampling, window):
     assert lines.range_step_m == pytest.approx(C / (2 * oversampling * BAND), rel=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", PULSES)
 def test_peak_is_at_the_range_with_amplitude_and_phase(name):
     """Between the samples, by band-limited interpolation of the line itself."""
@@ -98,6 +100,7 @@ def side_lobe_db(lines):
     return db(level[null:], level[peak])
 
 
+@pytest.mark.slow
 def test_side_lobes():
     pulse = Pulse(CARRIER, BAND, 20e-3)  # 2000 cycles: its spectrum is nearly flat
     echoes = echoes_of(pulse, [[0, 40, 0]], range_m=(35, 45))
@@ -120,6 +123,7 @@ def test_barker_side_lobes_are_the_codes():
     assert db(lines.samples[0, away]) == pytest.approx(-20 * np.log10(13), abs=0.1)
 
 
+@pytest.mark.slow
 def test_energy():
     """A flat band's response has the energy of its sinc: c/(2 B) in range, any oversampling."""
     echoes = echoes_of(Pulse(CARRIER, BAND, 20e-3), [[0, 40, 0]], range_m=(20, 60))
@@ -143,6 +147,7 @@ def test_noise_gain_is_that_of_a_matched_filter():
     assert power == pytest.approx(1 / (rate * energy), rel=0.03)
 
 
+@pytest.mark.slow
 def test_nothing_wraps():
     """A strong echo at either end of the window leaves only its own side lobes at the other."""
     pulse = PULSES["up"]

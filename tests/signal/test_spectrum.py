@@ -65,6 +65,7 @@ def test_the_centre_is_the_middle_of_the_occupied_band(occupied, tilt_db, noise_
     assert spectrum.oversampling == pytest.approx(1 / occupied, rel=0.03)
 
 
+@pytest.mark.slow
 def test_a_common_offset_weighs_as_in_the_image():
     """It adds up in phase over the image, echoes from everywhere do not."""
     x_m = 0.02 * np.arange(200)

@@ -86,6 +86,7 @@ def test_without_element_patterns_elements_have_no_sizes():
             simulate(sized, TRACK, SCENE, **{name: 1})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rate", [125e3, 200e3, 317e3])
 def test_rectangular_chirp_through_the_receivers_filter(rate):
     """The stated spectrum, by Fresnel integrals, summed over frequency with period 50 ms."""
@@ -283,6 +284,7 @@ def test_rectangular_chirp_never_wraps():
     assert db(outside) < -120
 
 
+@pytest.mark.slow
 def test_noise_has_the_stated_power_and_is_repeatable():
     quiet = simulate(SMOOTH, TRACK, SCENE, range_m=(10, 100))
     loud = simulate(SMOOTH, TRACK, SCENE, range_m=(10, 100), snr_db=12.0, seed=3)
@@ -352,6 +354,7 @@ def box_on_sand(**others):
     return Seabed((-6, 6), (30, 42), np.where(box, 1.5, 0.0), **{"density_m2": 40, **others})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("sonar", "options"),
     [

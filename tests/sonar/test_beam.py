@@ -66,6 +66,7 @@ def test_the_table_holds_the_weights(shape, width_deg, squint_deg):
     np.testing.assert_allclose(held, beam.weights(q, 1.0), atol=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("taper", [0.002, 0.004, 0.01, 0.03, 0.1, 0.2, 0.5, 1.0])
 def test_the_table_of_a_window_with_kinks_serves_blocks(taper):
     """One cubic of it serves a block: beyond its interval too, on whichever side of a kink."""
@@ -177,6 +178,7 @@ WINDOWED = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", WINDOWED)
 def test_an_image_is_the_weighted_sum(name, device):
     case, beam = WINDOWED[name]
@@ -212,6 +214,7 @@ def test_an_image_at_the_edge_of_a_window_is_as_accurate(shape, accuracy_db):
     assert relative_error_db(chosen, each) <= accuracy_db - 6
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("turned", [False, True])
 @pytest.mark.parametrize("squint_deg", [0, 10])
 @pytest.mark.parametrize("shape", ["hann", "hamming", "taylor", "rectangular"])
@@ -260,6 +263,7 @@ def test_the_references_weigh_each_channel(normalise):
     assert relative_error_db(ideal(lines, where, beam=beam), wanted) <= -80
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", [bistatic, points], ids=lambda case: case.__name__)
 def test_a_window_open_on_all_sides_changes_nothing(case, device):
     lines, grid = made(case)
@@ -279,6 +283,7 @@ def test_pixels_at_the_antennas_and_ahead_of_them_are_finite(platform):
         np.testing.assert_array_equal(pixels != 0, seen)
 
 
+@pytest.mark.slow
 def test_normalising_levels_points_along_the_track(platform):
     """Points to beyond the ends of the aperture, of which the outer ones are seen by fewer."""
     x = np.linspace(-6, 6, 9)
@@ -311,6 +316,7 @@ def test_normalising_amplifies_no_errors_where_little_is_seen(shape, y_m, accura
     assert relative_error_db(image, exact) <= accuracy_db
 
 
+@pytest.mark.slow
 def test_an_unseen_pixel_of_a_normalised_image_is_zero(platform):
     grid = patch(0.0, 42, 400, 3)
     lines = thesis_lines(grid, APERTURE[300:340])
@@ -323,6 +329,7 @@ def test_an_unseen_pixel_of_a_normalised_image_is_zero(platform):
     np.testing.assert_array_equal(pixels[1] != 0, sums > 0)
 
 
+@pytest.mark.slow
 def test_a_narrow_beam_costs_little(platform):
     """Few of the pairs are prepared; the image is that of the few."""
     track = along_x(1500, 0.05)
@@ -340,6 +347,7 @@ def test_a_narrow_beam_costs_little(platform):
     assert relative_error_db(image.pixels[::9, ::9], same_interpolator(preparation, some)) <= -70
 
 
+@pytest.mark.slow
 def test_progress_counts_what_is_skipped(platform):
     calls = []
     grid = Grid.plane((-30, 30, 200), (40, 42, 40))

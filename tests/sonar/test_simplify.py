@@ -141,6 +141,7 @@ def test_effects_are_left_out_up_to_their_share_of_the_error(case):
     assert kept.error <= SHARE * power(begins_db)
 
 
+@pytest.mark.slow
 @ALL
 @pytest.mark.parametrize("beside_db", [7, -0.1])
 def test_exact_images_keep_their_accuracy_on_either_side(case, beside_db, platform):
@@ -156,6 +157,7 @@ def test_exact_images_keep_their_accuracy_on_either_side(case, beside_db, platfo
     assert true_error_db(case, image) <= accuracy_db + 0.3
 
 
+@pytest.mark.slow
 @ALL
 @pytest.mark.parametrize("beside_db", [7, -0.1])
 def test_factorized_images_keep_their_tolerance_on_either_side(case, beside_db, platform):
@@ -369,6 +371,7 @@ def random_survey(seed):
     return lines, grid, beam, random.uniform(-85, -10)
 
 
+@pytest.mark.slow
 def test_no_geometry_leaves_out_more_than_is_allowed(monkeypatch):
     """Every pixel and channel that see each other, of surveys that nobody would make."""
     monkeypatch.setattr("clsas.sonar.simplify.LEAST_PIXELS", 1000)

@@ -19,6 +19,7 @@ def small(monkeypatch):
     )
 
 
+@pytest.mark.slow
 def test_every_image_is_within_its_bound(platform, monkeypatch):
     """Other ways to drive a CPU are tested elsewhere."""
     monkeypatch.setattr(selftest, "other_builds", lambda info: [])
@@ -30,6 +31,7 @@ def test_every_image_is_within_its_bound(platform, monkeypatch):
     assert imagers == {"exact", "factorized", "half precision", "mosaic", "wavenumber"}
 
 
+@pytest.mark.slow
 def test_other_builds_for_a_device_are_tested_too(platform, monkeypatch):
     monkeypatch.setattr(selftest, "_CHECKS", ())
     monkeypatch.setattr(selftest, "_BUILDS", ((1, False), (4, False)))
@@ -40,6 +42,7 @@ def test_other_builds_for_a_device_are_tested_too(platform, monkeypatch):
     assert all("width" in result.case for result in results)
 
 
+@pytest.mark.slow
 def test_plans_of_the_scenes_are_factorized(platform):
     """Else the factorized imager would not be tested."""
     for scene, imager, asked_db in selftest._CHECKS:

@@ -1,0 +1,297 @@
+"""What holds for every imager, on every platform."""
+
+import dataclasses
+from functools import cache
+
+import numpy as np
+import pytest
+from cases import APERTURE, CARRIER, beside, noise
+from contract import IMAGERS, Scene, narrow, scene
+from factorizing import bistatic_array
+from variants import DEFAULT, OWN, variant
+
+from clsas import ClsasWarning, Grid, PointTargets, simulate_lines
+from clsas.core.image import Image
+from clsas.core.image_error import relative_error_db
+
+BY_NAME = {imager.name: imager for imager in IMAGERS}
+FAR_M = np.array([1e7, -1e7, 1e7])
+
+
+def pairs(cases=None, needs=None, but=()):
+    """(imager, way to drive a device) of every imager, with each of its cases if asked for."""
+    found = []
+    for imager in IMAGERS:
+        if imager.name in but or (needs and needs not in imager.options):
+            continue
+        ways = OWN if "device" in imager.options else {"host": None}
+        for name, way in ways.items():
+            quick = name == DEFAULT
+            of = f"{imager.name}-{name}"
+            if cases is None:
+                found.append(_param((imager, way), name=of, quick=quick))
+            else:
+                # The first case is the smallest.
+                found += [
+                    _param((imager, way), case, name=f"{of}-{case.__name__}", quick=quick and not n)
+                    for n, case in enumerate(cases(imager))
+                ]
+    return found
+
+
+def _param(*values, name, quick):
+    return pytest.param(*values, id=name, marks=() if quick else pytest.mark.slow)
+
+
+every_imager = pytest.mark.parametrize("bound", pairs())
+every_scene = pytest.mark.parametrize(("bound", "case"), pairs(lambda imager: imager.cases))
+
+
+def former(bound, like=None):
+    """Function of scenes, to the pixels that an imager forms of them.
+
+    With a scene they are all formed alike: by the plan or the filters that it gets.
+    """
+    imager, way = bound
+    device = None if way is None else variant(*way)
+    settings = {} if like is None else imager.settings(like)
+
+    def form(scene, **options):
+        return imager.form(scene, device, **settings, **options).pixels
+
+    return form
+
+
+@cache
+def image_of(bound, case):
+    """Pixels of a scene as it is."""
+    return former(bound)(scene(case))
+
+
+# Accuracy
+
+
+@every_imager
+def test_the_error_against_the_ideal_is_what_was_asked_for(bound):
+    assert narrow().error_db(image_of(bound, narrow)) <= bound[0].asked_db
+
+
+def test_images_are_factorized_where_they_are_said_to_be():
+    for imager in (BY_NAME["factorized"], BY_NAME["half precision"]):
+        for case in imager.cases:
+            chosen = imager.settings(scene(case))["chosen"]
+            assert not chosen.is_exact
+            assert chosen.half_precision == (imager.name == "half precision")
+
+
+def straight():
+    lines, grid = scene(narrow).lines, scene(narrow).grid
+    return grid, {
+        "tx_m": lines.tx_m, "rx_m": lines.rx_m, "carrier_hz": 200e3, "bandwidth_hz": 20e3,
+        "first_range_m": 30.0,
+    }  # fmt: skip
+
+
+def array():
+    lines, grid = scene(bistatic_array).lines, scene(bistatic_array).grid
+    return grid, {
+        "tx_m": lines.tx_m, "rx_m": lines.rx_m, "carrier_hz": 120e3, "bandwidth_hz": 24e3,
+        "first_range_m": 28.0,
+    }  # fmt: skip
+
+
+def anywhere():
+    """Antennas and points anywhere, and receivers that move."""
+    rng = np.random.default_rng(3)
+    tx = APERTURE[::20] + rng.normal(0, 0.1, (32, 3))
+    where = Grid.points(rng.uniform([-1, 41, -3], [1, 42, -2], (60, 3)))
+    return where, {
+        "tx_m": tx, "rx_m": beside(tx, 0.2, 0, 0.1), "rx_velocity_m_s": [2.0, 1, 0],
+        "carrier_hz": CARRIER, "bandwidth_hz": 1e5, "first_range_m": 39.0,
+    }  # fmt: skip
+
+
+def geometries(imager):
+    return (straight, *{"exact": (anywhere,), "factorized": (array,)}.get(imager.name, ()))
+
+
+@pytest.mark.parametrize(("bound", "geometry"), pairs(geometries))
+def test_imaging_is_the_adjoint_of_simulation(bound, geometry):
+    """<A x, y> = <x, A^H y>, with A from amplitudes to lines of a flat band.
+
+    A's point response is sinc(2 B r/c), sampled `oversampling` times as finely as that takes. Its
+    matched sum over the samples of a line within the band is `oversampling` times the line's
+    value, so that A^H is `oversampling` times imaging.
+    """
+    grid, antennas = geometry()
+    rng = np.random.default_rng(3)
+    oversampling = 1.6
+    positions_m = grid.positions_m().reshape(-1, 3)
+    chosen = rng.permutation(len(positions_m))[:60]
+    x = rng.normal(size=(60, 2)) @ [1, 1j]
+    length, channels = 1200, len(antennas["tx_m"])
+    points = PointTargets(positions_m[chosen], x)
+    ax = simulate_lines(scene=points, oversampling=oversampling, length=length, **antennas)
+    # y: bursts within the band (to -120 dB) that end within the lines.
+    n = np.arange(length)
+    y = np.zeros((channels, length), complex)
+    for _ in range(30):
+        at, frequency = (
+            rng.uniform(low, high, (channels, 1)) for low, high in ((300, 800), (-0.15, 0.15))
+        )
+        y += (rng.normal(size=(channels, 1, 2)) @ [1, 1j]) * np.exp(
+            -(((n - at) / 9) ** 2) + 2j * np.pi * frequency * n
+        )
+    lines = dataclasses.replace(ax, samples=y)
+    pixels = former(bound)(Scene(lines, grid)).ravel()[chosen].astype(complex)
+    left = np.vdot(ax.samples.astype(complex), y)
+    right = np.vdot(x, oversampling * pixels)
+    size = np.linalg.norm(x) * np.linalg.norm(oversampling * pixels)
+    assert abs(left) > 0.01 * size  # the two sides do not vanish
+    assert abs(left - right) <= 10 ** (bound[0].asked_db / 20) * size
+
+
+@every_imager
+def test_a_point_keeps_its_amplitude_and_phase(bound):
+    amplitude = 3 * np.exp(1.1j)
+    track, grid = scene(narrow).lines.tx_m, scene(narrow).grid
+    target = grid.positions_m()[11, 13]
+    lines = simulate_lines(
+        track, track, PointTargets([target], [amplitude]), carrier_hz=200e3, bandwidth_hz=20e3
+    )
+    pixel = former(bound)(Scene(lines, grid))[11, 13]
+    # The tolerance is an rms over the image, in which all other pixels are small.
+    assert abs(pixel / (len(track) * amplitude) - 1) <= 3e-3
+
+
+# What images have in common
+
+
+@every_scene
+def test_it_is_linear(bound, case):
+    one = scene(case)
+    shape = one.lines.channels, one.lines.length
+    other = one.with_lines(samples=noise(*shape, seed=9))
+    a, b = 0.3 - 2j, 1.5j
+    both = one.with_lines(samples=a * one.lines.samples + b * other.lines.samples)
+    form = former(bound, like=both)
+    wanted = a * form(one) + b * form(other)
+    assert relative_error_db(form(both), wanted) <= bound[0].linear_db
+
+
+def moved(given, turn, shift_m):
+    """Return a scene turned about the origin and shifted."""
+    lines, grid, beam = given.lines, given.grid, given.beam
+    velocity = lines.rx_velocity_m_s
+    lines = dataclasses.replace(
+        lines,
+        tx_m=lines.tx_m @ turn.T + shift_m,
+        rx_m=lines.rx_m @ turn.T + shift_m,
+        rx_velocity_m_s=None if velocity is None else velocity @ turn.T,
+    )
+    if grid.points_m is not None:
+        grid = Grid.points(grid.points_m @ turn.T + shift_m)
+    else:
+        axes = turn @ grid.row_step_m, turn @ grid.column_step_m
+        grid = Grid.oriented(turn @ grid.origin_m + shift_m, *axes, grid.shape)
+    if beam is not None and beam.along is not None:
+        beam = dataclasses.replace(beam, along=turn @ beam.along)
+    return Scene(lines, grid, beam)
+
+
+def rotation(seed):
+    q, r = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))
+    q *= np.sign(np.diag(r))
+    return q * np.linalg.det(q)
+
+
+MOTIONS = {
+    "shift": (np.eye(3), np.array([1024.5, -512.25, 64.125])),
+    "far": (np.eye(3), FAR_M),
+    "rotation": (rotation(1), np.zeros(3)),
+}
+
+
+@every_scene
+@pytest.mark.parametrize("motion", MOTIONS)
+def test_where_the_scene_lies_does_not_matter(bound, case, motion):
+    here = scene(case)
+    there = moved(here, *MOTIONS[motion])
+    form = former(bound)
+    assert relative_error_db(form(there), image_of(bound, case)) <= max(bound[0].asked_db, -80)
+
+
+@every_imager
+def test_the_order_of_channels_does_not_matter(bound):
+    given = scene(narrow)
+    order = np.random.default_rng(6).permutation(given.lines.channels)
+    shuffled = dataclasses.replace(given, lines=given.lines.select(order))
+    assert relative_error_db(former(bound)(shuffled), image_of(bound, narrow)) <= bound[0].same_db
+
+
+@pytest.mark.filterwarnings("ignore:lines are held in single precision, not in half")
+@every_imager
+@pytest.mark.parametrize("scale", [1e-36, 1e-30, 1e-10, 1e10, 1e20, 1e30])
+def test_the_unit_of_the_samples_does_not_matter(bound, scale):
+    """Amplitudes whose squares leave the range of float32."""
+    given = scene(narrow)
+    scaled = given.with_lines(samples=given.lines.samples * np.complex128(scale))
+    pixels = former(bound)(scaled).astype(np.complex128) / scale
+    assert relative_error_db(pixels, image_of(bound, narrow)) <= max(bound[0].same_db, -80)
+
+
+@every_imager
+def test_it_gives_the_same_twice(bound):
+    np.testing.assert_array_equal(former(bound)(scene(narrow)), image_of(bound, narrow))
+
+
+@pytest.mark.parametrize("bound", pairs(needs="accumulate"))
+def test_data_may_arrive_in_pieces(bound):
+    given = scene(narrow)
+    image = None
+    for part in (slice(0, 100), slice(100, 240)):
+        some = dataclasses.replace(given, lines=given.lines.select(part))
+        pixels = former(bound)(some, accumulate=image)
+        image = Image(pixels, given.grid)
+    assert narrow().error_db(image.pixels) <= bound[0].asked_db + 3
+
+
+# Progress and interruption
+
+
+@pytest.mark.parametrize(("bound", "case"), pairs(lambda imager: imager.cases, "progress"))
+def test_progress_rises_to_its_end(bound, case):
+    calls = []
+    former(bound)(scene(case), progress=lambda *call: calls.append(call))
+    done, total = np.array(calls).T
+    assert np.all(np.diff(done) > 0)
+    assert np.all(total == total[0])
+    assert done[-1] == total[0]
+
+
+@pytest.mark.parametrize("bound", pairs(needs="progress"))
+def test_an_interrupted_run_leaves_the_device_usable(bound):
+    def interrupt(done, total):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        former(bound)(scene(narrow), progress=interrupt)
+    assert narrow().error_db(former(bound)(scene(narrow))) <= bound[0].asked_db
+
+
+# Nothing to see
+
+
+@every_imager
+def test_lines_of_zeros_give_zeros_without_a_warning(bound):
+    given = scene(narrow)
+    silent = given.with_lines(samples=np.zeros_like(given.lines.samples))
+    assert not former(bound)(silent).any()
+
+
+@pytest.mark.parametrize("y", [5.0, 400.0, -4000.0])
+@pytest.mark.parametrize("bound", pairs(but=("mosaic",)))  # whose records say so
+def test_a_grid_that_no_line_reaches_warns_and_is_zero(bound, y):
+    given = dataclasses.replace(scene(narrow), grid=Grid.plane((-1, 1, 9), (y, y + 1, 9)))
+    with pytest.warns(ClsasWarning, match="no pixel"):
+        assert not former(bound)(given).any()
