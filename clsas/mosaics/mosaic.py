@@ -8,7 +8,6 @@ A mosaic that was interrupted continues with the patches that are not finished.
 from __future__ import annotations
 
 import os
-import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
@@ -29,9 +28,9 @@ from clsas.mosaics.forming import Job
 from clsas.mosaics.patches import Layout, choose_patch_shape, patch_shape_of
 from clsas.mosaics.provenance import REQUESTS, inputs_of
 from clsas.mosaics.record import PatchIndex, Record, describe_damage
-from clsas.mosaics.scheduling import POLL_S, Run, form_patches
+from clsas.mosaics.scheduling import Run, form_patches, wait_for_first_file
 from clsas.mosaics.store import Store
-from clsas.mosaics.survey import files_of, has_ended, open_survey
+from clsas.mosaics.survey import open_survey
 from clsas.mosaics.visibility import SurveyVisibility
 from clsas.opencl.device import Device
 from clsas.planning.planner import TOLERANCE_DB, checked_pairs, tolerance_in_db
@@ -322,7 +321,7 @@ def mosaic(
         source = Path(source).resolve()
     devices = () if client is not None else open_devices(device)
     if follow_s is not None:
-        _wait_for_first(source, follow_s)
+        wait_for_first_file(source, follow_s)
     survey = open_survey(source)
     if is_folder and beam is not None and beam.along is None and beam.track_pings is None:
         beam = replace(beam, track_pings=MOST_TRACK_PINGS)
@@ -395,12 +394,3 @@ def _undamaged(store: Store) -> dict[PatchIndex, Record]:
             f"{store.path} is damaged and these patches are formed again: {describe_damage(damage)}"
         )
     return {index: record for index, record in store.records().items() if index not in damage}
-
-
-def _wait_for_first(source: Path, follow_s: float) -> None:
-    """Wait for the first file of a folder; raise ValueError if none comes."""
-    start = time.monotonic()
-    while not files_of(source):
-        if has_ended(source) or time.monotonic() - start > follow_s:
-            raise ValueError(f"source must hold range lines: {source} has no file *.h5")
-        time.sleep(POLL_S)

@@ -200,3 +200,12 @@ def form_patches(run: Run, finished: dict[PatchIndex, Record]) -> Iterator[Forme
 def _all(layout: Layout) -> Iterator[PatchIndex]:
     rows, columns = layout.shape
     return ((row, column) for row in range(rows) for column in range(columns))
+
+
+def wait_for_first_file(source: Path, follow_s: float) -> None:
+    """Wait for the first file of a folder; raise ValueError if none comes."""
+    start = time.monotonic()
+    while not files_of(source):
+        if has_ended(source) or time.monotonic() - start > follow_s:
+            raise ValueError(f"source must hold range lines: {source} has no file *.h5")
+        time.sleep(POLL_S)
