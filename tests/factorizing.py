@@ -18,7 +18,7 @@ from clsas.opencl.device import open_device
 from clsas.planning.costs import Costs
 from clsas.sonar.beam import BeamWindow
 
-EXACT_IS_SLOW = Costs(pixel_ns=1e3, point_ns=1e3)
+EXACT_IS_SLOW = Costs(pixel_ns=1e6, point_ns=1e6)
 """Plans for small images divide them only if nothing else is fast."""
 SPEED = 1500.0
 BAND = 0.2  # of the carrier

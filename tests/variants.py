@@ -91,7 +91,7 @@ EVERY_VARIANT = {
         "exact--80", "factorized", "plane-half",
     ),
     "test_upsampling.py::test_the_error_is_as_predicted": ("--60",),
-    "test_device.py::test_the_vector_widths_give_their_values": EVERY_CASE,
+    "test_kernels.py::test_the_vector_widths_give_their_values": EVERY_CASE,
     # Plans know a device's width, without running anything.
     "test_planner.py::test_half_precision_is_for_tolerances_and_devices_that_allow_it": EVERY_CASE,
 }  # fmt: skip

@@ -25,7 +25,7 @@ from clsas.trials.extremes import Known, along_x
 _BUILDS = ((1, False), (4, False), (8, False), (8, True), (16, False))  # width, permuted lookup
 _WIDEST = 16
 
-_DIVIDED = Costs(pixel_ns=1e3, point_ns=1e3)
+_DIVIDED = Costs(pixel_ns=1e6, point_ns=1e6)
 """Costs with which even small images are divided, since exact imaging is predicted to be slow."""
 _FAR_M = (1e7, -1e7, 1e7)
 _WAVENUMBER_DB = -60.0  # error bound of the wavenumber image, which takes no accuracy

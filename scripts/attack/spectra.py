@@ -23,7 +23,7 @@ from clsas.planning.costs import Costs
 from clsas.trials.extremes import raw
 
 POINTS = [(0.0, 42.5, 0), (0.08, 42.505, 0), (-0.07, 42.49, 0), (0.03, 42.512, 0)]
-SLOW_EXACT = Costs(pixel_ns=1e3, point_ns=1e3)  # so that small images are factorized
+SLOW_EXACT = Costs(pixel_ns=1e6, point_ns=1e6)  # so that small images are factorized
 MISSES = []
 
 

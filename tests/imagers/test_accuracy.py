@@ -24,7 +24,7 @@ from clsas.trials.extremes import (
     ultrasonic,
 )
 
-SLOW = Costs(pixel_ns=1e3, point_ns=1e3)  # plans for small images divide them
+SLOW = Costs(pixel_ns=1e6, point_ns=1e6)  # plans for small images divide them
 FAR = (1e7, -1e7, 1e7)
 HANN = BeamWindow(12, "hann", along=[1, 0, 0])
 
