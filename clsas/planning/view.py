@@ -57,6 +57,18 @@ def kept(function: Callable[..., Any]) -> Callable[..., Any]:
     return from_before
 
 
+def shared(function: Callable[[View], Any]) -> Callable[[View], Any]:
+    """Cache what views with other limits or roots have in common."""
+
+    @functools.wraps(function)
+    def from_before(view: View) -> Any:
+        if function.__qualname__ not in view.kept:
+            view.kept[function.__qualname__] = function(view)
+        return view.kept[function.__qualname__]
+
+    return from_before
+
+
 class View:
     """The track as seen from sample points of the grid: what costs and errors depend on.
 
@@ -227,23 +239,27 @@ class View:
         seen = ((self._sines_of_channels > low) & (self._sines_of_channels < high)).mean(axis=0)
         return float(((seen > 0) & (seen < 1)).mean())
 
-    @functools.cached_property
+    @property
+    @shared
     def ambiguity(self) -> Ambiguity:
         """Errors that the lines themselves leave open."""
         return ambiguity(self.lines, self.grid, self.spectrum, self.beam, self.channels_along)
 
-    @functools.cached_property
+    @property
+    @shared
     def _everywhere_m(self) -> NDArray[np.float64]:
         return self._pixels_m(_EVERYWHERE)
 
-    @functools.cached_property
+    @property
+    @shared
     def _sines_of_channels(self) -> NDArray[np.float64]:
         """Sines of the aspect angle of all over the grid, [channels, points]; of some channels."""
         some = some_channels(self.lines.channels, _CHANNELS)
         position_m, along = self.lines.phase_centres_m[some], self.channels_along[some]
         return sines(self._everywhere_m, position_m, along)
 
-    @functools.cached_property
+    @property
+    @shared
     def off_track_m(self) -> NDArray[np.float64]:
         """Track errors: distances of channels from the mean track, [channels]."""
         aalong_m = self.lines.phase_centres_m - self.track.positions_m(self.track.place)
@@ -252,12 +268,14 @@ class View:
             off_m += np.linalg.norm(self.own_drift, axis=1) * np.median(self.distance_m)
         return off_m
 
-    @functools.cached_property
+    @property
+    @shared
     def own_drift(self) -> NDArray[np.float64] | None:
         """See `clsas.factorized.aperture.own_drift`."""
         return own_drift(self.lines)
 
-    @functools.cached_property
+    @property
+    @shared
     def densest(self) -> float:
         """Largest density of channels along the track, over the mean density."""
         place = np.sort(self.track.place)
@@ -310,7 +328,8 @@ class View:
         half = self.extents(side, most=True) / 2
         return self.on_track & (self._boxes.overlap(self.limits, half) > 0)
 
-    @functools.cached_property
+    @property
+    @shared
     def _boxes(self) -> Visibility:
         """Boxes of cells at the sample points, as seen from the track."""
         origin_m = self.points_m[0]
