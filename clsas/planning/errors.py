@@ -69,11 +69,6 @@ class Errors:
     nodes: tuple[float, ...]
     leaves: float
 
-    @property
-    def total(self) -> float:
-        """All together."""
-        return self.roots + sum(self.nodes) + self.leaves
-
 
 def other_errors(
     view: View,

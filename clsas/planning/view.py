@@ -50,9 +50,7 @@ def kept(function: Callable[..., Any]) -> Callable[..., Any]:
     @functools.wraps(function)
     def from_before(view: View, *arguments: Hashable, **options: Hashable) -> Any:
         key = (function.__qualname__, view.limits, view.root, arguments, *options.items())
-        if key not in view.kept:
-            view.kept[key] = function(view, *arguments, **options)
-        return view.kept[key]
+        return view.cached(key, lambda: function(view, *arguments, **options))
 
     return from_before
 
@@ -62,9 +60,7 @@ def shared(function: Callable[[View], Any]) -> Callable[[View], Any]:
 
     @functools.wraps(function)
     def from_before(view: View) -> Any:
-        if function.__qualname__ not in view.kept:
-            view.kept[function.__qualname__] = function(view)
-        return view.kept[function.__qualname__]
+        return view.cached(function.__qualname__, lambda: function(view))
 
     return from_before
 
@@ -131,6 +127,12 @@ class View:
         if beam is not None:
             self.along = beam_directions(self.channels_along, self.track, self.track.samples)
             self.beam_rates = beam_rate(beam, self.track, self.along, self.points_m)
+
+    def cached(self, key: Hashable, find: Callable[[], Any]) -> Any:
+        """Return what is kept under a key; find it first if there is nothing."""
+        if key not in self.kept:
+            self.kept[key] = find()
+        return self.kept[key]
 
     def _with(self, **changes: Any) -> View:
         """Return this view with other limits, or within roots of a size."""
