@@ -170,7 +170,7 @@ class _Image(Table):
                 ]
                 raise ValueError(f"{requests[0]} must stand alone, got also {', '.join(others)}")
             tolerance_in_db(self.tolerance_db, self.tolerance_wavelengths)
-            checked_pairs(self.stages or [])
+            checked_pairs([(beams, divisions) for beams, divisions in self.stages or ()])
             if self.accuracy_db is not None:
                 validate.number(
                     "accuracy_db", self.accuracy_db, "dB", least=BEST_ACCURACY_DB, below=0.0

@@ -103,7 +103,7 @@ def _create_arrays(path: Path, grid: Grid, patch_shape: tuple[int, int]) -> None
         fill_value=0,
         dimension_names=names,
     )
-    coordinates = {}
+    coordinates: dict[str, tuple[tuple[str, ...], NDArray[np.float64]]] = {}
     if grid.has_axes:
         coordinates |= {name: ((name,), axis) for name, axis in zip("xy", grid.axes_m, strict=True)}
     if grid.height_m is not None:

@@ -86,7 +86,8 @@ class Job:
         if self.local is not None:
             return self.local
         with _OPENING:
-            found = open_visibility(self.files, beam_json(self.beam))
+            beam = None if self.beam is None else beam_json(self.beam)
+            found = open_visibility(self.files, beam)
         if found.survey.stamps != tuple(stamp for _, stamp in self.files):
             raise ValueError("source must not change while a mosaic is formed: a file of it did")
         return found
@@ -161,7 +162,7 @@ def _image(
     if missing.all():
         return Record(**known, seconds=time.perf_counter() - start), _empty(grid)
     beam = None
-    if job.beam is not None:
+    if job.beam is not None and visibility.along is not None:
         beam = replace(job.beam, along=visibility.along[visible][~missing])
     if missing.any():
         lines = lines.select(~missing)

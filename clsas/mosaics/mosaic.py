@@ -28,7 +28,7 @@ from clsas.mosaics.forming import Job
 from clsas.mosaics.patches import Layout, choose_patch_shape, patch_shape_of
 from clsas.mosaics.provenance import REQUESTS, inputs_of
 from clsas.mosaics.record import PatchIndex, Record, describe_damage
-from clsas.mosaics.scheduling import Run, form_patches, wait_for_first_file
+from clsas.mosaics.scheduling import Growth, Run, form_patches, wait_for_first_file
 from clsas.mosaics.store import Store
 from clsas.mosaics.survey import open_survey
 from clsas.mosaics.visibility import SurveyVisibility
@@ -84,6 +84,8 @@ class Patch:
         """The pixels. They are read from the store if another process formed them."""
         if self._formed is not None:
             return self._formed
+        if self._store is None:
+            raise RuntimeError("a patch without its pixels belongs to a store")
         return Image(self._store.read(self.rows, self.columns), self.grid)
 
 
@@ -207,8 +209,8 @@ class Mosaic:
         return whole if pixels is None else Image(pixels, self.grid)
 
     def _patch(self, index: PatchIndex, record: Record, formed: Image | None) -> Patch:
-        grid, *where = self._run.layout.window(index)
-        return Patch(*where, grid, record, formed, self._run.job.opened_store())
+        grid, row, column, rows, columns = self._run.layout.window(index)
+        return Patch(row, column, rows, columns, grid, record, formed, self._run.job.opened_store())
 
 
 def mosaic(
@@ -303,28 +305,16 @@ def mosaic(
         memory_bytes = MEMORY_BYTES
     memory_bytes = validate.count("memory_bytes", memory_bytes)
     if not isinstance(source, RangeLines):
-        validate.path("source", source)
+        source = validate.path("source", source)
     if client is not None:
         _check_client(client, source, store, device)
-    if follow_s is not None:
-        follow_s = validate.positive("follow_s", follow_s, "s")
-    is_folder = not isinstance(source, RangeLines) and Path(source).is_dir()
-    if is_folder and beam is not None and beam.normalise:
-        raise ValueError(
-            "beam must not normalise with a folder, which may grow: its scale is that of all "
-            "channels"
-        )
-    if follow_s is not None and not is_folder:
-        got = "lines in memory" if isinstance(source, RangeLines) else repr(str(source))
-        raise ValueError(f"source must be a folder where follow_s is given, got {got}")
-    if not isinstance(source, RangeLines):
-        source = Path(source).resolve()
+    growth = _checked_growth(source, follow_s)
+    if beam is not None and not isinstance(source, RangeLines) and source.is_dir():
+        beam = _beam_of_growing(beam)
     devices = () if client is not None else open_devices(device)
-    if follow_s is not None:
-        wait_for_first_file(source, follow_s)
-    survey = open_survey(source)
-    if is_folder and beam is not None and beam.along is None and beam.track_pings is None:
-        beam = replace(beam, track_pings=MOST_TRACK_PINGS)
+    if growth is not None:
+        wait_for_first_file(growth)
+    survey = open_survey(source if isinstance(source, RangeLines) else source.resolve())
     visibility = SurveyVisibility.of(survey, beam)
     opened = None if store is None else Store.at(store)
     inputs = {} if opened is None else inputs_of(survey, grid, request, beam)
@@ -343,13 +333,8 @@ def mosaic(
     finished: dict[PatchIndex, Record] = {}
     if opened is not None:
         opened.begin(inputs, grid, patch_shape)
-        finished = {
-            index: record
-            for index, record in _undamaged(opened).items()
-            # The survey may have grown by channels that contribute to a finished patch.
-            if not visibility.any_channel_from(record.survey_channels, layout.window(index).grid)
-        }
-    run = Run(layout, job, inputs, visibility, source, devices, client, follow_s)
+        finished = _still_finished(opened, visibility, layout)
+    run = Run(layout, job, inputs, visibility, devices, client, growth)
     return Mosaic(grid, patch_shape, finished, run)
 
 
@@ -374,6 +359,29 @@ def _checked_request(
     return request or {"tolerance_db": TOLERANCE_DB}
 
 
+def _checked_growth(source: RangeLines | Path, follow_s: float | None) -> Growth | None:
+    """Return how a survey grows, or None if it does not; raise unless its source is a folder."""
+    if follow_s is None:
+        return None
+    idle_s = validate.positive("follow_s", follow_s, "s")
+    if isinstance(source, RangeLines) or not source.is_dir():
+        got = "lines in memory" if isinstance(source, RangeLines) else repr(str(source))
+        raise ValueError(f"source must be a folder where follow_s is given, got {got}")
+    return Growth(source.resolve(), idle_s)
+
+
+def _beam_of_growing(beam: BeamWindow) -> BeamWindow:
+    """Return a beam that pings which come later do not change, or raise ValueError."""
+    if beam.normalise:
+        raise ValueError(
+            "beam must not normalise with a folder, which may grow: its scale is that of all "
+            "channels"
+        )
+    if beam.along is None and beam.track_pings is None:
+        return replace(beam, track_pings=MOST_TRACK_PINGS)
+    return beam
+
+
 def _check_client(client: object, source: object, store: object, device: object) -> None:
     """Raise TypeError or ValueError unless the other arguments go with a client."""
     if not hasattr(client, "get_executor"):
@@ -384,6 +392,17 @@ def _check_client(client: object, source: object, store: object, device: object)
         raise ValueError("source must be a path with a client, whose workers read it")
     if device is not None:
         raise ValueError("device must be left out with a client: every worker takes one")
+
+
+def _still_finished(
+    store: Store, visibility: SurveyVisibility, layout: Layout
+) -> dict[PatchIndex, Record]:
+    """Return the intact patches of a store to which no channel has been added since."""
+    return {
+        index: record
+        for index, record in _undamaged(store).items()
+        if not visibility.any_channel_from(record.survey_channels, layout.window(index).grid)
+    }
 
 
 def _undamaged(store: Store) -> dict[PatchIndex, Record]:

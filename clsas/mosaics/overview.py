@@ -32,27 +32,21 @@ def reduced(
         Largest number of pixels along the longer side of the overview.
     """
     height, width = patch_shape
-    step = math.ceil(max(grid.shape) / most)
-    shape = tuple(n // step or 1 for n in grid.shape)
-    step = [min(step, n) for n in grid.shape]
+    rows, columns = grid.shape
+    step = math.ceil(max(rows, columns) / most)
+    down, across = min(step, rows), min(step, columns)  # pixels that one of the overview covers
+    shape = (rows // step or 1, columns // step or 1)
     power = np.zeros(shape)
     # Read whole pixels of the overview, and about whole patches, at a time.
-    band, run = max(height // step[0], 1), max(width // step[1], 1)
+    band, run = max(height // down, 1), max(width // across, 1)
     for first in range(0, shape[0], band):
         last = min(first + band, shape[0])
         for start in range(0, shape[1], run):
             stop = min(start + run, shape[1])
-            rows, columns = (
-                slice(a * n, b * n) for a, b, n in ((first, last, step[0]), (start, stop, step[1]))
-            )
-            blocks = np.abs(read(rows, columns)) ** 2
-            blocks = blocks.reshape(last - first, step[0], stop - start, step[1])
+            pixels = read(slice(first * down, last * down), slice(start * across, stop * across))
+            blocks = (np.abs(pixels) ** 2).reshape(last - first, down, stop - start, across)
             power[first:last, start:stop] = blocks.mean(axis=(1, 3))
-    middle = sum(
-        (n - 1) / 2 * each
-        for n, each in zip(step, (grid.row_step_m, grid.column_step_m), strict=True)
-    )
-    coarse = Grid.oriented(
-        grid.origin_m + middle, grid.row_step_m * step[0], grid.column_step_m * step[1], shape
-    )
+    origin_m, row_step_m, column_step_m = grid.vectors_m
+    middle_m = (down - 1) / 2 * row_step_m + (across - 1) / 2 * column_step_m
+    coarse = Grid.oriented(origin_m + middle_m, row_step_m * down, column_step_m * across, shape)
     return Image(np.sqrt(power).astype(np.complex64), coarse)

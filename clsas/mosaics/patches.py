@@ -80,23 +80,23 @@ def choose_patch_shape(
     needed = 0
     while side >= _SMALLEST_SIDE:
         # Patches as even as possible.
-        shape = tuple(math.ceil(n / math.ceil(n / side)) for n in grid.shape)
+        height, width = (math.ceil(n / math.ceil(n / side)) for n in grid.shape)
         most = 0
         for row in (0, grid.shape[0] - 1):
-            start = [row // shape[0] * shape[0], grid.shape[1] // 2 // shape[1] * shape[1]]
-            window = grid.window(*(slice(a, a + n) for a, n in zip(start, shape, strict=True)))
+            top, left = row // height * height, grid.shape[1] // 2 // width * width
+            window = grid.window(slice(top, top + height), slice(left, left + width))
             visible = visibility.channels(window)
             if visible.any():
                 count, length = visibility.survey.extent(visible, *visibility.ranges_m(window))
                 most = max(most, count * length)
         # The device holds upsampled lines and stages: about one and a half times the lines.
-        needed = host_bytes(1, most, shape[0] * shape[1]) + 12 * most + (64 << 20)
+        needed = host_bytes(1, most, height * width) + 12 * most + (64 << 20)
         if needed <= memory_bytes:
-            return shape
+            return height, width
         side //= 2
     raise ValueError(
         f"memory_bytes must be at least {needed / 2**20:.0f} MiB to choose patches by it, of "
-        f"{shape[0]} x {shape[1]} pixels, got {memory_bytes / 2**20:.3g} MiB: give patches"
+        f"{height} x {width} pixels, got {memory_bytes / 2**20:.3g} MiB: give patches"
     )
 
 

@@ -35,12 +35,13 @@ def differences(stored: dict[str, Any], given: dict[str, Any]) -> list[str]:
     The survey may have grown: the given parts only have to begin with the stored ones.
     """
     found = []
-    for name in given:
-        mine, theirs = stored.get(name), given[name]
+    if given["parts"][: len(stored["parts"])] != stored["parts"]:
+        found.append("the range lines are others")
+    for name, theirs in given.items():
+        mine = stored.get(name)
         if name == "parts":
-            if theirs[: len(mine)] != mine:
-                found.append("the range lines are others")
-        elif name == "grid" and mine != theirs:
+            continue
+        if name == "grid" and mine != theirs:
             if stored.get("pixels") == given["pixels"]:
                 found.append("the grid lies elsewhere")
         elif isinstance(mine, dict) and isinstance(theirs, dict):
@@ -54,6 +55,6 @@ def differences(stored: dict[str, Any], given: dict[str, Any]) -> list[str]:
     return found
 
 
-def beam_json(beam: BeamWindow | None) -> str | None:
+def beam_json(beam: BeamWindow) -> str:
     """Return a beam as JSON."""
-    return None if beam is None else json.dumps(asdict(beam), default=lambda value: value.tolist())
+    return json.dumps(asdict(beam), default=lambda value: value.tolist())

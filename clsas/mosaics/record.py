@@ -49,7 +49,7 @@ class Record:
         The plan, as `clsas.Plan.from_json` reads it, without the beam's directions; None for an
         exact image or an empty patch.
     has_pixels : bool
-        Whether any pixel is not 0.
+        True if any pixel is not 0.
     """
 
     channels: int
@@ -71,7 +71,7 @@ class Record:
 
     @property
     def is_empty(self) -> bool:
-        """Whether no channel contributes, so that all pixels are zero."""
+        """True if no channel contributes; all pixels are then zero."""
         return self.channels == self.missing_channels
 
     @property

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from concurrent.futures import Executor, Future
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from clsas.core.image import Image
-from clsas.core.lines import RangeLines
 from clsas.core.threads import uninterrupted, wait
 from clsas.mosaics.devices import device_threads
 from clsas.mosaics.forming import Job, form_patch, stamped_files
@@ -29,6 +28,21 @@ POLL_S = 0.5
 Formed = tuple[PatchIndex, Record, Image | None]
 
 
+@dataclass(frozen=True)
+class Growth:
+    """Folder to which files of a survey are added.
+
+    Attributes
+    ----------
+    folder : Path
+    idle_s : float
+        Seconds without a new file after which the survey has ended.
+    """
+
+    folder: Path
+    idle_s: float
+
+
 @dataclass(frozen=True, eq=False)
 class Run:
     """All that forming a mosaic needs.
@@ -42,22 +56,20 @@ class Run:
         What the store says the mosaic was made with.
     visibility : SurveyVisibility
         The survey when the mosaic was requested.
-    source : RangeLines or Path
     devices : tuple of Device
         Devices of this process; empty with a client.
     client : distributed.Client or None
-    idle_s : float or None
-        Seconds without a new file after which a survey has ended; None if it does not grow.
+    growth : Growth or None
+        None if the survey is complete.
     """
 
     layout: Layout
     job: Job
     inputs: dict[str, Any]
     visibility: SurveyVisibility
-    source: RangeLines | Path
     devices: tuple[Device, ...]
     client: Client | None
-    idle_s: float | None
+    growth: Growth | None
 
     @property
     def workers(self) -> int:
@@ -94,7 +106,7 @@ class _GrowingSurvey:
     visibility : SurveyVisibility
         The survey at present.
     has_ended : bool
-        Whether no more files will come.
+        True once no more files will come.
     """
 
     def __init__(self, run: Run) -> None:
@@ -102,7 +114,7 @@ class _GrowingSurvey:
         self._inputs = run.inputs
         self._latest_s = time.monotonic()
         self.visibility = run.visibility
-        self.has_ended = run.idle_s is None
+        self.has_ended = run.growth is None
 
     @property
     def channels(self) -> int:
@@ -110,12 +122,13 @@ class _GrowingSurvey:
 
     def update(self) -> bool:
         """Look for new files; return whether any came or the survey has ended."""
-        if self.has_ended:
+        growth = self._run.growth
+        if growth is None or self.has_ended:
             return False
         # Asked before the files are listed, since nothing comes after the end.
-        ended = has_ended(self._run.source)
-        paths, survey = files_of(self._run.source), self.visibility.survey
-        grown = paths != survey.parts
+        ended = has_ended(growth.folder)
+        paths, survey = files_of(growth.folder), self.visibility.survey
+        grown = paths != survey.files
         if grown:
             first = len(survey.parts)
             survey = open_files(paths, survey)
@@ -126,7 +139,7 @@ class _GrowingSurvey:
                 parts = [*self._inputs["parts"], *survey.digests(first)]
                 self._inputs = self._inputs | {"parts": parts}
                 store.grow(self._inputs)
-        self.has_ended = ended or time.monotonic() - self._latest_s > self._run.idle_s
+        self.has_ended = ended or time.monotonic() - self._latest_s > growth.idle_s
         return grown or self.has_ended
 
     def ready(self, todo: Sequence[PatchIndex]) -> list[PatchIndex]:
@@ -140,7 +153,7 @@ class _GrowingSurvey:
         return [i for i in todo if self.visibility.has_passed(layout.window(i).grid, settled)]
 
 
-def form_patches(run: Run, finished: dict[PatchIndex, Record]) -> Iterator[Formed]:
+def form_patches(run: Run, finished: dict[PatchIndex, Record]) -> Generator[Formed, None, None]:
     """Form the patches that are not finished, and yield each with its record and image.
 
     The image is None where another process formed it. With a store, `finished` is kept up to date.
@@ -202,10 +215,10 @@ def _all(layout: Layout) -> Iterator[PatchIndex]:
     return ((row, column) for row in range(rows) for column in range(columns))
 
 
-def wait_for_first_file(source: Path, follow_s: float) -> None:
+def wait_for_first_file(growth: Growth) -> None:
     """Wait for the first file of a folder; raise ValueError if none comes."""
-    start = time.monotonic()
-    while not files_of(source):
-        if has_ended(source) or time.monotonic() - start > follow_s:
-            raise ValueError(f"source must hold range lines: {source} has no file *.h5")
+    start, folder = time.monotonic(), growth.folder
+    while not files_of(folder):
+        if has_ended(folder) or time.monotonic() - start > growth.idle_s:
+            raise ValueError(f"source must hold range lines: {folder} has no file *.h5")
         time.sleep(POLL_S)

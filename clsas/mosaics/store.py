@@ -119,7 +119,8 @@ class Store:
         stored = attributes["grid"]
         if stored is None:
             raise ValueError(f"{self.path} is a mosaic of points, whose grid it does not hold")
-        grid = Grid.oriented(**stored, shape=tuple(self.pixels.shape))
+        rows, columns = self.pixels.shape
+        grid = Grid.oriented(**stored, shape=(rows, columns))
         if (self.path / "height").exists():
             grid = grid.with_height(self._values("height"))
         if grid_digest(grid) != attributes["inputs"].get("grid"):
@@ -248,7 +249,7 @@ class Store:
         try:
             for index in indices:
                 self._record(index)
-            return self.pixels[rows, columns]
+            return np.asarray(self.pixels[rows, columns])
         except ValueError as error:
             found = {}
             for index in indices:
@@ -284,7 +285,8 @@ class Store:
             If a finished patch is damaged.
         """
         validate.count("most", most)
-        return reduced(self.grid, self.pixels.chunks, self.read, most)
+        rows, columns = self.pixels.chunks
+        return reduced(self.grid, (rows, columns), self.read, most)
 
     def _array(self, name: str) -> zarr.Array:
         _zarr()
@@ -299,7 +301,7 @@ class Store:
         """Return a whole array."""
         array = self._array(name)
         try:
-            return array[:]
+            return np.asarray(array[:])
         except ValueError as error:
             raise ValueError(f"{self.path} is damaged: {name} cannot be read: {error}") from error
 
@@ -324,7 +326,7 @@ class Store:
 
     def _touched(self, rows: slice, columns: slice) -> list[PatchIndex]:
         """Patches to which some pixels belong."""
-        touched = []
+        touched: list[range] = []
         for part, count, side in zip(
             (rows, columns), self.pixels.shape, self.pixels.chunks, strict=True
         ):
@@ -333,7 +335,8 @@ class Store:
                 return []
             ends = sorted((pixels[0], pixels[-1]))
             touched.append(range(ends[0] // side, ends[1] // side + 1))
-        return list(itertools.product(*touched))
+        rows_of, columns_of = touched
+        return list(itertools.product(rows_of, columns_of))
 
     def _folder(self, index: PatchIndex) -> Path:
         return self.path / "patches" / "{}.{}".format(*index)

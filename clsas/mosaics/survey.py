@@ -60,6 +60,11 @@ class Survey:
         return self.begins[-1]
 
     @property
+    def files(self) -> tuple[Path, ...]:
+        """The parts that are files: all of them, unless the lines are in memory."""
+        return tuple(part for part in self.parts if isinstance(part, Path))
+
+    @property
     def length(self) -> NDArray[np.int64]:
         """Samples of every channel, [channels]."""
         return np.repeat(self.lengths, np.diff(self.begins))
@@ -74,11 +79,11 @@ class Survey:
             count = self.begins[index + 1] - self.begins[index]
             digest = hashlib.sha256(lines_digest(self._part_geometry(index)).encode())
             if isinstance(part, RangeLines):
-                digest.update(part.samples)
+                digest.update(np.ascontiguousarray(part.samples).data)
             else:
                 for channel in np.unique(np.linspace(0, count - 1, _DIGESTED).astype(int)):
                     rows, columns = slice(channel, channel + 1), slice(0, self.lengths[index])
-                    digest.update(np.ascontiguousarray(self._samples(index, rows, columns)))
+                    digest.update(np.ascontiguousarray(self._samples(index, rows, columns)).data)
             found.append(digest.hexdigest()[:16])
         return found
 
@@ -132,14 +137,14 @@ class Survey:
             begin = self.begins[part]
             chosen = visible[rows]
             block = self._samples(part, slice(rows.start - begin, rows.stop - begin), columns)
-            here = slice(filled, filled + np.count_nonzero(chosen))
-            lines = samples[here, : block.shape[1]]
-            lines[:] = block if chosen.all() else block[chosen]
+            here = slice(filled, filled + int(np.count_nonzero(chosen)))
+            kept = samples[here, : block.shape[1]]
+            kept[:] = block if chosen.all() else block[chosen]
             fade = np.sin(np.pi / 2 * (np.arange(_TAPER) + 0.5) / _TAPER) ** 2
             if columns.start > 0:
-                lines[:, :_TAPER] *= fade.astype(np.float32)
+                kept[:, :_TAPER] *= fade.astype(np.float32)
             if columns.stop < self.lengths[part]:
-                lines[:, -_TAPER:] *= fade[::-1].astype(np.float32)
+                kept[:, -_TAPER:] *= fade[::-1].astype(np.float32)
             first_m[here] = geometry.first_range_m[rows][chosen]
             first_m[here] += columns.start * geometry.range_step_m
             filled = here.stop
@@ -251,10 +256,10 @@ def open_files(paths: tuple[Path, ...], before: Survey | None = None) -> Survey:
         As `open_survey` does, and if `paths` do not begin with the files of `before`.
     """
     known = 0 if before is None else len(before.parts)
-    if before is not None and paths[:known] != before.parts:
-        changed = next(a for a, b in zip((*paths, None), before.parts, strict=False) if a != b)
+    if before is not None and paths[:known] != before.files:
+        changed = next(a for a, b in zip((*paths, None), before.files, strict=False) if a != b)
         raise ValueError(
-            f"source must grow by files whose names follow the last one, {before.parts[-1].name}, "
+            f"source must grow by files whose names follow the last one, {before.files[-1].name}, "
             f"got {'fewer files' if changed is None else changed.name}"
         )
     stamps = [] if before is None else list(before.stamps)
@@ -278,10 +283,15 @@ def open_files(paths: tuple[Path, ...], before: Survey | None = None) -> Survey:
             raise ValueError(
                 f"{path}: rx_velocity_m_s must be in every file of the survey or in none"
             )
-    names = ["first_range_m", "tx_m", "rx_m"]
-    names += [] if found[0].rx_velocity_m_s is None else ["rx_velocity_m_s"]
-    joined = {name: np.concatenate([getattr(each, name) for each in found]) for name in names}
-    geometry = replace(found[0], samples=np.zeros((begins[-1], 1), np.complex64), **joined)
+    velocities = [each.rx_velocity_m_s for each in found if each.rx_velocity_m_s is not None]
+    geometry = replace(
+        found[0],
+        samples=np.zeros((begins[-1], 1), np.complex64),
+        first_range_m=np.concatenate([each.first_range_m for each in found]),
+        tx_m=np.concatenate([each.tx_m for each in found]),
+        rx_m=np.concatenate([each.rx_m for each in found]),
+        rx_velocity_m_s=np.concatenate(velocities) if velocities else None,
+    )
     return Survey(geometry, tuple(paths), tuple(begins), tuple(lengths), tuple(stamps))
 
 
