@@ -22,9 +22,11 @@ if TYPE_CHECKING:
     from clsas.planning.factorize import factorize
     from clsas.planning.planner import plan
     from clsas.products import plot
-    from clsas.products.assessment import Assessment, Effect, assess, survey_lines
+    from clsas.products.assessment import assess, survey_lines
+    from clsas.products.assessment_result import Assessment, Effect
     from clsas.products.quality import contrast, entropy, measure_point
-    from clsas.products.tradeoff import Tradeoff, tradeoff
+    from clsas.products.tradeoff import tradeoff
+    from clsas.products.tradeoff_result import Tradeoff
     from clsas.signal.compression import compress
     from clsas.signal.echoes import Echoes
     from clsas.simulation.scenes import PointTargets, Seabed
@@ -98,9 +100,11 @@ _MODULES = {
     "opencl.device": "DeviceError list_devices",
     "planning.factorize": "factorize",
     "planning.planner": "plan",
-    "products.assessment": "Assessment Effect assess survey_lines",
+    "products.assessment": "assess survey_lines",
+    "products.assessment_result": "Assessment Effect",
     "products.quality": "contrast entropy measure_point",
-    "products.tradeoff": "Tradeoff tradeoff",
+    "products.tradeoff": "tradeoff",
+    "products.tradeoff_result": "Tradeoff",
     "signal.compression": "compress",
     "signal.echoes": "Echoes",
     "simulation.scenes": "PointTargets Seabed",

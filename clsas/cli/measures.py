@@ -16,7 +16,8 @@ from clsas.cli.outputs import json_able, print_json, progress_bar, report
 from clsas.cli.parameters import INPUT, POSITION, STAGES, Output
 from clsas.core import validate
 from clsas.files.scene_files import SceneFile
-from clsas.products.quality import Cut, PointResponse
+from clsas.products.cuts import Cut
+from clsas.products.quality import PointResponse
 from clsas.products.shadows import DARKEST, dark_level_db
 from clsas.products.tradeoff import TOLERANCES_DB
 

@@ -1,4 +1,4 @@
-"""Which effects an image needs: the error of leaving each out, and the time that it takes."""
+"""Effects that an image needs: the error without each, and the time that each takes."""
 
 from __future__ import annotations
 
@@ -8,12 +8,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from clsas.core import reprs, validate
+from clsas.core import validate
 from clsas.core.decibels import in_db, power
 from clsas.core.geometry import pairwise_range_m
 from clsas.core.grid import Grid
 from clsas.core.lines import RangeLines
-from clsas.core.tables import Report, Table
 from clsas.exact.backprojection import prepare
 from clsas.exact.run import execute
 from clsas.factorized.plan import Plan
@@ -22,9 +21,9 @@ from clsas.planning.costs import Costs
 from clsas.planning.factorize import factorize
 from clsas.planning.forecast import half_precision_error
 from clsas.planning.planner import BEST_TOLERANCE_DB, TOLERANCE_DB, WORST_TOLERANCE_DB, plan
+from clsas.products.assessment_result import Assessment, Effect
 from clsas.products.effects import (
     BEAM,
-    ENDS,
     KEYS,
     SINGLE,
     SWAY,
@@ -34,6 +33,7 @@ from clsas.products.effects import (
     errors_without,
     track_errors_m,
 )
+from clsas.signal.compression import Window
 from clsas.simulation.scenes import PointTargets
 from clsas.simulation.simulator import simulate_lines
 from clsas.sonar.beam import BeamWindow
@@ -41,148 +41,8 @@ from clsas.sonar.simplify import APART, MOTION, RELIEF, SHARE, leave_out, simpli
 from clsas.sonar.system import Sonar
 from clsas.sonar.track import Pointing, Track, channels
 
-NONE_DB = -250.0
-"""Below this an error is none at all."""
-
-_POINTS = 16  # along either side of a grid, where the extent of lines is found
+_POINTS = 16  # grid points along either side at which ranges bound the extent of lines
 _ROOM = 32  # samples of a survey's lines beyond the grid
-
-
-@dataclass(frozen=True)
-class Effect:
-    """What leaving out one effect does to an image.
-
-    Attributes
-    ----------
-    name : str
-    modelled : bool
-        Whether lines, grid and beam hold the effect as they are.
-    error_db : float or None
-        Relative rms error of the image without it, dB; -300 where it does nothing, None where it
-        cannot be told from what is given.
-    range_wavelengths, most_wavelengths : float or None
-        By how much ranges are off without it, rms and at most; None of effects on amplitudes.
-    needed : bool or None
-        Whether its error is more than `clsas.sonar.simplify.SHARE` of the power that the tolerance
-        allows.
-    left_out : bool
-        Whether `clsas.plan` and `clsas.backproject` leave it out by themselves, with antennas
-        moved to make up for it.
-    seconds : float or None
-        By how much less time the image takes without it; negative where it saves time.
-    key : str
-        What leaves it out of a scene file.
-    """
-
-    name: str
-    modelled: bool
-    error_db: float | None
-    range_wavelengths: float | None
-    most_wavelengths: float | None
-    needed: bool | None
-    left_out: bool
-    seconds: float | None
-    key: str
-
-    __repr__ = reprs.of_fields
-
-
-@dataclass(frozen=True)
-class Assessment:
-    """Which effects an image needs, and what they cost; made by `assess`.
-
-    Attributes
-    ----------
-    tolerance_db : float
-        Relative rms error allowed.
-    wavelength_m : float
-        At the middle of the band.
-    channels : int
-    pixels : tuple of int
-        Shape of the grid.
-    device : str
-        Whose times these are.
-    measured : bool
-        Whether times were measured; otherwise the cost model predicts them.
-    seconds, simple_seconds : float
-        Time of the image with all effects that are modelled, and as it is formed: without those
-        that are left out.
-    effects : tuple of Effect
-    """
-
-    tolerance_db: float
-    wavelength_m: float
-    channels: int
-    pixels: tuple[int, ...]
-    device: str
-    measured: bool
-    seconds: float
-    simple_seconds: float
-    effects: tuple[Effect, ...]
-
-    def __repr__(self) -> str:
-        """Return the tolerance, and which effects are missing and which could be left out."""
-        return reprs.summary(
-            self,
-            f"tolerance {reprs.quantity(self.tolerance_db, 'dB')}",
-            f"{len(self.effects)} effects",
-            f"needed and not modelled: {', '.join(self.missing) or 'none'}",
-            f"modelled and not needed: {', '.join(self.spare) or 'none'}",
-            self.device,
-        )
-
-    def _repr_html_(self) -> str:
-        return self._report().html()
-
-    def __getitem__(self, name: str) -> Effect:
-        """Return the effect of a name."""
-        return {effect.name: effect for effect in self.effects}[name]
-
-    @property
-    def spare(self) -> tuple[str, ...]:
-        """Effects that are modelled and not needed."""
-        return tuple(
-            e.name for e in self.effects if e.modelled and e.needed is False and e.name != ENDS
-        )
-
-    @property
-    def missing(self) -> tuple[str, ...]:
-        """Effects that are needed and not modelled."""
-        return tuple(e.name for e in self.effects if e.needed and not e.modelled)
-
-    def describe(self) -> str:
-        """Return a table of the effects."""
-        return self._report().text()
-
-    def _report(self) -> Report:
-        names = ("effect", "modelled", "error", "wavelengths", "needed", "costs", "left out")
-        rows = []
-        for e in self.effects:
-            rows.append(
-                (
-                    e.name,
-                    "yes" if e.modelled else "no",
-                    _decibels(e.error_db),
-                    _wavelengths(e),
-                    {True: "yes", False: "no", None: "-"}[e.needed],
-                    "-" if e.seconds is None else f"{1e3 * e.seconds:+.0f} ms",
-                    "yes" if e.left_out else "-",
-                )
-            )
-        how = "measured" if self.measured else "predicted"
-        before = [
-            f"{' x '.join(map(str, self.pixels))} pixels from {self.channels} channels, tolerance "
-            f"{self.tolerance_db:.4g} dB, wavelength {1e3 * self.wavelength_m:.4g} mm; "
-            f"{1e3 * self.seconds:.0f} ms with all effects modelled, "
-            f"{1e3 * self.simple_seconds:.0f} ms as it is formed ({how}, {self.device})",
-        ]
-        after = []
-        for name in self.missing:
-            after.append(f"Needed and not modelled: {name}")
-        for name in self.spare:
-            how = f": {KEYS[name]}" if KEYS[name] else ""
-            after.append(f"Modelled and not needed: {name}{how}")
-        return Report([*before, Table(names, rows, align="left"), *after])
 
 
 def assess(
@@ -200,34 +60,34 @@ def assess(
     repeats: int = 0,
     ends: bool = True,
 ) -> Assessment:
-    """Find out which effects an image needs: what its error would be without each of them.
+    """Find out which effects an image needs: the error that it would have without each of them.
 
     Parameters
     ----------
     lines : RangeLines
-        What to image; `survey_lines` makes some of a sonar and a track.
+        Lines to image; `survey_lines` makes them from a sonar and a track.
     grid : Grid
-        Where.
+        Pixels of the image.
     beam : BeamWindow, optional
         Weights of the channels.
     tolerance_db : float
         Relative rms error allowed of the image, dB, from -75 to -10.
     sonar, track : Sonar, Track, optional
-        What made the lines: tells element patterns, and the velocity of receivers where the lines
-        hold none. Channels must be those of `clsas.channels`.
+        Survey that the lines come from. It gives element patterns, and the receivers' velocity if
+        the lines have none. Channels must be those of `clsas.channels`.
     pointing : Pointing, optional
-        Where elements look.
+        Directions of the elements.
     element_pattern : bool
-        Whether the lines hold the sonar's element patterns.
+        True if the lines hold the sonar's element patterns.
     device : Device, str or int, optional
-        Whose times count; see `clsas.opencl.device.choose`.
+        Device that forms the image; see `clsas.opencl.device.choose`.
     costs : Costs, optional
-        Instead of those stored for the device.
+        Costs to use instead of those stored for the device.
     repeats : int
-        Form the image with and without every effect so many times, in turns, and tell the least
-        times instead of predicted ones.
+        Measure times instead of predicting them: form the image this many times with and without
+        every effect, in turns, and take the shortest times.
     ends : bool
-        Whether the lines' ends are those of data.
+        True if recorded data end where the lines do.
 
     Returns
     -------
@@ -242,24 +102,13 @@ def assess(
 
     Notes
     -----
-    `clsas.products.effects.errors_without` tells how errors are found.
+    `clsas.products.effects.errors_without` explains how errors are found.
     """
-    validate.instance("lines", lines, RangeLines)
-    validate.instance("grid", grid, Grid)
-    if beam is not None:
-        validate.instance("beam", beam, BeamWindow)
-    validate.number(
+    tolerance_db = validate.number(
         "tolerance_db", tolerance_db, "dB", least=BEST_TOLERANCE_DB, most=WORST_TOLERANCE_DB
     )
-    validate.instance("sonar", sonar, Sonar, type(None))
-    validate.instance("track", track, Track, type(None))
     repeats = validate.count("repeats", repeats, least=0)
-    if sonar is not None and track is not None and sonar.receivers * track.pings != lines.channels:
-        raise ValueError(
-            f"sonar and track must have the channels of the lines, {lines.channels}, got "
-            f"{sonar.receivers} receivers and {track.pings} pings"
-        )
-    survey = Survey(lines, grid, beam, sonar, track, pointing, element_pattern, ends)
+    survey = _checked_survey(lines, grid, beam, sonar, track, pointing, element_pattern, ends)
     device = open_device(device)
     left_out = simplify(lines, grid, beam, tolerance_db).left_out
     images = _images(survey, bool(left_out), tolerance_db, device, costs)
@@ -273,30 +122,8 @@ def assess(
     if not full.is_exact and device.info.half_precision:
         errors[SINGLE] = ErrorWithout(in_db(half_precision_error(len(full.sides))))
     modelled[SINGLE] = not full.half_precision
-    allowed = SHARE * power(tolerance_db)
-    effects = []
-    for name, key in KEYS.items():
-        error = errors.get(name)
-        needed = None if error is None else power(error.error_db) > allowed
-        costs_s = seconds[_FULL] - seconds[name] if name in seconds else None
-        if name == SINGLE:  # images are formed in half precision where the plan says so
-            needed = None if error is None else modelled[SINGLE]
-            costs_s = None if costs_s is None else -costs_s
-        effects.append(
-            Effect(
-                name,
-                modelled[name],
-                None if error is None else error.error_db,
-                None if error is None else error.range_wavelengths,
-                None if error is None else error.most_wavelengths,
-                needed,
-                name in left_out,
-                costs_s,
-                key,
-            )
-        )
     return Assessment(
-        tolerance_db=float(tolerance_db),
+        tolerance_db=tolerance_db,
         wavelength_m=band_wavelength_m(lines),
         channels=lines.channels,
         pixels=grid.shape,
@@ -304,7 +131,68 @@ def assess(
         measured=repeats > 0,
         seconds=seconds[_FULL],
         simple_seconds=seconds.get(_SIMPLE, seconds[_FULL]),
-        effects=tuple(effects),
+        effects=tuple(
+            _effect(
+                name,
+                modelled[name],
+                errors.get(name),
+                SHARE * power(tolerance_db),
+                name in left_out,
+                seconds[_FULL] - seconds[name] if name in seconds else None,
+            )
+            for name in KEYS
+        ),
+    )
+
+
+def _checked_survey(
+    lines: RangeLines,
+    grid: Grid,
+    beam: BeamWindow | None,
+    sonar: Sonar | None,
+    track: Track | None,
+    pointing: Pointing | None,
+    element_pattern: bool,
+    ends: bool,
+) -> Survey:
+    """Return a survey; raise TypeError or ValueError for arguments that do not fit together."""
+    validate.instance("lines", lines, RangeLines)
+    validate.instance("grid", grid, Grid)
+    if beam is not None:
+        validate.instance("beam", beam, BeamWindow)
+    validate.instance("sonar", sonar, Sonar, type(None))
+    validate.instance("track", track, Track, type(None))
+    if sonar is not None and track is not None and sonar.receivers * track.pings != lines.channels:
+        raise ValueError(
+            f"sonar and track must have the channels of the lines, {lines.channels}, got "
+            f"{sonar.receivers} receivers and {track.pings} pings"
+        )
+    return Survey(lines, grid, beam, sonar, track, pointing, element_pattern, ends)
+
+
+def _effect(
+    name: str,
+    modelled: bool,
+    error: ErrorWithout | None,
+    allowed: float,
+    left_out: bool,
+    seconds: float | None,
+) -> Effect:
+    """Return one effect; it is needed if the power of its error is more than `allowed`."""
+    needed = None if error is None else power(error.error_db) > allowed
+    if name == SINGLE:  # images are formed in half precision where the plan says so
+        needed = None if error is None else modelled
+        seconds = None if seconds is None else -seconds
+    return Effect(
+        name,
+        modelled,
+        None if error is None else error.error_db,
+        None if error is None else error.range_wavelengths,
+        None if error is None else error.most_wavelengths,
+        needed,
+        left_out,
+        seconds,
+        KEYS[name],
     )
 
 
@@ -315,17 +203,17 @@ def survey_lines(
     *,
     motion_in_flight: bool = False,
     phase_centres: bool = False,
-    window: object = "none",
+    window: Window = "none",
     oversampling: float = 2.0,
 ) -> RangeLines:
-    """Return lines of a survey before anything is simulated: one point's, as long as the grid asks.
+    """Return the lines of one point, with the geometry and the band of a survey's lines.
 
-    They have the geometry and the band of the survey's lines.
+    They take little time, and are long enough for the grid.
 
     Parameters
     ----------
     sonar, track, grid
-        The survey, and where it is imaged.
+        The survey, and the pixels of its image.
     motion_in_flight, phase_centres
         As for `clsas.simulate`.
     window, oversampling
@@ -366,7 +254,7 @@ _FULL, _SIMPLE = "full", "simple"  # images beside those without one effect
 
 @dataclass(frozen=True, eq=False)
 class _Image:
-    """An image to be formed: of what, and by which plan."""
+    """An image to be formed: its inputs and its plan."""
 
     lines: RangeLines
     grid: Grid
@@ -375,8 +263,8 @@ class _Image:
     full_model: bool
 
     def form(self, device: Device) -> None:
-        """Form it from the beginning: without what an image before it has found out."""
-        if not self.plan.is_exact:
+        """Form the image with a fresh copy of the plan, which has kept nothing of earlier runs."""
+        if self.plan.accuracy_db is None:
             factorize(self.lines, self.grid, replace(self.plan), device=device)
             return
         preparation = prepare(
@@ -399,9 +287,10 @@ def _images(
     if simple:
         given[_SIMPLE] = lines, grid, beam
     modelled = survey.modelled
-    if modelled[BEAM]:
+    if beam is not None:
         given[BEAM] = lines, grid, None
-        beam = replace(beam, along=beam.directions(lines))  # which moved antennas would change
+        # The directions of these lines, which moving antennas would change.
+        beam = replace(beam, along=beam.directions(lines))
     if modelled[MOTION]:
         given[MOTION] = replace(lines, rx_velocity_m_s=None), grid, beam
     if modelled[APART]:
@@ -418,18 +307,18 @@ def _images(
     images = {}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", validate.ClsasWarning)  # of ends, which are an effect
-        for name, (of, on, seen_by) in given.items():
+        for name, (some_lines, some_grid, some_beam) in given.items():
             full_model = name != _SIMPLE
             chosen = plan(
-                of,
-                on,
+                some_lines,
+                some_grid,
                 tolerance_db=tolerance_db,
-                beam=seen_by,
+                beam=some_beam,
                 device=device,
                 costs=costs,
                 full_model=full_model,
             )
-            images[name] = _Image(of, on, seen_by, chosen, full_model)
+            images[name] = _Image(some_lines, some_grid, some_beam, chosen, full_model)
     return images
 
 
@@ -445,17 +334,3 @@ def _measured(images: dict[str, _Image], device: Device, repeats: int) -> dict[s
                 if turn:
                     seconds[name].append(time.perf_counter() - start)
     return {name: min(each) for name, each in seconds.items()}
-
-
-def _decibels(error_db: float | None) -> str:
-    if error_db is None:
-        return "-"
-    return "none" if error_db < NONE_DB else f"{error_db:.1f} dB"
-
-
-def _wavelengths(effect: Effect) -> str:
-    if effect.range_wavelengths is None or effect.most_wavelengths is None:
-        return "-"
-    if not effect.most_wavelengths:
-        return "none"
-    return f"{effect.range_wavelengths:.2g}, at most {effect.most_wavelengths:.2g}"

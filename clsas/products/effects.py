@@ -36,27 +36,27 @@ KEYS = {
     ENDS: "[simulate] range_m",
     SINGLE: "",
 }
-"""What leaves an effect out of a scene file; nothing does that is decided by grid or device."""
+"""Key of a scene file that leaves each effect out; "" where the grid or the device decides."""
 
 _CHANNELS, _PIXELS = 256, 16  # sampled: channels, and pixels along either side of the grid
-_FREQUENCIES = 8  # of the band, each with as much of the power
-_BEFORE = 1e-12  # of a direction: what lies in the plane of an element's face is before it
+_FREQUENCIES = 8  # samples of the band, each with an equal part of the power
+_BEFORE = 1e-12  # sine: points in the plane of an element's face count as before it
 
 
 @dataclass(frozen=True, eq=False)
 class Survey:
-    """What an image is formed of, and what is known of how its lines were made.
+    """Inputs of an image, and the survey that its lines come from as far as it is known.
 
     Attributes
     ----------
     lines, grid, beam
-        Of the image.
+        Inputs of the image.
     sonar, track, pointing
-        Of the lines, or None where they are not known.
+        Survey that the lines come from; None if not known.
     has_pattern : bool
-        Whether lines hold the sonar's element patterns.
+        True if the lines hold the sonar's element patterns.
     has_ends : bool
-        Whether ends of lines are those of data.
+        True if recorded data end where the lines do.
     """
 
     lines: RangeLines
@@ -69,28 +69,29 @@ class Survey:
     has_ends: bool = True
 
     @property
-    def knows_pattern(self) -> bool:
-        """Whether sonar and track tell the element patterns of every channel."""
-        known = self.sonar is not None and self.track is not None
-        return known and not self.sonar.is_omnidirectional
+    def directive(self) -> tuple[Sonar, Track] | None:
+        """Sonar and track if they are known and the elements are directive, else None."""
+        if self.sonar is None or self.track is None or self.sonar.is_omnidirectional:
+            return None
+        return self.sonar, self.track
 
     @property
     def modelled(self) -> dict[str, bool]:
-        """Whether the image models each effect."""
+        """For each effect, True if the image models it."""
         lines = self.lines
         return {
             MOTION: lines.rx_velocity_m_s is not None,
             APART: not np.array_equal(lines.tx_m, lines.rx_m),
             RELIEF: not surface_of(self.grid).is_plane,
             SWAY: bool(track_errors_m(lines).any()),
-            PATTERN: self.knows_pattern and self.has_pattern,
+            PATTERN: self.directive is not None and self.has_pattern,
             BEAM: self.beam is not None,
             ENDS: True,
         }
 
     @property
     def full_lines(self) -> RangeLines:
-        """Lines with the velocity of receivers, also where only the track tells it."""
+        """Lines with the receivers' velocity, taken from the track if the lines have none."""
         if self.lines.rx_velocity_m_s is not None or self.sonar is None or self.track is None:
             return self.lines
         velocity = np.repeat(self.track.velocity_m_s, self.sonar.receivers, axis=0)
@@ -99,7 +100,15 @@ class Survey:
 
 @dataclass(frozen=True)
 class ErrorWithout:
-    """Error of an image without an effect: dB, and of ranges, wavelengths, rms and at most."""
+    """Error of an image without an effect.
+
+    Attributes
+    ----------
+    error_db : float
+        Relative rms error, dB.
+    range_wavelengths, most_wavelengths : float or None
+        Error of ranges, rms and at most, wavelengths; None for effects on amplitudes.
+    """
 
     error_db: float
     range_wavelengths: float | None = None
@@ -107,20 +116,22 @@ class ErrorWithout:
 
 
 def errors_without(survey: Survey) -> dict[str, ErrorWithout]:
-    """Return the error of an image without each effect, of those that can be told.
+    """Return the error of an image without each effect, for the effects whose error is known.
 
-    For a sample of channels i and pixels x, all over the grid and its corners among them, ranges
-    without an effect differ by d from those of the full model, in float64, and weights w' from w.
-    The relative error of an image whose channels add up incoherently is then
+    The error is a mean over a sample of channels i and of pixels x all over the grid. Without an
+    effect, ranges differ by d from the full model's (float64), and weights are w' instead of w. The
+    relative error of an image whose channels add up incoherently is then
 
         sum_ix |w - w' exp(j 2 pi f d)|^2 / sum_ix w^2,
 
-    averaged over the frequencies f of the lines' band (cycles per metre of range). That holds
-    phases and the shift of envelopes, and grows to +3 dB where phases have nothing in common.
+    averaged over the frequencies f of the lines' band (cycles per metre of range). It holds the
+    errors of phases and of envelopes, and grows to +3 dB where phases have nothing in common.
     """
     lines, beam = survey.lines, survey.beam
     sample = _Sample.of(survey.full_lines, survey.grid, beam)
-    pattern = _pattern(sample, survey) if survey.knows_pattern else None
+    pattern = None
+    if survey.directive is not None:
+        pattern = _pattern(sample, *survey.directive, survey.pointing)
     of_lines = pattern if pattern is not None and survey.has_pattern else 1.0
     errors = {
         name: sample.error_of_ranges(range_m, sample.weights * of_lines)
@@ -161,11 +172,10 @@ def band_wavelength_m(lines: RangeLines) -> float:
 
 
 def track_errors_m(lines: RangeLines) -> NDArray[np.float64]:
-    """Return how far channels lie beside where a straight track has them, [channels, 3], metres.
+    """Return the distances of channels from a straight track, [channels, 3], metres.
 
-    The track is the line that fits the pings' phase centres best. What all pings have in common
-    is the array's shape: where each has the same number of channels, the mean of each over the
-    pings is no track error.
+    The track is the line that fits the pings' phase centres best. If all pings have the same number
+    of channels, the mean distance of a channel over the pings is the array's shape, and no error.
     """
     centres_m = lines.phase_centres_m
     starts = lines.ping_starts
@@ -178,31 +188,31 @@ def track_errors_m(lines: RangeLines) -> NDArray[np.float64]:
     if (counts == counts[0]).all():
         by_ping = away_m.reshape(-1, counts[0], 3)
         away_m = (by_ping - by_ping.mean(axis=0)).reshape(-1, 3)
-    # What rounding leaves of a straight track is none.
+    # Rounding puts channels of a straight track beside it.
     size_m = np.abs(centres_m).max()
     return np.where(np.abs(away_m) > 1e-14 * size_m, away_m, 0.0)
 
 
 @dataclass(frozen=True, eq=False)
 class _Sample:
-    """Some channels and pixels, and how they see each other; arrays are [pixels, channels].
+    """A sample of channels and pixels; arrays are [pixels, channels].
 
     Attributes
     ----------
     channels : int [channels]
-        Which of all these are.
+        Indices of the channels.
     lines : RangeLines
-        Theirs, with everything modelled.
+        Lines of the channels, with everything modelled.
     points_m, flat_m : float64 [pixels, 3]
-        The pixels, and where they lie on the plane without relief.
+        Positions of the pixels, with relief and without.
     range_m : float64
         Ranges of the full model.
     inside, weights : float64
         1 where a channel's line holds the pixel; the beam's weights there.
     cycles_per_m : float64 [frequencies]
-        Of the band, each with as much of the power.
+        Frequencies of the band, each with an equal part of the power.
     wavelength_m : float
-        At the middle of the band.
+        Wavelength at the middle of the band.
     """
 
     channels: NDArray[np.int64]
@@ -224,8 +234,8 @@ class _Sample:
         range_m = pairwise_range_m(
             points_m, part.tx_m, part.rx_m, part.rx_velocity_m_s, part.sound_speed_m_s
         )
-        inside = (range_m >= part.first_range_m) & (range_m <= part.last_range_m)
-        inside = inside.astype(np.float64)
+        holds = (range_m >= part.first_range_m) & (range_m <= part.last_range_m)
+        inside = holds.astype(np.float64)
         weights = inside
         if beam is not None:
             sine = sines(points_m, part.phase_centres_m, beam.directions(lines)[some]).T
@@ -266,22 +276,25 @@ def _error_of_weights(with_it: NDArray[np.float64], without: NDArray[np.float64]
 
 
 def _pixels_m(grid: Grid) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return pixels all over a grid and those of most relief, and where they lie without it."""
+    """Return pixels all over a grid and those of most relief, with the relief and without."""
     places = [np.unique(np.linspace(0, n - 1, _PIXELS).round().astype(int)) for n in grid.shape]
     index = np.ravel_multi_index(np.ix_(*places), grid.shape).ravel()
     surface = surface_of(grid)
-    if surface.is_plane:
+    relief_m = surface.off_m
+    if relief_m is None:
         points_m = grid.at(index)
         return points_m, points_m
-    index = np.append(index, [surface.off_m.argmin(), surface.off_m.argmax()])
+    index = np.append(index, [relief_m.argmin(), relief_m.argmax()])
     points_m = grid.at(index)
-    return points_m, points_m - surface.off_m[index, None] * surface.steps_m[2]
+    return points_m, points_m - relief_m[index, None] * surface.steps_m[2]
 
 
-def _pattern(sample: _Sample, survey: Survey) -> NDArray[np.float64]:
+def _pattern(
+    sample: _Sample, sonar: Sonar, track: Track, pointing: Pointing | None
+) -> NDArray[np.float64]:
     """Return the two-way pattern at the carrier, 0 behind an element's face."""
-    lines, sonar = sample.lines, survey.sonar
-    axes = (survey.pointing or Pointing.broadside()).axes(survey.track)
+    lines = sample.lines
+    axes = (pointing or Pointing.broadside()).axes(track)
     axes = axes[sample.channels // sonar.receivers]
     heard_m = np.broadcast_to(lines.rx_m, (len(sample.points_m), *lines.rx_m.shape))
     if lines.rx_velocity_m_s is not None:

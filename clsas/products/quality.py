@@ -13,52 +13,10 @@ from clsas.core import reprs, validate
 from clsas.core.grid import Axis, Grid
 from clsas.core.image import Image
 from clsas.core.image_error import complex_values
+from clsas.products.cuts import Cut, measure_cut
 
-_LOBES = 10  # side lobes on each side that the ISLR counts
 _SEARCH = 10  # pixels around the given place where the peak is looked for, unless told
-_REACH = 1024  # pixels around the peak that are looked at, at most
-_UPSAMPLING = 32  # points of a cut per pixel
-
-
-@dataclass(frozen=True, eq=False)
-class Cut:
-    """A point response along one axis, and what was measured on it.
-
-    Side lobes are numbered from the main lobe outwards and end at minima of the amplitude; the
-    main lobe is what lies between the first minimum on each side. Pairs are (towards smaller,
-    towards larger coordinate).
-
-    Attributes
-    ----------
-    axis : str
-        What the cut runs along: "x", "y" or "z", or "along columns" or "along rows" of a plane
-        that is not parallel to that coordinate.
-    offset_m : ndarray of float64, shape [points]
-        Distance from the peak, metres.
-    level_db : ndarray of float64, shape [points]
-        Amplitude over the peak's, dB.
-    resolution_m : float
-        Width of the main lobe at half the peak's power (-3.01 dB), metres.
-    pslr_nearest_db : (float, float)
-        Peak of the first side lobe over the main lobe's, dB.
-    pslr_db : (float, float)
-        Peak of the highest side lobe over the main lobe's, dB, as far as the cut reaches.
-    islr_db : float
-        Energy of the `lobes` nearest side lobes on both sides over that of the main lobe, dB.
-    lobes : (int, int)
-        How many whole side lobes the ISLR counts: 10, or less where the cut ends.
-    """
-
-    axis: str
-    offset_m: NDArray[np.float64]
-    level_db: NDArray[np.float64]
-    resolution_m: float
-    pslr_nearest_db: tuple[float, float]
-    pslr_db: tuple[float, float]
-    islr_db: float
-    lobes: tuple[int, int]
-
-    __repr__ = reprs.of_fields
+_REACH = 1024  # pixels on either side of the peak that enter a measurement, at most
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,13 +115,12 @@ def measure_point(
     if extent_m is not None:
         validate.number("extent_m", extent_m, "m", least=max(abs(dx), abs(dy)))
     place = _on_axes(image.grid, axes, near)
-    row, column = _find_peak(image.pixels, axes, place, search_m)
+    peak_row, peak_column = _find_peak(image.pixels, axes, place, search_m)
 
-    top, left = max(row - _REACH, 0), max(column - _REACH, 0)
-    pixels = image.pixels[top : row + _REACH + 1, left : column + _REACH + 1].astype(np.complex128)
-    row, column = row - top, column - left
-    pixels = _without_carrier(pixels, row, column)
-    row, column, amplitude = _refine_peak(pixels, row, column)
+    top, left = max(peak_row - _REACH, 0), max(peak_column - _REACH, 0)
+    around = image.pixels[top : peak_row + _REACH + 1, left : peak_column + _REACH + 1]
+    pixels = _without_carrier(around.astype(np.complex128), peak_row - top, peak_column - left)
+    row, column, amplitude = _refine_peak(pixels, peak_row - top, peak_column - left)
 
     along_x = _sinc([row], pixels.shape[0])[0] @ pixels
     along_y = pixels @ _sinc([column], pixels.shape[1])[0]
@@ -173,8 +130,8 @@ def measure_point(
         y_m=y_m,
         z_m=z_m,
         amplitude=amplitude,
-        azimuth=_measure_cut(across, along_x, column, amplitude, extent_m),
-        range=_measure_cut(upward, along_y, row, amplitude, extent_m),
+        azimuth=measure_cut(across, along_x, column, amplitude, extent_m),
+        range=measure_cut(upward, along_y, row, amplitude, extent_m),
     )
     highest_db = max(*response.azimuth.pslr_db, *response.range.pslr_db)
     if highest_db > 0:
@@ -271,17 +228,18 @@ def _on_axes(grid: Grid, axes: tuple[Axis, Axis], near: Sequence[float]) -> NDAr
     if np.shape(near) != (3,):
         return validate.array("near", near, np.float64, (2,))
     position_m = validate.array("near", near, np.float64, (3,))
-    steps = np.stack([grid.column_step_m, grid.row_step_m], axis=1)
-    index = np.linalg.lstsq(steps, position_m - grid.origin_m, rcond=None)[0]
+    origin_m, row_step_m, column_step_m = grid.vectors_m
+    steps_m = np.stack([column_step_m, row_step_m], axis=1)
+    index = np.linalg.lstsq(steps_m, position_m - origin_m, rcond=None)[0]
     return np.array([a.places_m[0] + i * a.step_m for a, i in zip(axes, index, strict=True)])
 
 
 def _position_m(grid: Grid, row: float, column: float) -> tuple[float, float, float]:
     """Return the position at a row and column between pixels, at the height of the nearest one."""
-    position_m = grid.origin_m + row * grid.row_step_m + column * grid.column_step_m
+    origin_m, row_step_m, column_step_m = grid.vectors_m
+    x_m, y_m, z_m = origin_m + row * row_step_m + column * column_step_m
     height_m = 0.0 if grid.height_m is None else grid.height_m[round(row), round(column)]
-    x_m, y_m, z_m = position_m + [0, 0, height_m]
-    return float(x_m), float(y_m), float(z_m)
+    return float(x_m), float(y_m), float(z_m + height_m)
 
 
 def _word(axis: Axis) -> str:
@@ -307,65 +265,7 @@ def _refine_peak(pixels: NDArray, row: float, column: float) -> tuple[float, flo
     zoom = np.arange(-16, 17)
     for step in (1 / 16, 1 / 256, 1 / 4096):
         rows, columns = row + step * zoom, column + step * zoom
-        near = _sinc(rows, pixels.shape[0]) @ pixels @ _sinc(columns, pixels.shape[1]).T
-        amplitude = np.abs(near)
-        i, j = np.unravel_index(amplitude.argmax(), amplitude.shape)
-        row, column = rows[i], columns[j]
-    return float(row), float(column), float(amplitude[i, j])
-
-
-def _measure_cut(
-    axis: Axis,
-    samples: NDArray,
-    peak: float,
-    amplitude: float,
-    extent_m: float | None,
-) -> Cut:
-    """Measure a line of pixels through the peak, which lies at index `peak` in it."""
-    from scipy import signal  # slow to import
-
-    step_m = axis.step_m
-    fine = signal.resample(samples, _UPSAMPLING * len(samples))
-    offset = (np.arange(len(fine)) / _UPSAMPLING - peak) * step_m
-    # Behind the last sample the periodic interpolation only leads back to the first one.
-    inside = np.arange(len(fine)) <= _UPSAMPLING * (len(samples) - 1)
-    if extent_m is not None:
-        inside &= np.abs(offset) <= extent_m
-    power = np.abs(fine[inside] / amplitude) ** 2
-    offset = offset[inside]
-    if step_m < 0:
-        offset, power = offset[::-1], power[::-1]
-
-    top = int(np.abs(offset).argmin())
-    sides = [power[top::-1], power[top:]]  # both outwards
-    half, main, energy, nearest, highest, counts = 0.0, -power[top], 0.0, [], [], []
-    for side, word in zip(sides, ("smaller", "larger"), strict=True):
-        ends = signal.argrelmin(side)[0]
-        if len(ends) < 2 or side[: ends[0] + 1].min() > 0.5:
-            raise ValueError(
-                f"no whole side lobe at {word} {axis.name} within the image (or extent_m): the "
-                "point is too near the border, or what is around it is not a point response"
-            )
-        below = int(np.argmax(side < 0.5))
-        half += below - (0.5 - side[below]) / (side[below - 1] - side[below])
-        lobes = ends[: _LOBES + 1]
-        main += side[: ends[0]].sum()
-        energy += side[lobes[0] : lobes[-1]].sum()
-        nearest.append(float(_decibels(side[ends[0] : ends[1]].max())))
-        highest.append(float(_decibels(side[ends[0] :].max())))
-        counts.append(len(lobes) - 1)
-    return Cut(
-        axis=axis.name,
-        offset_m=offset,
-        level_db=_decibels(power),
-        resolution_m=float(half * abs(step_m)) / _UPSAMPLING,
-        pslr_nearest_db=tuple(nearest),
-        pslr_db=tuple(highest),
-        islr_db=float(_decibels(energy / main)),
-        lobes=tuple(counts),
-    )
-
-
-def _decibels(power: ArrayLike) -> NDArray:
-    """Return 10 log10(power), not below -300 dB."""
-    return 10 * np.log10(np.maximum(power, 1e-30))
+        near = np.abs(_sinc(rows, pixels.shape[0]) @ pixels @ _sinc(columns, pixels.shape[1]).T)
+        i, j = np.unravel_index(near.argmax(), near.shape)
+        row, column = float(rows[i]), float(columns[j])
+    return row, column, float(near[i, j])

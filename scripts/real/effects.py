@@ -26,7 +26,7 @@ from clsas.exact.backprojection import prepare
 from clsas.exact.run import execute
 from clsas.files import scene_files as config
 from clsas.opencl.device import open_device
-from clsas.products.assessment import Assessment
+from clsas.products.assessment_result import Assessment
 
 AIRCRAFT_M_S = 100.0
 """About what the aircraft flew: its positions are known, their times are not."""

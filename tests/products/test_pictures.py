@@ -15,7 +15,7 @@ from clsas import plot
 from clsas.core.grid import Grid
 from clsas.core.image import Image
 from clsas.products.plot.colours import colour_map
-from clsas.products.tradeoff import Row, Tradeoff
+from clsas.products.tradeoff_result import Row, Tradeoff
 
 matplotlib = pytest.importorskip("matplotlib")
 

@@ -7,7 +7,8 @@ import pytest
 
 import clsas
 from clsas.core.grid import Grid
-from clsas.products.tradeoff import STAGES, Response, Row, Tradeoff, summary
+from clsas.products.tradeoff import STAGES, summary
+from clsas.products.tradeoff_result import Response, Row, Tradeoff
 
 # Far enough apart that their side lobes do not meet; the first one is the strongest.
 TARGETS = clsas.PointTargets([[0.02, 40.3, 0], [-0.25, 40.55, 0]], [1.0, 0.6])

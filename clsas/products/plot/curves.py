@@ -8,15 +8,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from clsas.core import validate
+from clsas.products.cuts import Cut
 from clsas.products.plot.canvas import axis_label, length_unit, new_figure
-from clsas.products.quality import Cut, PointResponse
+from clsas.products.quality import PointResponse
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
     from matplotlib.text import Annotation
 
-    from clsas.products.tradeoff import Row, Tradeoff
+    from clsas.products.tradeoff_result import Row, Tradeoff
 
 _DISTANCES = (10, 18, 28, 40, 54, 70, 88, 108)  # of labels from their points, tried in turn
 _ANGLES_DEG = (-45, 45, -90, 90, -20, 20, -135, 135, 180)

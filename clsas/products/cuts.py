@@ -1,0 +1,145 @@
+"""Cuts: lines of pixels through a point response, and what is measured on them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from clsas.core import reprs
+from clsas.core.grid import Axis
+
+_LOBES = 10  # side lobes on each side that the ISLR counts
+_UPSAMPLING = 32  # points of a cut per pixel
+
+
+@dataclass(frozen=True, eq=False)
+class Cut:
+    """A point response along one axis, and what was measured on it.
+
+    Side lobes are numbered from the main lobe outwards and end at minima of the amplitude; the
+    main lobe is what lies between the first minimum on each side. Pairs are (towards smaller,
+    towards larger coordinate).
+
+    Attributes
+    ----------
+    axis : str
+        What the cut runs along: "x", "y" or "z", or "along columns" or "along rows" of a plane
+        that is not parallel to that coordinate.
+    offset_m : ndarray of float64, shape [points]
+        Distance from the peak, metres.
+    level_db : ndarray of float64, shape [points]
+        Amplitude over the peak's, dB.
+    resolution_m : float
+        Width of the main lobe at half the peak's power (-3.01 dB), metres.
+    pslr_nearest_db : (float, float)
+        Peak of the first side lobe over the main lobe's, dB.
+    pslr_db : (float, float)
+        Peak of the highest side lobe over the main lobe's, dB, as far as the cut reaches.
+    islr_db : float
+        Energy of the `lobes` nearest side lobes on both sides over that of the main lobe, dB.
+    lobes : (int, int)
+        How many whole side lobes the ISLR counts: 10, or less where the cut ends.
+    """
+
+    axis: str
+    offset_m: NDArray[np.float64]
+    level_db: NDArray[np.float64]
+    resolution_m: float
+    pslr_nearest_db: tuple[float, float]
+    pslr_db: tuple[float, float]
+    islr_db: float
+    lobes: tuple[int, int]
+
+    __repr__ = reprs.of_fields
+
+
+def measure_cut(
+    axis: Axis,
+    samples: NDArray,
+    peak: float,
+    amplitude: float,
+    extent_m: float | None,
+) -> Cut:
+    """Measure a line of pixels through the peak, which lies at index `peak` in it."""
+    from scipy import signal  # slow to import
+
+    step_m = axis.step_m
+    fine = signal.resample(samples, _UPSAMPLING * len(samples))
+    offset = (np.arange(len(fine)) / _UPSAMPLING - peak) * step_m
+    # Behind the last sample the periodic interpolation only leads back to the first one.
+    inside = np.arange(len(fine)) <= _UPSAMPLING * (len(samples) - 1)
+    if extent_m is not None:
+        inside &= np.abs(offset) <= extent_m
+    power = np.abs(fine[inside] / amplitude) ** 2
+    offset = offset[inside]
+    if step_m < 0:
+        offset, power = offset[::-1], power[::-1]
+
+    top = int(np.abs(offset).argmin())
+    before = _Flank.of(power[top::-1], f"smaller {axis.name}")
+    after = _Flank.of(power[top:], f"larger {axis.name}")
+    main = before.main + after.main - float(power[top])  # which both flanks hold
+    return Cut(
+        axis=axis.name,
+        offset_m=offset,
+        level_db=_decibels(power),
+        resolution_m=(before.half_width + after.half_width) * abs(step_m) / _UPSAMPLING,
+        pslr_nearest_db=(before.nearest_db, after.nearest_db),
+        pslr_db=(before.highest_db, after.highest_db),
+        islr_db=float(_decibels((before.side_lobes + after.side_lobes) / main)),
+        lobes=(before.lobes, after.lobes),
+    )
+
+
+@dataclass(frozen=True)
+class _Flank:
+    """Half of a cut, from the peak outwards; energies are sums of its power.
+
+    Attributes
+    ----------
+    half_width : float
+        Points from the peak to half of its power.
+    main, side_lobes : float
+        Energy of the main lobe, and of the nearest side lobes.
+    nearest_db, highest_db : float
+        Peak of the first and of the highest side lobe, dB.
+    lobes : int
+        Number of whole side lobes in `side_lobes`.
+    """
+
+    half_width: float
+    main: float
+    side_lobes: float
+    nearest_db: float
+    highest_db: float
+    lobes: int
+
+    @classmethod
+    def of(cls, power: NDArray[np.float64], where: str) -> _Flank:
+        """Measure a flank from its power over the peak's; `where` names it in messages."""
+        from scipy import signal  # slow to import
+
+        minima = signal.argrelmin(power)[0]
+        if len(minima) < 2 or power[: minima[0] + 1].min() > 0.5:
+            raise ValueError(
+                f"no whole side lobe at {where} within the image (or extent_m): the "
+                "point is too near the border, or what is around it is not a point response"
+            )
+        first, second, last = minima[0], minima[1], minima[: _LOBES + 1][-1]
+        below = int(np.argmax(power < 0.5))
+        beyond = (0.5 - power[below]) / (power[below - 1] - power[below])
+        return cls(
+            half_width=float(below - beyond),
+            main=float(power[:first].sum()),
+            side_lobes=float(power[first:last].sum()),
+            nearest_db=float(_decibels(power[first:second].max())),
+            highest_db=float(_decibels(power[first:].max())),
+            lobes=min(len(minima), _LOBES + 1) - 1,
+        )
+
+
+def _decibels(power: ArrayLike) -> NDArray:
+    """Return 10 log10(power), not below -300 dB."""
+    return 10 * np.log10(np.maximum(power, 1e-30))
