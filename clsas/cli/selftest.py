@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import time
+from typing import TYPE_CHECKING
 
 import click
 
 from clsas.cli import options
 from clsas.cli.outputs import print_json, progress_bar
 from clsas.opencl.device import open_device
+
+if TYPE_CHECKING:
+    from clsas.trials.selftest import Result
 
 
 @click.command()
@@ -19,7 +23,7 @@ def selftest(ctx: click.Context, device: str | None, as_json: bool) -> None:
     """Test this device's accuracy at the extremes, in about a minute.
 
     Every imager forms images of scenes whose ideal image is known analytically. The exit code is 1
-    if the error of any image exceeds its bound.
+    if the error of any image exceeds its bound, or an image cannot be formed.
 
     \b
     Example:  clsas selftest --device 0
@@ -38,9 +42,7 @@ def selftest(ctx: click.Context, device: str | None, as_json: bool) -> None:
                 "driver": opened.info.driver,
                 "seconds": seconds,
                 "passed": not missed,
-                "results": [
-                    {**vars(result), "verdict": _verdict(result.passed)} for result in results
-                ],
+                "results": [{**vars(result), "verdict": _verdict(result)} for result in results],
             }
         )
     else:
@@ -48,14 +50,18 @@ def selftest(ctx: click.Context, device: str | None, as_json: bool) -> None:
         click.echo(f"{'asked':>6} {'measured':>9} {'bound':>6}  verdict  case")
         for result in results:
             asked = "-" if result.asked_db is None else f"{result.asked_db:.0f}"
+            measured = "-" if result.measured_db is None else f"{result.measured_db:.1f}"
+            failure = f": {result.failure}" if result.failure else ""
             click.echo(
-                f"{asked:>6} {result.measured_db:9.1f} {result.bound_db:6.0f}  "
-                f"{_verdict(result.passed):7}  {result.case}"
+                f"{asked:>6} {measured:>9} {result.bound_db:6.0f}  "
+                f"{_verdict(result):7}  {result.case}{failure}"
             )
         click.echo(f"{len(results) - missed} of {len(results)} within bounds, {seconds:.0f} s")
     if missed:
         ctx.exit(1)
 
 
-def _verdict(passed: bool) -> str:
-    return "ok" if passed else "MISSED"
+def _verdict(result: Result) -> str:
+    if result.failure:
+        return "FAILED"
+    return "ok" if result.passed else "MISSED"

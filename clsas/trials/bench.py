@@ -30,7 +30,7 @@ from clsas.trials.cases import Case
 
 _PIXELS = 300  # random pixels at which errors are measured
 _VISIBILITY_PIXELS = 64  # along either side, at which the share of visible channels is evaluated
-_FAST_RUNS = 3  # per round of fast methods, whose times scatter most
+_FAST_RUNS = 3  # runs per round of the fast methods: their times scatter most
 
 
 def run(
@@ -166,7 +166,7 @@ def run_factorized(
     fast = partial(factorize, lines, grid, device=device)
     exact = partial(form_exactly, lines, grid, beam=case.beam, device=device)
     error_db = relative_error_db(fast(chosen), exact(accuracy_db=REFERENCE_DB))
-    methods = [
+    methods: list[tuple[str, Callable[[], object]]] = [
         *_FAST_RUNS * [("first", lambda: fast(replace(chosen)))],  # a copy has an empty cache
         *_FAST_RUNS * [("again", lambda: fast(chosen))],
         ("exact", lambda: exact(accuracy_db=tolerance_db)),
@@ -254,7 +254,7 @@ def run_mosaic(
     contrast_db, reference_db = (shadow.contrast_db(each) for each in (formed, reference_image))
     error_db = relative_error_db(formed, reference_image)
     del formed, reference_image
-    methods = [
+    methods: list[tuple[str, Callable[[], object]]] = [
         *_FAST_RUNS * [("seconds", form)],
         ("exact_seconds", partial(exact, beam=beam, accuracy_db=tolerance_db)),
         ("unlimited_seconds", partial(exact, accuracy_db=tolerance_db)),

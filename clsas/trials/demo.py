@@ -5,26 +5,34 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from clsas.core.grid import Grid
+from clsas.core.image import Image
+from clsas.core.lines import RangeLines
 from clsas.exact.backprojection import form_exactly
 from clsas.files.hdf5 import save
-from clsas.files.scene_files import built_in_scene, read_scene
-from clsas.opencl.device import open_device
+from clsas.files.scene_files import SceneFile, built_in_scene, read_scene
+from clsas.opencl.device import Device, open_device
 from clsas.products import plot
-from clsas.products.quality import measure_point
+from clsas.products.quality import PointResponse, measure_point
 from clsas.signal.compression import compress
+from clsas.simulation.scenes import PointTargets
 from clsas.simulation.simulator import simulate
 from clsas.sonar.sampling import check_sampling
 from clsas.sonar.system import Sonar, element_pattern
 from clsas.sonar.track import Track, channels
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
 Progress = Callable[[int, int], None] | None
+Result = TypeVar("Result")
 
 _CLOSE_UP_M = 0.25  # half the side of the close-up around the measured point
 _CLOSE_UP_PIXELS = 501
@@ -77,6 +85,41 @@ def run(
         If a file cannot be written.
     """
     opened = open_device(device)
+    scene = _scene_in(out)
+    sonar, track, targets, grid = scene.need("sonar", "track", "targets", "grid")
+    demo = _Demo(out, scene, opened, say, progress)
+    demo.tell_scene(sonar, track, targets, grid)
+    lines = demo.lines(sonar, track, targets, grid)
+    info = opened.info
+    demo.tell("device", f"{info.label}, driver {info.driver}")
+    image = demo.form("image", lines, grid)
+    demo.keep("image", image, plot.image_db(image, title="whole scene"))
+    point = targets.positions_m[0]
+    close_up = demo.form("close-up", lines, _around(point))
+    demo.keep("point", close_up, plot.image_db(close_up, title="the point in the middle"))
+    response = measure_point(close_up, near=tuple(point[:2]))
+    plot.save_png(plot.cuts(response), out / "cuts.png")
+    expected_m = expected_resolution_m(sonar, track, point)
+    demo.tell_point(response, point, expected_m, sonar)
+    demo.tell("files", f"{out}: {', '.join(_FILES)}")
+    return {
+        "seconds": demo.seconds,
+        "device": info.label,
+        "driver": info.driver,
+        "point": response,
+        "expected": {"azimuth_resolution_m": expected_m[0], "range_resolution_m": expected_m[1]},
+        "files": [out / name for name in _FILES],
+    }
+
+
+def _scene_in(out: Path) -> SceneFile:
+    """Write the scene file into a folder and return the scene.
+
+    Raises
+    ------
+    FileExistsError
+        If the folder holds files with the demo's names that another program made.
+    """
     text, file = built_in_scene("thesis_wide_beam"), out / "scene.toml"
     taken = [name for name in _FILES if (out / name).exists()]
     if taken and not (file.is_file() and file.read_bytes() == text):
@@ -86,95 +129,118 @@ def run(
         )
     out.mkdir(parents=True, exist_ok=True)
     file.write_bytes(text)
-    scene = read_scene(file)
-    sonar, track, targets, grid = scene.need("sonar", "track", "targets", "grid")
-    seconds: dict[str, float] = {}
+    return read_scene(file)
 
-    def timed(step: str, work: Callable[[Progress], Any]) -> Any:
-        with progress(step) as callback:
+
+def _around(point_m: NDArray[np.float64]) -> Grid:
+    """Return the grid of the close-up of a point."""
+    x, y, _ = point_m
+    reach, count = _CLOSE_UP_M, _CLOSE_UP_PIXELS
+    return Grid.plane(x=(x - reach, x + reach, count), y=(y - reach, y + reach, count))
+
+
+@dataclass(frozen=True)
+class _Demo:
+    """Steps of the demo, which are timed and reported."""
+
+    out: Path
+    scene: SceneFile
+    device: Device
+    say: Callable[[str], None]
+    progress: Callable[[str], AbstractContextManager[Progress]]
+    seconds: dict[str, float] = field(default_factory=dict)
+
+    def tell(self, label: str, text: str) -> None:
+        """Write a line of the report."""
+        self.say(f"{label:<10} {text}")
+
+    def timed(self, step: str, work: Callable[[Progress], Result]) -> Result:
+        """Return the result of a step; measure its time."""
+        with self.progress(step) as callback:
             start = time.perf_counter()
             result = work(callback)
-            seconds[step] = time.perf_counter() - start
+            self.seconds[step] = time.perf_counter() - start
         return result
 
-    def keep(name: str, obj: Any, figure: Any) -> None:
-        save(out / f"{name}.h5", obj)
-        plot.save_png(figure, out / f"{name}.png")
+    def keep(self, name: str, obj: Any, figure: Figure) -> None:
+        """Save an object and its picture."""
+        save(self.out / f"{name}.h5", obj)
+        plot.save_png(figure, self.out / f"{name}.png")
 
-    def form(step: str, on: Grid) -> Any:
-        def work(callback: Progress) -> Any:
-            return form_exactly(lines, on, device=opened, **scene.image, progress=callback)
+    def lines(self, sonar: Sonar, track: Track, targets: PointTargets, grid: Grid) -> RangeLines:
+        """Simulate echoes and compress them."""
+        options = self.scene.simulate
+        echoes = self.timed(
+            "simulate", lambda p: simulate(sonar, track, targets, **options, progress=p)
+        )
+        self.keep("echoes", echoes, plot.geometry(echoes, grid))
+        self.tell(
+            "simulate",
+            f"{echoes.channels} echoes of {echoes.length} samples in "
+            f"{self.seconds['simulate']:.2f} s",
+        )
+        lines = self.timed(
+            "compress", lambda p: compress(echoes, **self.scene.compress, progress=p)
+        )
+        self.keep("lines", lines, plot.range_lines(lines))
+        self.tell(
+            "compress",
+            f"{lines.channels} lines of {lines.length} samples in {self.seconds['compress']:.2f} s",
+        )
+        return lines
 
-        image = timed(step, work)
-        say(
-            f"{step:<10} {' x '.join(map(str, on.shape))} pixels from {lines.channels} lines in "
-            f"{seconds[step]:.2f} s, with building the kernel"
+    def form(self, step: str, lines: RangeLines, grid: Grid) -> Image:
+        """Form an image exactly."""
+        options = self.scene.image
+        image = self.timed(
+            step, lambda p: form_exactly(lines, grid, device=self.device, **options, progress=p)
+        )
+        self.tell(
+            step,
+            f"{' x '.join(map(str, grid.shape))} pixels from {lines.channels} lines in "
+            f"{self.seconds[step]:.2f} s, with building the kernel",
         )
         return image
 
-    pulse = sonar.pulse
-    say(
-        f"{'scene':<10} {targets.points} points, {track.pings} pings of {sonar.receivers} "
-        f"receivers, {pulse.carrier_hz / 1e6:g} MHz, {pulse.bandwidth_hz / 1e3:g} kHz"
-    )
-    for finding in check_sampling(sonar, track, grid):
-        say(f"{'':<10} note: {finding.message}")
-
-    echoes = timed(
-        "simulate", lambda p: simulate(sonar, track, targets, **scene.simulate, progress=p)
-    )
-    keep("echoes", echoes, plot.geometry(echoes, grid))
-    say(
-        f"{'simulate':<10} {echoes.channels} echoes of {echoes.length} samples in "
-        f"{seconds['simulate']:.2f} s"
-    )
-
-    lines = timed("compress", lambda p: compress(echoes, **scene.compress, progress=p))
-    keep("lines", lines, plot.range_lines(lines))
-    say(
-        f"{'compress':<10} {lines.channels} lines of {lines.length} samples in "
-        f"{seconds['compress']:.2f} s"
-    )
-
-    info = opened.info
-    say(f"{'device':<10} {info.label}, driver {info.driver}")
-    image = form("image", grid)
-    keep("image", image, plot.image_db(image, title="whole scene"))
-
-    x, y, _ = point = targets.positions_m[0]
-    reach = _CLOSE_UP_M
-    around = Grid.plane(
-        x=(x - reach, x + reach, _CLOSE_UP_PIXELS), y=(y - reach, y + reach, _CLOSE_UP_PIXELS)
-    )
-    close_up = form("close-up", around)
-    keep("point", close_up, plot.image_db(close_up, title="the point in the middle"))
-
-    response = measure_point(close_up, near=(x, y))
-    plot.save_png(plot.cuts(response), out / "cuts.png")
-    azimuth_m, range_m = expected_resolution_m(sonar, track, point)
-    say(
-        f"{'measure':<10} peak at x = {response.x_m:.5f} m, y = {response.y_m:.5f} m; the point is "
-        f"at {x:g}, {y:g} m"
-    )
-    for name, cut, expected, rule in (
-        ("azimuth", response.azimuth, azimuth_m, f"L/2 = {500 * sonar.element_length_m:.2f}"),
-        ("range", response.range, range_m,
-         f"c/2B = {500 * sonar.sound_speed_m_s / pulse.bandwidth_hz:.2f}"),
-    ):  # fmt: skip
-        say(
-            f"{'':<10} {name:<7} {1e3 * cut.resolution_m:.2f} mm wide at -3 dB (theory "
-            f"{1e3 * expected:.2f} mm; {rule} mm), PSLR {max(cut.pslr_db):.1f} dB, "
-            f"ISLR {cut.islr_db:.1f} dB"
+    def tell_scene(self, sonar: Sonar, track: Track, targets: PointTargets, grid: Grid) -> None:
+        """Report the scene, and what its sampling costs in the image."""
+        pulse = sonar.pulse
+        self.tell(
+            "scene",
+            f"{targets.points} points, {track.pings} pings of {sonar.receivers} receivers, "
+            f"{pulse.carrier_hz / 1e6:g} MHz, {pulse.bandwidth_hz / 1e3:g} kHz",
         )
-    say(f"{'files':<10} {out}: {', '.join(_FILES)}")
-    return {
-        "seconds": seconds,
-        "device": info.label,
-        "driver": info.driver,
-        "point": response,
-        "expected": {"azimuth_resolution_m": azimuth_m, "range_resolution_m": range_m},
-        "files": [out / name for name in _FILES],
-    }
+        for finding in check_sampling(sonar, track, grid):
+            self.tell("", f"note: {finding.message}")
+
+    def tell_point(
+        self,
+        response: PointResponse,
+        point_m: NDArray[np.float64],
+        expected_m: tuple[float, float],
+        sonar: Sonar,
+    ) -> None:
+        """Report the measured point beside theory."""
+        x, y, _ = point_m
+        self.tell(
+            "measure",
+            f"peak at x = {response.x_m:.5f} m, y = {response.y_m:.5f} m; the point is at "
+            f"{x:g}, {y:g} m",
+        )
+        rules = (
+            "" if sonar.element_length_m is None else f"L/2 = {500 * sonar.element_length_m:.2f}",
+            f"c/2B = {500 * sonar.sound_speed_m_s / sonar.pulse.bandwidth_hz:.2f}",
+        )
+        cuts = (response.azimuth, response.range)
+        for name, cut, expected, rule in zip(
+            ("azimuth", "range"), cuts, expected_m, rules, strict=True
+        ):
+            self.tell(
+                "",
+                f"{name:<7} {1e3 * cut.resolution_m:.2f} mm wide at -3 dB (theory "
+                f"{1e3 * expected:.2f} mm; {rule} mm), PSLR {max(cut.pslr_db):.1f} dB, "
+                f"ISLR {cut.islr_db:.1f} dB",
+            )
 
 
 def expected_resolution_m(

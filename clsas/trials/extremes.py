@@ -115,7 +115,7 @@ def scene(
         Called with centre and width in cycles per metre; returns the bands of the pulse. By
         default the pulse's spectrum is flat, or tilted by `tilt_db`.
     on_carrier : bool
-        Whether lines keep their carrier. The sampled band must then include it.
+        True if lines keep their carrier. The sampled band must then include it.
     offset : float
         Constant in every line, relative to the rms of its echoes.
     tail : float
@@ -125,7 +125,7 @@ def scene(
     origin_m : (x, y, z)
         Offset of all coordinates.
     own_starts : bool
-        Whether lines begin at different ranges.
+        True if lines begin at different ranges.
     relief_m : float
         Standard deviation of the pixels' heights, which are independent of each other.
     seed : int
@@ -137,27 +137,18 @@ def scene(
     rng = np.random.default_rng(seed)
     tx, rx = (_quantised(tx_m if each is None else each) for each in (tx_m, rx_m))
     velocity = 0.0 if rx_velocity_m_s is None else rx_velocity_m_s
-    rows, columns = shape
-    x_m, y_m = (
-        step * (np.arange(count) - (count - 1) / 2)
-        for step, count in zip(pixel_m, (columns, rows), strict=True)
-    )
-    corner = _quantised(np.add(centre_m, [x_m[0], y_m[0], 0]))
-    pixels = corner + np.stack(
-        np.broadcast_arrays(x_m - x_m[0], (y_m - y_m[0])[:, None], 0.0), axis=-1
-    )
     height_m = relief_m * np.random.default_rng(seed).normal(size=shape)
-    pixels[..., 2] += height_m
+    corner, pixels = _pixels(centre_m, pixel_m, height_m)
+    extent_m = pixels[-1, -1, :2] - corner[:2]
     # No points near the border, so that the image holds their main lobes.
-    points = corner + rng.uniform(0.1, 0.9, (targets, 3)) * [np.ptp(x_m), np.ptp(y_m), 0]
+    points = corner + rng.uniform(0.1, 0.9, (targets, 3)) * [*extent_m, 0]
     amplitude = rng.normal(size=(targets, 2)) @ [1, 1j]
 
     per_m = 2 / speed_m_s
     centre, width = per_m * carrier_hz, per_m * bandwidth_hz
     step_m = 1 / (width * oversampling)
-    if colour is None:
-        bands = [Band(centre, _FLAT * width, _EDGE * width, tilt_db=tilt_db)]
-    else:
+    bands: Sequence[Band] = [Band(centre, _FLAT * width, _EDGE * width, tilt_db=tilt_db)]
+    if colour is not None:
         bands = colour(centre, width)
     at_m = oracle.ranges_m(points, tx, rx, speed_m_s, velocity)
     of_pixels_m = oracle.ranges_m(pixels, tx, rx, speed_m_s, velocity)
@@ -167,15 +158,11 @@ def scene(
     if offset or tail or noise:
         # Offsets and noise extend over the whole line, and fade with a Gaussian.
         fade_m = max(fade_m, np.ptp(of_pixels_m, axis=1).max())
-    nearest = np.minimum(at_m.min(axis=1), of_pixels_m.min(axis=1))
-    farthest = np.maximum(at_m.max(axis=1), of_pixels_m.max(axis=1))
-    first_m = nearest - fade_m
-    length = int(np.ceil(((farthest - nearest).max() + 2 * fade_m) / step_m)) + 1
+    first_m, length = _extent(np.hstack([at_m, of_pixels_m]), fade_m, step_m)
     if own_starts:
         first_m = first_m - rng.uniform(0, step_m, len(tx))
-    elif np.ptp(first_m) < length * step_m:  # otherwise lines would be mostly zeros
-        length += int(np.ceil(np.ptp(first_m) / step_m))
-        first_m = np.full(len(tx), first_m.min())
+    else:
+        first_m, length = _from_one_start(first_m, length, step_m)
     carrier = 0.0 if on_carrier else centre
     values = oracle.samples(echoes, first_m, step_m, length, carrier)
     rms = np.sqrt(np.mean(np.abs(values) ** 2))
@@ -189,28 +176,56 @@ def scene(
     weights = 1.0 if beam is None else _weights(beam, pixels, (tx + rx) / 2)
     origin = np.asarray(origin_m, np.float64)
     grid = Grid.oriented(corner + origin, [0, pixel_m[1], 0], [pixel_m[0], 0, 0], shape)
-    if relief_m:
-        grid = grid.with_height(height_m)
-    return Known(
-        RangeLines(
-            values,
-            first_m,
-            step_m,
-            tx + origin,
-            rx + origin,
-            0.0 if on_carrier else carrier_hz,
-            speed_m_s,
-            rx_velocity_m_s,
-        ),
-        grid,
-        oracle.image(echoes, of_pixels_m, weights).reshape(shape),
-        beam,
+    lines = RangeLines(
+        values,
+        first_m,
+        step_m,
+        tx + origin,
+        rx + origin,
+        0.0 if on_carrier else carrier_hz,
+        speed_m_s,
+        rx_velocity_m_s,
     )
+    ideal = oracle.image(echoes, of_pixels_m, weights).reshape(shape)
+    return Known(lines, grid.with_height(height_m) if relief_m else grid, ideal, beam)
+
+
+def _pixels(
+    centre_m: Sequence[float], pixel_m: tuple[float, float], height_m: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the position of the first pixel, without relief, and those of all, [..., 3]."""
+    rows, columns = height_m.shape
+    x_m, y_m = (
+        step * (np.arange(count) - (count - 1) / 2)
+        for step, count in zip(pixel_m, (columns, rows), strict=True)
+    )
+    corner = _quantised(np.add(centre_m, [x_m[0], y_m[0], 0]))
+    plane = np.broadcast_arrays(x_m - x_m[0], (y_m - y_m[0])[:, None], height_m)
+    return corner, corner + np.stack(plane, axis=-1)
+
+
+def _extent(
+    range_m: NDArray[np.float64], fade_m: float, step_m: float
+) -> tuple[NDArray[np.float64], int]:
+    """Return first ranges and length of lines that hold ranges [channels, n] and a margin."""
+    nearest, farthest = range_m.min(axis=1), range_m.max(axis=1)
+    length = int(np.ceil(((farthest - nearest).max() + 2 * fade_m) / step_m)) + 1
+    return nearest - fade_m, length
+
+
+def _from_one_start(
+    first_m: NDArray[np.float64], length: int, step_m: float
+) -> tuple[NDArray[np.float64], int]:
+    """Let all lines begin at the nearest range, unless they would then be mostly zeros."""
+    spread_m = np.ptp(first_m)
+    if spread_m >= length * step_m:
+        return first_m, length
+    return np.full(len(first_m), first_m.min()), length + int(np.ceil(spread_m / step_m))
 
 
 def ultrasonic(channels: int = 160, track: NDArray | None = None, **options: Any) -> Known:
     """1 MHz, 100 kHz, 42.5 m away: 28 000 wavelengths."""
-    defaults = {
+    defaults: dict[str, Any] = {
         "carrier_hz": 1e6, "bandwidth_hz": 1e5, "pixel_m": (4e-3, 4e-3), "shape": (48, 48),
     }  # fmt: skip
     track = along_x(channels, 8.25e-3) if track is None else track
@@ -323,6 +338,8 @@ def _weights(
     beam: BeamWindow, pixels_m: NDArray[np.float64], centres_m: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Return a beam's weights, [channels, pixels], from their definition."""
+    if beam.along is None:
+        raise ValueError("beam must have the direction `along`")
     towards = pixels_m.reshape(1, -1, 3) - centres_m[:, None]
     sine = towards @ beam.along / np.linalg.norm(towards, axis=-1)
     u = (np.degrees(np.arcsin(sine)) - beam.squint_deg) / beam.width_deg

@@ -125,7 +125,7 @@ def image(
 
     Restoring the carrier's phase, exp(+j 2 pi K rho), cancels what `samples` mixed out.
     """
-    return np.sum(weights * received(echoes, range_m), axis=0)
+    return np.sum(np.asarray(weights) * received(echoes, range_m), axis=0)
 
 
 def received(echoes: Sequence[Echo], at_m: NDArray[np.float64]) -> NDArray[np.complex128]:

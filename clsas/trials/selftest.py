@@ -7,6 +7,7 @@ import functools
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 from clsas.core import validate
 from clsas.core.image import Image
@@ -41,21 +42,24 @@ class Result:
         Scene and imager.
     asked_db : float or None
         Requested relative rms error, dB; None for an imager that takes no request.
-    measured_db : float
-        Measured relative rms error.
+    measured_db : float or None
+        Measured relative rms error; None if no image was formed.
     bound_db : float
         Largest error with which the test is passed.
+    failure : str
+        Type and message of the exception that imaging raised; "" if an image was formed.
     """
 
     case: str
     asked_db: float | None
-    measured_db: float
+    measured_db: float | None
     bound_db: float
+    failure: str = ""
 
     @property
     def passed(self) -> bool:
-        """Whether the error is within its bound (NaN is not)."""
-        return self.measured_db <= self.bound_db
+        """True if the error is within its bound (NaN is not)."""
+        return self.measured_db is not None and self.measured_db <= self.bound_db
 
 
 def run(
@@ -68,7 +72,7 @@ def run(
     The scenes cover 1 kHz to 10 GHz, one to 1000 channels, guard bands down to a tenth, and
     coordinates up to 10 000 km. Every imager is tested: exact, factorized (in single and in half
     precision), mosaic and wavenumber. On a CPU the kernels are built for every vector width that
-    the CPU supports.
+    the CPU supports. An image that cannot be formed has not passed; the others follow.
 
     Parameters
     ----------
@@ -99,20 +103,28 @@ def run(
     for done, (used, variant, scene, imager, asked_db) in enumerate(checks):
         if progress is not None:
             progress(done, len(checks))
-        known = made(scene)
-        with warnings.catch_warnings():
-            # Warnings do not matter here, only the measured error.
-            warnings.simplefilter("ignore", validate.ClsasWarning)
-            image = form(imager, known, asked_db, used)
         bound_db = _WAVENUMBER_DB if asked_db is None else asked_db
+        measured_db, failure = None, ""
+        try:
+            known = made(scene)
+            measured_db = known.error_db(_quietly(imager, known, bound_db, used).pixels)
+        except Exception as error:  # whatever a driver does, the other images tell more
+            failure = f"{type(error).__name__}: {error}"
         case = f"{scene}, {imager}{variant}"
-        results.append(Result(case, asked_db, known.error_db(image.pixels), bound_db))
+        results.append(Result(case, asked_db, measured_db, bound_db, failure))
     if progress is not None:
         progress(len(checks), len(checks))
     return tuple(results)
 
 
-def form(imager: str, known: Known, asked_db: float | None, device: Device) -> Image:
+def _quietly(imager: str, known: Known, asked_db: float, device: Device) -> Image:
+    """Form an image without warnings: only the measured error matters."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", validate.ClsasWarning)
+        return form(imager, known, asked_db, device)
+
+
+def form(imager: str, known: Known, asked_db: float, device: Device) -> Image:
     """Return the image of a scene by one of `IMAGERS`."""
     return IMAGERS[imager](known, asked_db, device)
 
@@ -179,7 +191,7 @@ def _mosaic(known: Known, asked_db: float, device: Device) -> Image:
     ).image()  # fmt: skip
 
 
-def _wavenumber(known: Known, asked_db: float | None, device: Device) -> Image:
+def _wavenumber(known: Known, asked_db: float, device: Device) -> Image:
     return wavenumber(known.lines, known.grid, beam=known.beam)
 
 
@@ -191,7 +203,7 @@ IMAGERS = {
     "wavenumber": _wavenumber,
 }
 _HANN = BeamWindow(12, "hann", along=[1, 0, 0])
-_SMALL = {"shape": (32, 32)}
+_SMALL: dict[str, Any] = {"shape": (32, 32)}
 _SCENES: dict[str, Callable[[], Known]] = {
     "flat": lambda: extremes.ultrasonic(96, **_SMALL),
     "tilted, guard band 10 %": lambda: extremes.ultrasonic(

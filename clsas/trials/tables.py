@@ -9,6 +9,7 @@ import multiprocessing
 import resource
 import tempfile
 import time
+from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
@@ -39,7 +40,7 @@ SHADOW_LEVELS_DB = (
 SIZES = (256, 512, 1024, 2048, 4096, 8192)
 
 
-def table(header: list[str], rows: list[list[object]]) -> None:
+def table(header: Sequence[str], rows: Sequence[Sequence[object]]) -> None:
     """Print a Markdown table."""
     print("|", " | ".join(header), "|")
     print("|", " | ".join("---" for _ in header), "|")
@@ -119,7 +120,7 @@ def taps(devices: list[str]) -> None:
     """Print the kernel's time by taps, from which `clsas.signal.interpolation.COST` is taken."""
     case = dataclasses.replace(cases.EXACT_CASES["bp-thesis"], channels=512)
     lines, grid = case.lines(), case.grid
-    best = {}
+    best: dict[tuple[str, int], float] = {}
     for _ in range(5):
         for name in devices:
             device = open_device(name)
@@ -329,7 +330,7 @@ def survey(devices: list[str]) -> None:
         with ProcessPoolExecutor(2, multiprocessing.get_context("spawn")) as pool:
             list(pool.map(survey_lines, [folder] * SURVEY_PARTS, range(SURVEY_PARTS)))
         size = sum(file.stat().st_size for file in Path(folder).iterdir())
-        rows = []
+        rows: list[list[object]] = []
         for name in devices:
             before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
             start = time.perf_counter()
@@ -345,7 +346,9 @@ def survey(devices: list[str]) -> None:
             seconds = time.perf_counter() - start
             peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
             rate = grid.size / seconds
-            square_m = np.linalg.norm(grid.row_step_m) * np.linalg.norm(grid.column_step_m)
+            _, row_step_m, column_step_m = grid.vectors_m
+            square_m = np.linalg.norm(row_step_m) * np.linalg.norm(column_step_m)
+            predicted_db = [r.predicted_error_db for r in records if not r.is_empty]
             rows.append(
                 [
                     name,
@@ -354,7 +357,7 @@ def survey(devices: list[str]) -> None:
                     f"{seconds:.1f}",
                     f"{sum(r.plan_seconds for r in records):.1f}",
                     f"{sum(r.read_seconds for r in records):.1f}",
-                    f"{max(r.predicted_error_db for r in records):.1f}",
+                    f"{max(each for each in predicted_db if each is not None):.1f}",
                     f"{rate / 1e6:.2f}",
                     f"{rate * square_m * DAY_S / 1e6:.0f}",
                     f"{peak:.0f} ({before:.0f})",
