@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import time
-from contextlib import nullcontext
-from functools import partial
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -22,19 +24,20 @@ from clsas.cli.inputs import (
     warn_of_sampling,
 )
 from clsas.cli.outputs import progress_bar, report
-from clsas.cli.parameters import INPUT
+from clsas.cli.parameters import HDF5
 from clsas.core import validate
+from clsas.core.image import holds_any
 from clsas.exact.backprojection import prepare
 from clsas.exact.run import execute
 from clsas.files.scene_tables import PLAN_KEYS
-from clsas.opencl.device import open_device
+from clsas.opencl.device import Device, KernelTimes, open_device
 from clsas.planning.planner import WORST_TOLERANCE_DB
 from clsas.products.tradeoff import summary
 from clsas.signal.interpolation import MOST_UPSAMPLING, TAPS
 
 
 @click.command()
-@click.argument("lines_file", metavar="LINES.H5", type=INPUT)
+@click.argument("lines_file", metavar="LINES.H5", type=HDF5)
 @options.output("Image")
 @options.grid
 @options.method
@@ -99,74 +102,151 @@ def image(
         warn_of_sampling(described, grid)
     lines = load(lines_file, clsas.RangeLines)
     opened = open_device(device)
-    results: dict[str, Any] = {"method": "exact"}
-    chosen, why, warned = None, "", False
+    chosen, planned_s = None, None
     if request.keys() & set(PLAN_KEYS):
         start = time.perf_counter()
         chosen = clsas.plan(lines, grid, **request, beam=beam, device=opened)
-        results["plan_seconds"] = time.perf_counter() - start
+        planned_s = time.perf_counter() - start
         _warn_of_error(chosen)
-        warned = chosen.kept["warned"]
-        if chosen.is_exact:
-            request = {"accuracy_db": chosen.accuracy_db}
-            why, chosen = f"exact: nothing faster within {chosen.tolerance_db:.4g} dB; ", None
-    with (
-        progress_bar("imaging") as progress,
-        opened.profile() if profile else nullcontext({}) as kernels,
-    ):
+    profiling: AbstractContextManager[dict[str, KernelTimes]] = nullcontext({})
+    if profile:
+        profiling = opened.profile()
+    with progress_bar("imaging") as progress, profiling as kernels:
         start = time.perf_counter()
-        if chosen is not None:
-            formed = clsas.factorize(lines, grid, chosen, device=opened, progress=progress)
-            how = f"{summary(chosen)}; predicted error {chosen.predicted_error_db:.0f} dB"
-            left_out = chosen.left_out
-            results |= {
-                "method": "stages" if chosen.nearest else "factorized",
-                "predicted_error_db": chosen.predicted_error_db,
-                "predicted_seconds": chosen.predicted_seconds,
-            }
+        if chosen is None or chosen.is_exact:
+            formed = _exactly(lines, grid, beam, opened, request, chosen, progress)
         else:
-            preparation = prepare(lines, grid, device=opened, beam=beam, **request)
-            if not why:  # otherwise the plan has warned
-                preparation.warn_of_ambiguity()
-            formed = execute(preparation, progress=progress, warned=warned)
-            interpolator, ratio = preparation.interpolator, preparation.resampling.ratio
-            left_out = preparation.left_out
-            how = (
-                f"{why}{interpolator.taps} taps on lines upsampled {ratio:.3g} times, "
-                f"{preparation.predicted_error_db:.0f} dB"
-            )
-            results |= {
-                "taps": interpolator.taps,
-                "upsampling": ratio,
-                "interpolation_error_db": interpolator.error_db,
-                "predicted_error_db": preparation.predicted_error_db,
-            }
+            formed = _factorized(lines, grid, opened, chosen, progress)
         seconds = time.perf_counter() - start
-    results["left_out"] = left_out
-    how += f"; without {', '.join(left_out)}, far below the error allowed" if left_out else ""
-    clsas.save(output, formed)
+    clsas.save(output, formed.image)
     if picture is not None:
         from clsas.products import plot
 
-        plot.save(plot.image_db(formed, **levels), picture)
-    planned = f", planned in {results['plan_seconds']:.2f} s" if "plan_seconds" in results else ""
-    table = "".join(
+        plot.save(plot.image_db(formed.image, **levels), picture)
+    planned = "" if planned_s is None else f", planned in {planned_s:.2f} s"
+    report(
+        as_json,
+        f"{output}: {' x '.join(map(str, grid.shape))} pixels from {lines.channels} lines in "
+        f"{seconds:.2f} s{planned} on {opened.info.label} ({formed.summary})" + _table(kernels),
+        file=output, picture=picture, shape=grid.shape, channels=lines.channels,
+        device=opened.info.label, driver=opened.info.driver,
+        **({} if planned_s is None else {"plan_seconds": planned_s}), **formed.results,
+        seconds=seconds, kernels=kernels,
+    )  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class _Formed:
+    """An image with a description of how it was formed.
+
+    Attributes
+    ----------
+    image : Image
+    how : str
+        The method, for people.
+    predicted_error_db : float
+    left_out : tuple of str
+        Effects that were left out.
+    figures : dict
+        More about the method, in types of JSON.
+    """
+
+    image: clsas.Image
+    how: str
+    predicted_error_db: float
+    left_out: tuple[str, ...]
+    figures: dict[str, Any]
+
+    @cached_property
+    def is_zero(self) -> bool:
+        """True if all pixels are zero. No error is then predicted: it is relative to the image."""
+        return not holds_any(self.image.pixels)
+
+    @property
+    def summary(self) -> str:
+        """How the image was formed, in a line."""
+        error = f"predicted error {self.predicted_error_db:.0f} dB"
+        parts = [self.how, "all pixels are zero" if self.is_zero else error]
+        if self.left_out:
+            parts.append(f"without {', '.join(self.left_out)}, far below the error allowed")
+        return "; ".join(parts)
+
+    @property
+    def results(self) -> dict[str, Any]:
+        """How the image was formed, in types of JSON."""
+        error_db = None if self.is_zero else self.predicted_error_db
+        return {
+            **self.figures,
+            "predicted_error_db": error_db,
+            "is_zero": self.is_zero,
+            "left_out": self.left_out,
+        }
+
+
+def _factorized(
+    lines: clsas.RangeLines,
+    grid: clsas.Grid,
+    device: Device,
+    chosen: clsas.Plan,
+    progress: Callable[[int, int], None] | None,
+) -> _Formed:
+    """Form a factorized image."""
+    return _Formed(
+        clsas.factorize(lines, grid, chosen, device=device, progress=progress),
+        summary(chosen),
+        chosen.predicted_error_db,
+        chosen.left_out,
+        {
+            "method": "stages" if chosen.nearest else "factorized",
+            "predicted_seconds": chosen.predicted_seconds,
+        },
+    )
+
+
+def _exactly(
+    lines: clsas.RangeLines,
+    grid: clsas.Grid,
+    beam: clsas.BeamWindow | None,
+    device: Device,
+    request: dict[str, Any],
+    chosen: clsas.Plan | None,
+    progress: Callable[[int, int], None] | None,
+) -> _Formed:
+    """Form an exact image as requested, or because a plan chose it."""
+    why, warned = "", False
+    if chosen is not None:
+        request = {"accuracy_db": chosen.accuracy_db}
+        why = f"exact: nothing faster within {chosen.tolerance_db:.4g} dB; "
+        warned = chosen.kept["warned"]
+    preparation = prepare(lines, grid, device=device, beam=beam, **request)
+    if chosen is None:  # otherwise the plan has warned
+        preparation.warn_of_ambiguity()
+    interpolator, ratio = preparation.interpolator, preparation.resampling.ratio
+    return _Formed(
+        execute(preparation, progress=progress, warned=warned),
+        f"{why}{interpolator.taps} taps on lines upsampled {ratio:.3g} times",
+        preparation.predicted_error_db,
+        preparation.left_out,
+        {
+            "method": "exact",
+            "taps": interpolator.taps,
+            "upsampling": ratio,
+            "interpolation_error_db": interpolator.error_db,
+        },
+    )
+
+
+def _table(kernels: dict[str, KernelTimes]) -> str:
+    """Return one line for every kernel, each after a line break."""
+    return "".join(
         f"\n  {name}: {times.count} runs of {1e3 * times.minimum_s:.3g} to "
         f"{1e3 * times.maximum_s:.3g} ms, median {1e3 * times.median_s:.3g} ms"
         for name, times in kernels.items()
     )
-    report(
-        as_json,
-        f"{output}: {' x '.join(map(str, grid.shape))} pixels from {lines.channels} lines in "
-        f"{seconds:.2f} s{planned} on {opened.info.label} ({how}){table}",
-        file=output, picture=picture, shape=grid.shape, channels=lines.channels,
-        device=opened.info.label, driver=opened.info.driver, **results, seconds=seconds,
-        kernels=kernels,
-    )  # fmt: skip
 
 
 @click.command()
-@click.argument("lines_file", metavar="LINES.H5", type=INPUT)
+@click.argument("lines_file", metavar="LINES.H5", type=HDF5)
 @options.grid
 @options.method
 @options.beam

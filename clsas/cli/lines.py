@@ -12,7 +12,7 @@ import clsas
 from clsas.cli import options
 from clsas.cli.inputs import load, read_levels, read_scene, warn_of_sampling
 from clsas.cli.outputs import progress_bar, report
-from clsas.cli.parameters import INPUT
+from clsas.cli.parameters import HDF5, INPUT
 from clsas.signal.compression import check_options
 from clsas.simulation.simulator import check_size
 
@@ -50,7 +50,7 @@ def simulate(scene_file: Path, output: Path, picture: Path | None, as_json: bool
 
 
 @click.command()
-@click.argument("echoes_file", metavar="ECHOES.H5", type=INPUT)
+@click.argument("echoes_file", metavar="ECHOES.H5", type=HDF5)
 @options.output("Range lines")
 @options.scene
 @click.option(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,7 @@ import clsas
 from clsas.cli import options
 from clsas.cli.inputs import load, read_beam, read_grid
 from clsas.cli.outputs import json_able, print_json, progress_bar, report
-from clsas.cli.parameters import INPUT, POSITION, STAGES, Output
+from clsas.cli.parameters import HDF5, INPUT, POSITION, STAGES, Output
 from clsas.core import validate
 from clsas.files.scene_files import SceneFile
 from clsas.products.cuts import Cut
@@ -23,7 +23,7 @@ from clsas.products.tradeoff import TOLERANCES_DB
 
 
 @click.command()
-@click.argument("image_file", metavar="IMAGE.H5", type=INPUT)
+@click.argument("image_file", metavar="IMAGE.H5", type=HDF5)
 @click.option(
     "--near",
     type=POSITION,
@@ -85,7 +85,7 @@ def quality(
 
 
 @click.command()
-@click.argument("lines_file", metavar="[LINES.H5]", type=INPUT, required=False)
+@click.argument("lines_file", metavar="[LINES.H5]", type=HDF5, required=False)
 @click.option("--case", help="Use a case of `clsas bench`: ffbp-thesis, ffbp-2k, ...")
 @options.grid
 @click.option(
@@ -135,15 +135,17 @@ def tradeoff(
     \b
     Example:  clsas tradeoff --case ffbp-thesis --csv tradeoff.csv --picture tradeoff.png
     """  # fmt: skip
-    if lines_file is None and case is None:
-        raise click.UsageError("give either LINES.H5 or --case")
     if lines_file is not None and case is not None:
         raise click.UsageError("--case has its own lines: leave out LINES.H5")
-    if case is None:
+    if lines_file is not None:
+        title = lines_file.name
         described, grid = read_grid(scene, given)
         beam = read_beam(described, given)
         lines = load(lines_file, clsas.RangeLines)
+    elif case is None:
+        raise click.UsageError("give either LINES.H5 or --case")
     else:
+        title = case
         if scene is not None or any(given[name] is not None for name in ("x", "y", "z")):
             raise click.UsageError("--case has its own grid: leave out --scene, --x, --y and --z")
         built_in = _case(case)
@@ -161,7 +163,7 @@ def tradeoff(
     if picture is not None:
         from clsas.products import plot
 
-        plot.save(plot.tradeoff(measured, title=case or lines_file.name), picture)
+        plot.save(plot.tradeoff(measured, title=title), picture)
     report(
         as_json,
         f"{measured.channels} lines, {' x '.join(map(str, measured.pixels))} pixels on "
@@ -207,6 +209,7 @@ def bench(
     from clsas.trials import bench as benchmark
     from clsas.trials import cases
 
+    measures: dict[str, Callable[..., dict[str, Any]]]
     measures = dict.fromkeys(cases.EXACT_CASES, benchmark.run)
     measures |= dict.fromkeys(cases.FACTORIZED_CASES, benchmark.run_factorized)
     measures |= dict.fromkeys(cases.MOSAIC_CASES, benchmark.run_mosaic)

@@ -27,9 +27,11 @@ from clsas.cli.outputs import progress_bar, report
 from clsas.cli.parameters import COUNTS, INPUT, File, Store, keep_apart
 from clsas.core.extras import install_command
 from clsas.core.threads import uninterrupted
+from clsas.exact.backprojection import ACCURACY_DB
 from clsas.files.scene_files import SceneFile, simulation_digest
 from clsas.files.scene_tables import PLAN_KEYS
 from clsas.mosaics.patches import patch_shape_of
+from clsas.mosaics.record import Record
 from clsas.opencl.device import open_device
 
 _SCHEDULER_S = 10  # time for a scheduler to answer
@@ -38,7 +40,7 @@ _LISTED = 3  # patches that are listed for each kind of defect
 
 
 @click.command()
-@click.argument("scene", metavar="SCENE.TOML", type=INPUT)
+@click.argument("scene", metavar="[SCENE.TOML]", type=INPUT, required=False)
 @click.option(
     "--lines", "lines_path", type=File(exists=True),
     help="File of range lines, or a folder of such files. [default: simulated from the scene]",
@@ -49,9 +51,10 @@ _LISTED = 3  # patches that are listed for each kind of defect
 )  # fmt: skip
 @options.axes
 @options.method
+@click.option("--exact", is_flag=True, help="Form exact patches; --accuracy-db implies it.")
 @click.option(
     "--accuracy-db", type=float, callback=options.check_accuracy_db,
-    help="Form an exact image with this relative rms error, dB.",
+    help="Relative rms error of exact patches, dB. [default: -60]",
 )  # fmt: skip
 @options.beam
 @click.option("--patches", type=COUNTS, help="Number of patches along y and x, such as 8x8.")
@@ -69,14 +72,15 @@ _LISTED = 3  # patches that are listed for each kind of defect
 )  # fmt: skip
 @click.option(
     "--verify", is_flag=True,
-    help="Only compare all patches of the store with their checksums.",
+    help="Only compare all patches of the store with their checksums; -o suffices without a scene.",
 )  # fmt: skip
 @options.picture("an overview in dB")
 @options.levels
 @click.option("--borders", is_flag=True, help="Draw the borders of the patches into the picture.")
 @options.as_json
 def mosaic(
-    scene: Path,
+    scene: Path | None,
+    exact: bool,
     lines_path: Path | None,
     output: Path | None,
     patches: tuple[int, int] | None,
@@ -97,32 +101,75 @@ def mosaic(
 ) -> None:
     """Form an image of any size patch by patch, into a Zarr store.
 
-    Grid, method and beam are those of `clsas image`; --accuracy-db requests an exact image. After
-    an interruption, by Ctrl-C or anything else, the same command continues, and forms damaged
-    patches again. With --verify it only lists damaged patches; the exit code is 1 if there are any.
-    Without --lines the scene is simulated first.
+    Grid, method and beam are those of `clsas image`. After an interruption, by Ctrl-C or anything
+    else, the same command continues, and forms damaged patches again. With --verify it only lists
+    damaged patches; the exit code is 1 if there are any. Without --lines the scene is simulated
+    first.
 
     \b
     Example:  clsas mosaic scene.toml --lines lines.h5 -o image.zarr --picture image.png
     """
-    if workers is not None and scheduler is not None:
-        raise click.UsageError("give only one of --workers and --scheduler")
-    if device and (workers or scheduler):
-        raise click.UsageError("--device has no effect with --workers or --scheduler")
     if verify:
-        _verify(output or read_scene(scene).mosaic.get("store") or _default_store(scene), as_json)
+        _verify(_store_to_verify(scene, output), as_json)
         return
+    if scene is None:
+        raise click.UsageError("SCENE.TOML is missing: clsas mosaic SCENE.TOML --lines LINES.H5")
+    _check_combination(bool(device), workers, scheduler, follow, idle_s)
     levels = read_levels(dynamic_range_db, percentiles, colour_map)
     described, grid = read_grid(scene, given, memory=False)
-    request = read_request(described, given)
-    if set(request) - {*PLAN_KEYS, "accuracy_db"}:
-        raise ValueError(f"{scene}: [image] taps and upsampling have no effect in a mosaic")
+    request = _read_request(described, given, exact)
     beam = read_beam(described, given)
     warn_of_sampling(described, grid)
     devices = [open_device(name) for name in device] or None
     in_scene = described.mosaic
     output = output or in_scene.get("store") or _default_store(scene)
-    lines_path = lines_path or in_scene.get("lines")
+    patches = patches or in_scene.get("patches")
+    if patches is not None:
+        patch_shape_of(patches, grid)  # before anything is simulated
+    memory_mib = memory_mib or in_scene.get("memory_mib")
+    recorded = lines_path or in_scene.get("lines")
+    _check_paths(output, picture, recorded, follow)
+    lines_path = recorded or _simulated(described, scene, output, picture, quiet=as_json)
+    start = time.perf_counter()
+    with _cluster(workers, scheduler) as client:
+        formed = clsas.mosaic(
+            lines_path, grid, output, **request, beam=beam, patches=patches,
+            memory_bytes=memory_mib and memory_mib << 20, device=devices,
+            client=client, follow_s=(idle_s or _IDLE_S) if follow else None,
+        )  # fmt: skip
+        before = len(formed.finished)
+        new, pixels = _form(formed, output.name, quiet=as_json)
+    seconds = time.perf_counter() - start
+    store = clsas.Store.opened(output)
+    if picture is not None:
+        from clsas.products import plot
+
+        plot.save(plot.mosaic(store, borders=borders, **levels), picture)
+    words, figures = _results(formed, store.records())
+    done = f"{new} formed in {seconds:.2f} s ({pixels / seconds / 1e6:.3g} Mpixel/s)"
+    finished = f", {before} finished before" if before else ""
+    report(
+        as_json,
+        f"{output}: {words[0]}, {done if new else 'none to form'}{finished}" + "".join(words[1:]),
+        file=output, picture=picture, formed=new, before=before, seconds=seconds,
+        pixels_per_s=pixels / seconds, **figures,
+    )  # fmt: skip
+
+
+def _check_combination(
+    has_device: bool, workers: int | None, scheduler: str | None, follow: bool, idle_s: float | None
+) -> None:
+    """Raise UsageError for options that exclude or need each other."""
+    if workers is not None and scheduler is not None:
+        raise click.UsageError("give only one of --workers and --scheduler")
+    if has_device and (workers or scheduler):
+        raise click.UsageError("--device has no effect with --workers or --scheduler")
+    if idle_s is not None and not follow:
+        raise click.UsageError("--idle-s requires --follow")
+
+
+def _check_paths(output: Path, picture: Path | None, lines_path: Path | None, follow: bool) -> None:
+    """Raise UsageError if files would overwrite each other, or --follow has no folder."""
     keep_apart("--picture", picture, "the store", output)
     if picture is not None and Path(os.path.realpath(picture)).is_relative_to(
         os.path.realpath(output)
@@ -131,56 +178,61 @@ def mosaic(
     keep_apart("the range lines", lines_path, "the store", output)
     if follow and (lines_path is None or not lines_path.is_dir()):
         raise click.UsageError("--follow requires --lines with a folder")
-    if idle_s is not None and not follow:
-        raise click.UsageError("--idle-s requires --follow")
-    patches = patches or in_scene.get("patches")
-    if patches is not None:
-        patch_shape_of(patches, grid)  # before anything is simulated
-    memory_mib = memory_mib or in_scene.get("memory_mib")
-    if lines_path is None:
-        lines_path = _beside(output, scene)
-        keep_apart("--picture", picture, "the simulated range lines", lines_path)
-        _simulate(described, scene, lines_path, click.echo if not as_json else None)
-    start = time.perf_counter()
-    with _cluster(workers, scheduler) as client:
-        formed = clsas.mosaic(
-            lines_path, grid, output, **request, beam=beam, patches=patches,
-            memory_bytes=memory_mib and memory_mib << 20, device=devices,
-            client=client, follow_s=(idle_s or _IDLE_S) if follow else None,
-        )  # fmt: skip
-        before, count, pixels = len(formed.finished), 0, 0
-        with _patch_progress(output.name, len(formed), before) as tell:
-            for patch in formed:
-                count, pixels = count + 1, pixels + patch.grid.size
-                if not as_json:
-                    tell(patch)
-    seconds = time.perf_counter() - start
-    store = clsas.Store.opened(output)
-    records = store.records()
-    if picture is not None:
-        from clsas.products import plot
 
-        plot.save(plot.mosaic(store, borders=borders, **levels), picture)
-    errors = [r.predicted_error_db for r in records.values() if r.predicted_error_db is not None]
+
+def _read_request(described: SceneFile, given: dict[str, Any], exact: bool) -> dict[str, Any]:
+    """Return the request for every patch: a plan's, or an accuracy."""
+    request = read_request(described, given, exact)
+    if set(request) - {*PLAN_KEYS, "accuracy_db"}:
+        raise ValueError(
+            f"{described.name}: [image] taps and upsampling have no effect in a mosaic"
+        )
+    return request or {"accuracy_db": ACCURACY_DB}
+
+
+def _form(formed: clsas.Mosaic, name: str, *, quiet: bool) -> tuple[int, int]:
+    """Form the patches that are not finished; return their number and that of their pixels.
+
+    A line is printed for each unless `quiet`.
+    """
+    new, pixels = 0, 0
+    with _patch_progress(name, len(formed), len(formed.finished)) as tell:
+        for patch in formed:
+            new, pixels = new + 1, pixels + patch.grid.size
+            if not quiet:
+                tell(patch)
+    return new, pixels
+
+
+def _results(
+    formed: clsas.Mosaic, records: dict[tuple[int, int], Record]
+) -> tuple[list[str], dict[str, Any]]:
+    """Return patches, errors and defects of a mosaic: in words, and in types of JSON.
+
+    The first of the words are the patches.
+    """
+    # Errors are relative to the image, so that a patch of zeros has none.
+    errors = [record.predicted_error_db for record in records.values() if record.has_pixels]
+    worst = max((error for error in errors if error is not None), default=None)
+    zero = bool(records) and not any(record.has_pixels for record in records.values())
     flagged = {index: record.flags for index, record in records.items() if record.flags}
-    worst = max(errors, default=None)
     rows, columns = formed.patch_shape
-    rate = f"{count} formed in {seconds:.2f} s ({pixels / seconds / 1e6:.3g} Mpixel/s)"
-    summary = (
-        f"{output}: {' x '.join(map(str, formed.shape))} patches of {rows} x {columns} pixels, "
-        + (rate if count else "none to form")
-        + (f", {before} finished before" if before else "")
-        + ("" if worst is None else f"; predicted error at most {worst:.1f} dB")
-    )
-    report(
-        as_json,
-        "\n".join([summary, *_described_flags(flagged)]),
-        file=output, picture=picture, shape=grid.shape, patches=formed.shape,
-        patch_shape=formed.patch_shape, finished=len(records), formed=count, before=before,
-        seconds=seconds, pixels_per_s=pixels / seconds, predicted_error_db=worst,
-        flags={f"{row},{column}": f for (row, column), f in flagged.items()},
-        seconds_of_patches=sum(record.seconds for record in records.values()),
-    )  # fmt: skip
+    words = [f"{' x '.join(map(str, formed.shape))} patches of {rows} x {columns} pixels"]
+    if zero:
+        words.append("; all pixels are zero")
+    elif worst is not None:
+        words.append(f"; predicted error at most {worst:.1f} dB")
+    words += [f"\n{line}" for line in _described_flags(flagged)]
+    return words, {
+        "shape": formed.grid.shape,
+        "patches": formed.shape,
+        "patch_shape": formed.patch_shape,
+        "finished": len(records),
+        "predicted_error_db": worst,
+        "is_zero": zero,
+        "flags": {f"{row},{column}": flags for (row, column), flags in flagged.items()},
+        "seconds_of_patches": sum(record.seconds for record in records.values()),
+    }
 
 
 def _described_flags(flagged: dict[tuple[int, int], tuple[str, ...]]) -> list[str]:
@@ -189,14 +241,23 @@ def _described_flags(flagged: dict[tuple[int, int], tuple[str, ...]]) -> list[st
     for (row, column), flags in flagged.items():
         alike.setdefault("; ".join(flags), []).append(f"{row},{column}")
     lines = []
-    for flags, patches in alike.items():
+    for words, patches in alike.items():
         more = f" and {len(patches) - _LISTED} more" if len(patches) > _LISTED else ""
-        lines.append(f"  patch {'; '.join(patches[:_LISTED])}{more}: {flags}")
+        lines.append(f"  patch {'; '.join(patches[:_LISTED])}{more}: {words}")
     return lines
 
 
 def _default_store(scene: Path) -> Path:
     return scene.with_suffix(".zarr")
+
+
+def _store_to_verify(scene: Path | None, output: Path | None) -> Path:
+    """Return the store given, or that of the scene."""
+    if output is not None:
+        return output
+    if scene is None:
+        raise click.UsageError("--verify requires a store: clsas mosaic --verify -o STORE.zarr")
+    return read_scene(scene).mosaic.get("store") or _default_store(scene)
 
 
 def _verify(path: Path, as_json: bool) -> None:
@@ -225,21 +286,27 @@ def _beside(output: Path, scene: Path) -> Path:
     return output.with_name(f"{output.stem}-{digest}.lines.h5")
 
 
-def _simulate(
-    described: SceneFile, scene: Path, path: Path, say: Callable[..., None] | None
-) -> None:
-    """Simulate a scene's range lines and write them to `path`, unless it exists."""
+def _simulated(
+    described: SceneFile, scene: Path, output: Path, picture: Path | None, *, quiet: bool
+) -> Path:
+    """Return the file of a scene's range lines, beside the store; simulate them if it is not there.
+
+    A line tells which, unless `quiet`.
+    """
+    path = _beside(output, scene)
+    keep_apart("--picture", picture, "the simulated range lines", path)
     if path.exists():
-        if say is not None:
-            say(f"{path}: range lines, simulated before", err=True)
-        return
+        if not quiet:
+            click.echo(f"{path}: range lines, simulated before", err=True)
+        return path
     sonar, track, targets = described.need("sonar", "track", "targets")
     with progress_bar("simulating") as progress:
         echoes = clsas.simulate(sonar, track, targets, **described.simulate, progress=progress)
     with progress_bar("compressing") as progress:
         clsas.save(path, clsas.compress(echoes, **described.compress, progress=progress))
-    if say is not None:
-        say(f"{path}: range lines, simulated from {scene}", err=True)
+    if not quiet:
+        click.echo(f"{path}: range lines, simulated from {scene}", err=True)
+    return path
 
 
 @contextmanager
@@ -266,7 +333,7 @@ def _cluster(workers: int | None, scheduler: str | None) -> Iterator[Any]:
                 raise click.ClickException(
                     f"--scheduler {scheduler} cannot be reached: {error}"
                 ) from None
-        else:
+        elif workers is not None:
             client = opened.enter_context(local_client(workers))
         try:
             yield client
@@ -290,7 +357,9 @@ def _patch_progress(name: str, total: int, done: int) -> Iterator[Callable[[clsa
         def tell(patch: clsas.Patch) -> None:
             record = patch.record
             parts = [f"{record.seconds:.2f} s", f"{record.channels} channels"]
-            if record.predicted_error_db is not None:
+            if not record.has_pixels:
+                parts.append("all pixels are zero")
+            elif record.predicted_error_db is not None:
                 parts.append(f"predicted error {record.predicted_error_db:.1f} dB")
             line = f"patch {patch.row},{patch.column}: {', '.join((*parts, *record.flags))}"
             console.print(line, markup=False)

@@ -160,7 +160,29 @@ class Store(File):
     written = True
 
 
+class Hdf5(File):
+    """An HDF5 file to read. A scene file in its place is refused with the usual command."""
+
+    def __init__(self) -> None:
+        super().__init__(exists=True, dir_okay=False)
+
+    def convert(self, value: Any, param: Any, ctx: Any) -> Path:
+        """Return the path; a scene file is a usage error."""
+        path = super().convert(value, param, ctx)
+        if path.suffix.lower() != ".toml":
+            return path
+        name = _option_name(param)
+        usual = [ctx.command_path, name]
+        for other in ctx.command.params:
+            if other.name == "scene":
+                usual.append(f"--scene {path}")
+            elif other.name == "output":
+                usual.append("-o OUTPUT.H5")
+        raise click.UsageError(f"{name} is missing, {path} is a scene: {' '.join(usual)}", ctx)
+
+
 INPUT = File(exists=True, dir_okay=False)
+HDF5 = Hdf5()
 
 
 def keep_apart(one: str, path: Path | None, other: str, path_of_other: Path | None) -> None:

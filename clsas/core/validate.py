@@ -14,10 +14,12 @@ import warnings
 from collections.abc import Sequence
 from numbers import Real
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
+
+Choice = TypeVar("Choice")
 
 _LONGEST = 100  # characters of a value in a message
 _LONGEST_LINE = 1000  # characters of a line of a message
@@ -111,7 +113,7 @@ def count(name: str, value: int, *, least: int = 1, most: int | None = None) -> 
     return int(value)
 
 
-def one_of(name: str, value: str, allowed: Sequence[str]) -> str:
+def one_of(name: str, value: Choice, allowed: Sequence[Choice]) -> Choice:
     """Return `value`; raises ValueError unless it is one of `allowed`."""
     if value not in allowed:
         raise ValueError(

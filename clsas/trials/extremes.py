@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -147,15 +148,13 @@ def scene(
     per_m = 2 / speed_m_s
     centre, width = per_m * carrier_hz, per_m * bandwidth_hz
     step_m = 1 / (width * oversampling)
-    bands: Sequence[Band] = [Band(centre, _FLAT * width, _EDGE * width, tilt_db=tilt_db)]
-    if colour is not None:
-        bands = colour(centre, width)
+    flat = [Band(centre, _FLAT * width, _EDGE * width, tilt_db=tilt_db)]
+    bands = flat if colour is None else colour(centre, width)
     at_m = oracle.ranges_m(points, tx, rx, speed_m_s, velocity)
     of_pixels_m = oracle.ranges_m(pixels, tx, rx, speed_m_s, velocity)
-    echoes = [Echo(at_m, amplitude, bands)]
-
     fade_m = _FADED / (2 * np.pi * min(band.edge for band in bands))
-    if offset or tail or noise:
+    levels = np.array([offset, tail, noise])
+    if levels.any():
         # Offsets and noise extend over the whole line, and fade with a Gaussian.
         fade_m = max(fade_m, np.ptp(of_pixels_m, axis=1).max())
     first_m, length = _extent(np.hstack([at_m, of_pixels_m]), fade_m, step_m)
@@ -163,29 +162,24 @@ def scene(
         first_m = first_m - rng.uniform(0, step_m, len(tx))
     else:
         first_m, length = _from_one_start(first_m, length, step_m)
-    carrier = 0.0 if on_carrier else centre
-    values = oracle.samples(echoes, first_m, step_m, length, carrier)
-    rms = np.sqrt(np.mean(np.abs(values) ** 2))
-    other = _disturbances(
-        rng, first_m, step_m, length, offset * rms, tail * rms, noise * rms, centre
-    )
-    if other:
-        values += oracle.samples(other, first_m, step_m, length, carrier)
-        echoes = [*echoes, *other]
+    mixed = partial(
+        oracle.samples, first_range_m=first_m, range_step_m=step_m, length=length,
+        carrier_cycles_per_m=0.0 if on_carrier else centre,
+    )  # fmt: skip
+    echoes = [Echo(at_m, amplitude, bands)]
+    values = mixed(echoes)
+    levels = levels * np.sqrt(np.mean(np.abs(values) ** 2))
+    if other := _disturbances(rng, first_m, step_m, length, levels, centre):
+        values += mixed(other)
+        echoes += other
 
     weights = 1.0 if beam is None else _weights(beam, pixels, (tx + rx) / 2)
     origin = np.asarray(origin_m, np.float64)
     grid = Grid.oriented(corner + origin, [0, pixel_m[1], 0], [pixel_m[0], 0, 0], shape)
     lines = RangeLines(
-        values,
-        first_m,
-        step_m,
-        tx + origin,
-        rx + origin,
-        0.0 if on_carrier else carrier_hz,
-        speed_m_s,
-        rx_velocity_m_s,
-    )
+        values, first_m, step_m, tx + origin, rx + origin, 0.0 if on_carrier else carrier_hz,
+        speed_m_s, rx_velocity_m_s,
+    )  # fmt: skip
     ideal = oracle.image(echoes, of_pixels_m, weights).reshape(shape)
     return Known(lines, grid.with_height(height_m) if relief_m else grid, ideal, beam)
 
@@ -299,15 +293,14 @@ def _disturbances(
     first_m: NDArray[np.float64],
     step_m: float,
     length: int,
-    offset: float,
-    tail: float,
-    noise: float,
+    levels: NDArray[np.float64],
     centre: float,
 ) -> list[Echo]:
     """Return a constant, a tail below the band, and noise as echoes.
 
-    Amplitudes are rms values over a line.
+    `levels` are those of the three, rms values over a line.
     """
+    offset, tail, noise = levels
     channels = len(first_m)
     middle_m = (first_m + (length - 1) / 2 * step_m)[:, None]
     edge = _FADED / (np.pi * length * step_m)  # fades at both ends
