@@ -30,6 +30,15 @@ def narrow() -> Known:
     )  # fmt: skip
 
 
+@cache
+def near() -> Known:
+    """`narrow` at a shorter range: its wavenumber image takes a third of the time."""
+    return extremes.scene(
+        along_x(100, 0.06), (0.1, 12, 0), carrier_hz=200e3, bandwidth_hz=20e3,
+        pixel_m=(0.02, 0.03), shape=(24, 24), beam=BeamWindow(16, "hann", along=[1, 0, 0]),
+    )  # fmt: skip
+
+
 @dataclass(frozen=True)
 class Scene:
     """Lines and a grid, with the weights of channels."""
@@ -71,6 +80,10 @@ class Imager:
         How far a sum of images may differ from the image of the sum.
     options : set of str
         Further arguments that it takes: device, progress, accumulate.
+    known : callable
+        Scene whose ideal image is known.
+    is_quick : bool
+        True if the fast tier of tests forms its images on the default device.
     """
 
     name: str
@@ -81,6 +94,8 @@ class Imager:
     same_db: float
     linear_db: float
     options: frozenset[str] = frozenset()
+    known: Callable[[], Known] = narrow
+    is_quick: bool = True
 
 
 def _exactly(scene, device, **options):
@@ -164,5 +179,16 @@ IMAGERS = (
         asked_db=-75,
         same_db=-110,
         linear_db=-100,
+        is_quick=False,
+    ),
+    Imager(
+        "wavenumber nearby",
+        _by_wavenumbers,
+        lambda scene: {},
+        (near,),
+        asked_db=-60,
+        same_db=-110,
+        linear_db=-100,
+        known=near,
     ),
 )

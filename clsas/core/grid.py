@@ -380,6 +380,8 @@ def _axis(name: str, axis: tuple[float, float, int]) -> tuple[float, float, int]
     count = validate.count(f"{name} count", count)
     validate.memory(f"{name} count", 8 * count)
     if count == 1:
+        if start != stop:
+            raise ValueError(f"{name} must be one position for 1 pixel, got {start} m to {stop} m")
         return start, 0.0, count
     if start == stop:
         raise ValueError(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -90,21 +90,9 @@ class RangeLines:
             object.__setattr__(self, name, value)
 
         put("samples", validate.array("samples", self.samples, np.complex64, (None, None)))
-        per_channel: dict[str, tuple[int, ...]] = {"first_range_m": (self.channels,)}
-        per_channel |= dict.fromkeys(("tx_m", "rx_m"), (self.channels, 3))
-        if self.rx_velocity_m_s is not None:
-            per_channel["rx_velocity_m_s"] = (self.channels, 3)
-        for name, shape in per_channel.items():
-            value = getattr(self, name)
-            put(name, validate.array(name, value, np.float64, shape, broadcast=True))
         put("range_step_m", validate.positive("range_step_m", self.range_step_m, "m"))
-        put("carrier_hz", validate.number("carrier_hz", self.carrier_hz, "Hz", least=0.0))
-        put("sound_speed_m_s", validate.positive("sound_speed_m_s", self.sound_speed_m_s, "m/s"))
-        if self.rx_velocity_m_s is not None:
-            fastest = float(np.linalg.norm(self.rx_velocity_m_s, axis=1).max())
-            validate.number(
-                "the speed of rx_velocity_m_s", fastest, "m/s", below=self.sound_speed_m_s
-            )
+        for name, value in checked_channels(self, "first_range_m").items():
+            put(name, value)
 
     def __repr__(self) -> str:
         """Return sizes and extents: the arrays are long."""
@@ -192,6 +180,39 @@ class RangeLines:
     def without_samples(self) -> RangeLines:
         """Return these lines with a single sample per channel, which is zero."""
         return replace(self, samples=np.zeros((self.channels, 1), np.complex64))
+
+
+def checked_channels(received: Any, start: str) -> dict[str, Any]:
+    """Return the fields that range lines and echoes share, checked and converted.
+
+    Parameters
+    ----------
+    received : RangeLines or Echoes
+        Object whose `samples` are checked already.
+    start : str
+        Name of the field with the first range or time of every channel.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If a field has the wrong type or shape, or is outside its limits.
+    """
+    channels = received.samples.shape[0]
+    shapes: dict[str, tuple[int, ...]] = {start: (channels,)}
+    shapes |= {"tx_m": (channels, 3), "rx_m": (channels, 3)}
+    if received.rx_velocity_m_s is not None:
+        shapes["rx_velocity_m_s"] = (channels, 3)
+    checked: dict[str, Any] = {
+        name: validate.array(name, getattr(received, name), np.float64, shape, broadcast=True)
+        for name, shape in shapes.items()
+    }
+    checked["carrier_hz"] = validate.number("carrier_hz", received.carrier_hz, "Hz", least=0.0)
+    speed_m_s = validate.positive("sound_speed_m_s", received.sound_speed_m_s, "m/s")
+    checked["sound_speed_m_s"] = speed_m_s
+    if "rx_velocity_m_s" in checked:
+        fastest_m_s = float(np.linalg.norm(checked["rx_velocity_m_s"], axis=1).max())
+        validate.number("the speed of rx_velocity_m_s", fastest_m_s, "m/s", below=speed_m_s)
+    return checked
 
 
 def some_channels(count: int, most: int) -> NDArray[np.int64]:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from clsas.core import reprs, validate
+from clsas.core.lines import checked_channels
 from clsas.sonar.system import Pulse
 
 
@@ -82,19 +83,9 @@ class Echoes:
 
         dtype = np.complex64 if np.iscomplexobj(self.samples) else np.float32
         put("samples", validate.array("samples", self.samples, dtype, (None, None)))
-        per_channel: dict[str, tuple[int, ...]] = {
-            "start_time_s": (self.channels,),
-            "tx_m": (self.channels, 3),
-            "rx_m": (self.channels, 3),
-        }
-        if self.rx_velocity_m_s is not None:
-            per_channel["rx_velocity_m_s"] = (self.channels, 3)
-        for name, shape in per_channel.items():
-            value = getattr(self, name)
-            put(name, validate.array(name, value, np.float64, shape, broadcast=True))
         put("sample_rate_hz", validate.positive("sample_rate_hz", self.sample_rate_hz, "Hz"))
-        put("carrier_hz", validate.number("carrier_hz", self.carrier_hz, "Hz", least=0.0))
-        put("sound_speed_m_s", validate.positive("sound_speed_m_s", self.sound_speed_m_s, "m/s"))
+        for name, value in checked_channels(self, "start_time_s").items():
+            put(name, value)
         if self.pulse is not None:
             if not isinstance(self.pulse, Pulse):
                 raise TypeError(f"pulse must be a Pulse or None, got {type(self.pulse).__name__}")
@@ -125,5 +116,5 @@ class Echoes:
 
     @property
     def is_passband(self) -> bool:
-        """Whether the samples are real and still on their carrier."""
+        """True if the samples are real and still on their carrier."""
         return self.samples.dtype.kind == "f"
