@@ -178,6 +178,19 @@ def test_a_plan_that_is_exact_is_as_accurate_as_asked_for(made, tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::clsas.ClsasWarning")
+@pytest.mark.parametrize("method", [(), ("--exact",)], ids=["planned", "exact"])
+def test_an_image_of_zeros_has_no_predicted_error(made, tmp_path, method):
+    nowhere = ["--x", "0:1:4", "--y", "900:901:4", "-o", tmp_path / "zero.h5"]
+    command = ["image", made[0] / "lines.h5", *nowhere, *method]
+    stdout, _ = run(*command)
+    assert "all pixels are zero" in stdout
+    assert "predicted error" not in stdout
+    results = json.loads(run(*command, "--json")[0])
+    assert results["is_zero"]
+    assert results["predicted_error_db"] is None
+
+
 def test_stages_that_leave_no_image_are_a_warning(made, tmp_path):
     scene = ("--scene", made[0] / "scene.toml")
     for command in (("image", "-o", tmp_path / "image.h5"), ("plan",)):
@@ -402,7 +415,18 @@ FIXED = ["--taps", "4", "--upsampling", "2"]
             1,
             "image.h5 must hold Echoes (clsas simulate makes them), got Image",
         ),
-        (["quality", "scene.toml"], 1, "scene.toml is not an HDF5 file"),
+        (["quality", "image.h5", "--reference", "scene.toml"], 1, "scene.toml is not an HDF5 file"),
+        (["quality", "scene.toml"], 2, "IMAGE.H5 is missing, scene.toml is a scene: clsas quality"),
+        (
+            ["image", "scene.toml"],
+            2,
+            "scene.toml is a scene: clsas image LINES.H5 -o OUTPUT.H5 --scene scene.toml",
+        ),
+        (
+            ["image", "lines.h5", "--x", "0:1:1", *GRID[2:], "-o", "new.h5"],
+            1,
+            "x must be one position for 1 pixel, got 0.0 m to 1.0 m",
+        ),
         (["simulate", "lines.h5", "-o", "new.h5"], 1, "lines.h5: is an HDF5 file, not a scene"),
         (["simulate", "typo.toml", "-o", "new.h5"], 1, "in [grid]: did you mean 'z_m'?"),
         (["simulate", "grid.toml", "-o", "new.h5"], 1, "grid.toml: missing table [sonar]"),

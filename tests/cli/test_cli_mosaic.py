@@ -3,7 +3,9 @@
 import json
 import os
 import re
+import runpy
 import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,41 +16,12 @@ import clsas
 from clsas.cli import main
 from clsas.files.scene_files import read_scene
 
-SCENE = """
-[sonar]
-preset = "edgetech"
-
-[track]
-start_m = [-12.0, 0.0, 10.0]
-velocity_m_s = [2.0, 0.0, 0.0]
-pings = 60
-ping_interval_s = 0.2
-
-[track.sway]
-amplitude_m = 0.1
-period_s = 10.0
-
-[[targets]]
-position_m = [0.0, 60.0, 0.0]
-
-[[targets]]
-position_m = [1.5, 57.0, 0.0]
-amplitude = 0.5
-
-[grid]
-x = { start_m = -2, stop_m = 2, count = 80 }
-y = { start_m = 56, stop_m = 61, count = 100 }
-
-[image]
-tolerance_db = -40
-
-[image.beam]
-width_deg = 6
-shape = "hann"
-
-[mosaic]
-patches = [2, 2]
-"""
+ROOT = Path(__file__).parents[2]
+# The case that scripts/attack takes apart, with fewer pixels and patches.
+SCENE = runpy.run_path(str(ROOT / "scripts" / "attack" / "case.py"))["SCENE"]
+for many, few in {"= 160": "= 80", "= 192": "= 100", "[6, 8]": "[2, 2]"}.items():
+    assert many in SCENE
+    SCENE = SCENE.replace(many, few)
 
 
 def run(*args, code=0):
@@ -185,10 +158,43 @@ def test_flags_are_told(made, tmp_path):
     assert "  patch 0,0; 0,1; 1,0 and 1 more: empty: in no channel's beam and range" in stdout
 
 
+def test_exact_patches(made, tmp_path):
+    scene, store = made[0] / "scene.toml", tmp_path / "exact.zarr"
+    stdout, _ = run("mosaic", scene, "--lines", lines_of(made), "--exact", "-o", store)
+    assert "predicted error at most -60" in stdout
+    records = clsas.Store.opened(store).records().values()
+    assert all(record.plan is None for record in records)
+
+
+def test_a_mosaic_of_zeros_has_no_predicted_error(made, tmp_path):
+    command = [
+        "mosaic", made[0] / "scene.toml", "--lines", lines_of(made), "--x", "100:104:20",
+        "--y", "56:61:20", "-o", tmp_path / "zero.zarr",
+    ]  # fmt: skip
+    stdout, stderr = run(*command)
+    assert "; all pixels are zero" in stdout
+    assert "predicted error" not in stdout + stderr
+    results = json.loads(run(*command, "--json")[0])
+    assert results["is_zero"]
+    assert results["predicted_error_db"] is None
+
+
+def test_a_store_is_verified_without_its_scene(made):
+    store = made[0] / "scene.zarr"
+    stdout, _ = run("mosaic", "--verify", "-o", store)
+    assert "4 patches match their checksums, none damaged" in stdout
+    assert run("mosaic", "--verify", made[0] / "scene.toml")[0] == stdout
+    _, stderr = run("mosaic", "--verify", code=2)
+    assert "--verify requires a store: clsas mosaic --verify -o STORE.zarr" in stderr
+    _, stderr = run("mosaic", "-o", store, code=2)
+    assert "SCENE.TOML is missing" in stderr
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("args", "code", "message"),
     [
+        (["--exact", "--tolerance-db", "-30"], 2, "give only one of --tolerance-db"),
         (["--patches", "2y2"], 2, "'2y2' must be ROWSxCOLUMNS"),
         (["--patches", "0x2"], 2, "'0x2' must be ROWSxCOLUMNS, at least 1x1"),
         (["--patches", "90x2"], 1, "patches must leave each some of 100 pixels"),

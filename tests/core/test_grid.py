@@ -178,6 +178,11 @@ ZERO, ONE, TWO = [0.0, 0, 0], [1.0, 0, 0], [2.0, 0, 0]
         (lambda: Grid.plane(x=(0, 1, 2.5), y=(0, 1, 2)), TypeError, "x count must be a whole"),
         (lambda: Grid.plane(x=(0, np.nan, 2), y=(0, 1, 2)), ValueError, "x stop must be finite m"),
         (lambda: Grid.plane(x=(0, 1, 2), y=(3, 3, 2)), ValueError, "y must end elsewhere"),
+        (
+            lambda: Grid.plane(x=(0, 1, 2), y=(3, 4, 1)),
+            ValueError,
+            "y must be one position for 1 pixel, got 3.0 m to 4.0 m",
+        ),
         (lambda: Grid.plane((0, 1, 2), (0, 1, 2), z=np.inf), ValueError, "z must be finite m"),
         (lambda: Grid.oriented(ZERO, ONE, TWO, (2, 2)), ValueError, "must not be parallel"),
         (lambda: Grid.oriented(ZERO, ZERO, ONE, (2, 2)), ValueError, "row_step_m must not be zero"),

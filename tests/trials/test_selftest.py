@@ -7,6 +7,7 @@ import pytest
 from click.testing import CliRunner
 
 from clsas.cli import main
+from clsas.opencl.device import DeviceError
 from clsas.trials import selftest
 
 
@@ -54,6 +55,7 @@ def test_plans_of_the_scenes_are_factorized(platform):
 def test_a_result_that_is_no_number_has_not_passed():
     assert not selftest.Result("", -60, math.nan, -60).passed
     assert not selftest.Result("", -60, -59.9, -60).passed
+    assert not selftest.Result("", -60, None, -60, "RuntimeError: no").passed
     assert selftest.Result("", None, -60.0, -60).passed
 
 
@@ -72,6 +74,25 @@ def test_a_miss_is_told_and_is_exit_code_1(small, monkeypatch):
     assert not found["passed"]
     assert [each["verdict"] for each in found["results"]] == ["MISSED", "ok"]
     assert found["results"][0]["measured_db"] == pytest.approx(0, abs=0.1)
+
+
+def test_an_image_that_cannot_be_formed_is_told_and_the_others_follow(small, monkeypatch):
+    monkeypatch.setattr(selftest, "IMAGERS", selftest.IMAGERS | {"exact": _broken})
+    result = CliRunner().invoke(main, ["selftest"])
+    assert result.exit_code == 1
+    (line,) = (line for line in result.stdout.splitlines() if "flat, exact" in line)
+    assert line.split() == [
+        "-60", "-", "-60", "FAILED", "flat,", "exact:", "DeviceError:", "out", "of", "lanes",
+    ]  # fmt: skip
+    assert "1 of 2 within bounds" in result.stdout
+    found = json.loads(CliRunner().invoke(main, ["selftest", "--json"]).stdout)
+    assert [each["verdict"] for each in found["results"]] == ["FAILED", "ok"]
+    assert found["results"][0]["measured_db"] is None
+    assert found["results"][0]["failure"] == "DeviceError: out of lanes"
+
+
+def _broken(known, asked_db, device):
+    raise DeviceError("out of lanes")
 
 
 def _doubled(known, asked_db, device):
