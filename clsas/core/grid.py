@@ -218,7 +218,7 @@ class Grid:
 
     @property
     def is_planar(self) -> bool:
-        """Whether the pixels lie on a plane with equal steps."""
+        """True if the pixels lie on a plane with equal steps."""
         return self.points_m is None and self.height_m is None
 
     @property
@@ -241,7 +241,7 @@ class Grid:
 
     @property
     def has_axes(self) -> bool:
-        """Whether columns run along x and rows along y, so that the grid has `axes_m`."""
+        """True if columns run along x and rows along y; the grid then has `axes_m`."""
         if self.points_m is not None:
             return False
         _, row_step_m, column_step_m = self.vectors_m

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     import xarray
     from matplotlib.axes import Axes
 
-_AT_ONCE = 1 << 16  # pixels that are looked at
+_AT_ONCE = 1 << 16  # pixels that are checked together
 
 
 @dataclass(frozen=True, eq=False)

@@ -233,7 +233,7 @@ def array(
     shape : tuple of int or None
         Required shape; None stands for any length of at least 1.
     broadcast : bool
-        Whether a value of shape `shape[1:]` is repeated along the first axis.
+        True repeats a value of shape `shape[1:]` along the first axis.
 
     Raises
     ------

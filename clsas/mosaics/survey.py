@@ -25,7 +25,7 @@ END = "end"
 
 _TAPER = 64  # samples over which a line that is cut fades
 _MARGIN = 32  # untouched samples between pixels and taper, for interpolation and ringing
-_DIGESTED = 16  # lines of a file whose samples enter its digest; all would have to be read
+_DIGESTED = 16  # lines of a file in its digest; for all of them the file would have to be read
 _SKIPPED = 64  # up to this many channels between two others are read too, rather than skipped
 _GAP = 3.0  # a distance between pings of more than this many median ones is a gap
 

@@ -65,12 +65,12 @@ class DeviceInfo:
     memory_bytes, max_buffer_bytes : int
         Global memory and largest single buffer.
     fp64 : bool
-        Whether the device has double precision (clsas never needs it).
+        True if the device has double precision (clsas never needs it).
     width : int
         Float lanes per work-item that clsas uses: 1 on GPUs, and where the driver's compiler
         vectorises across work-items itself.
     permute : bool
-        Whether kernels may look samples up in registers, of AVX2 or AVX-512.
+        True if kernels may look samples up in registers, of AVX2 or AVX-512.
     """
 
     index: int
@@ -89,7 +89,7 @@ class DeviceInfo:
 
     @property
     def half_precision(self) -> bool:
-        """Whether kernels take half-precision numbers in and out as fast as others.
+        """True if kernels load and store half-precision numbers as fast as others.
 
         Of CPUs those do that permute.
         """

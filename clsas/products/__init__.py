@@ -1,1 +1,1 @@
-"""What an image shows: quality, trade-offs, effects, pictures."""
+"""Quality measures, trade-offs, effects and pictures of images."""

@@ -1,4 +1,4 @@
-"""Cuts: lines of pixels through a point response, and what is measured on them."""
+"""Cuts: lines of pixels through a point response, with their measures."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ _UPSAMPLING = 32  # points of a cut per pixel
 
 @dataclass(frozen=True, eq=False)
 class Cut:
-    """A point response along one axis, and what was measured on it.
+    """A point response along one axis, with its measures.
 
-    Side lobes are numbered from the main lobe outwards and end at minima of the amplitude; the
-    main lobe is what lies between the first minimum on each side. Pairs are (towards smaller,
-    towards larger coordinate).
+    The main lobe lies between the first minimum on each side. Side lobes are numbered from there
+    outwards and end at minima of the amplitude. Pairs are (towards smaller, towards larger
+    coordinate).
 
     Attributes
     ----------
     axis : str
-        What the cut runs along: "x", "y" or "z", or "along columns" or "along rows" of a plane
-        that is not parallel to that coordinate.
+        Direction of the cut: "x", "y" or "z", or "along columns" or "along rows" if it is parallel
+        to none of them.
     offset_m : ndarray of float64, shape [points]
         Distance from the peak, metres.
     level_db : ndarray of float64, shape [points]
@@ -40,7 +40,7 @@ class Cut:
     islr_db : float
         Energy of the `lobes` nearest side lobes on both sides over that of the main lobe, dB.
     lobes : (int, int)
-        How many whole side lobes the ISLR counts: 10, or less where the cut ends.
+        Number of whole side lobes in the ISLR: 10, or less if the cut ends before.
     """
 
     axis: str
@@ -68,7 +68,7 @@ def measure_cut(
     step_m = axis.step_m
     fine = signal.resample(samples, _UPSAMPLING * len(samples))
     offset = (np.arange(len(fine)) / _UPSAMPLING - peak) * step_m
-    # Behind the last sample the periodic interpolation only leads back to the first one.
+    # Behind the last sample the periodic interpolation returns to the first one.
     inside = np.arange(len(fine)) <= _UPSAMPLING * (len(samples) - 1)
     if extent_m is not None:
         inside &= np.abs(offset) <= extent_m
@@ -80,7 +80,7 @@ def measure_cut(
     top = int(np.abs(offset).argmin())
     before = _Flank.of(power[top::-1], f"smaller {axis.name}")
     after = _Flank.of(power[top:], f"larger {axis.name}")
-    main = before.main + after.main - float(power[top])  # which both flanks hold
+    main = before.main + after.main - float(power[top])  # the peak is in both flanks
     return Cut(
         axis=axis.name,
         offset_m=offset,

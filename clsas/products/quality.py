@@ -15,7 +15,7 @@ from clsas.core.image import Image
 from clsas.core.image_error import complex_values
 from clsas.products.cuts import Cut, measure_cut
 
-_SEARCH = 10  # pixels around the given place where the peak is looked for, unless told
+_SEARCH = 10  # pixels around the given position within which the peak is searched
 _REACH = 1024  # pixels on either side of the peak that enter a measurement, at most
 
 
@@ -26,10 +26,10 @@ class PointResponse:
     Attributes
     ----------
     x_m, y_m, z_m : float
-        Where its peak is, metres.
+        Position of its peak, metres.
     amplitude : float
-        Amplitude of the peak. (There is no phase here: that of the range carrier, which the
-        pixels hold as an alias, is not known between them.)
+        Amplitude of the peak. The phase is not known between pixels, since these hold the range
+        carrier as an alias.
     azimuth, range : Cut
         The cuts through the peak along the image's columns and rows: x and y of a horizontal
         plane, x and z of one in depth.
@@ -69,15 +69,15 @@ def measure_point(
         An image on a plane of any direction or a height map, with pixels no larger than its
         bandwidth asks for (1 / bandwidth: the carrier need not be sampled).
     near : (float, float) or (float, float, float)
-        About where the point is, metres. Two numbers are places on the axes of the image
-        (`Grid.sides`), as pictures show them: x, y of a horizontal plane, x, z of one in depth.
-        Three are a position x, y, z; the nearest one on the plane counts.
+        Approximate position of the point, metres. Two numbers are coordinates on the axes of the
+        image (`Grid.sides`), as pictures show them: x, y of a horizontal plane, x, z of one in
+        depth. Three are a position x, y, z; the nearest one on the plane is taken.
     search_m : float, optional
-        How far from there, along columns and along rows, the greatest pixel is taken for the point;
-        10 pixels unless given.
+        Distance from there, along columns and along rows, within which the largest pixel is taken
+        for the point; by default 10 pixels.
     extent_m : float, optional
-        How far from the peak side lobes are looked for, metres, to keep other targets out; as
-        far as the image (and 1024 pixels) unless given.
+        Distance from the peak within which side lobes count, metres, to exclude other targets; by
+        default that of the image's border, at most 1024 pixels.
 
     Returns
     -------
@@ -86,16 +86,17 @@ def measure_point(
     Raises
     ------
     ValueError
-        If the image is one of arbitrary points, `near` is outside it, it is zero there or has no
+        If the image has arbitrary points, `near` is outside it, it is zero there or has no
         peak, its peak is at the border, `extent_m` is less than a pixel, or the main lobe and a
-        side lobe on each side do not fit in.
+        side lobe on each side do not fit into it.
     TypeError
         If an argument is of a wrong kind.
 
     Warns
     -----
     ClsasWarning
-        If a side lobe is higher than the peak, which then is itself one, or other targets are in.
+        If a side lobe is higher than the peak. The peak is then itself a side lobe, or there are
+        other targets.
 
     Notes
     -----

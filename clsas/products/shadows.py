@@ -1,4 +1,4 @@
-"""Dark places of an image: its shadows, where an error spread over the image shows first."""
+"""Dark parts of an image, such as shadows: an error all over the image shows there first."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from clsas.core.image import Image
 from clsas.core.image_error import darkest_pixels
 
 DARKEST = 0.1
-"""Share of an image that counts as dark unless told otherwise."""
+"""Default share of an image that counts as dark."""
 
 
 def dark_level_db(image: Image | ArrayLike, *, darkest: float = DARKEST) -> float:

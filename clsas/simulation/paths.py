@@ -56,7 +56,7 @@ class Paths:
     geometry : Channels
     sound_speed_m_s : float
     spreading : bool
-        Whether amplitudes fall as 1/(R_tx R_rx).
+        True if amplitudes fall as 1/(R_tx R_rx).
     patterns : ElementPatterns or None
         None: every element is omnidirectional.
     receivers : int

@@ -188,12 +188,12 @@ class BeamWindow:
 
     @property
     def jumps(self) -> bool:
-        """Whether the weights begin and end with a step, or nearly so."""
+        """True if the weights begin and end with a step, or nearly so."""
         return self.shape != "hann" and not (self._has_taper and self.taper > _STEEP_TAPER)
 
     @property
     def _has_taper(self) -> bool:
-        """Whether the shape is "tukey" with edges at least as wide as a table interval."""
+        """True for the shape "tukey" with edges at least as wide as a table interval."""
         return self.shape == "tukey" and self.taper * INTERVALS >= 2
 
     def block_error(self, reach: float) -> float:

@@ -234,7 +234,7 @@ class Sonar:
 
     @property
     def is_omnidirectional(self) -> bool:
-        """Whether no element has a size."""
+        """True if no element has a size."""
         sizes = (self.tx_length_m, self.rx_length_m, self.tx_height_m, self.rx_height_m)
         return all(size is None for size in sizes)
 

@@ -115,3 +115,29 @@ def test_xarray_names_bad_input(monkeypatch):
     monkeypatch.setitem(sys.modules, "xarray", None)
     with pytest.raises(ImportError, match="pip install xarray"):
         to_xarray(PLANE)
+
+
+@pytest.mark.parametrize("name", ["moving lines", "phase code"])
+def test_lines_survive_netcdf_as_the_documentation_splits_them(name, tmp_path):
+    lines = OBJECTS[name]
+    data = to_xarray(lines)
+    parts = data.assign(samples_real=data.samples.real, samples_imag=data.samples.imag)
+    parts.drop_vars("samples").to_netcdf(tmp_path / "lines.nc")
+    with xarray.open_dataset(tmp_path / "lines.nc") as read:
+        samples = read["samples_real"].values + 1j * read["samples_imag"].values
+        np.testing.assert_array_equal(samples, lines.samples)
+        np.testing.assert_array_equal(read["tx_m"], lines.tx_m)
+        assert read.attrs["carrier_hz"] == lines.carrier_hz
+
+
+def test_names_and_units_are_those_of_the_documentation():
+    array = to_xarray(OBJECTS["image"])
+    assert array.name == "amplitude_db"
+    assert set(array.coords) == {"x", "y", "z", "pixels_real", "pixels_imag"}
+    assert set(array.attrs) == {"long_name", "units", "reference", "comment", "Conventions"}
+    assert array.attrs["units"] == "dB"
+    for name in ("x", "y", "z"):
+        assert array[name].attrs["units"] == "m"
+        assert array[name].attrs["long_name"]
+    assert to_xarray(OBJECTS["oriented"]).x.dims == ("row", "column")
+    assert to_xarray(OBJECTS["image of points"]).dims == ("point_0",)

@@ -1,4 +1,4 @@
-"""What all pictures share: figures, axes in metres, and writing files."""
+"""Figures, axes in metres, and files of pictures."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 SUFFIXES = (".png", ".pdf", ".svg")
-"""What names of pictures may end in."""
+"""Suffixes of pictures."""
 
 _NAMES = {"x": "Along-track", "y": "Across-track", "z": "Height"}
-_PNG_DPI, _VECTOR_DPI = 150.0, 300.0  # of screens, and of the images within a printed page
+_PNG_DPI, _VECTOR_DPI = 150.0, 300.0  # for screens, and for images on a printed page
 _SETTINGS: Any = {
     "pdf.fonttype": 42,  # TrueType: publishers refuse matplotlib's default, Type 3
     "svg.hashsalt": "clsas",  # the same picture gives the same file
@@ -27,7 +27,7 @@ _DATES = {"pdf": {"CreationDate": None}, "svg": {"Date": None}}
 
 
 def save(figure: Figure, path: str | os.PathLike, *, dpi: float | None = None) -> None:
-    """Write a figure as PNG, PDF or SVG, replacing a file of that name at once or not at all.
+    """Write a figure as PNG, PDF or SVG. An existing file is replaced in one step.
 
     Parameters
     ----------
@@ -35,8 +35,8 @@ def save(figure: Figure, path: str | os.PathLike, *, dpi: float | None = None) -
     path : path-like
         The suffix decides the format: .png, .pdf or .svg; PNG without a suffix.
     dpi : float, optional
-        Pixels per inch: 150 for PNG unless given. In PDF and SVG, where lines and labels are drawn
-        at any size, that of the images: 300 unless given.
+        Pixels per inch; by default 150 for PNG, and 300 for the images within PDF and SVG, whose
+        lines and labels have no pixels.
 
     Raises
     ------
@@ -59,7 +59,7 @@ def save(figure: Figure, path: str | os.PathLike, *, dpi: float | None = None) -
 
     options: Any = {"metadata": _DATES[kind]} if kind in _DATES else {}
     with replacing(path) as temporary, mpl.rc_context(_SETTINGS):
-        # What the layout leaves outside, as labels beside square axes, is drawn too.
+        # "tight" includes labels that the layout leaves outside, as beside square axes.
         figure.savefig(temporary, format=kind, dpi=dpi, bbox_inches="tight", **options)
 
 
@@ -79,8 +79,8 @@ def save_png(figure: Figure, path: str | os.PathLike, *, dpi: float = _PNG_DPI) 
 
 
 def with_fewer_colours(png: str | os.PathLike | BytesIO, colours: int) -> bytes:
-    """Return a PNG of at most so many colours, up to 256, which takes a third of the bytes."""
-    from PIL import Image  # which matplotlib brings
+    """Return a PNG of at most `colours` colours, up to 256, in a third of the bytes."""
+    from PIL import Image  # a dependency of matplotlib
 
     reduced = BytesIO()
     with Image.open(png) as picture:
@@ -125,13 +125,13 @@ def axis_label(name: str, unit: str, of: str = "") -> str:
         "x", "y" or "z", or "along columns" or "along rows" as of `clsas.core.grid.Axis`.
     unit : str
     of : str
-        What it is measured from, as in "Along-track from the peak (mm)".
+        Origin of the coordinate, as in "Along-track from the peak (mm)".
     """
     return " ".join(filter(None, (_NAMES.get(name, f"Distance {name}"), of, f"({unit})")))
 
 
 def plain_ticks(axes: Axes) -> None:
-    """Write coordinates in full, however far the origin is, and as few as fit beside each other."""
+    """Write coordinates in full, however far the origin is, and only as many as fit."""
     from clsas.products.plot.ticks import FittingLocator
 
     axes.ticklabel_format(style="plain", useOffset=False)

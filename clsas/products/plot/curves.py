@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
     from clsas.products.tradeoff_result import Row, Tradeoff
 
-_DISTANCES = (10, 18, 28, 40, 54, 70, 88, 108)  # of labels from their points, tried in turn
+_DISTANCES = (10, 18, 28, 40, 54, 70, 88, 108)  # from points to labels, tried in turn
 _ANGLES_DEG = (-45, 45, -90, 90, -20, 20, -135, 135, 180)
 
 
@@ -33,7 +33,7 @@ def cuts(response: PointResponse, *, floor_db: float = -60.0, resolutions: float
     floor_db : float
         Lower end of the level axis, dB.
     resolutions : float
-        How many resolutions of the point the distance axis shows on each side.
+        Extent of the distance axis on each side, in resolutions of the point.
 
     Raises
     ------
@@ -66,14 +66,14 @@ def cuts(response: PointResponse, *, floor_db: float = -60.0, resolutions: float
 
 
 def tradeoff(measured: Tradeoff, *, title: str = "") -> Figure:
-    """Draw the time of every image over its error, and what was predicted of it.
+    """Draw measured and predicted time of every image over its error.
 
     Parameters
     ----------
     measured : Tradeoff
         From `clsas.tradeoff`.
     title : str
-        Put above, before the sizes and the device.
+        Beginning of the title; sizes and device follow.
 
     Raises
     ------
@@ -150,8 +150,8 @@ def _labels(axes: Axes, rows: list[Row], color: str) -> list[Annotation]:
 def _spread(axes: Axes, labels: list[Annotation]) -> None:
     """Move labels away from each other, from all points and from the edges of the axes.
 
-    Each takes the nearest place that is free, in the order given; one that finds none stays at the
-    farthest that was tried.
+    Each label takes the nearest free position, in the order given. If there is none, it stays at
+    the last position tried.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.text import Text
@@ -159,7 +159,7 @@ def _spread(axes: Axes, labels: list[Annotation]) -> None:
 
     figure: Any = axes.get_figure(root=True)
     renderer = FigureCanvasAgg(figure).get_renderer()
-    figure.draw_without_rendering()  # settles where the axes lie
+    figure.draw_without_rendering()  # places the axes
     point, inside = figure.dpi / 72, axes.get_window_extent()
     marks = [
         place for line in axes.get_lines() if line.get_marker() not in ("None", "none", None)
@@ -181,7 +181,7 @@ def _spread(axes: Axes, labels: list[Annotation]) -> None:
 
 
 def _figures_of(cut: Cut) -> str:
-    """Return what was measured on a cut, one figure a line."""
+    """Return the figures of a cut, one a line."""
     scale, unit = length_unit(cut.resolution_m)
     return (
         f"resolution {scale * cut.resolution_m:.4g} {unit} (−3 dB)\n"

@@ -33,19 +33,19 @@ if TYPE_CHECKING:
     from matplotlib.image import AxesImage
 
 DYNAMIC_RANGE_DB = 60.0
-"""What a picture shows below the reference unless told otherwise, dB."""
+"""Default dynamic range of a picture below the reference, dB."""
 
-_MOST_PIXELS = 1500  # along an axis: more than a picture shows
-_SAME_DB = 1e-3  # between levels that are the same but for rounding
-_COUNTED = 1 << 22  # pixels that percentiles are taken of, at most
-_WIDTH_IN = 7.0  # of figures of images, or nearly the height of those that are higher than wide
-_FLAT = 0.4  # height over width of an image below which the scale of levels goes below it
+_MOST_PIXELS = 1500  # along an axis; pictures have fewer dots
+_SAME_DB = 1e-3  # levels closer than this differ by rounding only
+_COUNTED = 1 << 22  # most pixels from which percentiles are computed
+_WIDTH_IN = 7.0  # width of figures; nearly the height of those that are higher than wide
+_FLAT = 0.4  # height over width; flatter images have the scale of levels below them
 _PREVIEW_IN, _PREVIEW_DPI, _PREVIEW_COLOURS = 4.5, 96.0, 64  # in a notebook: 20 to 90 kB
 
 
 @dataclass(frozen=True)
 class Scale:
-    """Which levels a picture shows, and in which colours; the arguments of `image`."""
+    """Levels and colours of a picture; the fields are arguments of `image`."""
 
     dynamic_range_db: float | None = None
     percentiles: tuple[float, float] | None = None
@@ -105,28 +105,28 @@ def image(
     Parameters
     ----------
     image : Image
-        On a plane of any direction or a height map. The axes are the coordinates that columns and
-        rows run along (x and y, or x and z of a plane in depth), else distances along them; in
-        millimetres where all of them are less than 0.5 m, else in metres. Columns and rows are
-        drawn at right angles also where they are not.
+        Image on a plane of any direction or a height map. The axes are the coordinates along
+        columns and rows (x and y, or x and z of a plane in depth), or else distances along them.
+        They are in millimetres if all are less than 0.5 m, else in metres. Columns and rows are
+        always drawn at right angles.
     axes : matplotlib.axes.Axes, optional
-        Where to draw. Unless given those of a new pyplot figure, so that notebooks and
-        `pyplot.show` show it.
+        Axes to draw into. By default those of a new pyplot figure, which notebooks and
+        `pyplot.show` show.
     dynamic_range_db : float, optional
-        The first colour stands for levels so far below the reference and less, 60 dB unless given;
-        the last one for the reference and more.
+        Levels between the first colour and the reference, which has the last colour; 60 dB by
+        default.
     percentiles : (low, high), optional
-        In place of `dynamic_range_db`: the colours span these percentiles, 0 to 100, of the levels
-        of all pixels that are not 0. (1, 99.5) shows speckle beside bright targets.
+        Let the colours span these percentiles, 0 to 100, of the levels of all pixels that are not
+        0, instead of `dynamic_range_db`. (1, 99.5) shows speckle beside bright targets.
     reference : float, optional
-        Amplitude of 0 dB; the image's greatest unless given.
+        Amplitude of 0 dB; by default the image's largest.
     colour_map : str or matplotlib.colors.Colormap
         "sonar" (black, copper, cream), or any of matplotlib's names. "inferno", "sonar",
         "cividis" and "gray" are perceptually even: equal steps in dB look equally large.
     colour_bar : bool
-        Whether to draw the scale of levels beside the axes.
+        True draws the scale of levels beside the axes.
     title : str
-        Put above.
+        Title above the axes.
 
     Returns
     -------
@@ -186,7 +186,7 @@ def image_db(image: Image, *, title: str = "", **options: Any) -> Figure:
     return figure
 
 
-_draw_image = image  # which functions here hide behind an argument of that name
+_draw_image = image  # functions with an argument `image` need another name for it
 
 
 def image_html(image: Image) -> str:
@@ -219,9 +219,9 @@ def range_lines(
     Parameters
     ----------
     lines : RangeLines
-        What to draw. Lines that start elsewhere than others are shown where they lie.
+        Lines to draw, each at its own ranges.
     dynamic_range_db, percentiles, colour_map, title
-        As for `image`; levels are relative to the greatest sample.
+        As for `image`; levels are relative to the largest sample.
 
     Raises
     ------
@@ -274,7 +274,7 @@ def draw_levels(
 def add_colour_bar(
     drawn: AxesImage, scale: Scale, level: NDArray[np.float32], **where: Any
 ) -> None:
-    """Draw the scale of levels; an end is pointed where levels lie beyond it."""
+    """Draw the scale of levels; an end is pointed if there are levels beyond it."""
     pointed = {(True, True): "both", (True, False): "min", (False, True): "max"}
     low, high = drawn.get_clim()
     ends = bool(level.min() < low - _SAME_DB), bool(level.max() > high + _SAME_DB)
@@ -290,7 +290,7 @@ def edges(axis: NDArray, other: NDArray) -> tuple[float, float]:
 
 
 def _greatest(level: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return the greatest of the pixels that share a dot: a mean would hide a point among many."""
+    """Return the largest level of the pixels that share a dot; a mean would hide points."""
     for axis in (0, 1):
         count = level.shape[axis]
         first = np.linspace(0, count, min(count, _MOST_PIXELS), endpoint=False).astype(int)
@@ -308,7 +308,7 @@ def _size_in(image: Image, width_in: float = _WIDTH_IN) -> tuple[float, float]:
 
 
 def _height_per_width(image: Image) -> float:
-    """Return the height of an image as it is drawn, over its width; that of a line is free."""
+    """Return height over width of an image as it is drawn; a default for lines and points."""
     if image.grid.points_m is not None or min(image.shape) == 1:
         return 0.75
     across_m, upward_m = (abs(s.step_m) * len(s.places_m) for s in image.grid.sides)

@@ -38,7 +38,7 @@ def mosaic(
         Pixels of the overview along its longer side, at most; each is the root of the mean power of
         those it covers.
     borders : bool
-        Whether to draw the borders of the patches.
+        True draws the borders of the patches.
     **options
         Further arguments of `clsas.plot.image_db`.
 

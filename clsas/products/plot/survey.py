@@ -18,16 +18,16 @@ if TYPE_CHECKING:
 
 
 def geometry(lines: RangeLines | Echoes, grid: Grid | None = None) -> Figure:
-    """Draw where transmitters and receivers were, and the grid's outline.
+    """Draw the positions of transmitters and receivers, and the grid's outline.
 
-    A view from above, x and y; of a grid in depth along x or y, a view from its side.
+    The view is from above, x and y. For a grid in depth along x or y it is from the side.
 
     Parameters
     ----------
     lines : RangeLines or Echoes
-        Whose `tx_m` and `rx_m` are drawn.
+        Lines or echoes with the positions `tx_m` and `rx_m`.
     grid : Grid, optional
-        What is imaged: its outline, or every point.
+        Grid of an image; arbitrary points are all drawn.
 
     Raises
     ------
@@ -40,7 +40,7 @@ def geometry(lines: RangeLines | Echoes, grid: Grid | None = None) -> Figure:
     if grid is not None:
         validate.instance("grid", grid, Grid)
     shown = _coordinates(grid)
-    # Metres, but for what is small altogether.
+    # Metres, unless the whole geometry is small.
     ends_m = [lines.rx_m, lines.tx_m] + ([] if grid is None else [_outline(grid)[0]])
     scale, unit = length_unit(max(float(np.abs(each[:, shown]).max()) for each in ends_m))
     figure = new_figure(7.0, 6.0)
@@ -72,7 +72,7 @@ def geometry(lines: RangeLines | Echoes, grid: Grid | None = None) -> Figure:
 
 
 def _coordinates(grid: Grid | None) -> list[int]:
-    """Return which two coordinates a view of the geometry shows, across and upward."""
+    """Return the two coordinates that the view shows, across and upward."""
     if grid is not None and grid.points_m is None and min(grid.shape) > 1:
         names = "".join(sorted(side.name for side in grid.sides))
         if names in ("xz", "yz"):
@@ -81,7 +81,7 @@ def _coordinates(grid: Grid | None) -> list[int]:
 
 
 def _outline(grid: Grid) -> tuple[NDArray, str]:
-    """Return the places to draw for a grid, [n, 3], and how."""
+    """Return the points or corners to draw for a grid, [n, 3], and the style of their line."""
     if grid.points_m is not None:
         return grid.points_m.reshape(-1, 3), "."
     down, right = (count - 1 for count in grid.shape)

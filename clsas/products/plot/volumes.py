@@ -20,10 +20,10 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 KINDS = ("maximum", "slices")
-_VIEWS = (("x", "y", "z"), ("z", "y", "x"), ("x", "z", "y"))  # across, upward, looked along
-_IN, _LEAST_IN = 6.0, 0.8  # sizes of two views beside each other, and of a view of something flat
+_VIEWS = (("x", "y", "z"), ("z", "y", "x"), ("x", "z", "y"))  # across, upward, line of sight
+_IN, _LEAST_IN = 6.0, 0.8  # width of two views beside each other, and least size of a view
 _LEFT, _BOTTOM, _GAP, _RIGHT, _TOP = 0.9, 0.6, 0.4, 1.3, 0.7  # inches about the views
-_TOLERANCE = 1e-3  # of a step, by which points may lie beside the box
+_TOLERANCE = 1e-3  # largest deviation of a point from the box, in steps
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,19 +61,19 @@ def volume(
     Parameters
     ----------
     image : Image
-        On points [n, m, k, 3] that form a regular box with sides along x, y and z, in any
-        order, as of::
+        Image on points [n, m, k, 3] that form a regular box with sides along x, y and z, in any
+        order, such as::
 
             z, y, x = np.meshgrid(z_m, y_m, x_m, indexing="ij")
             grid = clsas.Grid.points(np.stack([x, y, z], axis=-1))
 
     kind : str
-        "maximum": the greatest amplitude along the line of sight. "slices": three planes through
-        a point; dashed lines show where.
+        "maximum": the largest amplitude along the line of sight. "slices": three planes through
+        a point, with dashed lines at their positions.
     at : (x, y, z), optional
-        With "slices": that point, metres; the nearest pixel counts. The brightest one unless given.
+        Point of "slices", metres; the nearest pixel is taken. By default the brightest pixel.
     title : str
-        Put above.
+        Title above the views.
     **options
         `dynamic_range_db`, `percentiles`, `reference` and `colour_map` of `clsas.plot.image`; one
         scale holds for all views.
