@@ -224,7 +224,7 @@ class SceneTables(Table):
     mosaic: _Mosaic = _Mosaic()
 
     def build(self, folder: Path) -> dict[str, Any]:
-        """Return the fields of `clsas.files.scene_files.SceneFile` but for its name.
+        """Return the fields of `clsas.files.scene_files.SceneFile`, without its name.
 
         Parameters
         ----------

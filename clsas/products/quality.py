@@ -186,7 +186,7 @@ def _find_peak(
     place: NDArray[np.float64],
     search_m: float | None,
 ) -> tuple[int, int]:
-    """Return row and column of the greatest pixel near a place on the axes."""
+    """Return row and column of the largest pixel near coordinates on the axes."""
     if search_m is not None:
         validate.positive("search_m", search_m, "m")
     windows = []

@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     from matplotlib.colors import Colormap
 
 COLOUR_MAP = "inferno"
-"""The colour map unless another is asked for: perceptually even, from black to pale yellow."""
+"""Default colour map: perceptually even, from black to pale yellow."""
 
 # Black over copper to cream, as sidescan displays show sand. The colours lie on a curve through
 # CIELAB from lightness 1 to 96, hue 50 to 88 degrees and chroma 42 sin(pi t)(1 - t/4) + 8 t^4, at

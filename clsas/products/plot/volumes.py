@@ -127,7 +127,7 @@ def volume(
 def _panels(box: _Box) -> tuple[Figure, list[Axes], Axes]:
     """Return a figure, the axes of the views from above, side and front, and of the colour bar.
 
-    Views stand beside each other at one scale; what is flat is drawn no smaller than can be seen.
+    Views have one scale, except that a flat view is drawn large enough to be seen.
     """
     lengths_m = {
         name: float(np.ptp(place)) * len(place) / max(len(place) - 1, 1)
