@@ -123,10 +123,10 @@ def mosaic(
     devices = [open_device(name) for name in device] or None
     in_scene = described.mosaic
     output = output or in_scene.get("store") or _default_store(scene)
+    memory_mib = memory_mib or in_scene.get("memory_mib")
     patches = patches or in_scene.get("patches")
     if patches is not None:
         patch_shape_of(patches, grid)  # before anything is simulated
-    memory_mib = memory_mib or in_scene.get("memory_mib")
     recorded = lines_path or in_scene.get("lines")
     _check_paths(output, picture, recorded, follow)
     lines_path = recorded or _simulated(described, scene, output, picture, quiet=as_json)
@@ -146,14 +146,11 @@ def mosaic(
 
         plot.save(plot.mosaic(store, borders=borders, **levels), picture)
     words, figures = _results(formed, store.records())
-    done = f"{new} formed in {seconds:.2f} s ({pixels / seconds / 1e6:.3g} Mpixel/s)"
-    finished = f", {before} finished before" if before else ""
-    report(
-        as_json,
-        f"{output}: {words[0]}, {done if new else 'none to form'}{finished}" + "".join(words[1:]),
-        file=output, picture=picture, formed=new, before=before, seconds=seconds,
-        pixels_per_s=pixels / seconds, **figures,
-    )  # fmt: skip
+    rate = pixels / seconds
+    done = f"{new} formed in {seconds:.2f} s ({rate / 1e6:.3g} Mpixel/s)" if new else "none to form"
+    words[0] += f", {done}" + (f", {before} finished before" if before else "")
+    figures |= {"formed": new, "before": before, "seconds": seconds, "pixels_per_s": rate}
+    report(as_json, f"{output}: {''.join(words)}", file=output, picture=picture, **figures)
 
 
 def _check_combination(

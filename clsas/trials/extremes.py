@@ -154,31 +154,28 @@ def scene(
     of_pixels_m = oracle.ranges_m(pixels, tx, rx, speed_m_s, velocity)
     fade_m = _FADED / (2 * np.pi * min(band.edge for band in bands))
     levels = np.array([offset, tail, noise])
-    if levels.any():
-        # Offsets and noise extend over the whole line, and fade with a Gaussian.
+    if levels.any():  # they extend over the whole line, and fade with a Gaussian
         fade_m = max(fade_m, np.ptp(of_pixels_m, axis=1).max())
     first_m, length = _extent(np.hstack([at_m, of_pixels_m]), fade_m, step_m)
     if own_starts:
         first_m = first_m - rng.uniform(0, step_m, len(tx))
     else:
         first_m, length = _from_one_start(first_m, length, step_m)
+    echoes = [Echo(at_m, amplitude, bands)]
     mixed = partial(
         oracle.samples, first_range_m=first_m, range_step_m=step_m, length=length,
         carrier_cycles_per_m=0.0 if on_carrier else centre,
     )  # fmt: skip
-    echoes = [Echo(at_m, amplitude, bands)]
-    values = mixed(echoes)
-    levels = levels * np.sqrt(np.mean(np.abs(values) ** 2))
-    if other := _disturbances(rng, first_m, step_m, length, levels, centre):
-        values += mixed(other)
-        echoes += other
+    if levels.any():
+        rms = np.sqrt(np.mean(np.abs(mixed(echoes)) ** 2))
+        echoes += _disturbances(rng, first_m, step_m, length, levels * rms, centre)
 
     weights = 1.0 if beam is None else _weights(beam, pixels, (tx + rx) / 2)
     origin = np.asarray(origin_m, np.float64)
     grid = Grid.oriented(corner + origin, [0, pixel_m[1], 0], [pixel_m[0], 0, 0], shape)
     lines = RangeLines(
-        values, first_m, step_m, tx + origin, rx + origin, 0.0 if on_carrier else carrier_hz,
-        speed_m_s, rx_velocity_m_s,
+        mixed(echoes), first_m, step_m, tx + origin, rx + origin,
+        0.0 if on_carrier else carrier_hz, speed_m_s, rx_velocity_m_s,
     )  # fmt: skip
     ideal = oracle.image(echoes, of_pixels_m, weights).reshape(shape)
     return Known(lines, grid.with_height(height_m) if relief_m else grid, ideal, beam)
