@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, fields
-from typing import Any
 
 from numpy.typing import ArrayLike
 
-from clsas.core import validate
 from clsas.core.decibels import in_db
 from clsas.signal.interpolation import COST
 
@@ -111,6 +109,31 @@ def backprojecting(
 
 
 @dataclass(frozen=True)
+class StageChannels:
+    """Predicted channels of a stage.
+
+    Attributes
+    ----------
+    used : float
+        Channels of the stage before that one subimage combines, on average.
+    count : float
+        Virtual channels of a subimage, on average.
+    summed : float
+        Channels that one virtual channel is a weighted sum of.
+    everywhere : float
+        Virtual channels of a root along the whole aperture, at most.
+    most : float
+        Virtual channels of a subimage, at most.
+    """
+
+    used: float
+    count: float
+    summed: float
+    everywhere: float
+    most: float
+
+
+@dataclass(frozen=True)
 class ErrorBudget:
     """Relative error powers that add up to the prediction, by cause.
 
@@ -182,10 +205,3 @@ class ErrorBudget:
 
 
 _NEGLIGIBLE = 1e-3  # of the total
-
-
-def estimate_of(kind: type[Work] | type[ErrorBudget], values: dict[str, Any]) -> Any:
-    """Return estimates read from a file, checked: none is negative."""
-    return kind(
-        **{name: validate.number(name, value, "", least=0.0) for name, value in values.items()}
-    )

@@ -75,20 +75,21 @@ class Leaves:
         half_precision: bool,
         gain: float,
     ) -> None:
-        chosen = geometry.plan
         self.lines, self.geometry, self.level, self.device = lines, geometry, level, device
-        self.plan, self.surface, self.width = chosen, geometry.surface, device.info.width
-        self.normalise = chosen.beam is not None and chosen.beam.normalise
-        self.beam = beam_table(device, chosen.beam, lines)
+        self.plan, self.factorization = geometry.plan, geometry.factorization
+        self.surface, self.width = geometry.surface, device.info.width
+        beam = geometry.beam
+        self.normalise = beam is not None and beam.normalise
+        self.beam = beam_table(device, beam, lines)
         self.arguments = {
             "cycles_per_sample": geometry.cycles_per_m / geometry.samples_per_m,
-            "filter": filter_table(device, chosen.final.coefficients / gain),
-            "phase_polynomials": phase_polynomials(device, chosen.phase_terms),
+            "filter": filter_table(device, geometry.factorization.final.coefficients / gain),
+            "phase_polynomials": phase_polynomials(device, geometry.plan.phase_terms),
             "line_pitch": level.pitch,
             **self.beam.arguments,
         }
         # Where tile and leaf are one, every line is aligned on its centre.
-        self.aligned = chosen.tile == chosen.sides[-1]
+        self.aligned = geometry.factorization.tile == geometry.factorization.sides[-1]
         self.slot, self.image, self.half_precision = Slot(device), image, half_precision
         self._prepare()
 
@@ -98,7 +99,7 @@ class Leaves:
 
     def _options(self, layout: Tiles | Groups) -> dict[str, int]:
         """Return the kernels' build options."""
-        chosen, one_cubic = self.plan, False
+        chosen, taps, one_cubic = self.plan, self.factorization.final.taps, False
         if chosen.beam is not None:
             radius_m = self.surface.radius_m(self.geometry.division.sides[0])
             nearest_m = max(self.geometry.nearest_m - radius_m, 1e-6)
@@ -112,7 +113,7 @@ class Leaves:
             one_cubic = error**2 < _SHARE * power(allowed_db)
         return {
             "WIDTH": self.width,
-            "TAPS": chosen.final.taps,
+            "TAPS": taps,
             "BEAM": 0 if chosen.beam is None else INTERVALS,
             "ONE_CUBIC": int(one_cubic),
             "NORMALISE": int(self.normalise),
@@ -120,9 +121,7 @@ class Leaves:
             "ALIGNED": int(self.aligned),
             "HALF": int(self.half_precision),
             "PHASE_TERMS": chosen.phase_terms,
-        } | lookup_options(
-            self.device, layout, self.lines, self.geometry.samples_per_m, chosen.final.taps
-        )
+        } | lookup_options(self.device, layout, self.lines, self.geometry.samples_per_m, taps)
 
     def fill(self, slot: Slot, sector: Sector) -> None:
         """Start copying to the device what it is told of a sector's leaves."""
@@ -169,7 +168,7 @@ class Leaves:
         """Return the nodes of parts of some leaves, and the first one's line, [..., 3]."""
         need = sector.needs[-1]
         node = root * sector.nodes[-1].place.shape[1]
-        in_batch = root % self.plan.roots_at_once * need.first.shape[1] + leaf
+        in_batch = root % self.factorization.roots_at_once * need.first.shape[1] + leaf
         ranges = [
             node + need.first[root, leaf],
             node + need.last[root, leaf],
@@ -190,14 +189,14 @@ class PlaneLeaves(Leaves):
 
     def _prepare(self) -> None:
         device, image = self.device, self.image
-        chosen, plane = self.plan, self.surface.plane
+        chosen, plane = self.factorization, self.surface.plane
         # A CPU sets the pixels where they belong.
         on_cpu = device.info.kind == "cpu" and not self.normalise
         self.shared = device.share(image) if on_cpu else None
         layout = Tiles(plane, chosen.tile[0], self.width)
         options = self._options(layout)
         tile = {"TILE_ROWS": chosen.tile[0], "TILE_COLUMNS": chosen.tile[1]}
-        self.expand = expansion_kernel(device, chosen.beam)
+        self.expand = expansion_kernel(device, self.geometry.beam)
         self.backproject = device.kernel("backproject_tiles", **options, **tile)
         self.tiles = Division(self.surface, (chosen.sides[0], chosen.sides[-1], chosen.tile))
         self.per_root, self.leaf_of = self.tiles.per_root(2), self.tiles.parents(2)
@@ -212,7 +211,7 @@ class PlaneLeaves(Leaves):
 
     def form(self, tables: Slot, sector: Sector, batch: slice, samples: cl.Buffer) -> Finish:
         """Start forming the pixels of some roots; see `Leaves.form`."""
-        device, slot, chosen, level = self.device, self.slot, self.plan, self.level
+        device, slot, chosen, level = self.device, self.slot, self.factorization, self.level
         parts = [self._part(root) for root in sector.roots[batch]]
         tiles, first_tile = len(parts) * self.per_root, batch.start * self.per_root
         pitch = channel_pitch(sector.stride(-1))
@@ -226,7 +225,7 @@ class PlaneLeaves(Leaves):
                 references[f"reference_{name}"] = slot[name]
         plane, samples_per_m = self.surface.plane, self.geometry.samples_per_m
         steps_m = (plane.column_step_m, plane.row_step_m)
-        terms = expansion_terms(chosen.beam)
+        terms = expansion_terms(self.geometry.beam)
         most = max(pitch, channel_pitch(chosen.most_channels[-1]))
         expanded = {
             "ranges": tables["ranges"],
@@ -315,7 +314,7 @@ class PlaneLeaves(Leaves):
 
     def _part(self, root: NDArray[np.int64]) -> tuple[slice, slice]:
         """Return which pixels of the image a root has."""
-        ends = np.minimum(root + self.plan.sides[0], self.surface.plane.shape)
+        ends = np.minimum(root + self.factorization.sides[0], self.surface.plane.shape)
         rows, columns = (slice(int(a), int(b)) for a, b in zip(root, ends, strict=True))
         return rows, columns
 
@@ -327,7 +326,7 @@ class PlaneLeaves(Leaves):
         part: tuple[slice, slice],
     ) -> cl.Event:
         """Start reading the pixels of a root into a part of an image."""
-        height, width = self.plan.sides[0]
+        height, width = self.factorization.sides[0]
         rows, columns = image[part].shape
         return cl.enqueue_copy(
             self.device.queue,

@@ -18,9 +18,9 @@ from clsas.core.image import Image, holds_any
 from clsas.core.lines import RangeLines
 from clsas.exact.backprojection import form_exactly
 from clsas.exact.checks import check_numbers
-from clsas.factorized.filters import edges_gain
+from clsas.factorized.buffers import CHUNK
 from clsas.factorized.leaves import Finish, Level, PlaneLeaves, SurfaceLeaves
-from clsas.factorized.plan import CHUNK, Plan
+from clsas.factorized.plan import ExactImage, Plan
 from clsas.factorized.sector import Geometry, Sector
 from clsas.factorized.surface import surface_of
 from clsas.opencl import phases
@@ -57,13 +57,13 @@ def form(
 ) -> Image:
     """Return the image by a checked plan."""
     warned = chosen.kept.get("warned", False)  # not where the plan comes from a file
-    if chosen.is_exact:
+    if isinstance(chosen.image, ExactImage):
         # The plan has warned of ends of lines.
         return form_exactly(
             lines,
             grid,
             device=device,
-            accuracy_db=chosen.accuracy_db,
+            accuracy_db=chosen.image.accuracy_db,
             beam=chosen.beam,
             progress=progress,
             warned=warned,
@@ -117,9 +117,10 @@ class _Run:
         pixels: NDArray[np.complex64],
         largest: float,
     ) -> None:
-        self.lines, self.grid, self.plan, self.device = lines, grid, chosen, device
-        self.width, self.pitch = device.info.width, padded_length(chosen.resampling)
-        self.half_precision = chosen.half_precision
+        image = chosen.factorization
+        self.lines, self.plan, self.factorization, self.device = lines, chosen, image, device
+        self.width, self.pitch = device.info.width, padded_length(image.resampling)
+        self.half_precision = image.half_precision
         self.gain = _gain(largest, lines.channels) if self.half_precision and largest > 0 else 1.0
         self.samples = self._upload_lines()  # early: a device upsamples them beside what follows
         self.geometry = _geometry(lines, grid, chosen)
@@ -135,15 +136,15 @@ class _Run:
             )
         self.levels = [
             Level(half, -(-(2 * half + 1) // self.width) * self.width)
-            for half in chosen.half_lengths
+            for half in image.half_lengths
         ]
         self.filters = {
-            "range_filter": filter_table(device, chosen.align.coefficients),
-            "aperture_filter": filter_table(device, chosen.aperture.coefficients),
+            "range_filter": filter_table(device, image.align.coefficients),
+            "aperture_filter": filter_table(device, image.aperture.filter.coefficients),
             "phase_polynomials": phase_polynomials(device, phases.PRECISE_TERMS),
         }
-        options = {"WIDTH": self.width, "TAPS": chosen.align.taps}
-        options |= {"APERTURE_TAPS": chosen.aperture.taps, "HALF": int(self.half_precision)}
+        options = {"WIDTH": self.width, "TAPS": image.align.taps}
+        options |= {"APERTURE_TAPS": image.aperture.filter.taps, "HALF": int(self.half_precision)}
         options |= {"CHUNK": CHUNK, "PHASE_TERMS": phases.PRECISE_TERMS}
         ramp = int(self.geometry.ramps)
         self.first_stage = device.kernel("stage", SHIFTS_GIVEN=1, RAMP=ramp, **options)
@@ -162,8 +163,8 @@ class _Run:
 
     def _upload_lines(self) -> cl.Buffer:
         """Return all lines on the device, upsampled."""
-        device, chosen, count = self.device, self.plan, self.lines.channels
-        resampling = chosen.resampling
+        device, image, count = self.device, self.factorization, self.lines.channels
+        resampling = image.resampling
         line_bytes = sample_bytes(self.half_precision) * self.pitch
         if count * line_bytes > device.info.max_buffer_bytes:
             raise ValueError(
@@ -172,19 +173,17 @@ class _Run:
                 f"{device.info.label}, {device.info.max_buffer_bytes / 2**20:.0f} MiB: image "
                 f"a part of them, or backproject exactly"
             )
-        if chosen.upsampler is not None:
+        if image.upsampler is not None:
             return upsample(
                 self.lines.samples,
                 resampling,
-                chosen.upsampler,
+                image.upsampler,
                 self.pitch,
                 device,
                 half_precision=self.half_precision,
                 gain=self.gain,
             )
-        gain = None
-        if not chosen.nearest:
-            gain = edges_gain(chosen.align, chosen.final, len(chosen.sides), resampling.ratio)
+        gain = image.aperture.lines_gain(image.align, image.final, resampling.ratio)
         return device.share(
             upsampled_lines(self.lines.samples, resampling, self.width, MARGIN, self.pitch, gain)
         )
@@ -195,10 +194,10 @@ class _Run:
         The geometry of a sector is prepared while the device works on the one before.
         """
         under_way = deque()
-        batches = -(-len(self.division.roots) // self.plan.roots_at_once)
+        batches = -(-len(self.division.roots) // self.factorization.roots_at_once)
         most = max(math.ceil(_AHEAD_S * batches / max(self.plan.predicted_seconds, 1e-9)), 2)
         for sector, tables in self._sectors():
-            for first in range(0, len(sector.roots), self.plan.roots_at_once):
+            for first in range(0, len(sector.roots), self.factorization.roots_at_once):
                 under_way.append(self._start(sector, tables, first))
                 if len(under_way) > most:
                     yield under_way.popleft()()
@@ -209,13 +208,13 @@ class _Run:
 
     def _sectors(self) -> Iterator[tuple[Sector, _Tables]]:
         """Prepare the roots, some together; few at first, for the device to begin with."""
-        first = _PREPARED_FIRST * self.plan.roots_at_once
-        for sector in self.geometry.sectors(first, self.plan.roots_prepared):
+        first = _PREPARED_FIRST * self.factorization.roots_at_once
+        for sector in self.geometry.sectors(first, self.factorization.roots_prepared):
             yield sector, self._upload_tables(sector)
 
     def _start(self, sector: Sector, tables: _Tables, first: int) -> Finish:
         """Start forming the pixels of some roots of a sector."""
-        batch = slice(first, min(first + self.plan.roots_at_once, len(sector.roots)))
+        batch = slice(first, min(first + self.factorization.roots_at_once, len(sector.roots)))
         if not all(tables.strides):
             return self.leaves.blank(sector, batch)
         for level in range(len(self.levels)):
@@ -261,7 +260,7 @@ class _Run:
             tables.strides[level],
         )
         # A buffer that grows waits for all that is under way.
-        lines_each = max(stride, self.plan.most_channels[level])
+        lines_each = max(stride, self.factorization.most_channels[level])
         per_root = self.division.per_root(level)
         children = (batch.stop - batch.start) * per_root
         if level == 0:

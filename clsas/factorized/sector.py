@@ -16,6 +16,7 @@ from clsas.core.geometry import pairwise_range_m
 from clsas.core.lines import RangeLines, some_channels
 from clsas.factorized import tree
 from clsas.factorized.aperture import cycles_per_extent, drift, mean_track, own_drift, stretches
+from clsas.factorized.interpolated import BEAM_MARGIN
 from clsas.factorized.plan import Plan
 from clsas.factorized.surface import Surface
 from clsas.factorized.tree import Division, Nodes, Ranges
@@ -26,8 +27,6 @@ _SOME_LINES = 64  # of which samples are looked at
 _FAR = 1 << 28  # samples: off any line, and within int32
 MOST_KEPT_BYTES = 128 << 20
 """Of what one image leaves for the next by the same plan, at most, each of sectors and groups."""
-OF_BEAM = 1 / 16
-"""Of what a beam covers: by how much it may be taken to cover more."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,29 +96,31 @@ class Geometry:
 
     def __init__(self, lines: RangeLines, surface: Surface, chosen: Plan) -> None:
         self.lines, self.surface, self.plan = lines.without_samples(), surface, chosen
+        image, beam = chosen.factorization, chosen.beam
+        self.factorization, self.beam = image, beam
         self.kept: dict[Hashable, Any] = {}
-        self.samples_per_m = chosen.resampling.samples_per_m(lines)
-        self.cycles_per_m = chosen.resampling.cycles_per_m(lines)
-        self.division = Division(surface, chosen.sides)
+        self.samples_per_m = image.resampling.samples_per_m(lines)
+        self.cycles_per_m = image.resampling.cycles_per_m(lines)
+        self.division = Division(surface, image.sides)
         track = mean_track(lines)
         self.channels = np.argsort(track.place, kind="stable")
         self.track = replace(track, place=track.place[self.channels])
         self.along = None
-        if chosen.beam is not None:
-            along = chosen.beam.directions(lines)[self.channels]
+        if beam is not None:
+            along = beam.directions(lines)[self.channels]
             self.along = tree.beam_directions(along, self.track, track.samples)
         self.phase_centres_m = lines.phase_centres_m[self.channels]
         self.drift, own = drift(lines), own_drift(lines)
         self.own_drift = own if own is None else own[self.channels]
-        self._seen = Division(surface, (chosen.sides[0], self._together(), chosen.sides[-1]))
-        # The thesis's method has none; on the track itself there is nothing to make up for.
+        self._seen = Division(surface, (image.sides[0], self._together(), image.sides[-1]))
+        # On the track itself there is nothing to align.
         off_m = np.abs(self.phase_centres_m - self.track.positions_m(self.track.place)).max()
         wavelength_m = lines.sound_speed_m_s / max(lines.carrier_hz, 1.0)
         if own is not None:
             off_m += np.linalg.norm(own, axis=1).max() * np.abs(lines.last_range_m).max()
         apart = lines.rx_velocity_m_s is not None or not np.array_equal(lines.tx_m, lines.rx_m)
         away = apart or off_m > _ON_TRACK * wavelength_m
-        self.ramps = bool(away and not chosen.nearest)
+        self.ramps = bool(away and image.aperture.aligns_phases)
         # From elsewhere a channel off the track appears at another place.
         way_m = np.linalg.norm(self.track.sampled_m[1], axis=1)
         self._slack = 2 * off_m / max(way_m.min(), 1e-9)
@@ -131,10 +132,10 @@ class Geometry:
         With a beam, so that those come together which the same channels see.
         """
         roots = self.division.roots
-        if self.plan.limits is None:
+        if self.factorization.limits is None:
             return roots
         along = np.abs(self.surface.steps_m[:2] @ self.along.mean(axis=0))
-        slow = int(np.argmax(along * self.plan.sides[0]))
+        slow = int(np.argmax(along * self.factorization.sides[0]))
         return roots[np.lexsort((roots[:, 1 - slow], roots[:, slow]))]
 
     @functools.cached_property
@@ -148,7 +149,7 @@ class Geometry:
         some = some_channels(lines.channels, _SOME_LINES)
         root_m = self.division.centres_m(0, self.division.roots)
         away_m = cdist(root_m, lines.phase_centres_m[some])
-        radius_m = self.surface.radius_m(self.plan.sides[0])
+        radius_m = self.surface.radius_m(self.factorization.sides[0])
         near_m, far_m = away_m.min(axis=0) - radius_m, away_m.max(axis=0) + radius_m
         total, count = 0.0, 0
         for i, near, far in zip(some, near_m, far_m, strict=True):
@@ -164,10 +165,11 @@ class Geometry:
 
         They lie within a leaf's parent, and add little to what the beam covers.
         """
-        leaf, parent = self.plan.sides[-1], self.plan.sides[max(len(self.plan.sides) - 2, 0)]
-        if self.plan.beam is None:
+        sides = self.factorization.sides
+        leaf, parent = sides[-1], sides[max(len(sides) - 2, 0)]
+        if self.beam is None:
             return parent
-        most_m = OF_BEAM * self.nearest_m * np.ptp(np.clip(self.plan.limits, -1, 1))
+        most_m = BEAM_MARGIN * self.nearest_m * np.ptp(np.clip(self.factorization.limits, -1, 1))
         along_m = np.abs(self.surface.steps_m[:2] @ self.along.T)
 
         def fits(side: tuple[int, int]) -> bool:
@@ -202,8 +204,12 @@ class Geometry:
 
     def sector(self, roots: NDArray[np.int64]) -> Sector:
         """Return the geometry of some roots, given by their first pixels [roots, 2]."""
-        division, chosen, track, surface = self.division, self.plan, self.track, self.surface
-        sides, last = chosen.sides, len(chosen.sides) - 1
+        division, track, surface, sides = (
+            self.division,
+            self.track,
+            self.surface,
+            self.factorization.sides,
+        )
         root_m = division.centres_m(0, roots)
         corners = [division.corners(level, roots) for level in range(len(sides))]
         relative_m = [
@@ -213,58 +219,46 @@ class Geometry:
         seen_m = self._seen.centres_m(1, self._seen.corners(1, roots))
         half_m = surface.extents_in(together, sides[0], roots).max(axis=0) / 2
         half_m = half_m[:, None] * surface.steps_m
-        seen = tree.seen_from(chosen.limits, track, self.along, seen_m, half_m)
+        seen = tree.seen_from(self.factorization.limits, track, self.along, seen_m, half_m)
         seen = tuple(each[:, self._seen.parents(2)] for each in seen)
         inside = surface.holds(sides[-1], corners[-1])
-        channels = self._used(*(each[inside] for each in seen))
+        channels = self.factorization.aperture.used_channels(
+            track.place, *(each[inside] for each in seen), self._slack
+        )
         centres_m = self.phase_centres_m[channels]
         some = replace(track, place=track.place[channels])
         own = None if self.own_drift is None else self.own_drift[channels]
-        seen_at = place = some.places_seen_from(root_m, centres_m, own)
-        nodes = []
-        if chosen.nearest:
-            position_m = np.broadcast_to(centres_m, (*place.shape, 3))
-            for factor in chosen.nearest:
-                nodes.append(tree.nearest_nodes(place, position_m, factor))
-                place, position_m = nodes[-1].place, nodes[-1].position_m
-        else:
-            rates = cycles_per_extent(
-                track,
-                surface,
-                root_m,
-                surface.extents_in(sides[0], sides[0], roots).max(axis=0),
-                chosen.highest_cycles_per_m,
-                min(surface.radius_m(sides[-1]), chosen.closest_m),
-                chosen.limits,
-                self.along,
-            )
-            for level, side in enumerate(sides):
-                extents = chosen.crowding[level] * surface.extents_in(side, sides[0], roots)
-                rate = np.einsum("ra,ars->rs", extents, rates)
-                if chosen.beam is not None and level == last:
-                    rate += chosen.beam_cycles * tree.beam_rate(
-                        chosen.beam, track, self.along, root_m
-                    )
-                nodes.append(tree.interpolated_nodes(track, rate, place, chosen.aperture))
-                place = nodes[-1].place
-        needs = tree.ranges(division, nodes, seen_at, seen, inside)
-        return Sector(roots, root_m, channels, relative_m, nodes, needs, seen_at)
+        place = some.places_seen_from(root_m, centres_m, own)
+        nodes = self.factorization.aperture.virtual_channels(self, roots, root_m, place, centres_m)
+        needs = tree.ranges(division, nodes, place, seen, inside)
+        return Sector(roots, root_m, channels, relative_m, nodes, needs, place)
 
-    def _used(self, start: NDArray[np.float64], stop: NDArray[np.float64]) -> slice:
-        """Return the channels at places on the track from where leaves are seen; one at least."""
-        seen, place = stop > start, self.track.place
-        if self.plan.nearest or not seen.any():
-            return slice(0, len(place) if self.plan.nearest else 1)
-        first = np.searchsorted(place, start[seen].min() - self._slack, "left")
-        last = np.searchsorted(place, stop[seen].max() + self._slack, "right")
-        return slice(int(min(first, len(place) - 1)), int(max(last, first + 1)))
+    def phase_rates(
+        self, roots: NDArray[np.int64], root_m: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Return the largest phase rates of subimages in some roots: see `cycles_per_extent`."""
+        image, surface = self.factorization, self.surface
+        return cycles_per_extent(
+            self.track,
+            surface,
+            root_m,
+            surface.extents_in(image.sides[0], image.sides[0], roots).max(axis=0),
+            image.highest_cycles_per_m,
+            min(surface.radius_m(image.sides[-1]), image.closest_m),
+            image.limits,
+            self.along,
+        )
 
     def references(self, sector: Sector) -> dict[str, NDArray]:
         """Return how roots see the raw channels, in the order of their nodes, [roots, channels].
 
         The line, its first sample, the place between samples, phase in cycles and its ramp.
         """
-        lines, resampling, half = self.lines, self.plan.resampling, self.plan.half_lengths[0]
+        lines, resampling, half = (
+            self.lines,
+            self.factorization.resampling,
+            self.factorization.half_lengths[0],
+        )
         nodes = sector.nodes[0]
         channels = self.channels[sector.channels]
         range_m = pairwise_range_m(sector.root_m, *self._antennas(sector))
@@ -276,7 +270,7 @@ class Geometry:
         place *= resampling.ratio
         place += MARGIN - resampling.first - half
         lower = np.floor(place)
-        start = np.clip(lower + 1 - self.plan.align.taps // 2, -_FAR, _FAR)
+        start = np.clip(lower + 1 - self.factorization.align.taps // 2, -_FAR, _FAR)
         channel = np.broadcast_to(channels, place.shape)
         references = {
             "order": nodes.ordered(channel).astype(np.int32),

@@ -11,7 +11,8 @@ from clsas.core.grid import Grid
 from clsas.core.image import Image
 from clsas.core.lines import RangeLines
 from clsas.exact.checks import check_accumulate
-from clsas.factorized.plan import Plan, without_left_out
+from clsas.factorized.left_out import without_left_out
+from clsas.factorized.plan import Plan
 from clsas.factorized.run import form
 from clsas.opencl.device import Device, open_device
 from clsas.planning.planner import BEST_TOLERANCE_DB, WORST_TOLERANCE_DB, plan
@@ -111,11 +112,11 @@ def factorize(
 
 def _check_band(lines: RangeLines, chosen: Plan) -> None:
     """Warn where a plan was made for lines of another band."""
-    known = chosen.kept.get("lines")
-    if chosen.band is None or (known is not None and known() is lines):
+    known, band = chosen.kept.get("lines"), chosen.image.band
+    if band is None or (known is not None and known() is lines):
         return
     for channels in (FEW_CHANNELS, MEASURED_CHANNELS):
-        outside_db = in_db(power_outside(lines, *chosen.band, channels))
+        outside_db = in_db(power_outside(lines, *band, channels))
         if outside_db <= chosen.tolerance_db:
             chosen.kept["lines"] = weakref.ref(lines)
             return

@@ -14,14 +14,18 @@ from dataclasses import dataclass, field, replace
 from clsas.core.decibels import in_db, power
 from clsas.factorized.estimates import ErrorBudget
 from clsas.factorized.filters import Choice, Filters, steering_spectrum
+from clsas.factorized.interpolated import InterpolatedAperture
 from clsas.factorized.plan import Plan
 from clsas.opencl import phases
-from clsas.opencl.device import Device
-from clsas.planning import forecast
-from clsas.planning.costs import Costs
 from clsas.planning.errors import Errors, excess_error, other_errors, root_error
-from clsas.planning.exact_image import Exact
-from clsas.planning.forecast import Candidate, margin_db
+from clsas.planning.prediction import (
+    OUTSIDE,
+    Candidate,
+    Conditions,
+    band_of,
+    margin_db,
+    predicted_plan,
+)
 from clsas.planning.search import Allowed, Tree, root_limits, search
 from clsas.planning.view import View
 
@@ -29,7 +33,7 @@ from clsas.planning.view import View
 # edges of the beam that are left out, and for what is always there.
 _ROOTS_SHARE, _SPACING_SHARE, _EDGES_SHARE, _RESERVED_SHARE = 0.25, 0.2, 0.03, 0.08
 _MOST_SPENT = 0.9  # of the error power allowed, before filters
-_LEAST_DENSER, _MOST_DENSITY = 1.05, 2.0  # virtual channels: at a time, and altogether
+_LEAST_DENSER, _MOST_OVERSAMPLING = 1.05, 2.0  # virtual channels: at a time, and altogether
 _DENSITY_POWER = 0.08  # of an error that denser virtual channels are to mend
 _LEAST_STEP, _OVERSHOOT = 0.02, 1.3  # of the error allowed, and of what was too much
 _LEAST_BEAM_CYCLES, _MOST_BEAM_CYCLES = 0.5, 64.0
@@ -43,27 +47,19 @@ class _Problem:
     ----------
     view : View
         Without the edges of the beam, if there is one.
-    tolerance_db : float
-    exact : Exact
-        The image to beat.
-    device, costs, memory_bytes
-        What there is to work with.
+    conditions : Conditions
     designs : dict
         Filters designed before.
     """
 
     view: View
-    tolerance_db: float
-    exact: Exact
-    device: Device
-    costs: Costs
-    memory_bytes: int
+    conditions: Conditions
     designs: dict[tuple[Choice, int, float], Filters] = field(default_factory=dict)
 
     @property
     def allowed(self) -> float:
         """Error power of the tolerance."""
-        return power(self.tolerance_db)
+        return power(self.conditions.tolerance_db)
 
     @property
     def beam_edges(self) -> float:
@@ -73,7 +69,7 @@ class _Problem:
     @property
     def reserved(self) -> float:
         """Error power that is kept for what neither filters nor roots add, at least."""
-        of_phases = phases.error(phases.terms_within(self.tolerance_db)) ** 2
+        of_phases = phases.error(phases.terms_within(self.conditions.tolerance_db)) ** 2
         return self.beam_edges + _RESERVED_SHARE * self.allowed + of_phases
 
     def filters_db(self, reserved: float, root: tuple[int, int]) -> float | None:
@@ -95,14 +91,14 @@ class _Trial:
     most_root : (rows, columns)
         The largest roots.
     beam_cycles : float
-        See `Plan`.
+        See `InterpolatedAperture`.
     reserved : float
         Error power that is kept for what neither filters nor roots add.
     least_leaf_pixels : int
     tree : Tree or None
         The tree, once it was searched for.
-    density : tuple of float
-        How much denser than the band limit asks for its virtual channels are, stage by stage.
+    oversampling : tuple of float
+        How much denser than the filter needs its virtual channels are, stage by stage.
     """
 
     choices: Allowed
@@ -111,25 +107,18 @@ class _Trial:
     reserved: float
     least_leaf_pixels: int = 1
     tree: Tree | None = None
-    density: tuple[float, ...] = ()
+    oversampling: tuple[float, ...] = ()
 
 
 def fastest(
-    view: View,
-    tolerance_db: float,
-    exact: Exact,
-    seconds: float,
-    device: Device,
-    costs: Costs,
-    memory_bytes: int,
-    choices: Allowed,
+    view: View, conditions: Conditions, seconds: float, choices: Allowed
 ) -> tuple[Plan | None, float]:
     """Return the fastest plan within a tolerance, if it takes less than some seconds.
 
     Beside it, where there is none, the least memory of those that did not fit.
     """
-    trimmed = view.trimmed(_EDGES_SHARE * power(tolerance_db))
-    problem = _Problem(trimmed, tolerance_db, exact, device, costs, memory_bytes)
+    trimmed = view.trimmed(_EDGES_SHARE * power(conditions.tolerance_db))
+    problem = _Problem(trimmed, conditions)
     most_root = root_limits(trimmed, _ROOTS_SHARE * problem.allowed)
     needed, trial = math.inf, None
     if most_root is not None:
@@ -146,9 +135,9 @@ def fastest(
         errors, found = _estimated(problem, trial, filters)
         if found.predicted_seconds >= seconds:
             break
-        if found.predicted_error_db > tolerance_db:
+        if found.predicted_error_db > conditions.tolerance_db:
             trial = _more_accurate(problem, trial, errors, found)
-        elif found.memory_bytes > memory_bytes:
+        elif found.memory_bytes > conditions.memory_bytes:
             needed = min(needed, found.memory_bytes)
             rows, columns = found.sides[0]
             smaller = (rows // 2, columns) if rows > columns else (rows, columns // 2)
@@ -169,11 +158,11 @@ def _searched(problem: _Problem, trial: _Trial) -> _Trial | None:
         trial.most_root,
         trial.least_leaf_pixels,
         trial.beam_cycles,
-        problem.device,
-        problem.costs,
+        problem.conditions.device,
+        problem.conditions.costs,
         trial.choices,
     )
-    return tree and replace(trial, tree=tree, density=(1.0,) * len(tree.sides))
+    return tree and replace(trial, tree=tree, oversampling=(1.0,) * len(tree.sides))
 
 
 def _filters(problem: _Problem, trial: _Trial) -> Filters | None:
@@ -198,8 +187,15 @@ def _estimated(problem: _Problem, trial: _Trial, filters: Filters) -> tuple[Erro
     """Return what a candidate errs by beside its filters, and its plan."""
     sides, roots = trial.tree.sides, root_error(problem.view, trial.tree.sides[0])
     within = problem.view.within(sides[0])
+    conditions = problem.conditions
     errors = other_errors(
-        within, sides, roots, filters.aperture, trial.density, trial.beam_cycles, problem.device
+        within,
+        sides,
+        roots,
+        filters.aperture,
+        trial.oversampling,
+        trial.beam_cycles,
+        conditions.device,
     )
     budget = ErrorBudget(
         roots=errors.roots,
@@ -207,18 +203,21 @@ def _estimated(problem: _Problem, trial: _Trial, filters: Filters) -> tuple[Erro
         leaves=errors.leaves,
         beam_edges=problem.beam_edges,
     )
-    candidate = Candidate(sides, filters, crowding=trial.density, beam_cycles=trial.beam_cycles)
-    found = forecast.factorized(
-        within,
-        candidate,
-        budget,
-        problem.tolerance_db,
-        problem.exact,
-        problem.device,
-        problem.costs,
-        problem.memory_bytes,
+    aperture = InterpolatedAperture(
+        filter=filters.aperture,
+        oversampling=trial.oversampling,
+        beam_cycles=trial.beam_cycles,
+        band=band_of(within, OUTSIDE * problem.allowed),
     )
-    return errors, found
+    candidate = Candidate(
+        sides=sides,
+        tile=sides[-1],
+        align=filters.align,
+        final=filters.final,
+        aperture=aperture,
+        margin=power(margin_db(within)),
+    )
+    return errors, predicted_plan(within, candidate, budget, conditions)
 
 
 def _with_fewer_stages(problem: _Problem, trial: _Trial) -> _Trial | None:
@@ -227,7 +226,7 @@ def _with_fewer_stages(problem: _Problem, trial: _Trial) -> _Trial | None:
     That helps where virtual channels are as dense as they may be; else there is nothing left.
     """
     fewer = tuple(n for n in trial.choices.stages if n < len(trial.tree.sides))
-    if not fewer or _MOST_DENSITY not in trial.density[:-1]:
+    if not fewer or _MOST_OVERSAMPLING not in trial.oversampling[:-1]:
         return None
     choices = replace(trial.choices, stages=fewer)
     return replace(trial, choices=choices, tree=None, reserved=problem.reserved)
@@ -245,28 +244,34 @@ def _more_accurate(problem: _Problem, trial: _Trial, errors: Errors, found: Plan
     beam_cycles = trial.beam_cycles
     if excess[-1] and beam_cycles > 0:
         within = problem.view.within(found.sides[0])
-        without_beam = excess_error(within, last, found.aperture, trial.density[-1], None)
+        without_beam = excess_error(
+            within, last, found.factorization.aperture.filter, trial.oversampling[-1], None
+        )
         if 2 * without_beam < errors.nodes[-1]:  # most of it is the beam's
             if beam_cycles >= _MOST_BEAM_CYCLES:
                 return None  # no virtual channels follow a step
             beam_cycles, excess[-1] = 2 * beam_cycles, 0.0
             return replace(
-                trial, beam_cycles=beam_cycles, density=_denser(trial.density, excess, share)
+                trial,
+                beam_cycles=beam_cycles,
+                oversampling=_denser(trial.oversampling, excess, share),
             )
-    if excess[-1] and trial.density[-1] == _MOST_DENSITY:
+    if excess[-1] and trial.oversampling[-1] == _MOST_OVERSAMPLING:
         # Smaller leaves have fewer virtual channels, less evenly spaced.
         return replace(trial, least_leaf_pixels=2 * math.prod(last), tree=None)
-    if any(excess) and max(trial.density) < _MOST_DENSITY:
-        return replace(trial, density=_denser(trial.density, excess, share))
+    if any(excess) and max(trial.oversampling) < _MOST_OVERSAMPLING:
+        return replace(trial, oversampling=_denser(trial.oversampling, excess, share))
     too_much = power(-margin_db(problem.view)) * (power(found.predicted_error_db) - allowed)
     return replace(trial, reserved=trial.reserved + _OVERSHOOT * too_much + _LEAST_STEP * allowed)
 
 
-def _denser(density: tuple[float, ...], excess: list[float], share: float) -> tuple[float, ...]:
-    """Return how dense virtual channels are next, where their errors exceed a share."""
+def _denser(
+    oversampling: tuple[float, ...], excess: list[float], share: float
+) -> tuple[float, ...]:
+    """Return the next oversampling of virtual channels, where their errors exceed a share."""
     return tuple(
-        min(each * max((1 + over / share) ** _DENSITY_POWER, _LEAST_DENSER), _MOST_DENSITY)
+        min(each * max((1 + over / share) ** _DENSITY_POWER, _LEAST_DENSER), _MOST_OVERSAMPLING)
         if over
         else each
-        for each, over in zip(density, excess, strict=True)
+        for each, over in zip(oversampling, excess, strict=True)
     )

@@ -15,21 +15,28 @@ from clsas.core.grid import Grid
 from clsas.core.lines import RangeLines
 from clsas.exact.backprojection import ACCURACY_DB
 from clsas.factorized.estimates import ErrorBudget
-from clsas.factorized.filters import ALIGN_TAPS, Filters
-from clsas.factorized.plan import Plan, with_left_out
+from clsas.factorized.filters import ALIGN_TAPS
+from clsas.factorized.left_out import with_left_out
+from clsas.factorized.plan import Plan
+from clsas.factorized.thesis import NearestBeams
 from clsas.opencl.device import Device, open_device
-from clsas.planning import forecast
 from clsas.planning.costs import Costs
 from clsas.planning.costs import defaults as default_costs
 from clsas.planning.costs import measured as measured_costs
-from clsas.planning.errors import nearest_errors
+from clsas.planning.errors import leaf_error, nearest_errors
 from clsas.planning.exact_image import Exact, expect
 from clsas.planning.fastest import fastest
-from clsas.planning.forecast import MARGIN_DB, OUTSIDE, Candidate
+from clsas.planning.prediction import (
+    MARGIN_DB,
+    OUTSIDE,
+    Candidate,
+    Conditions,
+    exact_plan,
+    predicted_plan,
+)
 from clsas.planning.search import MOST_STAGES, Allowed
 from clsas.planning.view import View
 from clsas.signal import interpolation
-from clsas.signal.interpolation import Interpolator
 from clsas.sonar.beam import BeamWindow
 from clsas.sonar.coverage import warn_unreached
 from clsas.sonar.simplify import Model, simplify
@@ -159,13 +166,10 @@ def plan(
         aliasing=view.ambiguity.aliasing,
         left_out=model.error,
     )
-    found = replace(
-        found,
-        tolerance_db=tolerance_db,
-        predicted_error_db=errors.total_db,
-        errors=errors,
-        calibrated=calibrated,
+    prediction = replace(
+        found.prediction, error_db=errors.total_db, errors=errors, calibrated=calibrated
     )
+    found = replace(found, tolerance_db=tolerance_db, prediction=prediction)
     if model.left_out:
         found = with_left_out(found, model, lines, grid, beam)
     found.kept["lines"] = weakref.ref(lines)
@@ -189,22 +193,21 @@ def _chosen(
     # Backprojection keeps within a device by itself.
     room = device.info.memory_bytes // 2 if memory_bytes is None else memory_bytes
     exact_fits = memory_bytes is None or exact.memory_bytes <= memory_bytes
+    conditions = Conditions(tolerance_db, exact, device, costs, room)
     least: float = exact.memory_bytes
     if stages:
         if view.track is None:
             raise ValueError("lines must have channels at more than one place for stages")
         if beam is not None and beam.normalise:
             raise ValueError("beam must not normalise with stages; clsas.backproject does")
-        found = _nearest(view, stages, exact, device, costs, room)
+        found = _nearest(view, stages, conditions)
         if found.memory_bytes <= room:
             return found
         exact_fits, least = False, found.memory_bytes
     elif stages is None and _worth_a_search(exact, costs, exact_fits, allowed) and _divisible(view):
         # What is gained must be worth an error, and more than predictions scatter.
         to_beat = _WORTH * costs.seconds(exact.work) if exact_fits and allowed is None else math.inf
-        found, needed = fastest(
-            view, tolerance_db, exact, to_beat, device, costs, room, allowed or Allowed()
-        )
+        found, needed = fastest(view, conditions, to_beat, allowed or Allowed())
         if found is not None:
             return found
         least = min(least, needed)
@@ -213,7 +216,7 @@ def _chosen(
             f"memory_bytes must be at least {math.ceil(10 * least / 2**20) / 10:.1f} MiB for this "
             f"image, got {room / 2**20:.3g} MiB"
         )
-    return forecast.plain(view, tolerance_db, exact, device, costs)
+    return exact_plan(view, conditions)
 
 
 def tolerance_in_db(
@@ -284,14 +287,7 @@ def wavelengths(decibels: float) -> float:
     return 10 ** (decibels / 20) * math.sqrt(3) / (4 * math.pi)
 
 
-def _nearest(
-    view: View,
-    stages: Sequence[tuple[int, int]],
-    exact: Exact,
-    device: Device,
-    costs: Costs,
-    memory_bytes: int,
-) -> Plan:
+def _nearest(view: View, stages: Sequence[tuple[int, int]], conditions: Conditions) -> Plan:
     """Return the plan of THESIS chapter 4: nearest beams, linear interpolation in range."""
     rows, columns = view.grid.shape
     division = math.prod(divisions for _, divisions in stages)
@@ -302,17 +298,33 @@ def _nearest(
         sides.append(leaf)
         leaf = leaf[0] * divisions, leaf[1] * divisions
     linear = interpolation.design(2, NEAREST_UPSAMPLING, view.spectrum)
-    filters = Filters(linear, Interpolator(1, 1.0, np.zeros((0, 2, 0)), 0.0, 0.0), linear)
-    candidate = Candidate(tuple(sides[::-1]), filters, nearest=tuple(beams for beams, _ in stages))
+    candidate = Candidate(
+        sides=tuple(sides[::-1]),
+        tile=_tile(view, sides[0], conditions.device),
+        align=linear,
+        final=linear,
+        aperture=NearestBeams(factors=tuple(beams for beams, _ in stages)),
+    )
     error, by_stage = nearest_errors(view, stages)
-    errors = ErrorBudget(nearest_beams=error)
-    found = forecast.factorized(view, candidate, errors, None, exact, device, costs, memory_bytes)
+    found = predicted_plan(view, candidate, ErrorBudget(nearest_beams=error), conditions)
     *divided, last = found.stages
     divided = [
         replace(stage, error_db=in_db(power(stage.error_db) + of_beams))
         for stage, of_beams in zip(divided, by_stage, strict=True)
     ]
-    return replace(found, stages=(*divided, last))
+    return replace(found, prediction=replace(found.prediction, stages=(*divided, last)))
+
+
+def _tile(view: View, leaf: tuple[int, int], device: Device) -> tuple[int, int]:
+    """Return the largest tiles of a leaf that may be expanded about their centres."""
+    parts = [
+        (rows, columns)
+        for rows in range(16, min(leaf[0], 64) + 1, 16)
+        for columns in range(4, min(leaf[1], 64) + 1, 4)
+        if leaf[0] % rows == 0 and leaf[1] % columns == 0
+    ]
+    fit = [part for part in parts if leaf_error(view, np.array([part]), device)[0] < 1e-8]
+    return max(fit or parts[:1], key=math.prod)
 
 
 def checked_pairs(stages: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
