@@ -18,21 +18,21 @@ from clsas.core.image import Image, holds_any
 from clsas.core.lines import RangeLines
 from clsas.exact.backprojection import form_exactly
 from clsas.exact.checks import check_numbers
-from clsas.factorized.buffers import CHUNK
-from clsas.factorized.leaves import Finish, Level, PlaneLeaves, SurfaceLeaves
+from clsas.factorized.buffers import CHUNK, Level, row_pitch, stage_lines, stage_tables
+from clsas.factorized.leaves import Finish
 from clsas.factorized.plan import ExactImage, Plan
+from clsas.factorized.plane_leaves import PlaneLeaves
 from clsas.factorized.sector import Geometry, Sector
 from clsas.factorized.surface import surface_of
+from clsas.factorized.surface_leaves import SurfaceLeaves
 from clsas.opencl import phases
 from clsas.opencl.buffers import (
     GUARD,
     MARGIN,
-    VECTOR_ROOM,
-    channel_pitch,
     filter_table,
+    lines_buffer,
     padded_length,
     phase_polynomials,
-    sample_bytes,
     upsampled_lines,
 )
 from clsas.opencl.device import Device, Slot, aligned
@@ -134,10 +134,7 @@ class _Run:
                 "twice the memory: what can be seen of the grid is too faint beside the "
                 f"largest sample, {largest:.3g}, or that is too far from 1"
             )
-        self.levels = [
-            Level(half, -(-(2 * half + 1) // self.width) * self.width)
-            for half in image.half_lengths
-        ]
+        self.levels = [Level.of(half, self.width) for half in image.half_lengths]
         self.filters = {
             "range_filter": filter_table(device, image.align.coefficients),
             "aperture_filter": filter_table(device, image.aperture.filter.coefficients),
@@ -165,11 +162,11 @@ class _Run:
         """Return all lines on the device, upsampled."""
         device, image, count = self.device, self.factorization, self.lines.channels
         resampling = image.resampling
-        line_bytes = sample_bytes(self.half_precision) * self.pitch
-        if count * line_bytes > device.info.max_buffer_bytes:
+        needed = lines_buffer(count, self.pitch, self.half_precision).nbytes
+        if needed > device.info.max_buffer_bytes:
             raise ValueError(
                 f"{count} lines of {self.lines.length} samples need "
-                f"{count * line_bytes / 2**20:.0f} MiB when upsampled, more than a buffer of "
+                f"{needed / 2**20:.0f} MiB when upsampled, more than a buffer of "
                 f"{device.info.label}, {device.info.max_buffer_bytes / 2**20:.0f} MiB: image "
                 f"a part of them, or backproject exactly"
             )
@@ -229,27 +226,36 @@ class _Run:
         slot, levels = next(self.table_slots), range(len(self.levels))
         slot.wait()
         strides = [sector.stride(level) for level in levels]
-        for name, values in self.geometry.references(sector).items():
-            slot.fill(name, _padded(values))
-        for level, (nodes, need) in enumerate(zip(sector.nodes, sector.needs, strict=True)):
-            children = np.zeros((*need.first.shape, 5), np.int32)
-            children[..., 0], children[..., 1] = need.begin, need.end
-            if level:
-                parents = self.division.parents(level)
-                children[..., 2] = sector.needs[level - 1].first[:, parents]
-                position_m = sector.positions_m(level - 1).swapaxes(1, 2)
-                slot.fill(f"positions{level}", _padded(position_m.astype(np.float32)))
-                parent_m = sector.relative_m[level - 1][:, parents]
-                offsets_m = [parent_m, sector.relative_m[level] - parent_m]
-                offsets_m = np.concatenate(offsets_m, axis=-1).astype(np.float32)
-                slot.fill(f"offsets{level}", offsets_m)
-            children[..., 3], children[..., 4] = need.first, need.last - need.first
-            slot.fill(f"children{level}", children)
-            slot.fill(f"base{level}", _padded(nodes.base.astype(np.int32)))
-            slot.fill(f"between{level}", _padded(nodes.between.astype(np.float32)))
+        for level in levels:
+            roots, channels = sector.nodes[level].base.shape
+            subimages = self.division.per_root(level)
+            values = self._stage_values(sector, level)
+            ramps = self.geometry.ramps
+            for name, buffer in stage_tables(
+                level, roots, subimages, channels, ramps=ramps
+            ).items():
+                slot.fill(name, buffer.holding(values[name]))
         self.leaves.fill(slot, sector)
-        pitches = [_pitch(nodes.base.shape[1]) for nodes in sector.nodes]
+        pitches = [row_pitch(nodes.base.shape[1]) for nodes in sector.nodes]
         return _Tables(slot, pitches, strides)
+
+    def _stage_values(self, sector: Sector, level: int) -> dict[str, NDArray]:
+        """Return what the tables of a stage hold, see `cl/stage.cl`."""
+        nodes, need = sector.nodes[level], sector.needs[level]
+        values = {f"base{level}": nodes.base, f"between{level}": nodes.between}
+        first_of_parent = np.zeros_like(need.first)
+        if level:
+            parents = self.division.parents(level)
+            first_of_parent = sector.needs[level - 1].first[:, parents]
+            parent_m = sector.relative_m[level - 1][:, parents]
+            offsets_m = [parent_m, sector.relative_m[level] - parent_m]
+            values[f"offsets{level}"] = np.concatenate(offsets_m, axis=-1)
+            values[f"positions{level}"] = sector.positions_m(level - 1).swapaxes(1, 2)
+        else:
+            values |= self.geometry.references(sector)
+        children = [need.begin, need.end, first_of_parent, need.first, need.last - need.first]
+        values[f"children{level}"] = np.stack(children, axis=-1)
+        return values
 
     def _stage(self, tables: _Tables, level: int, batch: slice) -> None:
         """Form the lines of a stage from those of the one before, or from the raw ones."""
@@ -281,6 +287,10 @@ class _Run:
                 "cycles_per_m": self.geometry.cycles_per_m,
                 "parent_centre": before.centre,
             }
+        ((name, buffer),) = stage_lines(
+            level, children, lines_each, shape.pitch, half_precision=self.half_precision
+        ).items()
+        child_lines = self.slot.zeros(name, buffer.nbytes)
         items = _GROUP if self.width == 1 else 1
         # Few children are divided, so that there is work for all.
         step = _GROUP if self.width == 1 else 8 * self.width
@@ -300,10 +310,7 @@ class _Run:
             **shifts,
             half_length=shape.half,
             **self.filters,
-            child_lines=self.slot.zeros(
-                f"lines{level}",
-                sample_bytes(self.half_precision) * children * lines_each * shape.pitch,
-            ),
+            child_lines=child_lines,
             lines_per_child=stride,
             child_pitch=shape.pitch,
             length=shape.length,
@@ -330,16 +337,3 @@ def _gain(largest: float, channels: int) -> float:
 def _holds(rms: float) -> bool:
     """Return whether half precision holds lines of an rms value, or there is nothing to hold."""
     return rms == 0 or _LEAST_HALF <= rms <= _LARGEST_HALF
-
-
-def _pitch(channels: int) -> int:
-    """Channels of a row in a table, with room for a vector that begins at the last."""
-    return channel_pitch(channels) + VECTOR_ROOM
-
-
-def _padded(values: NDArray) -> NDArray:
-    """Return [..., channels] as the stages' kernel wants it: rows of whole vectors."""
-    count = values.shape[-1]
-    padded = np.zeros((*values.shape[:-1], _pitch(count)), values.dtype)
-    padded[..., :count] = values
-    return padded

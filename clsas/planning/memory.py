@@ -1,103 +1,153 @@
-"""The device memory of a candidate, and how many roots are formed together within it."""
+"""Device memory of a candidate, and how many roots are formed together within it.
+
+Predicted sizes go into the same lists of buffers from which a run allocates.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
 from clsas.exact.tiles import STACK
-from clsas.factorized.buffers import LEAST_BATCH
-from clsas.factorized.estimates import StageChannels
-from clsas.opencl.buffers import (
-    GIVEN_BYTES,
-    GUARD,
-    VECTOR_ROOM,
-    expansion_terms,
-    padded_length,
-    sample_bytes,
+from clsas.factorized.buffers import (
+    LEAST_BATCH,
+    leaf_tables,
+    pixel_buffers,
+    stage_lines,
+    stage_tables,
+    tile_buffers,
 )
+from clsas.opencl.buffers import Buffer, Buffers, lines_buffer
 from clsas.opencl.device import Device
+from clsas.opencl.upsampling import upsampling_buffers
 from clsas.planning.view import View
-from clsas.signal.interpolation import Resampling
+from clsas.sonar.beam import INTERVALS
 
 _CACHED_BYTES, _BATCH_BYTES = 16 << 20, 256 << 20  # of a batch, on CPUs and elsewhere
 _MOST_TABLE_BYTES = 64 << 20
 _ROOTS_PREPARED = 16  # together, so that arrays are few and large
 
 
+@dataclass(frozen=True, eq=False)
+class BufferSizes:
+    """Predicted sizes of a candidate's buffers.
+
+    Attributes
+    ----------
+    view : View
+    width : int
+        Lanes of the device.
+    sides, tile
+        As those of `Factorization`.
+    pitches : tuple of int
+        Samples of a line with zeros around it, stage by stage.
+    root_channels : tuple of int
+        Virtual channels of a root along the whole aperture, at most, stage by stage.
+    most_channels : tuple of int
+        Virtual channels of a subimage, at most, stage by stage.
+    line_pitch : int
+        Samples of an upsampled line with zeros around it.
+    filtered : bool
+        True if a device upsamples the lines.
+    half_precision : bool
+    """
+
+    view: View
+    width: int
+    sides: tuple[tuple[int, int], ...]
+    tile: tuple[int, int]
+    pitches: tuple[int, ...]
+    root_channels: tuple[int, ...]
+    most_channels: tuple[int, ...]
+    line_pitch: int
+    filtered: bool
+    half_precision: bool
+
+    def constant(self) -> Buffers:
+        """Return the buffers that do not depend on the number of roots."""
+        lines = self.view.lines
+        buffers = {"lines": lines_buffer(lines.channels, self.line_pitch, self.half_precision)}
+        if self.filtered:
+            buffers = upsampling_buffers(
+                lines.channels, lines.length, self.line_pitch, self.half_precision
+            )
+        if self.view.beam is not None:
+            buffers["beam_table"] = Buffer((INTERVALS, 4), np.float32)
+        return buffers
+
+    def tables(self, roots: int) -> Buffers:
+        """Return the tables of some roots."""
+        channels, tables = self.view.lines.channels, Buffers()
+        for level, side in enumerate(self.sides):
+            subimages = self._divided(side)
+            tables |= stage_tables(level, roots, subimages, channels, ramps=True)
+            channels = self.root_channels[level]
+        parts, pixels = self._parts()
+        points = None if self.view.surface.is_plane else roots * pixels
+        return tables | leaf_tables(roots * channels, roots * parts, points, self.view.beam)
+
+    def work(self, roots: int) -> Buffers:
+        """Return the buffers in which some roots are formed together."""
+        buffers, beam = Buffers(), self.view.beam
+        for level, side in enumerate(self.sides):
+            subimages, pitch = roots * self._divided(side), self.pitches[level]
+            most, half = self.most_channels[level], self.half_precision
+            buffers |= stage_lines(level, subimages, most, pitch, half_precision=half)
+        parts, pixels = self._parts()
+        if self.view.surface.is_plane:
+            aligned = self.tile == self.sides[-1]
+            buffers |= tile_buffers(roots * parts, most, beam, aligned=aligned)
+            buffers["tile_centres"] = Buffer((roots * parts, 6), np.float32)
+        return buffers | pixel_buffers(roots * pixels, beam)
+
+    def _divided(self, side: tuple[int, int]) -> int:
+        """Return the subimages of a size in a root."""
+        return math.prod(a // b for a, b in zip(self.sides[0], side, strict=True))
+
+    def _parts(self) -> tuple[int, int]:
+        """Return the tiles or groups of a root, and its pixels, at most."""
+        if self.view.surface.is_plane:
+            return self._divided(self.tile), math.prod(self.sides[0])
+        pixels = self.view.most_slots(self.sides[-1], self.sides[0], self.width)
+        return pixels // (STACK * self.width), pixels
+
+
 @dataclass(frozen=True)
 class Batches:
-    """Roots that are formed together, and whose geometry is prepared together."""
+    """Roots that are formed together, and whose geometry is prepared together.
+
+    Attributes
+    ----------
+    at_once, prepared : int
+    memory_bytes : int
+        Device memory that the image takes.
+    """
 
     at_once: int
     prepared: int
     memory_bytes: int
 
 
-def batches_within(
-    view: View,
-    sides: tuple[tuple[int, int], ...],
-    tile: tuple[int, int],
-    samples: Sequence[int],
-    channels: Sequence[StageChannels],
-    most_channels: Sequence[float],
-    resampling: Resampling,
-    *,
-    upsampled: bool,
-    half_precision: bool,
-    device: Device,
-    memory_bytes: int,
-) -> Batches:
-    lines = view.lines
-    line_bytes = sample_bytes(half_precision) * lines.channels * padded_length(resampling)
-    if upsampled:
-        line_bytes += min(lines.samples.nbytes, GIVEN_BYTES)
-    root_bytes, table_bytes = _root_bytes(
-        view,
-        sides,
-        tile,
-        samples,
-        channels,
-        most_channels,
-        device.info.width,
-        sample_bytes(half_precision),
-    )
-    roots = view.subimages(sides[0])
-    room = memory_bytes - line_bytes
+def batches_within(sizes: BufferSizes, roots: int, device: Device, memory_bytes: int) -> Batches:
+    """Return batches that fill the cache or the memory, whichever is less; at least one root."""
+    constant = total_bytes(sizes.constant())
+    of_root, of_tables = total_bytes(sizes.work(1)), total_bytes(sizes.tables(1))
+    room = memory_bytes - constant
     batch_bytes = _CACHED_BYTES if device.info.kind == "cpu" else _BATCH_BYTES
-    # Tables come in two sets.
-    at_once = max(batch_bytes // root_bytes, LEAST_BATCH)
-    at_once = int(min(room // (root_bytes + 2 * table_bytes), at_once))
+    at_once = max(batch_bytes // of_root, LEAST_BATCH)
+    # One set of tables is filled while the other is in use.
+    at_once = min(room // (of_root + 2 * of_tables), at_once)
     at_once = min(max(at_once, 1), roots)
-    room = min(room - at_once * root_bytes, _MOST_TABLE_BYTES)
-    of_batch = 2 * at_once * table_bytes
-    prepared = at_once * min(max(int(room // of_batch), 1), -(-_ROOTS_PREPARED // at_once))
-    needed = int(line_bytes + at_once * root_bytes + 2 * prepared * table_bytes)
+    room = min(room - at_once * of_root, _MOST_TABLE_BYTES)
+    most = max(room // (2 * at_once * of_tables), 1)
+    prepared = at_once * min(most, -(-_ROOTS_PREPARED // at_once))
+    tables = 2 * total_bytes(sizes.tables(prepared))
+    needed = constant + total_bytes(sizes.work(at_once)) + tables
     return Batches(at_once, prepared, needed)
 
 
-def _root_bytes(view, sides, tile, samples, stage_channels, most_channels, width, of_sample):
-    channels, work, tables = view.lines.channels, 0.0, 0.0
-    for level, most in enumerate(most_channels):
-        side = sides[level]
-        subimages = _subimages(sides[0], side)
-        work += of_sample * subimages * most * (samples[level] + 2 * GUARD)
-        tables += subimages * (44 if level else 20) + (channels + 32) * (8 + (12 if level else 20))
-        channels = stage_channels[level].everywhere
-    normalise = view.beam is not None and view.beam.normalise
-    tables += 40 * channels
-    if view.surface.is_plane:
-        terms = expansion_terms(view.beam)
-        parts, slots = _subimages(sides[0], tile), math.prod(sides[0])
-        references = 0 if tile == sides[-1] else 12
-        work += parts * ((most + VECTOR_ROOM) * (references + 4 * terms) + 24)
-    else:
-        slots = view.most_slots(sides[-1], sides[0], width)
-        parts = slots / (STACK * width)
-        tables += 24 * parts + 12 * slots
-    return work + 8 * (1 + normalise) * slots, tables + 12 * parts
-
-
-def _subimages(root: tuple[int, int], side: tuple[int, int]) -> int:
-    return math.prod(a // b for a, b in zip(root, side, strict=True))
+def total_bytes(buffers: Buffers) -> int:
+    """Return the size of all buffers."""
+    return sum(buffer.nbytes for buffer in buffers.values())

@@ -10,7 +10,7 @@ import numpy as np
 
 from clsas.core.decibels import in_db, power
 from clsas.core.digests import grid_digest, lines_digest
-from clsas.factorized.buffers import CHUNK
+from clsas.factorized.buffers import CHUNK, Level
 from clsas.factorized.estimates import (
     ErrorBudget,
     StageChannels,
@@ -24,10 +24,11 @@ from clsas.factorized.interpolated import InterpolatedAperture
 from clsas.factorized.plan import ExactImage, Factorization, Plan, Prediction, Stage
 from clsas.factorized.thesis import NearestBeams
 from clsas.opencl import phases
+from clsas.opencl.buffers import padded_length
 from clsas.opencl.device import Device
 from clsas.planning.costs import Costs
 from clsas.planning.exact_image import Exact
-from clsas.planning.memory import batches_within
+from clsas.planning.memory import BufferSizes, batches_within
 from clsas.planning.view import View
 from clsas.signal import interpolation
 from clsas.signal.interpolation import PHASES, Interpolator, Resampling, Upsampler
@@ -124,23 +125,23 @@ def predicted_plan(
     lines = _upsampled(view, candidate, other_errors)
     half_lengths = view.half_lengths(sides, candidate.align, candidate.final, lines.resampling)
     channels = candidate.aperture.predicted_channels(view, sides)
-    stages, work = _stages(view, candidate, lines, half_lengths, channels, device, costs)
+    levels = [Level.of(half, device.info.width) for half in half_lengths]
+    stages, work = _stages(view, candidate, lines, levels, channels, device, costs)
     errors, half_precision = _with_arithmetic(view, lines, channels, conditions)
-    most_channels = [_ROOM * each.most for each in channels]
-    batches = batches_within(
-        view,
-        sides,
-        candidate.tile,
-        [stage.samples for stage in stages],
-        channels,
-        most_channels,
-        lines.resampling,
-        upsampled=lines.upsampler is not None,
+    sizes = BufferSizes(
+        view=view,
+        width=device.info.width,
+        sides=sides,
+        tile=candidate.tile,
+        pitches=tuple(level.pitch for level in levels),
+        root_channels=tuple(math.ceil(each.everywhere) for each in channels),
+        most_channels=tuple(math.ceil(_ROOM * each.most) for each in channels),
+        line_pitch=padded_length(lines.resampling),
+        filtered=lines.upsampler is not None,
         half_precision=half_precision,
-        device=device,
-        memory_bytes=conditions.memory_bytes,
     )
     roots = stages[0].subimages
+    batches = batches_within(sizes, roots, device, conditions.memory_bytes)
     work += Work(batch=float(-(-roots // batches.at_once) * len(sides)))
     errors = errors.times(candidate.margin)
     image = Factorization(
@@ -153,7 +154,7 @@ def predicted_plan(
         upsampler=lines.upsampler,
         half_precision=half_precision,
         half_lengths=half_lengths,
-        most_channels=tuple(math.ceil(most) for most in most_channels),
+        most_channels=sizes.most_channels,
         highest_cycles_per_m=view.highest_cycles_per_m,
         closest_m=view.nearest_m,
         limits=view.limits,
@@ -260,7 +261,7 @@ def _stages(
     view: View,
     candidate: Candidate,
     lines: _Lines,
-    half_lengths: Sequence[int],
+    levels: Sequence[Level],
     channels: Sequence[StageChannels],
     device: Device,
     costs: Costs,
@@ -280,7 +281,7 @@ def _stages(
 
     for level, (side, of_stage) in enumerate(zip(candidate.sides, channels, strict=True)):
         count = view.subimages(side)
-        samples = -(-(2 * half_lengths[level] + 1) // width) * width
+        samples = levels[level].length
         combined = count * of_stage.used
         work = combining(combined, samples, taps, given=level == 0) + Work(subimage=count)
         if level == 0:

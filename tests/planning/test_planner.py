@@ -466,8 +466,7 @@ def test_predictions_are_sums_over_work_and_causes(case, tolerance_db):
     chosen = plan(lines, grid, tolerance_db=tolerance_db, beam=beam, costs=costs)
     assert chosen.is_exact == (case == "exact")
     seconds = sum(
-        1e-9 * getattr(costs, f"{name}_ns") * amount
-        for name, amount in vars(chosen.work).items()
+        1e-9 * getattr(costs, f"{name}_ns") * amount for name, amount in vars(chosen.work).items()
     )
     assert chosen.predicted_seconds == pytest.approx(seconds)
     causes = vars(chosen.errors)

@@ -82,7 +82,7 @@ def test_a_study_sweeps_what_the_planner_chooses_from(lines):
     assert "-40 dB, 8+6 taps, 2 stages" in labels
     assert "-40 dB, 4+4 taps, 1 stage" in labels
     assert all(row.error_db <= -39 for row in studied)
-    assert any("8 taps in range" in row.plan and "6 along" in row.plan for row in studied)
+    assert any("8 taps in range" in row.plan and "6 taps along" in row.plan for row in studied)
 
 
 @pytest.mark.slow
