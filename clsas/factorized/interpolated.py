@@ -92,6 +92,9 @@ class InterpolatedAperture:
     aligns_phases: ClassVar[bool] = True
     """The first stage turns the phase of channels off the mean track along their lines."""
 
+    splits_leaves: ClassVar[bool] = False
+    """Leaves are small enough for the expansion of ranges about their centres."""
+
     __repr__ = reprs.of_fields
 
     @property

@@ -8,7 +8,8 @@ from clsas.core import reprs
 from clsas.core.tables import Report, Table
 
 if TYPE_CHECKING:
-    from clsas.factorized.plan import Factorization, Plan, Stage
+    from clsas.factorized.factorization import Factorization
+    from clsas.factorized.plan import Plan, Stage
 
 _HEADINGS = (
     "stage", "subimages", "rows x columns", "channels", "samples", "operations", "error", "time",

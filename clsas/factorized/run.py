@@ -19,8 +19,9 @@ from clsas.core.lines import RangeLines
 from clsas.exact.backprojection import form_exactly
 from clsas.exact.checks import check_numbers
 from clsas.factorized.buffers import CHUNK, Level, row_pitch, stage_lines, stage_tables
+from clsas.factorized.factorization import ExactImage
 from clsas.factorized.leaves import Finish
-from clsas.factorized.plan import ExactImage, Plan
+from clsas.factorized.plan import Plan
 from clsas.factorized.plane_leaves import PlaneLeaves
 from clsas.factorized.sector import Geometry, Sector
 from clsas.factorized.surface import surface_of

@@ -52,6 +52,8 @@ class NearestBeams:
     band: ClassVar[None] = None
     """Linear interpolation takes any band."""
     aligns_phases: ClassVar[bool] = False
+    splits_leaves: ClassVar[bool] = True
+    """Leaves as large as the stages ask for are backprojected in tiles."""
 
     @property
     def stages(self) -> int:

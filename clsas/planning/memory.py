@@ -143,7 +143,7 @@ def batches_within(sizes: BufferSizes, roots: int, device: Device, memory_bytes:
     room = min(room - at_once * of_root, _MOST_TABLE_BYTES)
     most = max(room // (2 * at_once * of_tables), 1)
     prepared = at_once * min(most, -(-_ROOTS_PREPARED // at_once))
-    tables = 2 * total_bytes(sizes.tables(prepared))
+    tables = 2 * total_bytes(sizes.tables(min(prepared, roots)))
     needed = constant + total_bytes(sizes.work(at_once)) + tables
     return Batches(at_once, prepared, needed)
 

@@ -19,9 +19,10 @@ from clsas.factorized.estimates import (
     combining,
     upsampling,
 )
+from clsas.factorized.factorization import ExactImage, Factorization
 from clsas.factorized.filters import UPSAMPLING_SHARE
 from clsas.factorized.interpolated import InterpolatedAperture
-from clsas.factorized.plan import ExactImage, Factorization, Plan, Prediction, Stage
+from clsas.factorized.plan import Plan, Prediction, Stage
 from clsas.factorized.thesis import NearestBeams
 from clsas.opencl import phases
 from clsas.opencl.buffers import padded_length
