@@ -6,10 +6,10 @@ interpolated from those of fewer, virtual channels; their lines are weighted sum
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, Protocol
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
@@ -33,7 +33,7 @@ _Cycles = Annotated[float, Field(ge=-0.5, le=0.5)]
 
 
 class VisiblePhases(Protocol):
-    """What a prediction of virtual channels takes from `clsas.planning.view.View`."""
+    """Visibility and phase cycles of subimages, as `clsas.planning.view.View` predicts them."""
 
     @property
     def lines(self) -> RangeLines:
@@ -61,7 +61,7 @@ class VisiblePhases(Protocol):
     ) -> float:
         """Return the integral of rates over what is seen, its mean or maximum."""
 
-    def channels(self, taps: int, density: float, turns: ArrayLike) -> ArrayLike:
+    def channels(self, taps: int, density: float, turns: float) -> Any:
         """Return the number of virtual channels for phases that turn by some cycles."""
 
 
@@ -156,11 +156,12 @@ class InterpolatedAperture:
             Their positions.
         """
         sides, surface, track = geometry.factorization.sides, geometry.surface, geometry.track
-        rates, nodes = geometry.phase_rates(roots, root_m), []
+        rates, nodes = geometry.phase_rates(roots, root_m), list[Nodes]()
         for oversampling, side in zip(self.oversampling, sides, strict=True):
             extents = oversampling * surface.extents_in(side, sides[0], roots)
             rate = np.einsum("ra,ars->rs", extents, rates)
-            if geometry.beam is not None and len(nodes) == len(sides) - 1:
+            last = len(nodes) == len(sides) - 1
+            if last and geometry.beam is not None and geometry.along is not None:
                 beam_rate = tree.beam_rate(geometry.beam, track, geometry.along, root_m)
                 rate += self.beam_cycles * beam_rate
             nodes.append(tree.interpolated_nodes(track, rate, place, self.filter))
@@ -171,7 +172,8 @@ class InterpolatedAperture:
         self, view: VisiblePhases, sides: tuple[tuple[int, int], ...]
     ) -> list[StageChannels]:
         """Predict the virtual channels of subimages, stage by stage."""
-        taps, density, found = self.filter.taps, 2 * self.filter.upsampling, []
+        taps, density = self.filter.taps, 2 * self.filter.upsampling
+        found: list[StageChannels] = []
         everywhere_seen = np.ones_like(view.seen(sides[0]))
         used = view.lines.channels * view.share_seen(sides[0])
         for level, (oversampling, side) in enumerate(zip(self.oversampling, sides, strict=True)):

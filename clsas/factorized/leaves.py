@@ -1,9 +1,10 @@
-"""The last stage of a factorized image: pixels from the virtual channels of the leaves."""
+"""The last stage of a factorized image: leaves are backprojected from their virtual channels."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from itertools import permutations
+from typing import Any
 
 import numpy as np
 import pyopencl as cl
@@ -27,16 +28,16 @@ from clsas.opencl.device import Device, Slot
 from clsas.sonar.beam import INTERVALS
 from clsas.sonar.visibility import sines
 
-_SHARE = 0.02  # of an image's error: what neighbours' weights may be off
+_SHARE = 0.02  # of an image's error power, for one cubic of weights per block of pixels
 
 Finish = Callable[[], int]
-"""To be called to wait for pixels, and to put them in place; returns how many they are."""
+"""Waits for pixels, puts them in place, and returns their number."""
 
 
 class Leaves:
-    """What forms pixels from leaves: of tiles on a plane, of groups of points elsewhere.
+    """Backprojection of leaves: in tiles on a plane, in groups of points elsewhere.
 
-    Lines are of half precision or single, and `gain` times what they stand for.
+    Lines have half or single precision, and were multiplied by `gain`.
     """
 
     def __init__(
@@ -55,34 +56,34 @@ class Leaves:
         beam = geometry.beam
         self.normalise = beam is not None and beam.normalise
         self.beam = beam_table(device, beam, lines)
-        self.arguments = {
+        self.arguments: dict[str, Any] = {
             "cycles_per_sample": geometry.cycles_per_m / geometry.samples_per_m,
             "filter": filter_table(device, geometry.factorization.final.coefficients / gain),
             "phase_polynomials": phase_polynomials(device, geometry.plan.phase_terms),
             "line_pitch": level.pitch,
             **self.beam.arguments,
         }
-        # Where tile and leaf are one, every line is aligned on its centre.
+        # Lines are aligned on the centres of leaves. Smaller tiles need references of their own.
         self.aligned = geometry.factorization.tile == geometry.factorization.sides[-1]
         self.slot, self.image, self.half_precision = Slot(device), image, half_precision
         self._prepare()
 
     def _prepare(self) -> None:
-        """Build the kernels, and lay out what they work on."""
+        """Build the kernels, and lay out tiles or groups."""
         raise NotImplementedError
 
     def _options(self, layout: Tiles | Groups) -> dict[str, int]:
         """Return the kernels' build options."""
         chosen, taps, one_cubic = self.plan, self.factorization.final.taps, False
-        if chosen.beam is not None:
+        if chosen.beam is not None and self.geometry.along is not None:
             radius_m = self.surface.radius_m(self.geometry.division.sides[0])
             nearest_m = max(self.geometry.nearest_m - radius_m, 1e-6)
             wave_m, track = wavelength_m(self.lines), self.geometry.track
-            places = np.abs(track.samples - 0.5) <= 0.5
+            on_track = np.abs(track.samples - 0.5) <= 0.5
             centres_m = self.geometry.division.centres_m(0, self.geometry.division.roots)
-            sine = sines(centres_m, track.sampled_m[0][places], self.geometry.along[places])
+            sine = sines(centres_m, track.sampled_m[0][on_track], self.geometry.along[on_track])
             error = layout.one_cubic_error(chosen.beam, nearest_m, wave_m)
-            error /= chosen.beam.fullness(sine, wave_m, places.sum() / self.lines.channels)
+            error /= chosen.beam.fullness(sine, wave_m, on_track.sum() / self.lines.channels)
             allowed_db = min(chosen.predicted_error_db, chosen.tolerance_db or 0.0)
             one_cubic = error**2 < _SHARE * power(allowed_db)
         return {
@@ -98,10 +99,10 @@ class Leaves:
         } | lookup_options(self.device, layout, self.lines, self.geometry.samples_per_m, taps)
 
     def fill(self, slot: Slot, sector: Sector) -> None:
-        """Start copying to the device what it is told of a sector's leaves."""
+        """Start copying the tables of a sector's leaves to the device."""
         position_m = sector.positions_m(-1)
         rows = [float_pairs(position_m.reshape(-1, 3))]
-        if self.plan.beam is not None:
+        if self.geometry.along is not None:
             along = tree.interpolated_directions(
                 self.geometry.track.samples, self.geometry.along, sector.nodes[-1].place
             )
@@ -128,10 +129,10 @@ class Leaves:
         raise NotImplementedError
 
     def complete(self) -> None:
-        """Make sure that the image holds all pixels, once they are finished."""
+        """Hand all pixels to the host, once they are finished."""
 
     def blank(self, sector: Sector, batch: slice) -> Finish:
-        """Return what sets the pixels of some roots that no channel sees to 0."""
+        """Return a function that sets the pixels of roots that no channel sees to 0."""
         raise NotImplementedError
 
     def _parts(self, sector: Sector) -> dict[str, NDArray]:
@@ -144,7 +145,7 @@ class Leaves:
         root: NDArray[np.int64],
         leaf: NDArray[np.int64],
     ) -> NDArray[np.int32]:
-        """Return the nodes of parts of some leaves, and the first one's line, [..., 3]."""
+        """Return virtual channels of tiles or groups, and the first line, [..., 3]."""
         need = sector.needs[-1]
         node = root * sector.nodes[-1].place.shape[1]
         in_batch = root % self.factorization.roots_at_once * need.first.shape[1] + leaf
@@ -159,7 +160,7 @@ class Leaves:
         """Return buffers of at least these sizes, by name."""
         return {name: self.slot.buffer(name, each.nbytes) for name, each in buffers.items()}
 
-    def _pixels(self, tables: Slot, count: int) -> dict[str, cl.Buffer]:
+    def _pixels(self, tables: Slot, count: int) -> dict[str, Any]:
         """Return the arguments of kernels that form some pixels."""
         found = self._allocated(pixel_buffers(count, self.plan.beam))
         if self.normalise and self.aligned:
@@ -168,10 +169,10 @@ class Leaves:
 
 
 def _represented(sector: Sector) -> NDArray[np.float32]:
-    """Return how many raw channels each of the last stage's virtual ones stands for, [roots, n].
+    """Return how many raw channels each virtual channel of the leaves stands for, [roots, n].
 
-    Their weights by the beam, a smooth function along the track, are interpolated by cubics: the
-    stages' filters, which err as little on average, all err alike on something so smooth.
+    Cubics interpolate the beam's weights, which are smooth along the track. The stages' filters err
+    as little on average, but with the same sign on a function so smooth.
     """
     nodes = sector.nodes[-1].place
     shares = np.empty(nodes.shape)

@@ -20,8 +20,13 @@ def with_left_out(
 
     `simpler` is the plan of the model; it is kept for the image.
     """
-    digests = {"lines_digest": lines_digest(lines), "grid_digest": grid_digest(grid)}
-    plan = replace(simpler, left_out=model.left_out, beam=beam, **digests)
+    plan = replace(
+        simpler,
+        left_out=model.left_out,
+        beam=beam,
+        lines_digest=lines_digest(lines),
+        grid_digest=grid_digest(grid),
+    )
     plan.kept["model"] = model.lines.without_samples(), model.grid, simpler
     return plan
 
@@ -33,11 +38,13 @@ def without_left_out(plan: Plan, lines: RangeLines, grid: Grid) -> tuple[RangeLi
     """
     if "model" not in plan.kept:
         model = leave_out(lines, grid, plan.beam, plan.left_out)
-        digests = {
-            "lines_digest": lines_digest(model.lines),
-            "grid_digest": grid_digest(model.grid),
-        }
-        simpler = replace(plan, left_out=(), beam=model.beam, **digests)
+        simpler = replace(
+            plan,
+            left_out=(),
+            beam=model.beam,
+            lines_digest=lines_digest(model.lines),
+            grid_digest=grid_digest(model.grid),
+        )
         plan.kept["model"] = model.lines.without_samples(), model.grid, simpler
     geometry, simple_grid, simpler = plan.kept["model"]
     simple_lines = replace(geometry, samples=lines.samples)

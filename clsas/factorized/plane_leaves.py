@@ -88,8 +88,8 @@ class PlaneLeaves(Leaves):
             "expansions": buffers["expansions"],
             "channel_pitch": pitch,
         }
-        plane, samples_per_m = self.surface.plane, self.geometry.samples_per_m
-        steps_m = (plane.column_step_m, plane.row_step_m)
+        row_m, column_m = self.surface.steps_m[:2]
+        samples_per_m = self.geometry.samples_per_m
         self.device.run(
             self.expand,
             (pitch // self.width, tiles),
@@ -97,10 +97,10 @@ class PlaneLeaves(Leaves):
             geometry=tables["geometry"],
             geometry_pitch=sector.nodes[-1].place.size + VECTOR_ROOM,
             centres=self.centres,
-            column_step=steps_m[0],
-            row_step=steps_m[1],
+            column_step=column_m,
+            row_step=row_m,
             samples_per_m=samples_per_m,
-            drift=[self.geometry.drift @ step * samples_per_m for step in steps_m],
+            drift=[self.geometry.drift @ step * samples_per_m for step in (column_m, row_m)],
             **self.beam.origin,
             wait_for=tables.filled,
         )
@@ -115,12 +115,12 @@ class PlaneLeaves(Leaves):
         shape = self.surface.plane.shape
         if self.shared is not None and bool(np.all(roots + (height, width) <= shape)):
             corners, columns = roots, shape[1]
-            pixels = {"pixels": self.shared}
+            pixels: dict[str, Any] = {"pixels": self.shared}
         else:
-            corners, columns = np.arange(len(roots))[:, None] * [height, 0], width
+            corners, columns = np.arange(len(roots))[:, None] * np.array([height, 0]), width
             pixels = self._pixels(tables, len(roots) * height * width)
-        corners = self.device.upload(corners.astype(np.int32))
-        return {"corners": corners, "columns": columns, **pixels}
+        uploaded = self.device.upload(corners.astype(np.int32))
+        return {"corners": uploaded, "columns": columns, **pixels}
 
     def _finish(
         self, event: cl.Event, parts: list[tuple[slice, slice]], pixels: dict[str, Any]
@@ -149,7 +149,7 @@ class PlaneLeaves(Leaves):
         return finish
 
     def blank(self, sector: Sector, batch: slice) -> Finish:
-        """Return what sets pixels to 0; see `Leaves.blank`."""
+        """Return a function that sets pixels to 0; see `Leaves.blank`."""
         parts = [self._part(root) for root in sector.roots[batch]]
 
         def finish() -> int:
@@ -163,13 +163,13 @@ class PlaneLeaves(Leaves):
         """Hand the image back to the host; see `Leaves.complete`."""
         if self.shared is not None:
             flags, shape = cl.map_flags.READ, self.image.shape
-            mapped, _ = cl.enqueue_map_buffer(
-                self.device.queue, self.shared, flags, 0, shape, np.complex64
-            )
+            mapped: Any = cl.enqueue_map_buffer(  # PyOpenCL's types are of NumPy's older ones
+                self.device.queue, self.shared, flags, 0, shape, np.dtype(np.complex64)
+            )[0]
             mapped.base.release()
 
     def _part(self, root: NDArray[np.int64]) -> tuple[slice, slice]:
-        """Return which pixels of the image a root has."""
+        """Return the rows and columns of a root in the image."""
         ends = np.minimum(root + self.factorization.sides[0], self.surface.plane.shape)
         rows, columns = (slice(int(a), int(b)) for a, b in zip(root, ends, strict=True))
         return rows, columns
@@ -184,7 +184,7 @@ class PlaneLeaves(Leaves):
         """Start reading the pixels of a root into a part of an image."""
         height, width = self.factorization.sides[0]
         rows, columns = image[part].shape
-        return cl.enqueue_copy(
+        return cl.enqueue_copy(  # type: ignore[call-overload]
             self.device.queue,
             image,
             pixels,
@@ -197,7 +197,7 @@ class PlaneLeaves(Leaves):
         )
 
     def _references(self, sector: Sector, batch: slice, pitch: int) -> dict[str, NDArray]:
-        """Return where tiles' centres lie in the lines of their leaves, [roots, tiles, pitch]."""
+        """Return samples of tiles' centres in the lines of their leaves, [roots, tiles, pitch]."""
         shape, centre = (batch.stop - batch.start, self.per_root, pitch), self.level.centre
         sample = np.full(shape, centre, np.int32)
         fraction, phase = np.zeros((2, *shape), np.float32)

@@ -1,4 +1,4 @@
-"""Factorized backprojection: the aperture interpolated, stage by stage."""
+"""Factorized backprojection at work on a device, stage by stage."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import math
 from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pyopencl as cl
@@ -41,12 +42,12 @@ from clsas.opencl.upsampling import upsample
 from clsas.sonar.coverage import warn_unseen
 
 _GROUP = 64  # work-items that share a subimage where each has one lane
-_AHEAD_S = 0.1  # of work that is started: roots are prepared meanwhile, an interruption waits
-_PREPARED_FIRST = 4  # batches
-_LARGEST_HALF, _LEAST_HALF = 65504.0, 2.0**-13  # with a margin of 2 to what is rounded coarser
-_FILTERS_SUM = 8.0  # of the absolute values of upsampling and aligning filters, with a margin
-_MOST_EXPONENT = 100  # of a gain: float32 holds filters times it, and over it
-_GROUPS_PER_UNIT = 3  # at least, of compute units: so that they end together
+_AHEAD_S = 0.1  # of enqueued work: hides the preparation of roots; an interruption waits for it
+_PREPARED_FIRST = 4  # batches in the first sector, few, so that the device starts early
+_LARGEST_HALF, _LEAST_HALF = 65504.0, 2.0**-13  # below twice the latter, half precision coarsens
+_FILTERS_SUM = 8.0  # bounds the sum of absolute values of upsampling and aligning filters
+_MOST_EXPONENT = 100  # of a gain: float32 holds filters multiplied and divided by it
+_GROUPS_PER_UNIT = 3  # work-groups per compute unit, at least, so that all end together
 
 
 def form(
@@ -56,7 +57,7 @@ def form(
     device: Device,
     progress: Callable[[int, int], None] | None,
 ) -> Image:
-    """Return the image by a checked plan."""
+    """Return the image of a plan that was checked against lines and grid."""
     warned = chosen.kept.get("warned", False)  # not where the plan comes from a file
     if isinstance(chosen.image, ExactImage):
         # The plan has warned of ends of lines.
@@ -89,12 +90,12 @@ def form(
 
 @dataclass(frozen=True, eq=False)
 class _Tables:
-    """What a device is told of a sector's roots, all at once.
+    """Tables of a sector on the device.
 
     Attributes
     ----------
     slot : Slot
-        Its buffers.
+        Buffers, see `clsas.factorized.buffers`.
     pitches : list of int
         Channels of a row, stage by stage.
     strides : list of int
@@ -191,7 +192,7 @@ class _Run:
 
         The geometry of a sector is prepared while the device works on the one before.
         """
-        under_way = deque()
+        under_way: deque[Finish] = deque()
         batches = -(-len(self.division.roots) // self.factorization.roots_at_once)
         most = max(math.ceil(_AHEAD_S * batches / max(self.plan.predicted_seconds, 1e-9)), 2)
         for sector, tables in self._sectors():
@@ -205,7 +206,7 @@ class _Run:
         self.leaves.complete()
 
     def _sectors(self) -> Iterator[tuple[Sector, _Tables]]:
-        """Prepare the roots, some together; few at first, for the device to begin with."""
+        """Prepare sectors of roots; the first is small, for the device to begin with."""
         first = _PREPARED_FIRST * self.factorization.roots_at_once
         for sector in self.geometry.sectors(first, self.factorization.roots_prepared):
             yield sector, self._upload_tables(sector)
@@ -223,7 +224,7 @@ class _Run:
         return finish
 
     def _upload_tables(self, sector: Sector) -> _Tables:
-        """Start copying to the device all that it is told of a sector's roots."""
+        """Start copying the tables of a sector to the device."""
         slot, levels = next(self.table_slots), range(len(self.levels))
         slot.wait()
         strides = [sector.stride(level) for level in levels]
@@ -260,34 +261,12 @@ class _Run:
 
     def _stage(self, tables: _Tables, level: int, batch: slice) -> None:
         """Form the lines of a stage from those of the one before, or from the raw ones."""
-        device, table, shape, stride = (
-            self.device,
-            tables.slot,
-            self.levels[level],
-            tables.strides[level],
-        )
-        # A buffer that grows waits for all that is under way.
+        device, table = self.device, tables.slot
+        shape, stride = self.levels[level], tables.strides[level]
+        # Room for most subimages from the start: a buffer that grows waits for all commands.
         lines_each = max(stride, self.factorization.most_channels[level])
         per_root = self.division.per_root(level)
         children = (batch.stop - batch.start) * per_root
-        if level == 0:
-            kernel, parent, parent_pitch = self.first_stage, self.samples, self.pitch
-            names = ("order", "start", "nu", "cycles", *(["ramp"] if self.geometry.ramps else []))
-            shifts = {name: table[name] for name in names}
-        else:
-            kernel, before = self.later_stage, self.levels[level - 1]
-            parent, parent_pitch = self.slot[f"lines{level - 1}"], before.pitch
-            shifts = {
-                "parents": self.parents[level],
-                "parents_per_root": self.division.per_root(level - 1),
-                "lines_per_parent": tables.strides[level - 1],
-                "positions": table[f"positions{level}"],
-                "offsets": table[f"offsets{level}"],
-                "drift": self.geometry.drift,
-                "samples_per_m": self.geometry.samples_per_m,
-                "cycles_per_m": self.geometry.cycles_per_m,
-                "parent_centre": before.centre,
-            }
         ((name, buffer),) = stage_lines(
             level, children, lines_each, shape.pitch, half_precision=self.half_precision
         ).items()
@@ -298,17 +277,15 @@ class _Run:
         parts = -(-_GROUPS_PER_UNIT * device.info.compute_units // children)
         part_length = step * -(-shape.length // (step * parts))
         device.run(
-            kernel,
+            self.later_stage if level else self.first_stage,
             (children * items, -(-shape.length // part_length)),
-            parent_lines=parent,
-            parent_pitch=parent_pitch,
             children=table[f"children{level}"],
             first_child=batch.start * per_root,
             children_per_root=per_root,
             first_virtual=table[f"base{level}"],
             tap_position=table[f"between{level}"],
             channel_pitch=tables.pitches[level],
-            **shifts,
+            **self._shifts(tables, level),
             half_length=shape.half,
             **self.filters,
             child_lines=child_lines,
@@ -321,20 +298,45 @@ class _Run:
             local=(items, 1),
         )
 
+    def _shifts(self, tables: _Tables, level: int) -> dict[str, Any]:
+        """Return the kernel's arguments about a stage's parents, and how their lines are shifted.
+
+        Shifts of raw lines are found on the host in float64. Later ones follow from positions.
+        """
+        table, geometry = tables.slot, self.geometry
+        if level == 0:
+            names = ("order", "start", "nu", "cycles", *(["ramp"] if geometry.ramps else []))
+            shifts = {name: table[name] for name in names}
+            return {"parent_lines": self.samples, "parent_pitch": self.pitch, **shifts}
+        before = self.levels[level - 1]
+        return {
+            "parent_lines": self.slot[f"lines{level - 1}"],
+            "parent_pitch": before.pitch,
+            "parents": self.parents[level],
+            "parents_per_root": self.division.per_root(level - 1),
+            "lines_per_parent": tables.strides[level - 1],
+            "positions": table[f"positions{level}"],
+            "offsets": table[f"offsets{level}"],
+            "drift": geometry.drift,
+            "samples_per_m": geometry.samples_per_m,
+            "cycles_per_m": geometry.cycles_per_m,
+            "parent_centre": before.centre,
+        }
+
 
 def _geometry(lines: RangeLines, grid: Grid, chosen: Plan) -> Geometry:
-    """Return how lines see the roots of a plan, as the image before has left it."""
+    """Return the geometry of a plan's image, kept from the image before if there was one."""
     if "geometry" not in chosen.kept:
         chosen.kept["geometry"] = Geometry(lines, surface_of(grid), chosen)
     return chosen.kept["geometry"]
 
 
 def _gain(largest: float, channels: int) -> float:
-    """Return a power of 2 that brings lines, and sums of them all, within half precision."""
+    """Return a power of 2 with which lines, and the sum of all, stay within half precision."""
     exponent = math.floor(math.log2(_LARGEST_HALF / (_FILTERS_SUM * channels * largest)))
     return 2.0 ** min(max(exponent, -_MOST_EXPONENT), _MOST_EXPONENT)
 
 
 def _holds(rms: float) -> bool:
-    """Return whether half precision holds lines of an rms value, or there is nothing to hold."""
+    """Return whether half precision resolves lines of an rms value; zeros it does."""
     return rms == 0 or _LEAST_HALF <= rms <= _LARGEST_HALF

@@ -42,9 +42,9 @@ class SurfaceLeaves(Leaves):
         self.backproject = device.kernel("backproject_points", **options)
 
     def _cells(self, corners: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return of every cell, [rows, columns], which leaf holds it and where there it lies.
+        """Return the leaf of every cell, and the cell's number in it, [rows, columns] each.
 
-        The leaves are numbered as their corners come, [roots, leaves, 2], the cells block by block.
+        Leaves are numbered in the order of their corners, [roots, leaves, 2], cells block by block.
         """
         side = self.geometry.division.sides[-1]
         number = np.empty(corners.max(axis=(0, 1)) // side + 1, np.int64)
@@ -60,13 +60,13 @@ class SurfaceLeaves(Leaves):
         return leaf, down[:, None] + across
 
     def _roots(self, sector: Sector, batch: slice = _ALL) -> slice:
-        """Return which of all roots those of a sector, or some of these, are."""
+        """Return the numbers of a sector's roots, or of some of these, among all roots."""
         first = self.number[tuple(sector.roots[0])]
         some = range(first, first + len(sector.roots))[batch]
         return slice(some.start, some.stop)
 
     def _groups(self, roots: slice) -> slice:
-        """Return which groups some roots have."""
+        """Return the groups of some roots."""
         return slice(int(self.ends[roots.start]), int(self.ends[roots.stop]))
 
     def _parts(self, sector: Sector) -> dict[str, NDArray]:
@@ -127,10 +127,10 @@ class SurfaceLeaves(Leaves):
         return finish
 
     def blank(self, sector: Sector, batch: slice) -> Finish:
-        """Return what sets pixels to 0; see `Leaves.blank`."""
+        """Return a function that sets pixels to 0; see `Leaves.blank`."""
         return lambda: self._put(self._roots(sector, batch), np.complex64(0))
 
-    def _put(self, roots: slice, pixels: NDArray[np.complex64]) -> int:
-        """Set the pixels of some roots; return how many they are."""
+    def _put(self, roots: slice, pixels: NDArray[np.complex64] | np.complex64) -> int:
+        """Set the pixels of some roots; return their number."""
         self.image.reshape(-1)[self.groups.index[self._groups(roots)]] = pixels
         return int(self.pixels_before[roots.stop] - self.pixels_before[roots.start])

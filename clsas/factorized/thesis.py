@@ -218,18 +218,19 @@ def plan_errors_m(
     [42] and [43] applied to every channel: in each stage its line is shifted so that the range of
     the subimage's centre is right for the mean of its neighbours, which then stands for it.
     """
-    order = np.argsort(mean_track(lines).place, kind="stable")
+    track, image = mean_track(lines), plan.factorization
+    if track is None or not isinstance(image.aperture, NearestBeams) or not grid.is_planar:
+        raise ValueError("plan must be one of stages, for lines and a plane that it was made for")
+    order = np.argsort(track.place, kind="stable")
     ends_m = lines.tx_m[order], lines.rx_m[order]
-    division = Division(surface_of(grid), plan.sides)
-    pixels = np.asarray(pixels)
-    points_m = grid.origin_m + pixels[:, :1] * grid.row_step_m + pixels[:, 1:] * grid.column_step_m
+    division = Division(surface_of(grid), image.sides)
+    index = np.asarray(pixels, np.int64)
+    points_m = np.asarray(grid.origin_m) + index @ division.surface.steps_m
     errors_m = -pairwise_range_m(points_m, *ends_m)
     position_m = lines.phase_centres_m[order]
     beam = np.arange(lines.channels)  # of the stage before, that holds each channel
-    for level, (side, beams) in enumerate(
-        zip(plan.sides, plan.image.aperture.factors, strict=True)
-    ):
-        centres_m = division.centres_m(level, pixels // side * side)
+    for level, (side, beams) in enumerate(zip(image.sides, image.aperture.factors, strict=True)):
+        centres_m = division.centres_m(level, index // side * side)
         errors_m += pairwise_range_m(centres_m, *ends_m)[:, beam]
         starts = np.arange(0, len(position_m), beams)
         counts = np.diff(np.append(starts, len(position_m)))

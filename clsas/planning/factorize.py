@@ -112,17 +112,17 @@ def factorize(
 
 def _check_band(lines: RangeLines, chosen: Plan) -> None:
     """Warn where a plan was made for lines of another band."""
-    known, band = chosen.kept.get("lines"), chosen.image.band
-    if band is None or (known is not None and known() is lines):
+    known, band, tolerance_db = chosen.kept.get("lines"), chosen.image.band, chosen.tolerance_db
+    if band is None or tolerance_db is None or (known is not None and known() is lines):
         return
     for channels in (FEW_CHANNELS, MEASURED_CHANNELS):
         outside_db = in_db(power_outside(lines, *band, channels))
-        if outside_db <= chosen.tolerance_db:
+        if outside_db <= tolerance_db:
             chosen.kept["lines"] = weakref.ref(lines)
             return
     if lines.samples.any():
         validate.warn(
             f"the lines hold {outside_db:.0f} dB of their power outside the band that the plan was "
-            f"made for, so that the error may be more than {chosen.tolerance_db:g} dB: plan anew "
+            f"made for, so that the error may be more than {tolerance_db:g} dB: plan anew "
             "with clsas.plan"
         )

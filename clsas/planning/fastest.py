@@ -30,12 +30,12 @@ from clsas.planning.search import Allowed, Tree, root_limits, search
 from clsas.planning.view import View
 
 # Shares of the error power allowed: for roots, for the spacing of all stages' virtual channels, for
-# edges of the beam that are left out, and for what is always there.
+# the beam's edges that are left out, and for errors that every plan has.
 _ROOTS_SHARE, _SPACING_SHARE, _EDGES_SHARE, _RESERVED_SHARE = 0.25, 0.2, 0.03, 0.08
 _MOST_SPENT = 0.9  # of the error power allowed, before filters
-_LEAST_DENSER, _MOST_OVERSAMPLING = 1.05, 2.0  # virtual channels: at a time, and altogether
-_DENSITY_POWER = 0.08  # of an error that denser virtual channels are to mend
-_LEAST_STEP, _OVERSHOOT = 0.02, 1.3  # of the error allowed, and of what was too much
+_LEAST_DENSER, _MOST_OVERSAMPLING = 1.05, 2.0  # factors of one step, and of all together
+_DENSITY_POWER = 0.08  # exponent: how much denser for a relative excess of the error
+_LEAST_STEP, _OVERSHOOT = 0.02, 1.3  # shares of the allowed error, and of the excess
 _LEAST_BEAM_CYCLES, _MOST_BEAM_CYCLES = 0.5, 64.0
 
 
@@ -57,9 +57,16 @@ class _Problem:
     designs: dict[tuple[Choice, int, float], Filters] = field(default_factory=dict)
 
     @property
+    def tolerance_db(self) -> float:
+        """Relative rms error asked for."""
+        tolerance_db = self.conditions.tolerance_db
+        assert tolerance_db is not None  # with given stages there is nothing to search
+        return tolerance_db
+
+    @property
     def allowed(self) -> float:
         """Error power of the tolerance."""
-        return power(self.conditions.tolerance_db)
+        return power(self.tolerance_db)
 
     @property
     def beam_edges(self) -> float:
@@ -69,7 +76,7 @@ class _Problem:
     @property
     def reserved(self) -> float:
         """Error power that is kept for what neither filters nor roots add, at least."""
-        of_phases = phases.error(phases.terms_within(self.conditions.tolerance_db)) ** 2
+        of_phases = phases.error(phases.terms_within(self.tolerance_db)) ** 2
         return self.beam_edges + _RESERVED_SHARE * self.allowed + of_phases
 
     def filters_db(self, reserved: float, root: tuple[int, int]) -> float | None:
@@ -117,25 +124,26 @@ def fastest(
 
     Beside it, where there is none, the least memory of those that did not fit.
     """
-    trimmed = view.trimmed(_EDGES_SHARE * power(conditions.tolerance_db))
-    problem = _Problem(trimmed, conditions)
-    most_root = root_limits(trimmed, _ROOTS_SHARE * problem.allowed)
+    problem = _Problem(view, conditions)
+    problem = replace(problem, view=view.trimmed(_EDGES_SHARE * problem.allowed))
+    most_root = root_limits(problem.view, _ROOTS_SHARE * problem.allowed)
     needed, trial = math.inf, None
     if most_root is not None:
         beam_cycles = 0.0 if view.beam is None else _LEAST_BEAM_CYCLES
         trial = _Trial(choices, most_root, beam_cycles, problem.reserved)
     while trial is not None:
-        if trial.tree is None:
+        tree = trial.tree
+        if tree is None:
             trial = _searched(problem, trial)
             continue
-        filters = _filters(problem, trial)
+        filters = _filters(problem, trial, tree)
         if filters is None:
-            trial = _with_fewer_stages(problem, trial)
+            trial = _with_fewer_stages(problem, trial, tree)
             continue
-        errors, found = _estimated(problem, trial, filters)
+        errors, found = _estimated(problem, trial, tree, filters)
         if found.predicted_seconds >= seconds:
             break
-        if found.predicted_error_db > conditions.tolerance_db:
+        if found.predicted_error_db > problem.tolerance_db:
             trial = _more_accurate(problem, trial, errors, found)
         elif found.memory_bytes > conditions.memory_bytes:
             needed = min(needed, found.memory_bytes)
@@ -162,17 +170,19 @@ def _searched(problem: _Problem, trial: _Trial) -> _Trial | None:
         problem.conditions.costs,
         trial.choices,
     )
-    return tree and replace(trial, tree=tree, oversampling=(1.0,) * len(tree.sides))
+    return (
+        None if tree is None else replace(trial, tree=tree, oversampling=(1.0,) * len(tree.sides))
+    )
 
 
-def _filters(problem: _Problem, trial: _Trial) -> Filters | None:
-    """Return the filters of a trial's tree, None where they cannot err by as little as is left."""
+def _filters(problem: _Problem, trial: _Trial, tree: Tree) -> Filters | None:
+    """Return the filters of a trial's tree; None if none are accurate enough."""
     # Roots are often smaller than they might be, and leave more to filters.
-    filters_db = problem.filters_db(trial.reserved, trial.tree.sides[0])
+    filters_db = problem.filters_db(trial.reserved, tree.sides[0])
     if filters_db is None:
         return None
-    view, stages = problem.view, len(trial.tree.sides)
-    choice = trial.tree.filters(view.spectrum, filters_db)
+    view, stages = problem.view, len(tree.sides)
+    choice = tree.filters(view.spectrum, filters_db)
     if choice is None:
         return None
     key = choice, stages, filters_db
@@ -183,9 +193,11 @@ def _filters(problem: _Problem, trial: _Trial) -> Filters | None:
     return problem.designs[key]
 
 
-def _estimated(problem: _Problem, trial: _Trial, filters: Filters) -> tuple[Errors, Plan]:
-    """Return what a candidate errs by beside its filters, and its plan."""
-    sides, roots = trial.tree.sides, root_error(problem.view, trial.tree.sides[0])
+def _estimated(
+    problem: _Problem, trial: _Trial, tree: Tree, filters: Filters
+) -> tuple[Errors, Plan]:
+    """Return the errors of a candidate that its filters do not account for, and its plan."""
+    sides, roots = tree.sides, root_error(problem.view, tree.sides[0])
     within = problem.view.within(sides[0])
     conditions = problem.conditions
     errors = other_errors(
@@ -220,12 +232,12 @@ def _estimated(problem: _Problem, trial: _Trial, filters: Filters) -> tuple[Erro
     return errors, predicted_plan(within, candidate, budget, conditions)
 
 
-def _with_fewer_stages(problem: _Problem, trial: _Trial) -> _Trial | None:
+def _with_fewer_stages(problem: _Problem, trial: _Trial, tree: Tree) -> _Trial | None:
     """Return a trial of fewer stages: their subimages are larger, with more virtual channels.
 
     That helps where virtual channels are as dense as they may be; else there is nothing left.
     """
-    fewer = tuple(n for n in trial.choices.stages if n < len(trial.tree.sides))
+    fewer = tuple(n for n in trial.choices.stages if n < len(tree.sides))
     if not fewer or _MOST_OVERSAMPLING not in trial.oversampling[:-1]:
         return None
     choices = replace(trial.choices, stages=fewer)
@@ -235,8 +247,8 @@ def _with_fewer_stages(problem: _Problem, trial: _Trial) -> _Trial | None:
 def _more_accurate(problem: _Problem, trial: _Trial, errors: Errors, found: Plan) -> _Trial | None:
     """Return a trial that errs by less than a candidate that missed the tolerance.
 
-    What uneven spacing and a beam add falls with the density of virtual channels; filters must make
-    up for the rest.
+    Denser virtual channels reduce the errors of uneven spacing and of a beam. Filters make up for
+    the rest.
     """
     allowed, last = problem.allowed, found.sides[-1]
     share = _SPACING_SHARE * allowed / len(found.sides)
@@ -268,7 +280,7 @@ def _more_accurate(problem: _Problem, trial: _Trial, errors: Errors, found: Plan
 def _denser(
     oversampling: tuple[float, ...], excess: list[float], share: float
 ) -> tuple[float, ...]:
-    """Return the next oversampling of virtual channels, where their errors exceed a share."""
+    """Return the next oversampling of virtual channels: more where errors exceed their share."""
     return tuple(
         min(each * max((1 + over / share) ** _DENSITY_POWER, _LEAST_DENSER), _MOST_OVERSAMPLING)
         if over

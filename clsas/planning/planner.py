@@ -207,9 +207,9 @@ def _chosen(
     elif stages is None and _worth_a_search(exact, costs, exact_fits, allowed) and _divisible(view):
         # What is gained must be worth an error, and more than predictions scatter.
         to_beat = _WORTH * costs.seconds(exact.work) if exact_fits and allowed is None else math.inf
-        found, needed = fastest(view, conditions, to_beat, allowed or Allowed())
-        if found is not None:
-            return found
+        faster, needed = fastest(view, conditions, to_beat, allowed or Allowed())
+        if faster is not None:
+            return faster
         least = min(least, needed)
     if not exact_fits:
         raise ValueError(

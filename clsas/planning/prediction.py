@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -273,7 +274,7 @@ def _stages(
     error_db = in_db(power(lines.align_db) + power(aperture.error_db))
     stages, total = [], Work(call=1.0)
 
-    def add(side: tuple[int, int], count: int, samples: int, work: Work, **figures: float) -> None:
+    def add(side: tuple[int, int], count: int, samples: int, work: Work, **figures: Any) -> None:
         nonlocal total
         total += work
         rows, columns = side

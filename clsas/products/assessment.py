@@ -383,7 +383,7 @@ class _Image:
             self.lines,
             self.grid,
             device=device,
-            accuracy_db=self.plan.accuracy_db,
+            accuracy_db=self.plan.image.accuracy_db,
             beam=self.beam,
             full_model=self.full_model,
         )

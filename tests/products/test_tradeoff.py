@@ -207,6 +207,6 @@ def test_without_matplotlib_the_message_says_how_to_get_it(tmp_path, monkeypatch
 
 def test_summary_of_a_plan(lines):
     text = summary(clsas.plan(lines, GRID, stages=[(2, 2), (4, 2)]))
-    assert text.endswith("; 2 taps in range, 2 at the end, sums of 2, 4 lines")
+    assert text.endswith("; 2 taps in range, 2 at the end, sums of 2, 4 neighbours")
     assert text.startswith("64x48, 32x24; ")
     assert summary(clsas.plan(lines, GRID, stages=[])) == "plain backprojection"
