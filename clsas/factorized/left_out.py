@@ -48,6 +48,6 @@ def without_left_out(plan: Plan, lines: RangeLines, grid: Grid) -> tuple[RangeLi
         plan.kept["model"] = model.lines.without_samples(), model.grid, simpler
     geometry, simple_grid, simpler = plan.kept["model"]
     simple_lines = replace(geometry, samples=lines.samples)
-    simpler.kept["lines"] = weakref.ref(simple_lines)  # whose band is that of the lines given
+    simpler.kept["lines"] = weakref.ref(simple_lines)  # the given lines' band is theirs
     simpler.kept["warned"] = plan.kept.get("warned", False)
     return simple_lines, simple_grid, simpler

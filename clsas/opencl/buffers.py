@@ -81,7 +81,7 @@ class BeamTable:
 
     @property
     def origin(self) -> dict[str, Any]:
-        """What `expand_tiles` takes of them."""
+        """The arguments of `expand_tiles`."""
         name = "beam_origin"
         return {name: self.arguments[name]} if self.arguments else {}
 

@@ -76,10 +76,10 @@ def factorize(
     Aligned on a subimage's centre c, channel n's steering function exp(j 2 k (rho_n(x) - rho_n(c)))
     varies slowly along the track, and is interpolated from those of fewer, virtual channels:
     f_n ~ sum_m a_nm f_m. Hence sum_n s_n f_n ~ sum_m (sum_n a_nm s_n) f_m: the virtual channels'
-    lines are weighted sums of aligned lines, and so again from stage to stage. Where the plan says
-    so, these lines are held in half precision; what is added up is single.
+    lines are weighted sums of aligned lines, and so on from stage to stage. A plan may hold these
+    lines in half precision; sums are single.
 
-    A plan keeps the geometry that its first image found out, in `Plan.kept`, for those after it.
+    A plan keeps the geometry of its first image, in `Plan.kept`, for the images after it.
     """
     validate.instance("lines", lines, RangeLines)
     validate.instance("grid", grid, Grid)

@@ -46,15 +46,15 @@ BEST_TOLERANCE_DB = -75.0
 WORST_TOLERANCE_DB = -10.0
 
 TOLERANCE_DB = -50.0
-"""What is taken where nothing is asked of an image."""
+"""Tolerance of images for which none is asked."""
 
 NEAREST_UPSAMPLING = 8.0
-"""By how much lines are upsampled before the linear interpolation of given stages."""
+"""Upsampling of lines before the linear interpolation of given stages."""
 
-_WORTH = 0.95  # of the time of an exact image
+_WORTH = 0.95  # of the time of an exact image, at most: less gain is within predictions' scatter
 _SEARCH_S = 0.05  # that a search takes at least: 0.05 to 0.12 s on a core of 2.5 GHz
-_LEAST_COVERED = 0.25  # of the sum of weights at the best covered pixel
-_LEAST_SHARE_COVERED, _LEAST_PARTIAL = 0.1, 0.25  # of an image
+_LEAST_COVERED = 0.25  # least sum of weights, relative to that at the best covered pixel
+_LEAST_SHARE_COVERED, _LEAST_PARTIAL = 0.1, 0.25  # shares of an image
 
 
 def plan(
@@ -72,53 +72,52 @@ def plan(
     depth: int | None = None,
     full_model: bool = False,
 ) -> Plan:
-    """Choose the fastest way to an image of a given error.
+    """Plan the fastest image whose error keeps a tolerance.
 
     Exactly one of `tolerance_db`, `tolerance_wavelengths` and `stages` must be given.
 
     Parameters
     ----------
     lines : RangeLines
-        What to image.
+        Lines to image. Of their samples only the spectrum and the fading at the ends matter.
     grid : Grid
-        Where.
+        Pixels of the image.
     tolerance_db : float
-        Wanted relative rms error against the exact image, dB, from -75 to -10.
+        Requested relative rms error against the exact image, dB, from -75 to -10.
     tolerance_wavelengths : float
-        The same as a range error, in wavelengths of the carrier: that which is spread evenly
-        between minus and plus so much, 4 pi/sqrt(3) radians rms per wavelength.
+        The same as a range error in wavelengths of the carrier. Errors that are spread evenly
+        between minus and plus this value make 4 pi/sqrt(3) radians rms per wavelength.
     stages : sequence of (QR, QI)
-        Form the image as THESIS chapter 4 does: in every stage QR neighbouring lines are summed
-        and the subimages divided by QI along either side; then the last ones are backprojected.
-        No stage is plain backprojection. Range is interpolated linearly.
+        Form the image as THESIS chapter 4 does. Every stage sums QR neighbouring lines and divides
+        subimages by QI along either side; then the last subimages are backprojected. An empty
+        sequence is plain backprojection. Range is interpolated linearly.
     beam : BeamWindow, optional
         Weights of the channels.
     device : Device, str or int, optional
-        Whose costs count; see `clsas.opencl.device.choose`.
+        Device that forms the image; see `clsas.opencl.device.choose`.
     memory_bytes : int, optional
-        Device memory that may be used. Unless given it is half of the device's, or as much as
-        plain backprojection takes.
+        Device memory that may be used. By default half of the device's, or as much as plain
+        backprojection takes.
     costs : Costs, optional
-        Instead of those stored for the device.
+        Costs in place of those stored for the device.
     taps : (range, aperture), optional
-        For study, with a tolerance: take filters of so many taps, 4, 6 or 8, however long the
-        image takes, instead of the fastest.
+        For study, with a tolerance: numbers of taps, 4, 6 or 8, in place of the fastest.
     depth : int, optional
-        The same of the number of stages, 1 to 5.
+        For study, with a tolerance: number of stages, 1 to 5, in place of the fastest.
     full_model : bool
         For study: model every effect, also those whose error lies far below the tolerance.
 
     Returns
     -------
     Plan
-        With empty `sides`, plain backprojection, where nothing is faster: near the aperture, with
-        few channels or pixels, or much relief.
+        An exact image if nothing is faster: near the aperture, with few channels or pixels, or much
+        relief.
 
     Raises
     ------
     TypeError, ValueError
-        If an argument is not what is allowed, or no way to the image fits the memory: the message
-        names what the least demanding one needs.
+        If an argument is not allowed, or no plan fits the memory: the message names what the least
+        demanding one needs.
     DeviceError
         If there is no such device.
 
@@ -173,7 +172,7 @@ def plan(
     if model.left_out:
         found = with_left_out(found, model, lines, grid, beam)
     found.kept["lines"] = weakref.ref(lines)
-    # Who forms the image next need not warn again.
+    # The image need not warn again.
     found.kept["warned"] = warn_unreached(lines, grid, beam, view.channels_along)
     return found
 
@@ -190,7 +189,7 @@ def _chosen(
     """Return the plan of checked arguments."""
     beam = view.beam
     exact = expect(view, ACCURACY_DB if tolerance_db is None else tolerance_db - MARGIN_DB, device)
-    # Backprojection keeps within a device by itself.
+    # Exact imaging divides itself to fit a device.
     room = device.info.memory_bytes // 2 if memory_bytes is None else memory_bytes
     exact_fits = memory_bytes is None or exact.memory_bytes <= memory_bytes
     conditions = Conditions(tolerance_db, exact, device, costs, room)
@@ -205,7 +204,6 @@ def _chosen(
             return found
         exact_fits, least = False, found.memory_bytes
     elif stages is None and _worth_a_search(exact, costs, exact_fits, allowed) and _divisible(view):
-        # What is gained must be worth an error, and more than predictions scatter.
         to_beat = _WORTH * costs.seconds(exact.work) if exact_fits and allowed is None else math.inf
         faster, needed = fastest(view, conditions, to_beat, allowed or Allowed())
         if faster is not None:
@@ -238,7 +236,7 @@ def tolerance_in_db(
 
 
 def _allowed(taps: tuple[int, int] | None, depth: int | None) -> Allowed | None:
-    """Return the filters and stages asked for, None where the search is free."""
+    """Return the requested filters and stages, None if the search is free."""
     if taps is None and depth is None:
         return None
     fields = {}
@@ -257,7 +255,7 @@ def _allowed(taps: tuple[int, int] | None, depth: int | None) -> Allowed | None:
 
 
 def _worth_a_search(exact: Exact, costs: Costs, exact_fits: bool, allowed: Allowed | None) -> bool:
-    """Return whether something faster than the exact image is needed, or worth a search."""
+    """Return whether a search may pay, or is needed because the exact image does not fit."""
     return not exact_fits or allowed is not None or costs.seconds(exact.work) > _SEARCH_S
 
 
@@ -267,13 +265,13 @@ def _divisible(view: View) -> bool:
         return False
     if view.beam is None:
         return True
-    # What is normalised is amplified with its errors where hardly anything is seen.
+    # Normalising divides by a small sum at the beam's edge, and amplifies errors there.
     if view.beam.normalise and view.coverage(1).min() < _LEAST_COVERED:
         return False
-    # Steps of a window that are seen from few pixels cost these more than is expected of all.
+    # If few pixels see a step of the beam, their error exceeds the prediction for all.
     if view.beam.jumps and 0 < view.share_partial < _LEAST_PARTIAL:
         return False
-    # Where hardly any pixel sees anything there is as little to gain as is known about errors.
+    # If hardly any pixel is visible there is little to gain, and errors are not predictable.
     return float(view.coverage(2).mean()) >= _LEAST_SHARE_COVERED
 
 
@@ -283,7 +281,7 @@ def decibels(wavelengths: float) -> float:
 
 
 def wavelengths(decibels: float) -> float:
-    """Return what `decibels` made an error of."""
+    """Return the range error, in wavelengths, that makes an error in decibels."""
     return 10 ** (decibels / 20) * math.sqrt(3) / (4 * math.pi)
 
 
@@ -328,7 +326,7 @@ def _tile(view: View, leaf: tuple[int, int], device: Device) -> tuple[int, int]:
 
 
 def checked_pairs(stages: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
-    """Return (QR, QI) of every stage, or raise what is wrong with any of them."""
+    """Return (QR, QI) of every stage; raises TypeError or ValueError if one is wrong."""
     try:
         pairs = [(stage[0], stage[1]) for stage in stages if len(stage) == 2]
         whole = len(pairs) == len(stages)
@@ -343,7 +341,7 @@ def checked_pairs(stages: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
 
 
 def _checked_stages(stages: Sequence[tuple[int, int]], lines: RangeLines, grid: Grid) -> list:
-    """Return (QR, QI) of every stage, or raise what these lines and this grid do not allow."""
+    """Return (QR, QI) of every stage; raises ValueError if lines or grid do not allow them."""
     pairs = checked_pairs(stages)
     if not pairs:
         return pairs

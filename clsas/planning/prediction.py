@@ -43,13 +43,13 @@ OUTSIDE = 0.1
 """Share of the allowed error power that may come from outside the nominal band."""
 _ROUNDING_SHARE = 0.1  # of an image's error power, for half precision
 _MOST_CHUNKS = 16  # in a sum that is rounded to half precision
-_FEW_CHANNELS = 7.0, 30.0  # see a pixel where errors scatter much; with stepped weights
-_ROOM = 1.06  # buffers hold so many times the largest predicted number of virtual channels
+_FEW_CHANNELS = 7.0, 30.0  # per pixel, that double the scatter of errors; the latter with steps
+_ROOM = 1.06  # spare room of buffers over the largest predicted number of virtual channels
 
 
 @dataclass(frozen=True)
 class Conditions:
-    """What a plan must keep to, and the exact image that it competes with.
+    """Requirements of a plan, and the exact image that it competes with.
 
     Attributes
     ----------
@@ -178,8 +178,8 @@ def exact_plan(view: View, conditions: Conditions) -> Plan:
 def margin_db(view: View) -> float:
     """Return the margin of predicted errors, dB, which covers the scatter of measured ones.
 
-    Errors scatter more where few channels see a pixel: they depend on how these happen to lie
-    between virtual channels, and to a step of the beam. They also scatter more where the lines'
+    Errors scatter more if few channels see a pixel: they depend on the positions of these between
+    virtual channels, and relative to a step of the beam. They also scatter more if the lines'
     power lies at few frequencies.
     """
     channels = view.lines.channels * view.share_seen((16, 16))
@@ -197,7 +197,7 @@ def band_of(view: View, outside: float) -> tuple[float, float]:
 def half_precision_error(stages: int) -> float:
     """Return the least error power that half precision adds through some stages.
 
-    It is more where virtual channels are sums of many: see `_half_rounding`.
+    It is more if virtual channels are sums of many: see `_half_rounding`.
     """
     return HALF_ROUNDING * (1 + 1.5 * stages)
 
@@ -320,7 +320,7 @@ def _stages(
 def _with_arithmetic(
     view: View, lines: _Lines, channels: Sequence[StageChannels], conditions: Conditions
 ) -> tuple[ErrorBudget, bool]:
-    """Return the errors with those of polynomials and of rounding, and whether that is to half."""
+    """Add the errors of polynomials and rounding; return whether lines have half precision."""
     tolerance_db, errors = conditions.tolerance_db, lines.errors
     if tolerance_db is None:
         return errors, False
@@ -334,11 +334,11 @@ def _with_arithmetic(
 
 
 def _half_rounding(view: View, summed: Sequence[float]) -> float:
-    """Return the power of the error that rounding lines to half precision adds.
+    """Return the error power of rounding lines to half precision.
 
-    `summed` is the number of channels that a virtual one sums, stage by stage. Rounded are the
-    upsampled lines, and the lines that a stage hands on: the latter once per chunk of channels,
-    while the sum still grows, which counts as half. A sum of very many chunks loses what is added.
+    `summed` is the number of channels that a virtual one sums, stage by stage. Upsampled lines are
+    rounded once. Lines of a stage are rounded once per chunk of channels, while the sum still
+    grows, which counts as half. A sum of very many chunks loses what is added last.
     """
     chunks = np.array(summed) / CHUNK
     chunks[0] *= view.densest
