@@ -29,6 +29,7 @@ from clsas.core import validate
 from clsas.core.image import holds_any
 from clsas.exact.backprojection import prepare
 from clsas.exact.run import execute
+from clsas.factorized.factorization import ExactImage
 from clsas.files.scene_tables import PLAN_KEYS
 from clsas.opencl.device import Device, KernelTimes, open_device
 from clsas.planning.planner import WORST_TOLERANCE_DB
@@ -197,7 +198,7 @@ def _factorized(
         chosen.predicted_error_db,
         chosen.left_out,
         {
-            "method": "stages" if chosen.nearest else "factorized",
+            "method": "stages" if chosen.tolerance_db is None else "factorized",
             "predicted_seconds": chosen.predicted_seconds,
         },
     )
@@ -214,8 +215,8 @@ def _exactly(
 ) -> _Formed:
     """Form an exact image as requested, or because a plan chose it."""
     why, warned = "", False
-    if chosen is not None:
-        request = {"accuracy_db": chosen.accuracy_db}
+    if chosen is not None and isinstance(chosen.image, ExactImage):
+        request = {"accuracy_db": chosen.image.accuracy_db}
         why = f"exact: nothing faster within {chosen.tolerance_db:.4g} dB; "
         warned = chosen.kept["warned"]
     preparation = prepare(lines, grid, device=device, beam=beam, **request)
@@ -288,7 +289,7 @@ def plan(
 
 def _warn_of_error(chosen: clsas.Plan) -> None:
     """Warn if the error of the thesis's method may be as large as the image."""
-    if chosen.nearest and chosen.predicted_error_db > WORST_TOLERANCE_DB:
+    if chosen.tolerance_db is None and chosen.predicted_error_db > WORST_TOLERANCE_DB:
         click.echo(
             f"Warning: with these stages the error may be as large as "
             f"{chosen.predicted_error_db:.0f} dB, too large for an image to be of use: sum fewer "

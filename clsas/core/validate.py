@@ -19,8 +19,6 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
-Choice = TypeVar("Choice")
-
 _LONGEST = 100  # characters of a value in a message
 _LONGEST_LINE = 1000  # characters of a line of a message
 # Largest parts of a value in a message; longer parts and deeper lists end in "...".
@@ -30,6 +28,9 @@ _REPR.maxlist = _REPR.maxtuple = _REPR.maxdict = _REPR.maxset = _REPR.maxfrozens
 _REPR.maxstring = _REPR.maxother = _REPR.maxlong = 2 * _LONGEST
 # Files with the memory limit of a process's control group, versions 2 and 1.
 _GROUP_LIMITS = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes")
+
+
+_T = TypeVar("_T")
 
 
 class ClsasWarning(UserWarning):
@@ -113,7 +114,7 @@ def count(name: str, value: int, *, least: int = 1, most: int | None = None) -> 
     return int(value)
 
 
-def one_of(name: str, value: Choice, allowed: Sequence[Choice]) -> Choice:
+def one_of(name: str, value: _T, allowed: Sequence[_T]) -> _T:
     """Return `value`; raises ValueError unless it is one of `allowed`."""
     if value not in allowed:
         raise ValueError(

@@ -5,9 +5,9 @@ from __future__ import annotations
 import json
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from clsas.core import reading, validate
 from clsas.core.atomic import replacing
@@ -46,9 +46,12 @@ class Costs:
         for field in fields(self):
             validate.number(field.name, getattr(self, field.name), "ns", least=0.0)
 
-    def seconds(self, work: Work) -> ArrayLike:
-        """Return the time that work takes: amounts times costs, added up."""
-        total_ns: ArrayLike = 0.0
+    def seconds(self, work: Work) -> Any:
+        """Return the time that work takes: amounts times costs, added up.
+
+        That is a float, or an array if amounts are arrays.
+        """
+        total_ns: Any = 0.0
         for name, amount in vars(work).items():
             if isinstance(amount, np.ndarray) or amount:
                 total_ns = total_ns + getattr(self, f"{name}_ns") * amount

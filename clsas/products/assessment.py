@@ -15,12 +15,13 @@ from clsas.core.grid import Grid
 from clsas.core.lines import RangeLines
 from clsas.exact.backprojection import prepare
 from clsas.exact.run import execute
+from clsas.factorized.factorization import Factorization
 from clsas.factorized.plan import Plan
 from clsas.opencl.device import Device, open_device
 from clsas.planning.costs import Costs
 from clsas.planning.factorize import factorize
-from clsas.planning.forecast import half_precision_error
 from clsas.planning.planner import BEST_TOLERANCE_DB, TOLERANCE_DB, WORST_TOLERANCE_DB, plan
+from clsas.planning.prediction import half_precision_error
 from clsas.products.assessment_result import Assessment, Effect
 from clsas.products.effects import (
     BEAM,
@@ -116,7 +117,7 @@ def assess(
     seconds = {name: image.plan.predicted_seconds for name, image in images.items()}
     if repeats:
         if full.half_precision:
-            images[SINGLE] = replace(images[_FULL], plan=replace(full, half_precision=False))
+            images[SINGLE] = replace(images[_FULL], plan=full.changed(half_precision=False))
         seconds = _measured(images, device, repeats)
     errors, modelled = errors_without(survey), survey.modelled
     if not full.is_exact and device.info.half_precision:
@@ -264,14 +265,15 @@ class _Image:
 
     def form(self, device: Device) -> None:
         """Form the image with a fresh copy of the plan, which has kept nothing of earlier runs."""
-        if self.plan.accuracy_db is None:
+        image = self.plan.image
+        if isinstance(image, Factorization):
             factorize(self.lines, self.grid, replace(self.plan), device=device)
             return
         preparation = prepare(
             self.lines,
             self.grid,
             device=device,
-            accuracy_db=self.plan.accuracy_db,
+            accuracy_db=image.accuracy_db,
             beam=self.beam,
             full_model=self.full_model,
         )

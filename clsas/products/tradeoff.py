@@ -221,15 +221,14 @@ def _timed(candidates: Sequence[_Candidate], repeats: int, step: Callable[[], No
 
 def summary(chosen: Plan) -> str:
     """Return a plan in a line: its subimages (rows x columns) stage by stage, and its filters."""
-    align, final = chosen.align, chosen.final
-    if chosen.is_exact or align is None or final is None:
+    if chosen.is_exact:
         return "plain backprojection"
     sides = ", ".join(f"{rows}x{columns}" for rows, columns in chosen.sides)
-    if chosen.nearest or chosen.aperture is None:
-        along = f"sums of {', '.join(map(str, chosen.nearest))} lines"
-    else:
-        along = f"{chosen.aperture.taps} along the aperture"
-    return f"{sides}; {align.taps} taps in range, {final.taps} at the end, {along}"
+    image = chosen.factorization
+    return (
+        f"{sides}; {image.align.taps} taps in range, {image.final.taps} at the end, "
+        f"{image.aperture.describe()}"
+    )
 
 
 def _feasible(
