@@ -29,6 +29,7 @@ _COHERENT_CHANNELS, _COHERENT_POINTS, _COHERENT_FREQUENCIES = 128, 3, 256  # sam
 _FEW_FREQUENCIES = 4.0  # with power at a single frequency errors are up to 5 times the predicted
 _LOUDEST = 16  # loudest channels, sampled in addition to those spread evenly
 _SUMMABLE = 1e-20, 1e38  # energies that float32 squares and sums without loss
+_RESOLVED = 1024  # samples; shorter lines are padded to resolve the edges of their band
 _LINES_TOGETHER = 8  # transformed together, so that they stay in the processor's caches
 
 
@@ -200,23 +201,22 @@ def _mean_power(
     multiplies every line.
     """
     largest = _largest_part(samples) or samples.real.dtype.type(1)
-    length = scipy.fft.next_fast_len(max(2 * samples.shape[1], 4))
+    padding = 1 if samples.shape[1] >= _RESOLVED else 2
+    length = scipy.fft.next_fast_len(max(padding * samples.shape[1], 4))
     power, faded = np.zeros(length), np.zeros(length)
     parts = samples.view(samples.real.dtype)
     blocks = -(-len(parts) // _LINES_TOGETHER)
     for block, scale in zip(
-        np.array_split(parts, blocks), np.array_split(factor, blocks), strict=True
+        np.array_split(parts, blocks), np.array_split(factor / largest, blocks), strict=True
     ):
-        scaled = block / largest * scale[:, None]
-        amplitude = scipy.fft.fft(scaled.view(samples.dtype), length)
+        amplitude = scipy.fft.fft((block * scale[:, None]).view(samples.dtype), length)
+        # A Hann window over the part of the FFT's length where the lines lie.
+        ends = amplitude[:, -padding:], amplitude[:, :padding]
+        around = np.concatenate([ends[0], amplitude, ends[1]], axis=1)
+        windowed = (around[:, : -2 * padding] + around[:, 2 * padding :]) * np.float32(-0.5)
+        windowed += amplitude
         power += _column_power(amplitude)
-        # A Hann window over half of the FFT's length, where the lines lie.
-        around = np.empty_like(amplitude)
-        np.add(amplitude[:, :-4], amplitude[:, 4:], out=around[:, 2:-2])
-        around[:, :2] = amplitude[:, -2:] + amplitude[:, 2:4]
-        around[:, -2:] = amplitude[:, -4:-2] + amplitude[:, :2]
-        around *= 0.5
-        faded += _column_power(np.subtract(amplitude, around, out=around))
+        faded += _column_power(windowed)
     frequency = scipy.fft.fftfreq(length)
     if not power.any():
         power[:] = 1.0
@@ -226,8 +226,10 @@ def _mean_power(
 
 
 def _column_power(amplitude: NDArray[np.complexfloating]) -> NDArray[np.float64]:
-    """Power of every column, summed in double precision."""
-    return np.sum(amplitude.real**2 + amplitude.imag**2, axis=0, dtype=np.float64)
+    """Power of every column; overwrites the amplitudes of a few lines."""
+    parts = amplitude.view(amplitude.real.dtype)
+    squares = np.multiply(parts, parts, out=parts).sum(axis=0)
+    return squares.astype(np.float64).reshape(-1, 2).sum(axis=1)
 
 
 def _image_power(
