@@ -24,7 +24,7 @@ from clsas.planning.costs import Costs
 from clsas.planning.exact_image import Exact, expect
 from clsas.planning.factorize import factorize
 from clsas.planning.planner import plan
-from clsas.planning.view import View
+from clsas.planning.visibility_model import VisibilityModel
 from clsas.simulation.scenes import PointTargets
 from clsas.simulation.simulator import simulate_lines
 from clsas.sonar.beam import BeamWindow
@@ -177,7 +177,7 @@ def _images(device: Device) -> list[_Image]:
     images = []
 
     def backprojected(lines: RangeLines, grid: Grid, beam: BeamWindow | None = None) -> None:
-        expected = expect(View(lines, grid, beam), _EXACT_DB, device)
+        expected = expect(VisibilityModel(lines, grid, beam), _EXACT_DB, device)
         form = partial(backproject, lines, grid, device=device, accuracy_db=_EXACT_DB, beam=beam)
         images.append(_Image(form, lines.channels, expected, expected.tiled))
 

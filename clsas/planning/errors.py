@@ -20,7 +20,7 @@ from clsas.factorized.aperture import drift, stretches
 from clsas.factorized.thesis import stage_errors_m
 from clsas.factorized.tree import interpolated_directions, interpolated_nodes
 from clsas.opencl.device import Device
-from clsas.planning.view import View, kept
+from clsas.planning.visibility_model import VisibilityModel, cached
 from clsas.signal.interpolation import Interpolator
 from clsas.sonar.visibility import sines
 
@@ -29,7 +29,9 @@ _CHANNELS, _FURTHEST, _PLACES, _PIXELS = 128, 32, 160, 24  # sampled for errors
 _SOME_POINTS = (0, 7, 14, 16, 23)  # of 5 by 5 sample points, one in every row and column
 
 
-def leaf_error(view: View, sides: NDArray[np.int64], device: Device) -> NDArray[np.float64]:
+def leaf_error(
+    view: VisibilityModel, sides: NDArray[np.int64], device: Device
+) -> NDArray[np.float64]:
     """Return the power of the error that expanding leaves of some sizes adds.
 
     See `layout.lay_out`: the fourth order, in long leaves 0.35 of the largest rms. Off a plane
@@ -71,7 +73,7 @@ class Errors:
 
 
 def other_errors(
-    view: View,
+    view: VisibilityModel,
     sides: Sequence[tuple[int, int]],
     roots: float,
     aperture: Interpolator,
@@ -92,7 +94,7 @@ def other_errors(
 
 
 def _over_relief(
-    view: View, side: tuple[int, int], error: Callable[[NDArray[np.float64]], float]
+    view: VisibilityModel, side: tuple[int, int], error: Callable[[NDArray[np.float64]], float]
 ) -> float:
     """Return the mean over the grid of an error that depends on the extents of subimages.
 
@@ -109,8 +111,8 @@ def _over_relief(
     return plane + max(error(surface.extents(side, most_m)) - plane, 0.0) * float(share)
 
 
-@kept
-def root_error(view: View, side: tuple[int, int]) -> float:
+@cached
+def root_error(view: VisibilityModel, side: tuple[int, int]) -> float:
     """Return the power of the error of roots: of rounding, and of channels put on the mean track.
 
     The latter is `_off_track`.
@@ -122,7 +124,7 @@ def root_error(view: View, side: tuple[int, int]) -> float:
     return float(off_track + rounding)
 
 
-def _off_track(view: View, side: tuple[int, int], extents: NDArray[np.float64]) -> float:
+def _off_track(view: VisibilityModel, side: tuple[int, int], extents: NDArray[np.float64]) -> float:
     """Return the power of the error that channels put on the mean track make.
 
     It is evaluated for sampled channels, roots and pixels: the change in range from a root's centre
@@ -132,7 +134,7 @@ def _off_track(view: View, side: tuple[int, int], extents: NDArray[np.float64]) 
     """
     lines, track = view.lines, view.track
     points = np.array(_SOME_POINTS)
-    seen = view.seen(side)[points]
+    seen = view.visible(side)[points]
     candidates = np.flatnonzero(np.interp(track.place, track.samples, seen.any(axis=0)))
     index, counts = _some_off_track(view, candidates)
     part = replace(track, place=track.place[index])
@@ -176,7 +178,7 @@ def _off_track(view: View, side: tuple[int, int], extents: NDArray[np.float64]) 
 
 
 def _some_off_track(
-    view: View, candidates: NDArray[np.int64]
+    view: VisibilityModel, candidates: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Sample channels, the furthest off the track among them; return their weights too.
 
@@ -184,7 +186,7 @@ def _some_off_track(
     """
     if len(candidates) <= _CHANNELS:
         return candidates, np.ones(len(candidates))
-    by_distance = candidates[np.argsort(view.off_track_m[candidates], kind="stable")]
+    by_distance = candidates[np.argsort(view.track_error_m[candidates], kind="stable")]
     others, furthest = np.split(by_distance, [-_FURTHEST])
     others.sort()
     some = others[some_channels(len(others), _CHANNELS - _FURTHEST)]
@@ -192,9 +194,9 @@ def _some_off_track(
     return np.concatenate([some, furthest]), counts
 
 
-@kept
+@cached
 def excess_error(
-    view: View,
+    view: VisibilityModel,
     side: tuple[int, int],
     aperture: Interpolator,
     crowding: float,
@@ -209,7 +211,7 @@ def excess_error(
 
 
 def _between_nodes(
-    view: View,
+    view: VisibilityModel,
     side: tuple[int, int],
     aperture: Interpolator,
     crowding: float,
@@ -273,9 +275,9 @@ class _Samples:
     exact: NDArray[np.float32]
 
 
-@kept
+@cached
 def _samples(
-    view: View, side: tuple[int, int], weighted: bool, extents: tuple[float, ...]
+    view: VisibilityModel, side: tuple[int, int], weighted: bool, extents: tuple[float, ...]
 ) -> _Samples | None:
     """Return samples for errors between virtual channels, None where nothing is seen."""
     channels, first, count = _channels_seen(view, side)
@@ -299,7 +301,7 @@ def _samples(
 
 
 def _channels_seen(
-    view: View, side: tuple[int, int]
+    view: VisibilityModel, side: tuple[int, int]
 ) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.int64]]:
     """Return the channels' aperture coordinates, and the range of them that sees each subimage.
 
@@ -308,7 +310,7 @@ def _channels_seen(
     between the track's samples.
     """
     places, samples = np.sort(view.track.place), view.track.samples
-    seen = view.seen(side)
+    seen = view.visible(side)
     begin = samples[np.maximum(seen.argmax(axis=1) - 1, 0)]
     end = samples[np.minimum(seen.shape[1] - seen[:, ::-1].argmax(axis=1), len(samples) - 1)]
     end[~seen.any(axis=1)] = -np.inf
@@ -317,7 +319,7 @@ def _channels_seen(
 
 
 def _steering(
-    view: View,
+    view: VisibilityModel,
     centres_m: NDArray[np.float64],
     pixels_m: NDArray[np.float64],
     carriers: NDArray[np.float64],
@@ -358,7 +360,7 @@ def _steering(
 
 
 def _pixels_m(
-    view: View, extents: NDArray[np.float64], point: int
+    view: VisibilityModel, extents: NDArray[np.float64], point: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return sampled pixels of a subimage, relative to its middle, [n + 1, 3]; the middle is first.
 
@@ -376,7 +378,9 @@ def _pixels_m(
     return np.concatenate([np.zeros((1, 3)), pixels_m]), places[:, -1]
 
 
-def nearest_errors(view: View, stages: Sequence[tuple[int, int]]) -> tuple[float, list[float]]:
+def nearest_errors(
+    view: VisibilityModel, stages: Sequence[tuple[int, int]]
+) -> tuple[float, list[float]]:
     """Return the power of the error of nearest beams, THESIS [45], spread evenly, and by stage.
 
     Range errors of stages add, not their powers.

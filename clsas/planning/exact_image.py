@@ -13,7 +13,7 @@ from clsas.exact.tiles import GroupsEstimate, Tiles
 from clsas.factorized.estimates import Work, backprojecting, upsampling
 from clsas.opencl.buffers import VECTOR_ROOM, channel_pitch
 from clsas.opencl.device import Device
-from clsas.planning.view import View
+from clsas.planning.visibility_model import VisibilityModel
 from clsas.sonar.beam import INTERVALS
 
 
@@ -63,7 +63,7 @@ class Exact:
         return Work(call=1.0) + lines + pixels
 
 
-def expect(view: View, accuracy_db: float, device: Device) -> Exact:
+def expect(view: VisibilityModel, accuracy_db: float, device: Device) -> Exact:
     """Predict an exact image, by the same decision that forms it."""
     lines, beam = view.lines, view.beam
     decision = decide(
@@ -81,7 +81,7 @@ def expect(view: View, accuracy_db: float, device: Device) -> Exact:
     tiled = isinstance(layout, Tiles)
     share = most = 1.0
     if beam is not None and view.track is not None:
-        share, most = view.share_seen((16, 16)), view.share_seen((64, 64), most=True)
+        share, most = view.visible_share((16, 16)), view.visible_share((64, 64), most=True)
     blocks = blocks_of(
         device,
         lines,
@@ -107,7 +107,7 @@ def expect(view: View, accuracy_db: float, device: Device) -> Exact:
 
 
 def _memory_bytes(
-    view: View,
+    view: VisibilityModel,
     device: Device,
     blocks: Blocks,
     layout: Tiles | GroupsEstimate,

@@ -18,12 +18,13 @@ from clsas.factorized.plan import Plan
 from clsas.opencl import phases
 from clsas.opencl.device import Device
 from clsas.planning import forecast
+from clsas.planning.beam_coverage import trimmed
 from clsas.planning.costs import Costs
 from clsas.planning.errors import Errors, excess_error, other_errors, root_error
 from clsas.planning.exact_image import Exact
 from clsas.planning.forecast import Candidate, margin_db
 from clsas.planning.search import Allowed, Tree, root_limits, search
-from clsas.planning.view import View
+from clsas.planning.visibility_model import VisibilityModel
 
 # Shares of the error power allowed: for roots, for the spacing of all stages' virtual channels, for
 # edges of the beam that are left out, and for what is always there.
@@ -41,7 +42,7 @@ class _Problem:
 
     Attributes
     ----------
-    view : View
+    view : VisibilityModel
         Without the edges of the beam, if there is one.
     tolerance_db : float
     exact : Exact
@@ -52,7 +53,7 @@ class _Problem:
         Filters designed before.
     """
 
-    view: View
+    view: VisibilityModel
     tolerance_db: float
     exact: Exact
     device: Device
@@ -115,7 +116,7 @@ class _Trial:
 
 
 def fastest(
-    view: View,
+    view: VisibilityModel,
     tolerance_db: float,
     exact: Exact,
     seconds: float,
@@ -128,9 +129,9 @@ def fastest(
 
     Beside it, where there is none, the least memory of those that did not fit.
     """
-    trimmed = view.trimmed(_EDGES_SHARE * power(tolerance_db))
-    problem = _Problem(trimmed, tolerance_db, exact, device, costs, memory_bytes)
-    most_root = root_limits(trimmed, _ROOTS_SHARE * problem.allowed)
+    view_trimmed = trimmed(view, _EDGES_SHARE * power(tolerance_db))
+    problem = _Problem(view_trimmed, tolerance_db, exact, device, costs, memory_bytes)
+    most_root = root_limits(view_trimmed, _ROOTS_SHARE * problem.allowed)
     needed, trial = math.inf, None
     if most_root is not None:
         beam_cycles = 0.0 if view.beam is None else _LEAST_BEAM_CYCLES

@@ -33,7 +33,7 @@ from clsas.opencl.device import Device
 from clsas.planning.costs import Costs
 from clsas.planning.errors import leaf_error
 from clsas.planning.exact_image import Exact
-from clsas.planning.view import View
+from clsas.planning.visibility_model import VisibilityModel
 from clsas.signal import interpolation
 from clsas.signal.interpolation import PHASES
 
@@ -50,14 +50,14 @@ _MOST_TABLE_BYTES = 64 << 20
 _ROOTS_PREPARED = 16  # together, so that arrays are few and large
 
 
-def margin_db(view: View) -> float:
+def margin_db(view: VisibilityModel) -> float:
     """Return the margin of predicted errors, dB, which covers the scatter of measured ones.
 
     Errors scatter more where few channels see a pixel: they depend on how these happen to lie
     between virtual channels, and to a step of the beam. They also scatter more where the lines'
     power lies at few frequencies.
     """
-    channels = view.lines.channels * view.share_seen((16, 16))
+    channels = view.lines.channels * view.visible_share((16, 16))
     few = _FEW_CHANNELS[view.beam is not None and view.beam.jumps]
     return MARGIN_DB + in_db(view.spectrum.scatter * (1 + few / max(channels, 1.0)))
 
@@ -74,7 +74,7 @@ class Candidate:
 
 
 def factorized(
-    view: View,
+    view: VisibilityModel,
     candidate: Candidate,
     other_errors: ErrorBudget,
     tolerance_db: float | None,
@@ -110,21 +110,23 @@ def factorized(
     of_aperture = aperture.taps, 2 * aperture.upsampling
     stages, channels, reach, work = [], float(lines.channels), [], Work(call=1.0)
     width = device.info.width
-    used = channels * view.share_seen(sides[0])
+    used = channels * view.visible_share(sides[0])
     for level, side in enumerate(sides):
         count = view.subimages(side)
         samples = -(-(2 * halves[level] + 1) // width) * width
-        seen = view.seen(side)
+        seen = view.visible(side)
         if nearest:
             used, channels = channels, math.ceil(channels / nearest[level])
         else:
             if level:
-                turns = candidate.crowding[level - 1] * view.turns(sides[level - 1], seen)
-                used = min(channels, view.channels(*of_aperture, turns))
-            turns = candidate.crowding[level] * view.turns(side, seen)
+                turns = candidate.crowding[level - 1] * view.subimage_phase_cycles(
+                    sides[level - 1], seen
+                )
+                used = min(channels, view.virtual_channels(*of_aperture, turns))
+            turns = candidate.crowding[level] * view.subimage_phase_cycles(side, seen)
             if view.beam is not None and level == len(sides) - 1:
-                turns += candidate.beam_cycles * view.cycles(view.beam_rates, seen)
-            channels = view.channels(*of_aperture, turns)
+                turns += candidate.beam_cycles * view.visible_phase_cycles(view.beam_rates, seen)
+            channels = view.virtual_channels(*of_aperture, turns)
             reach.append(aperture.taps * used / channels)
         taps = align.taps + aperture.taps
         of_stage = combining(count * used, samples, taps, given=level == 0)
@@ -137,7 +139,7 @@ def factorized(
         operations, error_db = count * used * samples, in_db(_power_of_stage(candidate))
         seconds = costs.seconds(of_stage)
         stages.append(Stage(*side, count, round(channels), samples, operations, error_db, seconds))
-    tiled, pixels = view.surface.is_plane, view.slots(side, width)
+    tiled, pixels = view.surface.is_plane, view.padded_pixels(side, width)
     operations = count * pixels * channels
     of_leaves = backprojecting_leaves(
         count * channels, pixels, final.taps, tiled=tiled, weighted=view.beam is not None
@@ -211,7 +213,7 @@ def factorized(
     )
 
 
-def _band(view: View, outside: float) -> tuple[float, float]:
+def _band(view: VisibilityModel, outside: float) -> tuple[float, float]:
     """Return the centre and half width of the band that holds all but a share of the power."""
     spectrum = view.spectrum
     bins = np.searchsorted(np.cumsum(spectrum.share), 1 - outside)
@@ -226,7 +228,7 @@ def half_precision_error(stages: int) -> float:
     return HALF_ROUNDING * (1 + 1.5 * stages)
 
 
-def _half_rounding(view: View, reach: Sequence[float]) -> float:
+def _half_rounding(view: VisibilityModel, reach: Sequence[float]) -> float:
     """Return the power of the error that rounding lines to half precision adds.
 
     `reach` is the number of channels that a virtual one sums, stage by stage. Rounded are the
@@ -234,7 +236,7 @@ def _half_rounding(view: View, reach: Sequence[float]) -> float:
     while the sum still grows, which counts as half. A sum of very many chunks loses what is added.
     """
     chunks = np.array(reach) / CHUNK
-    chunks[0] *= view.densest
+    chunks[0] *= view.peak_density
     if chunks.max() > _MOST_CHUNKS:
         return np.inf
     return HALF_ROUNDING * (1 + float(np.sum(1 + chunks / 2)))
@@ -264,7 +266,7 @@ def _filter_errors(candidate: Candidate) -> dict[str, float]:
 
 
 def _most_channels(
-    view: View, candidate: Candidate, stages: Sequence[Stage]
+    view: VisibilityModel, candidate: Candidate, stages: Sequence[Stage]
 ) -> list[tuple[float, float]]:
     """Return the virtual channels of the whole aperture, and the most of a subimage, by stage.
 
@@ -278,15 +280,19 @@ def _most_channels(
         [],
     )
     for level, side in enumerate(candidate.sides):
-        seen = view.seen(side)
+        seen = view.visible(side)
         everywhere, most = (
-            density * candidate.crowding[level] * view.turns(side, where, most=True) + taps + 2
+            density * candidate.crowding[level] * view.subimage_phase_cycles(side, where, most=True)
+            + taps
+            + 2
             for where in (np.ones_like(seen), seen)
         )
         if view.beam is not None:
             if level == len(candidate.sides) - 1:
                 most += (
-                    density * candidate.beam_cycles * view.cycles(view.beam_rates, seen, most=True)
+                    density
+                    * candidate.beam_cycles
+                    * view.visible_phase_cycles(view.beam_rates, seen, most=True)
                 )
             most *= 1 + OF_BEAM
         found.append((everywhere, _ROOM * most))
@@ -294,7 +300,7 @@ def _most_channels(
 
 
 def _root_bytes(
-    view: View,
+    view: VisibilityModel,
     candidate: Candidate,
     tile: tuple[int, int],
     stages: Sequence[Stage],
@@ -321,7 +327,7 @@ def _root_bytes(
         references = 0 if tile == sides[-1] else 12
         work += parts * ((most + VECTOR_ROOM) * (references + 4 * terms) + 24)
     else:
-        slots = view.most_slots(sides[-1], sides[0], width)
+        slots = view.most_padded_pixels(sides[-1], sides[0], width)
         parts = slots / (STACK * width)
         tables += 24 * parts + 12 * slots
     return work + 8 * (1 + normalise) * slots, tables + 12 * parts
@@ -331,7 +337,7 @@ def _subimages(root: tuple[int, int], side: tuple[int, int]) -> int:
     return math.prod(a // b for a, b in zip(root, side, strict=True))
 
 
-def _tile(view: View, leaf: tuple[int, int], device: Device) -> tuple[int, int]:
+def _tile(view: VisibilityModel, leaf: tuple[int, int], device: Device) -> tuple[int, int]:
     """Return the largest tiles of a leaf that may be expanded about their centres."""
     parts = [
         (rows, columns)
@@ -344,7 +350,7 @@ def _tile(view: View, leaf: tuple[int, int], device: Device) -> tuple[int, int]:
 
 
 def plain(
-    view: View, tolerance_db: float | None, exact: Exact, device: Device, costs: Costs
+    view: VisibilityModel, tolerance_db: float | None, exact: Exact, device: Device, costs: Costs
 ) -> Plan:
     """Return the plan of an exact image."""
     seconds = float(costs.seconds(exact.work))

@@ -19,6 +19,7 @@ from clsas.factorized.filters import ALIGN_TAPS, Filters
 from clsas.factorized.plan import Plan, with_left_out
 from clsas.opencl.device import Device, open_device
 from clsas.planning import forecast
+from clsas.planning.beam_coverage import coverage, partly_visible_share, sweeps_once
 from clsas.planning.costs import Costs
 from clsas.planning.costs import defaults as default_costs
 from clsas.planning.costs import measured as measured_costs
@@ -27,7 +28,7 @@ from clsas.planning.exact_image import Exact, expect
 from clsas.planning.fastest import fastest
 from clsas.planning.forecast import MARGIN_DB, OUTSIDE, Candidate
 from clsas.planning.search import MOST_STAGES, Allowed
-from clsas.planning.view import View
+from clsas.planning.visibility_model import VisibilityModel
 from clsas.signal import interpolation
 from clsas.signal.interpolation import Interpolator
 from clsas.sonar.beam import BeamWindow
@@ -147,7 +148,9 @@ def plan(
     if memory_bytes is not None:
         memory_bytes = validate.count("memory_bytes", memory_bytes)
     model = Model(lines, grid, beam) if full_model else simplify(lines, grid, beam, tolerance_db)
-    view = View(model.lines, model.grid, model.beam, OUTSIDE * power(tolerance_db or 0.0))
+    view = VisibilityModel(
+        model.lines, model.grid, model.beam, OUTSIDE * power(tolerance_db or 0.0)
+    )
     rest_db = tolerance_db
     if tolerance_db is not None:
         view.ambiguity.warn("tolerance_db", tolerance_db)
@@ -175,7 +178,7 @@ def plan(
 
 
 def _chosen(
-    view: View,
+    view: VisibilityModel,
     tolerance_db: float | None,
     stages: list[tuple[int, int]] | None,
     device: Device,
@@ -258,20 +261,20 @@ def _worth_a_search(exact: Exact, costs: Costs, exact_fits: bool, allowed: Allow
     return not exact_fits or allowed is not None or costs.seconds(exact.work) > _SEARCH_S
 
 
-def _divisible(view: View) -> bool:
+def _divisible(view: VisibilityModel) -> bool:
     """Return whether an image can be factorized at all."""
-    if view.track is None or view.grid.size == 1 or not view.sweeps_once:
+    if view.track is None or view.grid.size == 1 or not sweeps_once(view):
         return False
     if view.beam is None:
         return True
     # What is normalised is amplified with its errors where hardly anything is seen.
-    if view.beam.normalise and view.coverage(1).min() < _LEAST_COVERED:
+    if view.beam.normalise and coverage(view, 1).min() < _LEAST_COVERED:
         return False
     # Steps of a window that are seen from few pixels cost these more than is expected of all.
-    if view.beam.jumps and 0 < view.share_partial < _LEAST_PARTIAL:
+    if view.beam.jumps and 0 < partly_visible_share(view) < _LEAST_PARTIAL:
         return False
     # Where hardly any pixel sees anything there is as little to gain as is known about errors.
-    return float(view.coverage(2).mean()) >= _LEAST_SHARE_COVERED
+    return float(coverage(view, 2).mean()) >= _LEAST_SHARE_COVERED
 
 
 def decibels(wavelengths: float) -> float:
@@ -285,7 +288,7 @@ def wavelengths(decibels: float) -> float:
 
 
 def _nearest(
-    view: View,
+    view: VisibilityModel,
     stages: Sequence[tuple[int, int]],
     exact: Exact,
     device: Device,

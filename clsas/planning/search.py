@@ -1,10 +1,16 @@
-"""The fastest tree of subimages whose filters err by no more than allowed."""
+"""The fastest tree of subimages whose filters err by no more than allowed.
+
+For every root, number of stages and choice of filters, the fastest division down to the leaves is a
+shortest path over the sizes of subimages (dynamic programming). Roots are tried in the order of a
+lower bound of their time, until none of the others can be faster.
+"""
 
 from __future__ import annotations
 
 import functools
 import math
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, field
 from itertools import product
 
 import numpy as np
@@ -17,13 +23,15 @@ from clsas.factorized.plan import LEAST_BATCH
 from clsas.opencl.device import Device
 from clsas.planning.costs import Costs
 from clsas.planning.errors import leaf_error, root_error
-from clsas.planning.view import View
+from clsas.planning.visibility_model import Side, VisibilityModel, cached, mean_over_points
 from clsas.signal.interpolation import PHASES, upsampler
 from clsas.signal.spectrum import Spectrum
 
 _ROWS = (16, 32, 64, 128, 256, 512, 1024, 2048)  # of subimages
 _COLUMNS = (4, 8, 16, 32, 64, 128, 256, 512, 1024, 2048)
 MOST_STAGES = 5
+_LEAF_SHARE = 0.25  # of the filters' error power, which expanding a leaf may add
+_SPARE_SAMPLES = 16  # of a line, besides what a subimage and the filters need
 
 
 @dataclass(frozen=True)
@@ -37,9 +45,9 @@ class Allowed:
 
 @dataclass(frozen=True)
 class Tree:
-    """Sizes of subimages, and taps of the filters between them."""
+    """Sizes of subimages from the roots to the leaves, and taps of the filters between them."""
 
-    sides: tuple[tuple[int, int], ...]
+    sides: tuple[Side, ...]
     align_taps: int
     aperture_taps: int
 
@@ -49,183 +57,258 @@ class Tree:
 
 
 @dataclass(frozen=True, eq=False)
-class _Sizes:
-    """Subimages of every size, [sizes] each.
+class Sizes:
+    """Subimages of every size that the search considers, [sizes] each.
 
     Attributes
     ----------
-    view : View
-    sides : int [sizes, 2]
+    model : VisibilityModel
+    sides : int64 [sizes, 2]
         Rows and columns.
-    counts : int
+    counts : float64
         Number that hold a pixel.
-    slots : float
-        Mean number of pixels, padded to whole work-items.
-    share : float
-        Share of the channels that see any of one.
-    reach_m : float
+    padded_pixels : float64
+        Mean pixel count, padded to whole work-items.
+    visible_share : float64
+        Mean fraction of the channels whose beam touches one.
+    half_range_extent_m : float64
         Largest difference in range between a pixel and the centre.
-    beam_turns : float
-        Cycles of the beam's weights that virtual channels of a leaf must follow.
-    leaf : bool
-        True where leaves may have this size.
+    beam_cycles : float64
+        Phase cycles of a beam's weights along the visible aperture; see `tree.beam_rate`.
+    leaf_error : float64
+        Error power that expanding a leaf of this size adds.
     """
 
-    view: View
+    model: VisibilityModel
     sides: NDArray[np.int64]
-    counts: NDArray[np.int64]
-    slots: NDArray[np.float64]
-    share: NDArray[np.float64]
-    reach_m: NDArray[np.float64]
-    beam_turns: NDArray[np.float64]
-    leaf: NDArray[np.bool_]
+    counts: NDArray[np.float64]
+    padded_pixels: NDArray[np.float64]
+    visible_share: NDArray[np.float64]
+    half_range_extent_m: NDArray[np.float64]
+    beam_cycles: NDArray[np.float64]
+    leaf_error: NDArray[np.float64]
+    _in_roots: dict[int, Division] = field(default_factory=dict, init=False)
 
     @functools.cached_property
-    def pairs(self) -> list[tuple[int, int]]:
+    def pairs(self) -> tuple[Side, ...]:
         """`sides` as pairs of int."""
-        return [(int(rows), int(columns)) for rows, columns in self.sides]
+        return tuple((int(rows), int(columns)) for rows, columns in self.sides)
 
     @functools.cached_property
-    def inside(self) -> NDArray[np.bool_]:
+    def divides(self) -> NDArray[np.bool_]:
         """True where subimages of one size divide into those of another, [sizes, sizes]."""
         return (self.sides[:, None] % self.sides == 0).all(axis=-1)
 
-    def cycles(
-        self, root: tuple[int, int], within: NDArray[np.int64] | slice = slice(None)
-    ) -> NDArray[np.float64]:
-        """Return the cycles that phases turn by in a root.
+    @functools.cached_property
+    def anywhere(self) -> Division:
+        """All sizes, with the phases at the sample points: lower bounds of those in a root."""
+        return self._division((0, 0), np.arange(len(self.sides)))
 
-        Entry [i, j]: while a subimage of size i is seen, the phases of one of size j.
-        """
-        sides = [tuple(side) for side in self.sides[within].tolist()]
-        extents = [self.view.extents(side, root=root if any(root) else None) for side in sides]
-        return self.view.cycles_in_root(root, sides) @ np.stack(extents).T
+    def in_root(self, root: int) -> Division:
+        """Return the sizes that divide a root, with the largest phases in it."""
+        if root not in self._in_roots:
+            index = np.flatnonzero(self.divides[root])
+            self._in_roots[root] = self._division(self.pairs[root], index)
+        return self._in_roots[root]
 
-    def in_root(self, root: int) -> _Within:
-        """Return the sizes that divide a root."""
-        within = np.flatnonzero(self.inside[root])
-        return _Within.of(self, within, self.cycles(self.pairs[root], within))
+    def _division(self, root: Side, index: NDArray[np.int64]) -> Division:
+        """Return some sizes with their phases in a root, whose rows are 0 for sample points."""
+        if self.model.surface.is_plane:
+            extents = self.sides[index].astype(np.float64)
+        else:
+            of_root = root if any(root) else None
+            extents = np.stack([self.model.extents(self.pairs[i], root=of_root) for i in index])
+        cycles = self.model.phase_cycles_in_root(root, self.pairs)[index] @ extents.T
+        smaller = self.divides[np.ix_(index, index)].T & (index[:, None] != index)
+        return Division(index, cycles, np.where(smaller, 0.0, np.inf))
 
 
 @dataclass(frozen=True, eq=False)
-class _Within:
-    """The sizes that divide a root.
+class Division:
+    """Sizes that subimages in a root may have.
 
     Attributes
     ----------
-    sizes : int [n]
-        Their indices.
-    turns, of_leaf : float [n, n], [n]
-        Cycles of a parent of size j that a child of size i uses; and those of leaves.
-    step_s : float [n, n]
+    index : int64 [n]
+        Which of the `Sizes`.
+    cycles : float64 [n, n]
+        Phase of a parent of size j, accumulated where a child of size i is visible.
+    divisible_s : float64 [n, n]
         0 where a parent of size j may divide into children of size i, else infinite.
     """
 
-    sizes: NDArray[np.int64]
-    turns: NDArray[np.float64]
-    of_leaf: NDArray[np.float64]
-    step_s: NDArray[np.float64]
-
-    @classmethod
-    def of(cls, sizes: _Sizes, within: NDArray[np.int64], turns: NDArray[np.float64]) -> _Within:
-        smaller = sizes.inside[np.ix_(within, within)].T & (within[:, None] != within)
-        of_leaf = np.diag(turns) + sizes.beam_turns[within]
-        return cls(within, turns, of_leaf, np.where(smaller, 0.0, np.inf))
+    index: NDArray[np.int64]
+    cycles: NDArray[np.float64]
+    divisible_s: NDArray[np.float64]
 
 
-def _sizes(
-    view: View, device: Device, filters_db: float, leaf_pixels: int, beam_cycles: float
-) -> _Sizes:
-    """Return all sizes of subimages that a grid may be divided into."""
+@cached
+def all_sizes(model: VisibilityModel, most: Side, device: Device) -> Sizes:
+    """Return the sizes of subimages up to `most` rows and columns."""
     rows, columns = (
-        [side for side in sides if side < 2 * max(n, min(sides))]
-        for sides, n in zip((_ROWS, _COLUMNS), view.surface.plane.shape, strict=True)
+        [side for side in sides if side <= limit and side < 2 * max(n, min(sides))]
+        for sides, n, limit in zip((_ROWS, _COLUMNS), model.surface.plane.shape, most, strict=True)
     )
-    pairs = list(product(rows, columns))
-    sides = np.array(pairs)
-    beam_turns = np.zeros(len(sides))
-    if view.beam is not None:
-        beam_turns[:] = [view.cycles(view.beam_rates, view.seen(side)) for side in pairs]
-    curved = leaf_error(view, sides, device) > 0.25 * power(filters_db)
-    return _Sizes(
-        view,
+    pairs = tuple(product(rows, columns))
+    sides = np.array(pairs, np.int64).reshape(-1, 2)
+    if not pairs:
+        return Sizes(model, sides, *np.zeros((6, 0)))
+    visible = model.visible_by_size(pairs)
+    share = mean_over_points(visible.sum(axis=-1)) / np.count_nonzero(model.on_track)
+    beam_cycles = np.zeros(len(sides))
+    if model.beam is not None:
+        rates = model.beam_rates * model.spacing
+        beam_cycles = mean_over_points(np.einsum("nps,ps->np", visible, rates))
+    return Sizes(
+        model,
         sides,
-        counts=np.array([view.subimages(side) for side in pairs]),
-        slots=np.array([view.slots(side, device.info.width) for side in pairs]),
-        share=np.array([view.share_seen(side) for side in pairs]),
-        reach_m=np.array([view.reach_m(side) for side in pairs]),
-        beam_turns=beam_cycles * beam_turns,
-        leaf=~curved & (np.prod(sides, axis=1) >= leaf_pixels),
+        counts=np.array([float(model.subimages(side)) for side in pairs]),
+        padded_pixels=np.array([model.padded_pixels(side, device.info.width) for side in pairs]),
+        visible_share=share,
+        half_range_extent_m=np.array([model.half_range_extent_m(side) for side in pairs]),
+        beam_cycles=beam_cycles,
+        leaf_error=leaf_error(model, sides, device),
     )
 
 
 @dataclass(frozen=True, eq=False)
-class _Option:
-    """Filters for a number of stages, and the time that things take with them.
+class Options:
+    """Choices of filters for one number of stages, and the time that things take with each.
 
     Attributes
     ----------
-    choice : Choice
     stages : int
-    channel_s : float [sizes]
-        Of every channel of all subimages of a size, in stages after the first.
-    subimages_s : float [sizes]
-        Of these subimages besides.
-    leaves_s : float [sizes]
-        Of every virtual channel of all leaves of a size; infinite where leaves may not have it.
-    roots_s : float [sizes]
-        Of the first stage with roots of a size, and of all that does not depend on the division.
+    choices : list of Choice, [options]
+    density, ends : float64 [options, 1, 1]
+        Virtual channels per cycle, and those besides; see `VisibilityModel.virtual_channels`.
+    channel_s : float64 [options, sizes]
+        Each channel of all subimages of a size, in stages after the first.
+    subimages_s : float64 [sizes]
+        These subimages themselves.
+    leaves_s : float64 [options, sizes]
+        Each virtual channel of all leaves of a size; infinite where leaves may not have it.
+    roots_s : float64 [options, sizes]
+        The first stage with roots of a size, and all that does not depend on the division.
+    leaf_beam_cycles : float64 [sizes]
+        Phase cycles that the beam's weights add to those of a leaf.
     """
 
-    choice: Choice
     stages: int
+    choices: list[Choice]
+    density: NDArray[np.float64]
+    ends: NDArray[np.float64]
     channel_s: NDArray[np.float64]
     subimages_s: NDArray[np.float64]
     leaves_s: NDArray[np.float64]
     roots_s: NDArray[np.float64]
+    leaf_beam_cycles: NDArray[np.float64]
 
-    def channels(self, view: View, turns: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the virtual channels of subimages whose phases turn by so many cycles."""
-        return view.channels(self.choice.aperture_taps, 2 * self.choice.density, turns)
+    def onward_s(
+        self, division: Division, some: NDArray[np.int64]
+    ) -> tuple[list[NDArray[np.float64]], NDArray[np.float64]]:
+        """Least time from subimages of every size to their pixels, by stage.
+
+        Parameters
+        ----------
+        division : Division
+            Sizes to divide into, [n].
+        some : int64 [m]
+            Which of the options.
+
+        Returns
+        -------
+        list of float64 [m, n]
+            Seconds, from the roots to the leaves.
+        float64 [m, n, n]
+            Seconds of a step to children of size i from parents of size j.
+        """
+        index = division.index
+        density, ends = self.density[some], self.ends[some]
+        # A child uses those of its parent's channels whose beam touches it.
+        step_s = density * division.cycles
+        step_s += ends
+        step_s *= self.channel_s[some][:, index, None]
+        step_s += self.subimages_s[index, None]
+        step_s += division.divisible_s
+        leaf_cycles = np.diag(division.cycles) + self.leaf_beam_cycles[index]
+        onward_s = (density[..., 0] * leaf_cycles + ends[..., 0]) * self.leaves_s[some][:, index]
+        by_stage = [onward_s]
+        for _ in range(self.stages - 1):
+            onward_s = (step_s + onward_s[:, :, None]).min(axis=1)
+            by_stage.append(onward_s)
+        return by_stage[::-1], step_s
+
+    def path(self, division: Division, option: int, root: int) -> list[int]:
+        """Return the sizes of the fastest tree from a root, as indices into `Sizes`."""
+        by_stage, step_s = self.onward_s(division, np.array([option]))
+        size = int(np.searchsorted(division.index, root))
+        path = [size]
+        for onward_s in by_stage[1:]:
+            path.append(int((step_s[0, :, path[-1]] + onward_s[0]).argmin()))
+        return [int(division.index[each]) for each in path]
 
 
-def _options(sizes: _Sizes, filters_db: float, costs: Costs, allowed: Allowed) -> list[_Option]:
-    """Return all choices of filters, and the time that things take with each."""
-    view, options = sizes.view, []
-    counts, channels = sizes.counts, view.lines.channels
-    batches = np.maximum(counts / LEAST_BATCH, 1.0)
+def options(
+    sizes: Sizes,
+    filters_db: float,
+    leaf_pixels: int,
+    beam_cycles: float,
+    costs: Costs,
+    allowed: Allowed,
+) -> Iterator[Options]:
+    """Yield all choices of filters, by number of stages, with the time that things take."""
+    model, counts, channels = sizes.model, sizes.counts, sizes.model.lines.channels
     most_db = filters_db + in_db(UPSAMPLING_SHARE)
-    filtered = upsampler(view.spectrum, PHASES // 2, np.ones_like, most_db) is not None
-    tiled, weighted = view.surface.is_plane, view.beam is not None
-    for stages, *taps in product(allowed.stages, allowed.align_taps, allowed.aperture_taps):
-        choice = choose(view.spectrum, *taps, stages, filters_db)
-        if choice is None:
+    filtered = upsampler(model.spectrum, PHASES // 2, np.ones_like, most_db) is not None
+    tiled, weighted = model.surface.is_plane, model.beam is not None
+    leaf = sizes.leaf_error <= _LEAF_SHARE * power(filters_db)
+    leaf &= np.prod(sizes.sides, axis=1) >= leaf_pixels
+    for stages in allowed.stages:
+        all_taps = product(allowed.align_taps, allowed.aperture_taps)
+        found = (choose(model.spectrum, *taps, stages, filters_db) for taps in all_taps)
+        choices = [choice for choice in found if choice is not None]
+        if not choices:
             continue
-        samples = 2 * sizes.reach_m * choice.rate / view.lines.range_step_m
-        samples += choice.final_taps + 16
-        leaves = backprojecting_leaves(
-            counts, sizes.slots, choice.final_taps, tiled=tiled, weighted=weighted
-        )
-        of_roots = combining(counts * sizes.share * channels, samples, sum(taps), given=True)
-        of_roots += Work(reference=counts * channels, subimage=counts, batch=batches * stages)
-        of_roots += upsampling(view.lines.samples.size * choice.rate, filtered=filtered)
-        options.append(
-            _Option(
-                choice,
-                stages,
-                channel_s=costs.seconds(combining(counts, samples, sum(taps), given=False)),
-                subimages_s=costs.seconds(Work(subimage=counts)),
-                leaves_s=np.where(sizes.leaf, costs.seconds(leaves), np.inf),
-                roots_s=costs.seconds(of_roots),
+        rate, final_taps, taps = (
+            np.array(each)[:, None]
+            for each in zip(
+                *((c.rate, c.final_taps, c.align_taps + c.aperture_taps) for c in choices),
+                strict=True,
             )
         )
-    return options
+        samples = 2 * sizes.half_range_extent_m * rate / model.lines.range_step_m
+        samples += final_taps + _SPARE_SAMPLES
+        roots = combining(counts * sizes.visible_share * channels, samples, taps, given=True)
+        batches = np.maximum(counts / LEAST_BATCH, 1.0) * stages
+        roots += Work(reference=counts * channels, subimage=counts, batch=batches)
+        roots += upsampling(model.lines.samples.size * rate, filtered=filtered)
+        leaves_s = [
+            costs.seconds(
+                backprojecting_leaves(
+                    counts, sizes.padded_pixels, c.final_taps, tiled=tiled, weighted=weighted
+                )
+            )
+            for c in choices
+        ]
+        density = np.array([2 * choice.density for choice in choices])
+        aperture_taps = np.array([choice.aperture_taps for choice in choices])
+        yield Options(
+            stages,
+            choices,
+            density[:, None, None],
+            np.array(model.virtual_channels(aperture_taps, 0.0, 0.0))[:, None, None],
+            channel_s=np.asarray(costs.seconds(combining(counts, samples, taps, given=False))),
+            subimages_s=np.asarray(costs.seconds(Work(subimage=counts))),
+            leaves_s=np.where(leaf, leaves_s, np.inf),
+            roots_s=np.asarray(costs.seconds(roots)),
+            leaf_beam_cycles=beam_cycles * sizes.beam_cycles,
+        )
 
 
 def search(
-    view: View,
+    model: VisibilityModel,
     filters_db: float,
-    most: tuple[int, int],
+    most: Side,
     leaf_pixels: int,
     beam_cycles: float,
     device: Device,
@@ -236,75 +319,52 @@ def search(
 
     None where there is none with roots of `most` rows and columns and leaves of `leaf_pixels` at
     least.
-
-    For every root, number of stages and choice of filters, the fastest way to the leaves is a
-    shortest path over the sizes that subimages may have. Those are tried first that could be
-    fastest, until none of the others can be.
     """
-    sizes = _sizes(view, device, filters_db, leaf_pixels, beam_cycles)
-    options = _options(sizes, filters_db, costs, allowed)
-    roots = np.flatnonzero((sizes.sides <= most).all(axis=1))
-    if not options or not roots.size:
+    sizes = all_sizes(model, most, device)
+    by_stages = list(options(sizes, filters_db, leaf_pixels, beam_cycles, costs, allowed))
+    if not by_stages or not sizes.pairs:
         return None
-    # In a root phases turn no less than in the middle of it.
-    anywhere = _Within.of(sizes, np.arange(len(sizes.sides)), sizes.cycles((0, 0)))
-    roots_s = np.array([option.roots_s for option in options])
-    least_s = np.array([_onward(view, option, anywhere)[0] for option in options])
-    least_s = (roots_s + least_s)[:, roots]
-    in_root = functools.cache(sizes.in_root)
+    # The phase rate is lowest at a root's centre, so these are lower bounds.
+    bounds_s = [
+        each.roots_s + each.onward_s(sizes.anywhere, np.arange(len(each.choices)))[0][0]
+        for each in by_stages
+    ]
+    least_s = np.min([bound_s.min(axis=0) for bound_s in bounds_s], axis=0)
     best_s, best = math.inf, None
-    for place in np.argsort(least_s, axis=None, kind="stable"):
-        if least_s.flat[place] >= best_s:
+    for root in map(int, np.argsort(least_s, kind="stable")):
+        if least_s[root] >= best_s:
             break
-        index, root = place // len(roots), int(roots[place % len(roots)])
-        within = in_root(root)
-        onward_s, children = _onward(view, options[index], within)
-        size = int(np.searchsorted(within.sizes, root))
-        cost_s = roots_s[index, root] + onward_s[size]
-        if cost_s < best_s:
-            path = [size]
-            for each in children:
-                path.append(int(each[path[-1]]))
-            choice = options[index].choice
-            sides = tuple(sizes.pairs[within.sizes[size]] for size in path)
-            best_s, best = cost_s, Tree(sides, choice.align_taps, choice.aperture_taps)
-    return best
+        division = sizes.in_root(root)
+        size = int(np.searchsorted(division.index, root))
+        for each, bound_s in zip(by_stages, bounds_s, strict=True):
+            some = np.flatnonzero(bound_s[:, root] < best_s)
+            if not some.size:
+                continue
+            cost_s = each.roots_s[some, root] + each.onward_s(division, some)[0][0][:, size]
+            fastest = int(cost_s.argmin())
+            if cost_s[fastest] < best_s:
+                best_s, best = float(cost_s[fastest]), (each, int(some[fastest]), root)
+    if best is None:
+        return None
+    of_stages, option, root = best
+    path = of_stages.path(sizes.in_root(root), option, root)
+    choice = of_stages.choices[option]
+    return Tree(tuple(sizes.pairs[i] for i in path), choice.align_taps, choice.aperture_taps)
 
 
-def _onward(
-    view: View, option: _Option, within: _Within
-) -> tuple[NDArray[np.float64], list[NDArray[np.int64]]]:
-    """Return the seconds from subimages of each size to pixels, in the stages left.
-
-    Beside it, stage by stage, the best size of children (an index into `within.sizes`).
-    """
-    # To a child of size i from a parent of size j: the channels of the parent that it uses.
-    step_s = option.channels(view, within.turns)
-    step_s *= option.channel_s[within.sizes, None]
-    step_s += option.subimages_s[within.sizes, None]
-    step_s += within.step_s
-    onward_s = option.channels(view, within.of_leaf) * option.leaves_s[within.sizes]
-    children = []
-    for _ in range(option.stages - 1):
-        through_s = step_s + onward_s[:, None]
-        children.append(best := through_s.argmin(axis=0))
-        onward_s = through_s[best, np.arange(len(best))]
-    return onward_s, children[::-1]
-
-
-def root_limits(view: View, allowed: float) -> tuple[int, int] | None:
+def root_limits(model: VisibilityModel, allowed: float) -> Side | None:
     """Return the largest rows and columns of roots that keep their errors within a power.
 
     None where there are none.
     """
     rows, columns = (
         min((side for side in sides if side >= n), default=sides[-1])
-        for sides, n in zip((_ROWS, _COLUMNS), view.surface.plane.shape, strict=True)
+        for sides, n in zip((_ROWS, _COLUMNS), model.surface.plane.shape, strict=True)
     )
-    while root_error(view, (rows, columns)) > allowed:
+    while root_error(model, (rows, columns)) > allowed:
         smaller = [(rows // 2, columns), (rows, columns // 2)]
         smaller = [side for side in smaller if side[0] >= _ROWS[0] and side[1] >= _COLUMNS[0]]
         if not smaller:
             return None
-        rows, columns = min(smaller, key=functools.partial(root_error, view))
+        rows, columns = min(smaller, key=functools.partial(root_error, model))
     return rows, columns

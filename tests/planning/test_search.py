@@ -9,7 +9,7 @@ from clsas.opencl.device import open_device
 from clsas.planning import search
 from clsas.planning.costs import Costs
 from clsas.planning.search import Allowed
-from clsas.planning.view import View
+from clsas.planning.visibility_model import VisibilityModel
 
 
 def everything_tried(view, filters_db, most, leaf_pixels, beam_cycles, device, costs, allowed):
@@ -28,7 +28,7 @@ def everything_tried(view, filters_db, most, leaf_pixels, beam_cycles, device, c
 @pytest.fixture(scope="module", params=[None, BEAMS[0]], ids=["wide", "beam"])
 def view(request):
     grid = around(0, 40, shape=(500, 700))
-    return View(over(grid)[0], grid, request.param)
+    return VisibilityModel(over(grid)[0], grid, request.param)
 
 
 def cost_of(tree, view, filters_db, most, leaf_pixels, beam_cycles, device, costs, allowed):
