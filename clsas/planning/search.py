@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from itertools import product
 
@@ -173,12 +172,13 @@ def all_sizes(model: VisibilityModel, most: Side, device: Device) -> Sizes:
 
 @dataclass(frozen=True, eq=False)
 class Options:
-    """Choices of filters for one number of stages, and the time that things take with each.
+    """Choices of filters and numbers of stages, and the time that things take with each.
 
     Attributes
     ----------
-    stages : int
     choices : list of Choice, [options]
+    stages : int64 [options]
+        Never increasing.
     density, ends : float64 [options, 1, 1]
         Virtual channels per cycle, and those besides; see `VisibilityModel.virtual_channels`.
     channel_s : float64 [options, sizes]
@@ -193,8 +193,8 @@ class Options:
         Phase cycles that the beam's weights add to those of a leaf.
     """
 
-    stages: int
     choices: list[Choice]
+    stages: NDArray[np.int64]
     density: NDArray[np.float64]
     ends: NDArray[np.float64]
     channel_s: NDArray[np.float64]
@@ -206,19 +206,12 @@ class Options:
     def onward_s(
         self, division: Division, some: NDArray[np.int64]
     ) -> tuple[list[NDArray[np.float64]], NDArray[np.float64]]:
-        """Least time from subimages of every size to their pixels, by stage.
-
-        Parameters
-        ----------
-        division : Division
-            Sizes to divide into, [n].
-        some : int64 [m]
-            Which of the options.
+        """Least time from subimages of every size to their pixels, with some options [m].
 
         Returns
         -------
         list of float64 [m, n]
-            Seconds, from the roots to the leaves.
+            Seconds with 1, 2, ... stages left; the last is that of the roots.
         float64 [m, n, n]
             Seconds of a step to children of size i from parents of size j.
         """
@@ -232,77 +225,73 @@ class Options:
         step_s += division.divisible_s
         leaf_cycles = np.diag(division.cycles) + self.leaf_beam_cycles[index]
         onward_s = (density[..., 0] * leaf_cycles + ends[..., 0]) * self.leaves_s[some][:, index]
-        by_stage = [onward_s]
-        for _ in range(self.stages - 1):
-            onward_s = (step_s + onward_s[:, :, None]).min(axis=1)
-            by_stage.append(onward_s)
-        return by_stage[::-1], step_s
+        by_stages = [onward_s]
+        for left in range(2, int(self.stages[some].max()) + 1):
+            more = int(np.count_nonzero(self.stages[some] >= left))
+            onward_s = onward_s.copy()
+            onward_s[:more] = (step_s[:more] + onward_s[:more, :, None]).min(axis=1)
+            by_stages.append(onward_s)
+        return by_stages, step_s
 
     def path(self, division: Division, option: int, root: int) -> list[int]:
         """Return the sizes of the fastest tree from a root, as indices into `Sizes`."""
-        by_stage, step_s = self.onward_s(division, np.array([option]))
-        size = int(np.searchsorted(division.index, root))
-        path = [size]
-        for onward_s in by_stage[1:]:
+        by_stages, step_s = self.onward_s(division, np.array([option]))
+        path = [int(np.searchsorted(division.index, root))]
+        for onward_s in by_stages[-2::-1]:
             path.append(int((step_s[0, :, path[-1]] + onward_s[0]).argmin()))
         return [int(division.index[each]) for each in path]
 
 
-def options(
+def all_options(
     sizes: Sizes,
     filters_db: float,
     leaf_pixels: int,
     beam_cycles: float,
     costs: Costs,
     allowed: Allowed,
-) -> Iterator[Options]:
-    """Yield all choices of filters, by number of stages, with the time that things take."""
+) -> Options | None:
+    """Return all choices of filters that err by no more than `filters_db`; None without any."""
     model, counts, channels = sizes.model, sizes.counts, sizes.model.lines.channels
+    choices, stages = [], []
+    most_first = sorted(allowed.stages, reverse=True)
+    for number, *taps in product(most_first, allowed.align_taps, allowed.aperture_taps):
+        choice = choose(model.spectrum, *taps, number, filters_db)
+        if choice is not None:
+            choices.append(choice)
+            stages.append(number)
+    if not choices:
+        return None
+    numbers = [(c.rate, c.final_taps, c.align_taps + c.aperture_taps) for c in choices]
+    rate, final_taps, taps = np.array(numbers).T[..., None]
+    samples = 2 * sizes.half_range_extent_m * rate / model.lines.range_step_m
+    samples += final_taps + _SPARE_SAMPLES
+    roots = combining(counts * sizes.visible_share * channels, samples, taps, given=True)
+    batches = np.maximum(counts / LEAST_BATCH, 1.0) * np.array(stages)[:, None]
+    roots += Work(reference=counts * channels, subimage=counts, batch=batches)
     most_db = filters_db + in_db(UPSAMPLING_SHARE)
     filtered = upsampler(model.spectrum, PHASES // 2, np.ones_like, most_db) is not None
+    roots += upsampling(model.lines.samples.size * rate, filtered=filtered)
     tiled, weighted = model.surface.is_plane, model.beam is not None
+    pixels = sizes.padded_pixels
+    leaves_s = {
+        n: costs.seconds(backprojecting_leaves(counts, pixels, n, tiled=tiled, weighted=weighted))
+        for n in {choice.final_taps for choice in choices}
+    }
     leaf = sizes.leaf_error <= _LEAF_SHARE * power(filters_db)
     leaf &= np.prod(sizes.sides, axis=1) >= leaf_pixels
-    for stages in allowed.stages:
-        all_taps = product(allowed.align_taps, allowed.aperture_taps)
-        found = (choose(model.spectrum, *taps, stages, filters_db) for taps in all_taps)
-        choices = [choice for choice in found if choice is not None]
-        if not choices:
-            continue
-        rate, final_taps, taps = (
-            np.array(each)[:, None]
-            for each in zip(
-                *((c.rate, c.final_taps, c.align_taps + c.aperture_taps) for c in choices),
-                strict=True,
-            )
-        )
-        samples = 2 * sizes.half_range_extent_m * rate / model.lines.range_step_m
-        samples += final_taps + _SPARE_SAMPLES
-        roots = combining(counts * sizes.visible_share * channels, samples, taps, given=True)
-        batches = np.maximum(counts / LEAST_BATCH, 1.0) * stages
-        roots += Work(reference=counts * channels, subimage=counts, batch=batches)
-        roots += upsampling(model.lines.samples.size * rate, filtered=filtered)
-        leaves_s = [
-            costs.seconds(
-                backprojecting_leaves(
-                    counts, sizes.padded_pixels, c.final_taps, tiled=tiled, weighted=weighted
-                )
-            )
-            for c in choices
-        ]
-        density = np.array([2 * choice.density for choice in choices])
-        aperture_taps = np.array([choice.aperture_taps for choice in choices])
-        yield Options(
-            stages,
-            choices,
-            density[:, None, None],
-            np.array(model.virtual_channels(aperture_taps, 0.0, 0.0))[:, None, None],
-            channel_s=np.asarray(costs.seconds(combining(counts, samples, taps, given=False))),
-            subimages_s=np.asarray(costs.seconds(Work(subimage=counts))),
-            leaves_s=np.where(leaf, leaves_s, np.inf),
-            roots_s=np.asarray(costs.seconds(roots)),
-            leaf_beam_cycles=beam_cycles * sizes.beam_cycles,
-        )
+    density = np.array([2 * choice.density for choice in choices])
+    aperture_taps = np.array([choice.aperture_taps for choice in choices])
+    return Options(
+        choices,
+        np.array(stages),
+        density[:, None, None],
+        np.array(model.virtual_channels(aperture_taps, 0.0, 0.0))[:, None, None],
+        channel_s=np.asarray(costs.seconds(combining(counts, samples, taps, given=False))),
+        subimages_s=np.asarray(costs.seconds(Work(subimage=counts))),
+        leaves_s=np.where(leaf, np.array([leaves_s[c.final_taps] for c in choices]), np.inf),
+        roots_s=np.asarray(costs.seconds(roots)),
+        leaf_beam_cycles=beam_cycles * sizes.beam_cycles,
+    )
 
 
 def search(
@@ -321,34 +310,29 @@ def search(
     least.
     """
     sizes = all_sizes(model, most, device)
-    by_stages = list(options(sizes, filters_db, leaf_pixels, beam_cycles, costs, allowed))
-    if not by_stages or not sizes.pairs:
+    options = all_options(sizes, filters_db, leaf_pixels, beam_cycles, costs, allowed)
+    if options is None or not sizes.pairs:
         return None
     # The phase rate is lowest at a root's centre, so these are lower bounds.
-    bounds_s = [
-        each.roots_s + each.onward_s(sizes.anywhere, np.arange(len(each.choices)))[0][0]
-        for each in by_stages
-    ]
-    least_s = np.min([bound_s.min(axis=0) for bound_s in bounds_s], axis=0)
-    best_s, best = math.inf, None
+    every = np.arange(len(options.choices))
+    bound_s = options.roots_s + options.onward_s(sizes.anywhere, every)[0][-1]
+    least_s = bound_s.min(axis=0)
+    best_s, best = math.inf, (0, 0)
     for root in map(int, np.argsort(least_s, kind="stable")):
         if least_s[root] >= best_s:
             break
         division = sizes.in_root(root)
+        some = np.flatnonzero(bound_s[:, root] < best_s)
         size = int(np.searchsorted(division.index, root))
-        for each, bound_s in zip(by_stages, bounds_s, strict=True):
-            some = np.flatnonzero(bound_s[:, root] < best_s)
-            if not some.size:
-                continue
-            cost_s = each.roots_s[some, root] + each.onward_s(division, some)[0][0][:, size]
-            fastest = int(cost_s.argmin())
-            if cost_s[fastest] < best_s:
-                best_s, best = float(cost_s[fastest]), (each, int(some[fastest]), root)
-    if best is None:
+        cost_s = options.roots_s[some, root] + options.onward_s(division, some)[0][-1][:, size]
+        fastest = int(cost_s.argmin())
+        if cost_s[fastest] < best_s:
+            best_s, best = float(cost_s[fastest]), (int(some[fastest]), root)
+    if best_s == math.inf:
         return None
-    of_stages, option, root = best
-    path = of_stages.path(sizes.in_root(root), option, root)
-    choice = of_stages.choices[option]
+    option, root = best
+    path = options.path(sizes.in_root(root), option, root)
+    choice = options.choices[option]
     return Tree(tuple(sizes.pairs[i] for i in path), choice.align_taps, choice.aperture_taps)
 
 
