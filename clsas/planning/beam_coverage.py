@@ -9,7 +9,7 @@ from clsas.core.lines import some_channels, wavelength_m
 from clsas.planning.visibility_model import VisibilityModel, shared
 from clsas.sonar.visibility import sines
 
-_SAMPLED_CHANNELS = 256  # whose aspect angles are evaluated; spread evenly
+_SAMPLED_CHANNELS = 128  # whose aspect angles are evaluated; spread evenly
 _SAMPLED_POINTS = np.linspace(0, 1, 17)  # as fractions of the rows and columns
 _BINS = 512  # of the beam's width, in the histogram of power by aspect angle
 _MOST_TURNED = 1 / 16  # change of direction from one channel to the next, over the beam's width

@@ -25,7 +25,10 @@ from clsas.signal.interpolation import Interpolator
 from clsas.sonar.visibility import sines
 
 _FLOAT32 = 4.5e-8  # rms error of a phase in the stages over the phase across a root: measured
-_CHANNELS, _FURTHEST, _PLACES, _PIXELS = 128, 32, 160, 24  # sampled for errors
+_SAMPLED_CHANNELS = 128  # for the errors of roots, the farthest from the mean track among them
+_FARTHEST_CHANNELS = 32  # of these, farthest from the mean track
+_SAMPLED_PLACES = 96  # along the visible aperture, for errors between virtual channels
+_SAMPLED_PIXELS = 16  # of a subimage
 _SOME_POINTS = (0, 7, 14, 16, 23)  # of 5 by 5 sample points, one in every row and column
 
 
@@ -184,13 +187,13 @@ def _some_off_track(
 
     Where a track turns sharply, a few channels may be much further off than all others.
     """
-    if len(candidates) <= _CHANNELS:
+    if len(candidates) <= _SAMPLED_CHANNELS:
         return candidates, np.ones(len(candidates))
     by_distance = candidates[np.argsort(view.track_error_m[candidates], kind="stable")]
-    others, furthest = np.split(by_distance, [-_FURTHEST])
+    others, furthest = np.split(by_distance, [-_FARTHEST_CHANNELS])
     others.sort()
-    some = others[some_channels(len(others), _CHANNELS - _FURTHEST)]
-    counts = np.repeat([len(others) / len(some), 1.0], [len(some), _FURTHEST])
+    some = others[some_channels(len(others), _SAMPLED_CHANNELS - _FARTHEST_CHANNELS)]
+    counts = np.repeat([len(others) / len(some), 1.0], [len(some), _FARTHEST_CHANNELS])
     return np.concatenate([some, furthest]), counts
 
 
@@ -289,13 +292,13 @@ def _samples(
         points = np.intersect1d(points, _SOME_POINTS)
     first, count = first[points], count[points]
     # One channel beyond those that see anything: edges lie in between.
-    number = np.linspace(first - 1, first + count, _PLACES, axis=1)
+    number = np.linspace(first - 1, first + count, _SAMPLED_PLACES, axis=1)
     number = np.clip(number, 0, len(channels) - 1)
     place = np.interp(number, np.arange(len(channels)), channels)
-    frequencies = view.carriers(_PIXELS)
+    frequencies = view.carriers(_SAMPLED_PIXELS)
     found = [_pixels_m(view, np.array(extents), point) for point in points]
     pixels_m = np.stack([each_m for each_m, _ in found])
-    carriers = np.stack([frequencies[(share * _PIXELS).astype(int)] for _, share in found])
+    carriers = np.stack([frequencies[(share * _SAMPLED_PIXELS).astype(int)] for _, share in found])
     pixels = view.points_m[points], pixels_m, carriers
     return _Samples(points, count, place, pixels, _steering(view, *pixels, weighted, place))
 
@@ -372,7 +375,7 @@ def _pixels_m(
     ratio = 1.0
     for _ in range(20):  # towards x^(dimensions + 1) = x + 1
         ratio = (1 + ratio) ** (1 / (dimensions + 1))
-    index = point * _PIXELS + np.arange(_PIXELS)[:, None]
+    index = point * _SAMPLED_PIXELS + np.arange(_SAMPLED_PIXELS)[:, None]
     places = (0.5 + index * ratio ** -np.arange(1.0, dimensions + 1)) % 1
     pixels_m = ((places[:, :-1] - 0.5) * extents) @ view.surface.steps_m
     return np.concatenate([np.zeros((1, 3)), pixels_m]), places[:, -1]

@@ -164,7 +164,7 @@ def all_sizes(model: VisibilityModel, most: Side, device: Device) -> Sizes:
         counts=np.array([float(model.subimages(side)) for side in pairs]),
         padded_pixels=np.array([model.padded_pixels(side, device.info.width) for side in pairs]),
         visible_share=share,
-        half_range_extent_m=np.array([model.half_range_extent_m(side) for side in pairs]),
+        half_range_extent_m=model.half_range_extents_m(pairs),
         beam_cycles=beam_cycles,
         leaf_error=leaf_error(model, sides, device),
     )

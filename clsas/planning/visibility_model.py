@@ -6,6 +6,7 @@ import copy
 import functools
 import math
 from collections.abc import Callable, Hashable, Sequence
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -297,12 +298,17 @@ class VisibilityModel:
             key, lambda: within_roots(np.maximum, self._relief_m(side, half), half, root)
         )
 
-    def half_range_extent_m(self, side: Side) -> float:
-        """Return the largest difference in range between a pixel and its subimage's centre."""
-        radius_m = self.surface.radius_m(side)
-        bend_m = radius_m**2 / (2 * max(self.nearest_m, radius_m))
-        extents = self.surface.extents(side, self.surface.relief_m(side).max())
-        return min(float(extents @ self._range_slopes_m) / 2 + bend_m, radius_m)
+    def half_range_extents_m(self, sides: Sequence[Side]) -> NDArray[np.float64]:
+        """Return the largest differences in range between pixels and subimages' centres, [sizes].
+
+        The sides of subimages project onto the line of sight; within near subimages ranges bend.
+        """
+        steps_m = self.surface.steps_m
+        boxes = np.stack([self.extents(side, root=side, most=True) for side in sides])
+        corners = np.array(list(product((-0.5, 0.5), repeat=len(steps_m))))
+        radius_m = np.linalg.norm((boxes[:, None] * corners) @ steps_m, axis=-1).max(axis=1)
+        bend_m = radius_m**2 / (2 * np.maximum(self.nearest_m, radius_m))
+        return np.minimum(boxes @ self._range_slopes_m / 2 + bend_m, radius_m)
 
     @property
     @cached
@@ -322,11 +328,11 @@ class VisibilityModel:
         """
         samples_per_m = to.samples_per_m(self.lines)
         return tuple(
-            math.ceil(self.half_range_extent_m(side) * samples_per_m)
+            math.ceil(extent_m * samples_per_m)
             + (len(sides) - 1 - level) * (align.taps // 2 + 1)
             + final.taps // 2
             + 1
-            for level, side in enumerate(sides)
+            for level, extent_m in enumerate(self.half_range_extents_m(sides))
         )
 
     # What is visible through the beam.
