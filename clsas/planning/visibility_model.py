@@ -35,7 +35,7 @@ _INNER = np.arange(len(_POINTS) ** 2).reshape(len(_POINTS), -1)[1:-1, 1:-1].rave
 _DENSE = 65  # points along either side of the grid for its least distance from the track
 _NEIGHBOURS = 64  # channels over which the density of channels is measured
 _MOST_OUTSIDE = 1e-6  # share of the lines' power above their highest frequency
-_SEARCH_STEP = 4  # of the track's samples the search uses one in so many, to compare roots
+_SEARCH_STEP = 8  # of the track's samples the search uses one in so many, to compare roots
 _SMALL = (16, 16)  # rows and columns of a subimage that stands for a pixel
 
 

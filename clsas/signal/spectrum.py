@@ -14,7 +14,7 @@ from clsas.core.geometry import pairwise_range_m
 from clsas.core.grid import Grid
 from clsas.core.lines import RangeLines, some_channels
 
-MEASURED_CHANNELS = 256  # sampled for an accurate spectrum
+MEASURED_CHANNELS = 128  # sampled for an accurate spectrum
 FEW_CHANNELS = 32  # sampled for a quick estimate
 NEEDED_OVERSAMPLING = 1.05
 """Sample rate over occupied bandwidth above which a guard band separates the band's edges."""
