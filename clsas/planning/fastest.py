@@ -19,11 +19,13 @@ from clsas.opencl import phases
 from clsas.opencl.device import Device
 from clsas.planning import forecast
 from clsas.planning.beam_coverage import trimmed
+from clsas.planning.channels import frequencies
 from clsas.planning.costs import Costs
-from clsas.planning.errors import Errors, excess_error, other_errors, root_error
+from clsas.planning.errors import Errors, other_errors, root_error
 from clsas.planning.exact_image import Exact
 from clsas.planning.forecast import Candidate, margin_db
 from clsas.planning.search import Allowed, Tree, root_limits, search
+from clsas.planning.spacing_errors import spacing_error
 from clsas.planning.visibility_model import VisibilityModel
 
 # Shares of the error power allowed: for roots, for the spacing of all stages' virtual channels, for
@@ -189,8 +191,8 @@ def _filters(problem: _Problem, trial: _Trial) -> Filters | None:
         return None
     key = choice, stages, filters_db
     if key not in problem.designs:
-        frequencies, share = view.frequencies
-        steering = steering_spectrum(frequencies / view.highest_cycles_per_m, share)
+        cycles_per_m, share = frequencies(view)
+        steering = steering_spectrum(cycles_per_m / view.highest_cycles_per_m, share)
         problem.designs[key] = choice.design(view.spectrum, steering, stages, filters_db)
     return problem.designs[key]
 
@@ -204,7 +206,7 @@ def _estimated(problem: _Problem, trial: _Trial, filters: Filters) -> tuple[Erro
     )
     budget = ErrorBudget(
         roots=errors.roots,
-        spacing=sum(errors.nodes),
+        spacing=sum(errors.spacing),
         leaves=errors.leaves,
         beam_edges=problem.beam_edges,
     )
@@ -242,12 +244,12 @@ def _more_accurate(problem: _Problem, trial: _Trial, errors: Errors, found: Plan
     """
     allowed, last = problem.allowed, found.sides[-1]
     share = _SPACING_SHARE * allowed / len(found.sides)
-    excess = [max(of_stage - share, 0.0) for of_stage in errors.nodes]
+    excess = [max(of_stage - share, 0.0) for of_stage in errors.spacing]
     beam_cycles = trial.beam_cycles
     if excess[-1] and beam_cycles > 0:
         within = problem.view.within(found.sides[0])
-        without_beam = excess_error(within, last, found.aperture, trial.density[-1], None)
-        if 2 * without_beam < errors.nodes[-1]:  # most of it is the beam's
+        without_beam = spacing_error(within, last, found.aperture, trial.density[-1], None)
+        if 2 * without_beam < errors.spacing[-1]:  # most of it is the beam's
             if beam_cycles >= _MOST_BEAM_CYCLES:
                 return None  # no virtual channels follow a step
             beam_cycles, excess[-1] = 2 * beam_cycles, 0.0

@@ -30,6 +30,7 @@ from clsas.opencl.buffers import (
     sample_bytes,
 )
 from clsas.opencl.device import Device
+from clsas.planning.channels import peak_density
 from clsas.planning.costs import Costs
 from clsas.planning.errors import leaf_error
 from clsas.planning.exact_image import Exact
@@ -236,7 +237,7 @@ def _half_rounding(view: VisibilityModel, reach: Sequence[float]) -> float:
     while the sum still grows, which counts as half. A sum of very many chunks loses what is added.
     """
     chunks = np.array(reach) / CHUNK
-    chunks[0] *= view.peak_density
+    chunks[0] *= peak_density(view)
     if chunks.max() > _MOST_CHUNKS:
         return np.inf
     return HALF_ROUNDING * (1 + float(np.sum(1 + chunks / 2)))

@@ -16,7 +16,7 @@ from scipy.spatial import KDTree
 from clsas.core.grid import Grid
 from clsas.core.lines import RangeLines
 from clsas.exact.tiles import STACK
-from clsas.factorized.aperture import cycles_per_extent, mean_track, own_drift
+from clsas.factorized.aperture import cycles_per_extent, mean_track
 from clsas.factorized.surface import LEAST_SIDE, surface_of, within_roots
 from clsas.factorized.tree import beam_directions, beam_rate
 from clsas.signal.ambiguity import Ambiguity, ambiguity
@@ -176,60 +176,11 @@ class VisibilityModel:
         """Return this model with the phase rates of subimages in roots of a size."""
         return self._with(root=root)
 
-    # The lines and the channels.
-
-    @property
-    def frequencies(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Phase per metre of range at the lines' frequencies, cycles, and their shares of power.
-
-        Always positive.
-        """
-        found, power = self.spectrum.frequency, self.spectrum.share
-        found = self.spectrum.centre + np.concatenate([-found[::-1], found])
-        cycles_per_m = np.abs(cycles_per_m_at(self.lines, found))
-        share = np.concatenate([power[::-1], power]) / 2
-        return np.maximum(cycles_per_m, 1e-3 * self.highest_cycles_per_m), share
-
-    def carriers(self, count: int) -> NDArray[np.float64]:
-        """Return some of these frequencies, each of which stands for the same power."""
-        cycles_per_m, share = self.frequencies
-        index = np.interp((np.arange(count) + 0.5) / count, np.cumsum(share), np.arange(len(share)))
-        return np.interp(index, np.arange(len(share)), cycles_per_m)
-
     @property
     @shared
     def ambiguity(self) -> Ambiguity:
         """Errors that the lines themselves leave open."""
         return ambiguity(self.lines, self.grid, self.spectrum, self.beam, self.channels_along)
-
-    @property
-    @shared
-    def track_error_m(self) -> NDArray[np.float64]:
-        """Distances of channels from the mean track, [channels].
-
-        The motion of receivers that differs from the mean is added, as it acts at the median range.
-        """
-        away_m = self.lines.phase_centres_m - self.track.positions_m(self.track.place)
-        error_m = np.linalg.norm(away_m, axis=1)
-        if self.own_drift is not None:
-            error_m += np.linalg.norm(self.own_drift, axis=1) * np.median(self.distance_m)
-        return error_m
-
-    @property
-    @shared
-    def own_drift(self) -> NDArray[np.float64] | None:
-        """See `clsas.factorized.aperture.own_drift`."""
-        return own_drift(self.lines)
-
-    @property
-    @shared
-    def peak_density(self) -> float:
-        """Peak channel density along the aperture, relative to the mean."""
-        place = np.sort(self.track.place)
-        some = min(_NEIGHBOURS, len(place) - 1)
-        closest = float((place[some:] - place[:-some]).min())
-        average = float(place[-1] - place[0]) * some / (len(place) - 1)
-        return average / closest if closest > 0 else np.inf
 
     # The grid and its subimages.
 
@@ -281,22 +232,23 @@ class VisibilityModel:
         """
         if self.surface.is_plane:
             return self.surface.extents(side)
-        relief_m = self._relief_m(side, root or self.root or side)
-        return self.surface.extents(side, float(relief_m.max() if most else relief_m.mean()))
+        root = root or self.root or side
+        mean_m, largest_m = self.from_cache(
+            ("relief", side, root), lambda: _mean_and_max(self._relief_m(side, root))
+        )
+        return self.surface.extents(side, largest_m if most else mean_m)
 
     def _relief_m(self, side: Side, root: Side) -> NDArray[np.float64]:
         """Largest relief of the subimages of a size in every root, [down, across]."""
-        key = "relief", side, root
         if root == side:
-            return self.from_cache(key, lambda: self.surface.relief_m(side))
-        # Half as large a root, already known in most cases, leaves little to compare.
+            return self.surface.relief_m(side)
+        # Half as large a root, already known in most cases, leaves two values to compare.
         axis = 0 if root[0] // side[0] > root[1] // side[1] else 1
-        half = tuple(n // 2 if a == axis else n for a, n in enumerate(root))
-        if any(h % s for h, s in zip(half, side, strict=True)) or root[axis] % 2:
-            return self.from_cache(key, lambda: self.surface.relief_m(side, root))
-        return self.from_cache(
-            key, lambda: within_roots(np.maximum, self._relief_m(side, half), half, root)
-        )
+        half = (root[0] // 2, root[1]) if axis == 0 else (root[0], root[1] // 2)
+        if root[axis] % 2 or half[axis] % side[axis]:
+            return self.surface.relief_m(side, root)
+        of_half = self.from_cache(("reliefs", side, half), lambda: self._relief_m(side, half))
+        return np.maximum.reduceat(of_half, np.arange(0, of_half.shape[axis], 2), axis=axis)
 
     def half_range_extents_m(self, sides: Sequence[Side]) -> NDArray[np.float64]:
         """Return the largest differences in range between pixels and subimages' centres, [sizes].
@@ -461,6 +413,10 @@ def mean_over_points(values: NDArray[np.float64]) -> NDArray[np.float64]:
 def _over_points(values: NDArray[np.float64], most: bool) -> float:
     """Return the largest of values at the sample points, or their mean over the grid."""
     return float(values.max() if most else mean_over_points(values))
+
+
+def _mean_and_max(values: NDArray[np.float64]) -> tuple[float, float]:
+    return float(values.mean()), float(values.max())
 
 
 def _spacing(samples: NDArray[np.float64]) -> NDArray[np.float64]:
