@@ -207,9 +207,9 @@ def _mean_power(
     parts = samples.view(samples.real.dtype)
     blocks = -(-len(parts) // _LINES_TOGETHER)
     for block, scale in zip(
-        np.array_split(parts, blocks), np.array_split(factor / largest, blocks), strict=True
+        np.array_split(parts, blocks), np.array_split(factor, blocks), strict=True
     ):
-        amplitude = scipy.fft.fft((block * scale[:, None]).view(samples.dtype), length)
+        amplitude = scipy.fft.fft((block / largest * scale[:, None]).view(samples.dtype), length)
         # A Hann window over the part of the FFT's length where the lines lie.
         ends = amplitude[:, -padding:], amplitude[:, :padding]
         around = np.concatenate([ends[0], amplitude, ends[1]], axis=1)

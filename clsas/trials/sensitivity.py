@@ -207,6 +207,15 @@ def trials(device: Device) -> list[Trial]:
         rx_m=position_m + apart_m,
         rx_velocity_m_s=np.broadcast_to(velocity_m_s, position_m.shape),
     )
+    # A rough track with a gap, and noise in all of the band, cut at both ends.
+    random = np.random.default_rng(0)
+    rough_m = position_m + random.standard_normal(position_m.shape) * [0.0, 2e-3, 2e-3]
+    rough_m[:, 1] += 0.3 * np.sin(position_m[:, 0])
+    rough_m[len(rough_m) // 2 :, 0] += 2.0
+    add(medium, -30.0, _SLOW_EXACT, tx_m=rough_m, rx_m=rough_m)
+    shape = (medium.channels, 200)
+    noise = (random.standard_normal((*shape, 2)) @ [1, 1j]).astype(np.complex64)
+    add(replace(medium, beam=None), -32.0, _SLOW_EXACT, samples=noise, first_range_m=45.0)
     add(small, -50.0, _SLOW_EXACT, measured=True)
     add(replace(small, beam=BeamWindow(20.0)), -35.0, _SLOW_EXACT, measured=True)
     add(replace(small, beam=None), -60.0, _SLOW_EXACT, measured=True)
@@ -223,12 +232,10 @@ def changes(device: Device, pattern: str = "") -> Iterator[list[str]]:
     scenes = trials(device)
     for scene in scenes:  # builds the kernels
         scene.run()
-    usual = [scene.run() for scene in scenes]
+    usual = [_best(scene) for scene in scenes]
     for constant in constants(pattern):
         name = f"{constant.module.__name__.removeprefix('clsas.')}.{constant.name}"
-        for other in constant.neighbours:
-            if other == constant.value:
-                continue
+        for other in sorted({*constant.neighbours} - {constant.value}):
             row = [name, f"{constant.value:.4g}", f"{other:.4g}"]
             with constant.set_to(other):
                 try:
@@ -237,6 +244,13 @@ def changes(device: Device, pattern: str = "") -> Iterator[list[str]]:
                     yield [*row, f"{type(error).__name__}: {str(error)[:60]}", *[""] * 4]
                     continue
             yield [*row, *_compared(usual, found)]
+
+
+def _best(scene: Trial) -> Result:
+    """Return the result of a scene with the least times of some runs."""
+    runs = [scene.run() for _ in range(_RUNS)]
+    least = {name: min(getattr(r, name) for r in runs) for name in ("measured_s", "planning_s")}
+    return replace(runs[0], **least)
 
 
 COLUMNS = (
