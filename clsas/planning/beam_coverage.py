@@ -6,7 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsas.core.lines import some_channels, wavelength_m
-from clsas.planning.visibility_model import VisibilityModel, shared
+from clsas.planning.caching import shared
+from clsas.planning.visibility_model import VisibilityModel
 from clsas.sonar.visibility import sines
 
 _SAMPLED_CHANNELS = 128  # whose aspect angles are evaluated; spread evenly

@@ -6,7 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsas.factorized import aperture
-from clsas.planning.visibility_model import VisibilityModel, shared
+from clsas.planning.caching import shared
+from clsas.planning.visibility_model import VisibilityModel
 from clsas.signal.spectrum import cycles_per_m_at
 
 _NEIGHBOURS = 64  # channels over which the density of channels is measured

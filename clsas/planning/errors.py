@@ -18,10 +18,11 @@ from clsas.factorized.aperture import drift, stretches
 from clsas.factorized.thesis import stage_errors_m
 from clsas.factorized.tree import interpolated_directions
 from clsas.opencl.device import Device
+from clsas.planning.caching import cached
 from clsas.planning.channels import own_drift, track_error_m
 from clsas.planning.sample_pixels import SPREAD_POINTS, mean_over_relief, pixels_m
 from clsas.planning.spacing_errors import spacing_error
-from clsas.planning.visibility_model import Side, VisibilityModel, cached
+from clsas.planning.visibility_model import Side, VisibilityModel
 from clsas.signal.interpolation import Interpolator
 from clsas.sonar.visibility import sines
 

@@ -20,9 +20,10 @@ from clsas.factorized.estimates import Work, backprojecting_leaves, combining, u
 from clsas.factorized.filters import ALIGN_TAPS, APERTURE_TAPS, UPSAMPLING_SHARE, Choice, choose
 from clsas.factorized.plan import LEAST_BATCH
 from clsas.opencl.device import Device
+from clsas.planning.caching import cached
 from clsas.planning.costs import Costs
 from clsas.planning.errors import leaf_error, root_error
-from clsas.planning.visibility_model import Side, VisibilityModel, cached, mean_over_points
+from clsas.planning.visibility_model import Side, VisibilityModel, mean_over_points
 from clsas.signal.interpolation import PHASES, upsampler
 from clsas.signal.spectrum import Spectrum
 
@@ -254,8 +255,8 @@ def all_options(
     model, counts, channels = sizes.model, sizes.counts, sizes.model.lines.channels
     choices, stages = [], []
     most_first = sorted(allowed.stages, reverse=True)
-    for number, *taps in product(most_first, allowed.align_taps, allowed.aperture_taps):
-        choice = choose(model.spectrum, *taps, number, filters_db)
+    for number, align, aperture in product(most_first, allowed.align_taps, allowed.aperture_taps):
+        choice = choose(model.spectrum, align, aperture, number, filters_db)
         if choice is not None:
             choices.append(choice)
             stages.append(number)

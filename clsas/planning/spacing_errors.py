@@ -17,10 +17,13 @@ from scipy.sparse import csr_array
 from clsas.core.decibels import power
 from clsas.core.lines import wavelength_m
 from clsas.factorized.tree import interpolated_directions, interpolated_nodes
+from clsas.planning.caching import cached
 from clsas.planning.channels import carriers
 from clsas.planning.sample_pixels import SAMPLED_PIXELS, SPREAD_POINTS, mean_over_relief, pixels_m
-from clsas.planning.visibility_model import Side, VisibilityModel, cached
+from clsas.planning.visibility_model import Side, VisibilityModel
 from clsas.signal.interpolation import Interpolator
+
+_Pixels = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]
 
 _SAMPLED_PLACES = 96  # along the visible aperture; half as many move the error by 3 dB at most
 
@@ -74,7 +77,7 @@ def _interpolation_error(
     if weighted:
         rates = rates + beam_cycles * model.beam_rates[samples.points]
     nodes = interpolated_nodes(model.track, rates, samples.place, aperture)
-    of_nodes = _steering(model, *samples.pixels, weighted, nodes.place)
+    of_nodes = _steering(model, samples.pixels, weighted, nodes.place)
     # One sparse matrix interpolates at all aperture coordinates of all subimages.
     index = nodes.base[..., None] + np.arange(nodes.taps)
     index += nodes.place.shape[1] * np.arange(len(index))[:, None, None]
@@ -102,8 +105,8 @@ class _Samples:
         Number of channels whose beam touches each.
     place : float64 [n, places]
         Aperture coordinates, ascending, distributed as those of the channels.
-    pixels : (centres_m, pixels_m, carriers)
-        Arguments of `_steering`.
+    pixels : (centres_m, offsets_m, cycles_per_m)
+        See `_steering`.
     exact : float32 [n, places, 2 pixels]
         The steering functions.
     """
@@ -111,7 +114,7 @@ class _Samples:
     points: NDArray[np.int64]
     count: NDArray[np.int64]
     place: NDArray[np.float64]
-    pixels: tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]
+    pixels: _Pixels
     exact: NDArray[np.float32]
 
 
@@ -134,11 +137,11 @@ def _samples(
     number = np.clip(number, 0, len(channels) - 1)
     place = np.interp(number, np.arange(len(channels)), channels)
     cycles_per_m = carriers(model, SAMPLED_PIXELS)
-    found = [pixels_m(model, np.array(extents), point) for point in points]
+    found = [pixels_m(model, np.array(extents), point) for point in points.tolist()]
     offsets_m = np.stack([each_m for each_m, _ in found])
     chosen = np.stack([cycles_per_m[(share * SAMPLED_PIXELS).astype(int)] for _, share in found])
     pixels = model.points_m[points], offsets_m, chosen
-    return _Samples(points, count, place, pixels, _steering(model, *pixels, weighted, place))
+    return _Samples(points, count, place, pixels, _steering(model, pixels, weighted, place))
 
 
 def _visible_channels(
@@ -162,9 +165,7 @@ def _visible_channels(
 
 def _steering(
     model: VisibilityModel,
-    centres_m: NDArray[np.float64],
-    offsets_m: NDArray[np.float64],
-    cycles_per_m: NDArray[np.float64],
+    pixels: _Pixels,
     weighted: bool,
     at: NDArray[np.float64],
 ) -> NDArray[np.float32]:
@@ -174,16 +175,14 @@ def _steering(
 
     Parameters
     ----------
-    centres_m : float64 [n, 3]
-        Centres of subimages.
-    offsets_m : float64 [n, pixels + 1, 3]
-        From these: the reference point, then the pixels.
-    cycles_per_m : float64 [n, pixels]
-        Phase per metre of range of each pixel.
+    pixels : (centres_m, offsets_m, cycles_per_m)
+        Centres of subimages, float64 [n, 3]; from these the reference point and then the pixels,
+        [n, pixels + 1, 3]; phase per metre of range of each pixel, [n, pixels].
     weighted : bool
         Multiply by the beam's weights.
     at : float64 [n, places]
     """
+    centres_m, offsets_m, cycles_per_m = pixels
     sight = centres_m[:, None] - model.track.positions_m(at)
     offsets_m = offsets_m.swapaxes(1, 2)
     square = np.einsum("nsi,nsi->ns", sight, sight)[..., None] + 2 * sight @ offsets_m

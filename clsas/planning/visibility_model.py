@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import copy
-import functools
 import math
 from collections.abc import Callable, Hashable, Sequence
 from itertools import product
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from clsas.core.grid import Grid
@@ -19,6 +18,7 @@ from clsas.exact.tiles import STACK
 from clsas.factorized.aperture import cycles_per_extent, mean_track
 from clsas.factorized.surface import LEAST_SIDE, surface_of, within_roots
 from clsas.factorized.tree import beam_directions, beam_rate
+from clsas.planning.caching import cached, shared
 from clsas.signal.ambiguity import Ambiguity, ambiguity
 from clsas.signal.interpolation import Interpolator, Resampling
 from clsas.signal.spectrum import cycles_per_m_at, measure_spectrum
@@ -33,34 +33,11 @@ _WEIGHTS = np.array([0.135, 0.24, 0.25, 0.24, 0.135])  # of these in means over 
 _POINT_WEIGHTS = np.outer(_WEIGHTS, _WEIGHTS).ravel() / _WEIGHTS.sum() ** 2
 _INNER = np.arange(len(_POINTS) ** 2).reshape(len(_POINTS), -1)[1:-1, 1:-1].ravel()
 _DENSE = 65  # points along either side of the grid for its least distance from the track
-_NEIGHBOURS = 64  # channels over which the density of channels is measured
 _MOST_OUTSIDE = 1e-6  # share of the lines' power above their highest frequency
 _SEARCH_STEP = 8  # of the track's samples the search uses one in so many, to compare roots
-_SMALL = (16, 16)  # rows and columns of a subimage that stands for a pixel
 
-
-def cached(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Cache a function or method of a model by the model's limits and root and by its arguments.
-
-    Models derived from each other share their cache.
-    """
-
-    @functools.wraps(function)
-    def from_cache(model: VisibilityModel, *arguments: Hashable, **options: Hashable) -> Any:
-        key = (function.__qualname__, model.limits, model.root, arguments, *options.items())
-        return model.from_cache(key, lambda: function(model, *arguments, **options))
-
-    return from_cache
-
-
-def shared(function: Callable[[VisibilityModel], Any]) -> Callable[[VisibilityModel], Any]:
-    """Cache a property that does not depend on limits and root."""
-
-    @functools.wraps(function)
-    def from_cache(model: VisibilityModel) -> Any:
-        return model.from_cache(function.__qualname__, lambda: function(model))
-
-    return from_cache
+SMALL = (16, 16)
+"""Rows and columns of a subimage that stands for a pixel."""
 
 
 class VisibilityModel:
@@ -188,13 +165,14 @@ class VisibilityModel:
         """Return positions at some fractions of the rows and columns, [n, 3]."""
         index = np.stack(np.meshgrid(fractions, fractions, indexing="ij"), axis=-1).reshape(-1, 2)
         index = index * (np.array(self.surface.plane.shape) - 1)
-        plane_m = self.surface.plane.origin_m + index @ self.surface.steps_m[:2]
+        origin_m: Any = self.surface.plane.origin_m
+        plane_m = origin_m + index @ self.surface.steps_m[:2]
         if self.surface.is_plane:
             return plane_m
         # As far off the plane as the pixels around.
         around = (index // LEAST_SIDE * LEAST_SIDE).astype(np.int64)
         middle = around + (np.array(LEAST_SIDE) - 1) / 2
-        off_m = self.surface.middles_m(LEAST_SIDE, around) - self.surface.plane.origin_m
+        off_m = self.surface.middles_m(LEAST_SIDE, around) - origin_m
         return plane_m + off_m - middle @ self.surface.steps_m[:2]
 
     def subimages(self, side: Side) -> int:
@@ -266,7 +244,7 @@ class VisibilityModel:
     @cached
     def _range_slopes_m(self) -> NDArray[np.float64]:
         """Largest change of range per row, column and metre of relief, [axes]."""
-        visible = self.visible(_SMALL)
+        visible = self.visible(SMALL)
         slopes = np.abs(self.sight @ self.surface.steps_m.T)
         slopes = slopes[visible] if visible.any() else slopes.reshape(-1, slopes.shape[-1])
         return 1.02 * slopes.max(axis=0)
@@ -330,7 +308,7 @@ class VisibilityModel:
     def visible_track_ends(self) -> float:
         """Mean number of the track's ends whose beam touches a sample point."""
         ends = np.flatnonzero(self.on_track)[[0, -1]]
-        return float(self.visible(_SMALL)[:, ends].sum(axis=1).mean())
+        return float(self.visible(SMALL)[:, ends].sum(axis=1).mean())
 
     # Phases along the aperture.
 
@@ -364,11 +342,11 @@ class VisibilityModel:
         rates = np.tensordot(self.extents(side, most=most), self.rates, 1)
         return self.visible_phase_cycles(rates, visible, most=most)
 
-    def virtual_channels(self, taps: int, density: float, phase_cycles: ArrayLike) -> ArrayLike:
+    def virtual_channels(self, taps: Any, density: float, phase_cycles: Any) -> Any:
         """Return the number of virtual channels of a subimage, from its phase in cycles.
 
-        `taps` and `density`, virtual channels per cycle, are the aperture filter's. The filter
-        extends beyond the track's ends.
+        All may be arrays. `taps` and `density`, virtual channels per cycle, are the aperture
+        filter's. The filter extends beyond the track's ends.
         """
         return density * phase_cycles + 1 + self.visible_track_ends * (taps / 2 - 0.5)
 
