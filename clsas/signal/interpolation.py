@@ -166,7 +166,8 @@ def _positions(taps: int) -> tuple[NDArray[np.float64], NDArray[np.float64], NDA
     basis = np.stack([even, nu[:, None] * even])
     # All but the middle stand for two positions.
     weight = np.sqrt([1.0, *np.full(len(nu) - 1, 2.0)])
-    return nu, basis, np.linalg.pinv(weight[:, None] * basis, rcond=_SINGULAR) * weight
+    fit = np.linalg.pinv(weight[:, None] * basis, rcond=_SINGULAR) * weight
+    return nu, basis, fit.astype(np.float64, copy=False)
 
 
 def choose(
@@ -217,8 +218,7 @@ def choose(
     rates: Sequence[float] = UPSAMPLINGS if upsampling is None else (upsampling,)
     candidates = []
     for each_taps in TAPS if taps is None else (taps,):
-        for rate in rates:
-            found = design(each_taps, rate, spectrum)
+        for found in designs(each_taps, rates, spectrum):
             if found.error_db <= target_db:
                 candidates.append(found)
                 break
