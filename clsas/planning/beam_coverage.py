@@ -10,10 +10,11 @@ from clsas.planning.caching import shared
 from clsas.planning.visibility_model import VisibilityModel
 from clsas.sonar.visibility import sines
 
-_SAMPLED_CHANNELS = 128  # whose aspect angles are evaluated; spread evenly
-_SAMPLED_POINTS = np.linspace(0, 1, 17)  # as fractions of the rows and columns
-_BINS = 512  # of the beam's width, in the histogram of power by aspect angle
-_MOST_TURNED = 1 / 16  # change of direction from one channel to the next, over the beam's width
+_SAMPLED_POINTS = np.linspace(0, 1, 17)  # fractions of rows and columns; their sines are smooth
+_BINS = 512  # of power by aspect angle; half or twice as many change nothing
+# Largest change of direction from one channel to the next, over the beam's width. At a kink a beam
+# swings past pixels between two channels, which no virtual channel can follow.
+_MOST_TURNED = 1 / 16
 
 
 def trimmed(model: VisibilityModel, share: float) -> VisibilityModel:
@@ -102,5 +103,5 @@ def _points_m(model: VisibilityModel) -> NDArray[np.float64]:
 @shared
 def _sines_of_channels(model: VisibilityModel) -> NDArray[np.float64]:
     """Sines of the aspect angle at points all over the grid, [channels, points]."""
-    some = some_channels(model.lines.channels, _SAMPLED_CHANNELS)
+    some = some_channels(model.lines.channels)
     return sines(_points_m(model), model.lines.phase_centres_m[some], model.channels_along[some])

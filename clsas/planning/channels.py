@@ -10,7 +10,7 @@ from clsas.planning.caching import shared
 from clsas.planning.visibility_model import VisibilityModel
 from clsas.signal.spectrum import cycles_per_m_at
 
-_NEIGHBOURS = 64  # channels over which the density of channels is measured
+_NEIGHBOURS = 64  # channels over which density is measured; half or twice: no change
 _LEAST_FREQUENCY = 1e-3  # of the highest: virtual channels sample a phase that hardly turns
 
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
 from clsas.core.geometry import pairwise_range_m
-from clsas.core.lines import some_channels, wavelength_m
+from clsas.core.lines import SAMPLED_CHANNELS, some_channels, wavelength_m
 from clsas.exact.tiles import BLOCKS, ROUNDING
 from clsas.factorized.aperture import drift, stretches
 from clsas.factorized.thesis import stage_errors_m
@@ -26,9 +26,10 @@ from clsas.planning.visibility_model import Side, VisibilityModel
 from clsas.signal.interpolation import Interpolator
 from clsas.sonar.visibility import sines
 
-_FLOAT32 = 4.5e-8  # rms error of a phase in the stages over the phase across a root: measured
-_SAMPLED_CHANNELS = 128  # for the errors of roots; half as many move them by 0.2 dB
-_FARTHEST_CHANNELS = 32  # of these, those farthest from the mean track: they catch sharp turns
+# Rms error of a phase in the stages over the phase across a root, from float32: measured. With half
+# of it images at -60 dB are up to 3 % faster; with twice of it measured errors fall by 0.1 dB.
+_FLOAT32 = 4.5e-8
+_FARTHEST_CHANNELS = 32  # of those sampled: far from the mean track, where it turns sharply
 
 
 @dataclass(frozen=True)
@@ -165,12 +166,12 @@ def _sampled_channels(
 
     Where a track turns sharply, a few channels may be much farther off than all others.
     """
-    if len(candidates) <= _SAMPLED_CHANNELS:
+    if len(candidates) <= SAMPLED_CHANNELS:
         return candidates, np.ones(len(candidates))
     by_distance = candidates[np.argsort(track_error_m(model)[candidates], kind="stable")]
     others, farthest = np.split(by_distance, [-_FARTHEST_CHANNELS])
     others.sort()
-    some = others[some_channels(len(others), _SAMPLED_CHANNELS - _FARTHEST_CHANNELS)]
+    some = others[some_channels(len(others), SAMPLED_CHANNELS - _FARTHEST_CHANNELS)]
     counts = np.repeat([len(others) / len(some), 1.0], [len(some), _FARTHEST_CHANNELS])
     return np.concatenate([some, farthest]), counts
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from clsas.planning.visibility_model import Side, VisibilityModel
 
 SAMPLED_PIXELS = 16
-"""Pixels sampled of every subimage. Half as many move predicted errors by less than 0.05 dB."""
+"""Pixels sampled of every subimage. Half as many move predicted errors by 0.05 dB at most."""
 
 SPREAD_POINTS = (0, 7, 14, 16, 23)
 """Of the model's 5 by 5 sample points, one in every row and column."""

@@ -22,15 +22,15 @@ from clsas.sonar.beam import BeamWindow
 from clsas.sonar.visibility import sines
 
 _AT_END = 0.03  # error near an end over its power; measured on noise in 40 to 90 % of the band
-_END = 4  # samples whose mean power is that of an end
-_NEAR_END = 5  # samples around an end within which interpolators differ
-_CUT, _FADING = (
-    0.01,
-    16,
-)  # an end fades if its power is below 1 % of the last 16 samples'
+_END = 4  # samples whose mean power is that of an end: the taps on one side of a filter
+_NEAR_END = 5  # samples around an end within which interpolators differ: half of 8 taps, and one
+_CUT = 0.01  # an end fades if its power is below this share of that of the last samples
+_FADING = 16  # these samples
 _THIN = 0.42  # half bandwidth, cycles per sample, up to which a cut only affects `_NEAR_END`
-_CHANNELS, _POINTS = 64, 16  # sampled channels, and sample points along either side of the grid
-_MOST, _LEAST = 0.5, 1e-3  # shares of the allowed error power: above, warn; below, ignore
+_CHANNELS = 64  # sampled; half or twice as many change nothing
+_POINTS = 16  # sampled along either side of the grid
+_MOST = 0.5  # share of the allowed error power above which to warn: 3 dB more than requested
+_LEAST = 1e-3  # share of the allowed error power below which to ignore it
 
 
 @dataclass(frozen=True)

@@ -29,9 +29,9 @@ Gain = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 """Spectral gain as a function of the distance from the spectral centre, cycles per sample."""
 
 _NOISE_FLOOR = 1e-13  # of the power, in every bin: keeps fits regular where the band is empty
-_POSITIONS = 17  # between two samples, at which filters are fitted
+_POSITIONS = 17  # between two samples, at which filters are fitted; half or twice: 0.3 dB
 _SINGULAR = np.finfo(np.float64).eps  # relative singular values below this are rounding
-_SCATTER_DB = 0.5  # margin for the scatter of measured errors around the predicted one
+_SCATTER_DB = 0.5  # margin for the scatter of measured errors, of exact images too
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,7 +138,7 @@ def designs(taps: int, upsamplings: Sequence[float], spectrum: Spectrum) -> list
         residuals.append(of_frequency @ coefficients[:, :, part] @ of_position[part].T - aim)
     # With the phase of the position removed, the error is the response minus 1. Its mean over
     # positions is real, since errors at nu and -nu are conjugates.
-    mean = np.array([1.0, *np.full(len(nu) - 1, 2.0)]) / _POSITIONS
+    mean = np.array([1.0, *np.full(len(nu) - 1, 2.0)]) / (2 * len(nu) - 1)
     even, odd = residuals
     square = (even**2 + odd**2) @ mean
     bias = (even * aims[0] + odd * aims[1]) @ mean
