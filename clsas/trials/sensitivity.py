@@ -1,4 +1,4 @@
-"""How much the tuned constants of planning and imaging matter: each is halved and doubled."""
+"""Sensitivity of plans and images to tuned constants: each is set to half and twice its value."""
 
 from __future__ import annotations
 
@@ -146,7 +146,7 @@ class Trial:
 
 @dataclass(frozen=True)
 class Result:
-    """What a trial found: seconds, and errors in dB; NaN where nothing was formed."""
+    """Outcome of a trial: seconds, and errors in dB; NaN if it was not planned or not formed."""
 
     predicted_s: float
     predicted_db: float
