@@ -93,7 +93,9 @@ def planned(scene, tolerance_db, half=False):
     chosen = plan(
         scene.lines, scene.grid, tolerance_db=tolerance_db, beam=scene.beam, costs=EXACT_IS_SLOW
     )
-    return dataclasses.replace(chosen, half_precision=half and chosen.upsampler is not None)
+    if chosen.is_exact:
+        return chosen
+    return chosen.changed(half_precision=half and chosen.factorization.upsampler is not None)
 
 
 def _factorizer(tolerance_db, half):

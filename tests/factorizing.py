@@ -140,9 +140,13 @@ def peak_device_bytes(monkeypatch, run, image_shape):
     flags = cl.mem_flags.READ_WRITE
     copied = flags | cl.mem_flags.COPY_HOST_PTR
     monkeypatch.setattr(device, "buffer", lambda size: counted(flags, max(int(size), 4)))
-    monkeypatch.setattr(
-        device, "upload", lambda array: counted(copied, hostbuf=np.ascontiguousarray(array))
-    )
+
+    def uploaded(array):
+        if not array.size:
+            return device.buffer(0)
+        return counted(copied, hostbuf=np.ascontiguousarray(array))
+
+    monkeypatch.setattr(device, "upload", uploaded)
     share = device.share
 
     def shared(array):

@@ -108,7 +108,7 @@ def image(
         _warn_of_error(chosen)
         warned = chosen.kept["warned"]
         if chosen.is_exact:
-            request = {"accuracy_db": chosen.accuracy_db}
+            request = {"accuracy_db": chosen.image.accuracy_db}
             why, chosen = f"exact: nothing faster within {chosen.tolerance_db:.4g} dB; ", None
     with (
         progress_bar("imaging") as progress,
@@ -120,7 +120,7 @@ def image(
             how = f"{summary(chosen)}; predicted error {chosen.predicted_error_db:.0f} dB"
             left_out = chosen.left_out
             results |= {
-                "method": "stages" if chosen.nearest else "factorized",
+                "method": "stages" if chosen.tolerance_db is None else "factorized",
                 "predicted_error_db": chosen.predicted_error_db,
                 "predicted_seconds": chosen.predicted_seconds,
             }
@@ -208,7 +208,7 @@ def plan(
 
 def _warn_of_error(chosen: clsas.Plan) -> None:
     """Warn if the error of the thesis's method may be as large as the image."""
-    if chosen.nearest and chosen.predicted_error_db > WORST_TOLERANCE_DB:
+    if chosen.tolerance_db is None and chosen.predicted_error_db > WORST_TOLERANCE_DB:
         click.echo(
             f"Warning: with these stages the error may be as large as "
             f"{chosen.predicted_error_db:.0f} dB, too large for an image to be of use: sum fewer "

@@ -14,7 +14,7 @@ import warnings
 from collections.abc import Sequence
 from numbers import Real
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
@@ -28,6 +28,9 @@ _REPR.maxlist = _REPR.maxtuple = _REPR.maxdict = _REPR.maxset = _REPR.maxfrozens
 _REPR.maxstring = _REPR.maxother = _REPR.maxlong = 2 * _LONGEST
 # Files with the memory limit of a process's control group, versions 2 and 1.
 _GROUP_LIMITS = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes")
+
+
+_T = TypeVar("_T")
 
 
 class ClsasWarning(UserWarning):
@@ -111,7 +114,7 @@ def count(name: str, value: int, *, least: int = 1, most: int | None = None) -> 
     return int(value)
 
 
-def one_of(name: str, value: str, allowed: Sequence[str]) -> str:
+def one_of(name: str, value: _T, allowed: Sequence[_T]) -> _T:
     """Return `value`; raises ValueError unless it is one of `allowed`."""
     if value not in allowed:
         raise ValueError(

@@ -1,20 +1,23 @@
-"""Predictions of an image before it is formed: its work and its errors."""
+"""Predictions of an image before it is formed: its work, its channels and its errors."""
 
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, fields
-from typing import Any
+from typing import TypeAlias
 
-from numpy.typing import ArrayLike
+import numpy as np
+from numpy.typing import NDArray
 
-from clsas.core import validate
 from clsas.core.decibels import in_db
 from clsas.signal.interpolation import COST
+
+Amount: TypeAlias = float | NDArray[np.float64]
+"""A number, or one for each of some sizes of subimages."""
 
 
 @dataclass(frozen=True)
 class Work:
-    """Amounts of each thing that takes time on a device or its host.
+    """Counted operations of a device and its host.
 
     `clsas.planning.costs.Costs` has the same fields, in nanoseconds each: `Costs.seconds`
     multiplies the two. Amounts are numbers, or arrays over sizes of subimages.
@@ -49,35 +52,35 @@ class Work:
         Pixels times channels that a beam weighs, in exact images and leaves.
     """
 
-    call: ArrayLike = 0.0
-    upsampled_sample: ArrayLike = 0.0
-    filtered_sample: ArrayLike = 0.0
-    reference: ArrayLike = 0.0
-    batch: ArrayLike = 0.0
-    subimage: ArrayLike = 0.0
-    sample: ArrayLike = 0.0
-    sample_tap: ArrayLike = 0.0
-    given_sample: ArrayLike = 0.0
-    leaf_channel: ArrayLike = 0.0
-    leaf: ArrayLike = 0.0
-    leaf_point: ArrayLike = 0.0
-    group: ArrayLike = 0.0
-    part: ArrayLike = 0.0
-    pixel: ArrayLike = 0.0
-    point: ArrayLike = 0.0
-    beam: ArrayLike = 0.0
+    call: Amount = 0.0
+    upsampled_sample: Amount = 0.0
+    filtered_sample: Amount = 0.0
+    reference: Amount = 0.0
+    batch: Amount = 0.0
+    subimage: Amount = 0.0
+    sample: Amount = 0.0
+    sample_tap: Amount = 0.0
+    given_sample: Amount = 0.0
+    leaf_channel: Amount = 0.0
+    leaf: Amount = 0.0
+    leaf_point: Amount = 0.0
+    group: Amount = 0.0
+    part: Amount = 0.0
+    pixel: Amount = 0.0
+    point: Amount = 0.0
+    beam: Amount = 0.0
 
     def __add__(self, other: Work) -> Work:
-        """Return both."""
+        """Return the work of both."""
         return Work(*(getattr(self, f.name) + getattr(other, f.name) for f in fields(self)))
 
 
-def upsampling(samples: ArrayLike, *, filtered: bool) -> Work:
+def upsampling(samples: Amount, *, filtered: bool) -> Work:
     """Return the work of making so many samples of upsampled lines."""
     return Work(filtered_sample=samples) if filtered else Work(upsampled_sample=samples)
 
 
-def combining(lines: ArrayLike, samples: ArrayLike, taps: int, *, given: bool) -> Work:
+def combining(lines: Amount, samples: Amount, taps: int, *, given: bool) -> Work:
     """Return the work of aligning and combining lines of so many samples in a stage.
 
     `taps` are those of both filters; `given` is whether it is the first stage.
@@ -87,7 +90,7 @@ def combining(lines: ArrayLike, samples: ArrayLike, taps: int, *, given: bool) -
 
 
 def backprojecting_leaves(
-    lines: ArrayLike, pixels: ArrayLike, taps: int, *, tiled: bool, weighted: bool
+    lines: Amount, pixels: Amount, taps: int, *, tiled: bool, weighted: bool
 ) -> Work:
     """Return the work of backprojecting the lines of leaves of so many pixels."""
     pairs = lines * pixels
@@ -108,6 +111,31 @@ def backprojecting(
     return Work(
         part=parts * channels, point=of_taps, beam=weighted_pairs, group=parts * part_pixels
     )
+
+
+@dataclass(frozen=True)
+class StageChannels:
+    """Predicted channels of a stage.
+
+    Attributes
+    ----------
+    used : float
+        Channels of the stage before that one subimage combines, on average.
+    count : float
+        Virtual channels of a subimage, on average.
+    summed : float
+        Channels that one virtual channel is a weighted sum of.
+    everywhere : float
+        Virtual channels of a root along the whole aperture, at most.
+    most : float
+        Virtual channels of a subimage, at most.
+    """
+
+    used: float
+    count: float
+    summed: float
+    everywhere: float
+    most: float
 
 
 @dataclass(frozen=True)
@@ -182,10 +210,3 @@ class ErrorBudget:
 
 
 _NEGLIGIBLE = 1e-3  # of the total
-
-
-def estimate_of(kind: type[Work] | type[ErrorBudget], values: dict[str, Any]) -> Any:
-    """Return estimates read from a file, checked: none is negative."""
-    return kind(
-        **{name: validate.number(name, value, "", least=0.0) for name, value in values.items()}
-    )

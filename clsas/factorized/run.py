@@ -1,4 +1,4 @@
-"""Factorized backprojection: the aperture interpolated, stage by stage."""
+"""Factorized backprojection at work on a device, stage by stage."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import math
 from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pyopencl as cl
@@ -18,21 +19,22 @@ from clsas.core.image import Image, holds_any
 from clsas.core.lines import RangeLines
 from clsas.exact.backprojection import form_exactly
 from clsas.exact.checks import check_numbers
-from clsas.factorized.filters import edges_gain
-from clsas.factorized.leaves import Finish, Level, PlaneLeaves, SurfaceLeaves
-from clsas.factorized.plan import CHUNK, Plan
+from clsas.factorized.buffers import CHUNK, Level, row_pitch, stage_lines, stage_tables
+from clsas.factorized.factorization import ExactImage
+from clsas.factorized.leaves import Finish
+from clsas.factorized.plan import Plan
+from clsas.factorized.plane_leaves import PlaneLeaves
 from clsas.factorized.sector import Geometry, Sector
 from clsas.factorized.surface import surface_of
+from clsas.factorized.surface_leaves import SurfaceLeaves
 from clsas.opencl import phases
 from clsas.opencl.buffers import (
     GUARD,
     MARGIN,
-    VECTOR_ROOM,
-    channel_pitch,
     filter_table,
+    lines_buffer,
     padded_length,
     phase_polynomials,
-    sample_bytes,
     upsampled_lines,
 )
 from clsas.opencl.device import Device, Slot, aligned
@@ -40,12 +42,12 @@ from clsas.opencl.upsampling import upsample
 from clsas.sonar.coverage import warn_unseen
 
 _GROUP = 64  # work-items that share a subimage where each has one lane
-_AHEAD_S = 0.1  # of work that is started: roots are prepared meanwhile, an interruption waits
-_PREPARED_FIRST = 4  # batches
-_LARGEST_HALF, _LEAST_HALF = 65504.0, 2.0**-13  # with a margin of 2 to what is rounded coarser
-_FILTERS_SUM = 8.0  # of the absolute values of upsampling and aligning filters, with a margin
-_MOST_EXPONENT = 100  # of a gain: float32 holds filters times it, and over it
-_GROUPS_PER_UNIT = 3  # at least, of compute units: so that they end together
+_AHEAD_S = 0.1  # of enqueued work: hides the preparation of roots; an interruption waits for it
+_PREPARED_FIRST = 4  # batches in the first sector, few, so that the device starts early
+_LARGEST_HALF, _LEAST_HALF = 65504.0, 2.0**-13  # below twice the latter, half precision coarsens
+_FILTERS_SUM = 8.0  # bounds the sum of absolute values of upsampling and aligning filters
+_MOST_EXPONENT = 100  # of a gain: float32 holds filters multiplied and divided by it
+_GROUPS_PER_UNIT = 3  # work-groups per compute unit, at least, so that all end together
 
 
 def form(
@@ -55,15 +57,15 @@ def form(
     device: Device,
     progress: Callable[[int, int], None] | None,
 ) -> Image:
-    """Return the image by a checked plan."""
+    """Return the image of a plan that was checked against lines and grid."""
     warned = chosen.kept.get("warned", False)  # not where the plan comes from a file
-    if chosen.is_exact:
+    if isinstance(chosen.image, ExactImage):
         # The plan has warned of ends of lines.
         return form_exactly(
             lines,
             grid,
             device=device,
-            accuracy_db=chosen.accuracy_db,
+            accuracy_db=chosen.image.accuracy_db,
             beam=chosen.beam,
             progress=progress,
             warned=warned,
@@ -88,12 +90,12 @@ def form(
 
 @dataclass(frozen=True, eq=False)
 class _Tables:
-    """What a device is told of a sector's roots, all at once.
+    """Tables of a sector on the device.
 
     Attributes
     ----------
     slot : Slot
-        Its buffers.
+        Buffers, see `clsas.factorized.buffers`.
     pitches : list of int
         Channels of a row, stage by stage.
     strides : list of int
@@ -117,9 +119,10 @@ class _Run:
         pixels: NDArray[np.complex64],
         largest: float,
     ) -> None:
-        self.lines, self.grid, self.plan, self.device = lines, grid, chosen, device
-        self.width, self.pitch = device.info.width, padded_length(chosen.resampling)
-        self.half_precision = chosen.half_precision
+        image = chosen.factorization
+        self.lines, self.plan, self.factorization, self.device = lines, chosen, image, device
+        self.width, self.pitch = device.info.width, padded_length(image.resampling)
+        self.half_precision = image.half_precision
         self.gain = _gain(largest, lines.channels) if self.half_precision and largest > 0 else 1.0
         self.samples = self._upload_lines()  # early: a device upsamples them beside what follows
         self.geometry = _geometry(lines, grid, chosen)
@@ -133,17 +136,14 @@ class _Run:
                 "twice the memory: what can be seen of the grid is too faint beside the "
                 f"largest sample, {largest:.3g}, or that is too far from 1"
             )
-        self.levels = [
-            Level(half, -(-(2 * half + 1) // self.width) * self.width)
-            for half in chosen.half_lengths
-        ]
+        self.levels = [Level.of(half, self.width) for half in image.half_lengths]
         self.filters = {
-            "range_filter": filter_table(device, chosen.align.coefficients),
-            "aperture_filter": filter_table(device, chosen.aperture.coefficients),
+            "range_filter": filter_table(device, image.align.coefficients),
+            "aperture_filter": filter_table(device, image.aperture.filter.coefficients),
             "phase_polynomials": phase_polynomials(device, phases.PRECISE_TERMS),
         }
-        options = {"WIDTH": self.width, "TAPS": chosen.align.taps}
-        options |= {"APERTURE_TAPS": chosen.aperture.taps, "HALF": int(self.half_precision)}
+        options = {"WIDTH": self.width, "TAPS": image.align.taps}
+        options |= {"APERTURE_TAPS": image.aperture.filter.taps, "HALF": int(self.half_precision)}
         options |= {"CHUNK": CHUNK, "PHASE_TERMS": phases.PRECISE_TERMS}
         ramp = int(self.geometry.ramps)
         self.first_stage = device.kernel("stage", SHIFTS_GIVEN=1, RAMP=ramp, **options)
@@ -162,29 +162,27 @@ class _Run:
 
     def _upload_lines(self) -> cl.Buffer:
         """Return all lines on the device, upsampled."""
-        device, chosen, count = self.device, self.plan, self.lines.channels
-        resampling = chosen.resampling
-        line_bytes = sample_bytes(self.half_precision) * self.pitch
-        if count * line_bytes > device.info.max_buffer_bytes:
+        device, image, count = self.device, self.factorization, self.lines.channels
+        resampling = image.resampling
+        needed = lines_buffer(count, self.pitch, self.half_precision).nbytes
+        if needed > device.info.max_buffer_bytes:
             raise ValueError(
                 f"{count} lines of {self.lines.length} samples need "
-                f"{count * line_bytes / 2**20:.0f} MiB when upsampled, more than a buffer of "
+                f"{needed / 2**20:.0f} MiB when upsampled, more than a buffer of "
                 f"{device.info.label}, {device.info.max_buffer_bytes / 2**20:.0f} MiB: image "
                 f"a part of them, or backproject exactly"
             )
-        if chosen.upsampler is not None:
+        if image.upsampler is not None:
             return upsample(
                 self.lines.samples,
                 resampling,
-                chosen.upsampler,
+                image.upsampler,
                 self.pitch,
                 device,
                 half_precision=self.half_precision,
                 gain=self.gain,
             )
-        gain = None
-        if not chosen.nearest:
-            gain = edges_gain(chosen.align, chosen.final, len(chosen.sides), resampling.ratio)
+        gain = image.aperture.lines_gain(image.align, image.final, resampling.ratio)
         return device.share(
             upsampled_lines(self.lines.samples, resampling, self.width, MARGIN, self.pitch, gain)
         )
@@ -194,11 +192,11 @@ class _Run:
 
         The geometry of a sector is prepared while the device works on the one before.
         """
-        under_way = deque()
-        batches = -(-len(self.division.roots) // self.plan.roots_at_once)
+        under_way: deque[Finish] = deque()
+        batches = -(-len(self.division.roots) // self.factorization.roots_at_once)
         most = max(math.ceil(_AHEAD_S * batches / max(self.plan.predicted_seconds, 1e-9)), 2)
         for sector, tables in self._sectors():
-            for first in range(0, len(sector.roots), self.plan.roots_at_once):
+            for first in range(0, len(sector.roots), self.factorization.roots_at_once):
                 under_way.append(self._start(sector, tables, first))
                 if len(under_way) > most:
                     yield under_way.popleft()()
@@ -208,14 +206,14 @@ class _Run:
         self.leaves.complete()
 
     def _sectors(self) -> Iterator[tuple[Sector, _Tables]]:
-        """Prepare the roots, some together; few at first, for the device to begin with."""
-        first = _PREPARED_FIRST * self.plan.roots_at_once
-        for sector in self.geometry.sectors(first, self.plan.roots_prepared):
+        """Prepare sectors of roots; the first is small, for the device to begin with."""
+        first = _PREPARED_FIRST * self.factorization.roots_at_once
+        for sector in self.geometry.sectors(first, self.factorization.roots_prepared):
             yield sector, self._upload_tables(sector)
 
     def _start(self, sector: Sector, tables: _Tables, first: int) -> Finish:
         """Start forming the pixels of some roots of a sector."""
-        batch = slice(first, min(first + self.plan.roots_at_once, len(sector.roots)))
+        batch = slice(first, min(first + self.factorization.roots_at_once, len(sector.roots)))
         if not all(tables.strides):
             return self.leaves.blank(sector, batch)
         for level in range(len(self.levels)):
@@ -226,85 +224,71 @@ class _Run:
         return finish
 
     def _upload_tables(self, sector: Sector) -> _Tables:
-        """Start copying to the device all that it is told of a sector's roots."""
+        """Start copying the tables of a sector to the device."""
         slot, levels = next(self.table_slots), range(len(self.levels))
         slot.wait()
         strides = [sector.stride(level) for level in levels]
-        for name, values in self.geometry.references(sector).items():
-            slot.fill(name, _padded(values))
-        for level, (nodes, need) in enumerate(zip(sector.nodes, sector.needs, strict=True)):
-            children = np.zeros((*need.first.shape, 5), np.int32)
-            children[..., 0], children[..., 1] = need.begin, need.end
-            if level:
-                parents = self.division.parents(level)
-                children[..., 2] = sector.needs[level - 1].first[:, parents]
-                position_m = sector.positions_m(level - 1).swapaxes(1, 2)
-                slot.fill(f"positions{level}", _padded(position_m.astype(np.float32)))
-                parent_m = sector.relative_m[level - 1][:, parents]
-                offsets_m = [parent_m, sector.relative_m[level] - parent_m]
-                offsets_m = np.concatenate(offsets_m, axis=-1).astype(np.float32)
-                slot.fill(f"offsets{level}", offsets_m)
-            children[..., 3], children[..., 4] = need.first, need.last - need.first
-            slot.fill(f"children{level}", children)
-            slot.fill(f"base{level}", _padded(nodes.base.astype(np.int32)))
-            slot.fill(f"between{level}", _padded(nodes.between.astype(np.float32)))
+        for level in levels:
+            roots, channels = sector.nodes[level].base.shape
+            subimages = self.division.per_root(level)
+            values = self._stage_values(sector, level)
+            ramps = self.geometry.ramps
+            for name, buffer in stage_tables(
+                level, roots, subimages, channels, ramps=ramps
+            ).items():
+                slot.fill(name, buffer.holding(values[name]))
         self.leaves.fill(slot, sector)
-        pitches = [_pitch(nodes.base.shape[1]) for nodes in sector.nodes]
+        pitches = [row_pitch(nodes.base.shape[1]) for nodes in sector.nodes]
         return _Tables(slot, pitches, strides)
+
+    def _stage_values(self, sector: Sector, level: int) -> dict[str, NDArray]:
+        """Return what the tables of a stage hold, see `cl/stage.cl`."""
+        nodes, need = sector.nodes[level], sector.needs[level]
+        values = {f"base{level}": nodes.base, f"between{level}": nodes.between}
+        first_of_parent = np.zeros_like(need.first)
+        if level:
+            parents = self.division.parents(level)
+            first_of_parent = sector.needs[level - 1].first[:, parents]
+            parent_m = sector.relative_m[level - 1][:, parents]
+            offsets_m = [parent_m, sector.relative_m[level] - parent_m]
+            values[f"offsets{level}"] = np.concatenate(offsets_m, axis=-1)
+            values[f"positions{level}"] = sector.positions_m(level - 1).swapaxes(1, 2)
+        else:
+            values |= self.geometry.references(sector)
+        children = [need.begin, need.end, first_of_parent, need.first, need.last - need.first]
+        values[f"children{level}"] = np.stack(children, axis=-1)
+        return values
 
     def _stage(self, tables: _Tables, level: int, batch: slice) -> None:
         """Form the lines of a stage from those of the one before, or from the raw ones."""
-        device, table, shape, stride = (
-            self.device,
-            tables.slot,
-            self.levels[level],
-            tables.strides[level],
-        )
-        # A buffer that grows waits for all that is under way.
-        lines_each = max(stride, self.plan.most_channels[level])
+        device, table = self.device, tables.slot
+        shape, stride = self.levels[level], tables.strides[level]
+        # Room for most subimages from the start: a buffer that grows waits for all commands.
+        lines_each = max(stride, self.factorization.most_channels[level])
         per_root = self.division.per_root(level)
         children = (batch.stop - batch.start) * per_root
-        if level == 0:
-            kernel, parent, parent_pitch = self.first_stage, self.samples, self.pitch
-            names = ("order", "start", "nu", "cycles", *(["ramp"] if self.geometry.ramps else []))
-            shifts = {name: table[name] for name in names}
-        else:
-            kernel, before = self.later_stage, self.levels[level - 1]
-            parent, parent_pitch = self.slot[f"lines{level - 1}"], before.pitch
-            shifts = {
-                "parents": self.parents[level],
-                "parents_per_root": self.division.per_root(level - 1),
-                "lines_per_parent": tables.strides[level - 1],
-                "positions": table[f"positions{level}"],
-                "offsets": table[f"offsets{level}"],
-                "drift": self.geometry.drift,
-                "samples_per_m": self.geometry.samples_per_m,
-                "cycles_per_m": self.geometry.cycles_per_m,
-                "parent_centre": before.centre,
-            }
+        ((name, buffer),) = stage_lines(
+            level, children, lines_each, shape.pitch, half_precision=self.half_precision
+        ).items()
+        child_lines = self.slot.zeros(name, buffer.nbytes)
         items = _GROUP if self.width == 1 else 1
         # Few children are divided, so that there is work for all.
         step = _GROUP if self.width == 1 else 8 * self.width
         parts = -(-_GROUPS_PER_UNIT * device.info.compute_units // children)
         part_length = step * -(-shape.length // (step * parts))
         device.run(
-            kernel,
+            self.later_stage if level else self.first_stage,
             (children * items, -(-shape.length // part_length)),
-            parent_lines=parent,
-            parent_pitch=parent_pitch,
             children=table[f"children{level}"],
             first_child=batch.start * per_root,
             children_per_root=per_root,
             first_virtual=table[f"base{level}"],
             tap_position=table[f"between{level}"],
             channel_pitch=tables.pitches[level],
-            **shifts,
+            **self._shifts(tables, level),
             half_length=shape.half,
             **self.filters,
-            child_lines=self.slot.zeros(
-                f"lines{level}",
-                sample_bytes(self.half_precision) * children * lines_each * shape.pitch,
-            ),
+            child_lines=child_lines,
             lines_per_child=stride,
             child_pitch=shape.pitch,
             length=shape.length,
@@ -314,33 +298,45 @@ class _Run:
             local=(items, 1),
         )
 
+    def _shifts(self, tables: _Tables, level: int) -> dict[str, Any]:
+        """Return the kernel's arguments about a stage's parents, and how their lines are shifted.
+
+        Shifts of raw lines are found on the host in float64. Later ones follow from positions.
+        """
+        table, geometry = tables.slot, self.geometry
+        if level == 0:
+            names = ("order", "start", "nu", "cycles", *(["ramp"] if geometry.ramps else []))
+            shifts = {name: table[name] for name in names}
+            return {"parent_lines": self.samples, "parent_pitch": self.pitch, **shifts}
+        before = self.levels[level - 1]
+        return {
+            "parent_lines": self.slot[f"lines{level - 1}"],
+            "parent_pitch": before.pitch,
+            "parents": self.parents[level],
+            "parents_per_root": self.division.per_root(level - 1),
+            "lines_per_parent": tables.strides[level - 1],
+            "positions": table[f"positions{level}"],
+            "offsets": table[f"offsets{level}"],
+            "drift": geometry.drift,
+            "samples_per_m": geometry.samples_per_m,
+            "cycles_per_m": geometry.cycles_per_m,
+            "parent_centre": before.centre,
+        }
+
 
 def _geometry(lines: RangeLines, grid: Grid, chosen: Plan) -> Geometry:
-    """Return how lines see the roots of a plan, as the image before has left it."""
+    """Return the geometry of a plan's image, kept from the image before if there was one."""
     if "geometry" not in chosen.kept:
         chosen.kept["geometry"] = Geometry(lines, surface_of(grid), chosen)
     return chosen.kept["geometry"]
 
 
 def _gain(largest: float, channels: int) -> float:
-    """Return a power of 2 that brings lines, and sums of them all, within half precision."""
+    """Return a power of 2 with which lines, and the sum of all, stay within half precision."""
     exponent = math.floor(math.log2(_LARGEST_HALF / (_FILTERS_SUM * channels * largest)))
     return 2.0 ** min(max(exponent, -_MOST_EXPONENT), _MOST_EXPONENT)
 
 
 def _holds(rms: float) -> bool:
-    """Return whether half precision holds lines of an rms value, or there is nothing to hold."""
+    """Return whether half precision resolves lines of an rms value; zeros it does."""
     return rms == 0 or _LEAST_HALF <= rms <= _LARGEST_HALF
-
-
-def _pitch(channels: int) -> int:
-    """Channels of a row in a table, with room for a vector that begins at the last."""
-    return channel_pitch(channels) + VECTOR_ROOM
-
-
-def _padded(values: NDArray) -> NDArray:
-    """Return [..., channels] as the stages' kernel wants it: rows of whole vectors."""
-    count = values.shape[-1]
-    padded = np.zeros((*values.shape[:-1], _pitch(count)), values.dtype)
-    padded[..., :count] = values
-    return padded

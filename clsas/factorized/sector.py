@@ -1,4 +1,4 @@
-"""The geometry of some roots of a factorized image: what the device is told of them."""
+"""Geometry of a factorized image: virtual channels of roots, and how these see the raw ones."""
 
 from __future__ import annotations
 
@@ -16,39 +16,39 @@ from clsas.core.geometry import pairwise_range_m
 from clsas.core.lines import RangeLines, some_channels
 from clsas.factorized import tree
 from clsas.factorized.aperture import cycles_per_extent, drift, mean_track, own_drift, stretches
+from clsas.factorized.interpolated import BEAM_MARGIN
 from clsas.factorized.plan import Plan
 from clsas.factorized.surface import Surface
 from clsas.factorized.tree import Division, Nodes, Ranges
 from clsas.opencl.buffers import MARGIN
 
-_ON_TRACK = 1e-4  # wavelengths
-_SOME_LINES = 64  # of which samples are looked at
+_ON_TRACK = 1e-4  # wavelengths; closer, channels lie on the mean track
+_SAMPLED_LINES = 64  # whose power is measured, spread evenly
 _FAR = 1 << 28  # samples: off any line, and within int32
 MOST_KEPT_BYTES = 128 << 20
-"""Of what one image leaves for the next by the same plan, at most, each of sectors and groups."""
-OF_BEAM = 1 / 16
-"""Of what a beam covers: by how much it may be taken to cover more."""
+"""Most memory of sectors, and of groups, that a plan keeps for its next image."""
 
 
 @dataclass(frozen=True, eq=False)
 class Sector:
-    """Some roots: which virtual channels their subimages have, and how they see the raw ones.
+    """Some roots with the virtual channels of their subimages.
 
     Attributes
     ----------
     roots : int [roots, 2]
-        Their first pixels.
+        First pixels.
     root_m : float64 [roots, 3]
-        Middles of the roots.
+        Centres of the roots.
     channels : slice
-        Which of the raw channels, in the order of the track, see any of them.
+        Raw channels, in the order of the track, that see any of them.
     relative_m : list of float64 [roots, subimages, 3]
-        Those of subimages from that of their root, stage by stage.
+        Centres of subimages relative to those of their roots, stage by stage.
     nodes : list of Nodes
-        Stage by stage.
+        Virtual channels, stage by stage.
     needs : list of Ranges
+        Virtual channels of each subimage, and the channels that it combines, stage by stage.
     place : float64 [roots, channels]
-        Where these raw channels appear on the track.
+        Aperture coordinates of the raw channels.
     """
 
     roots: NDArray[np.int64]
@@ -61,113 +61,128 @@ class Sector:
 
     @property
     def nbytes(self) -> int:
-        """Memory of all arrays, about."""
+        """Approximate memory of all arrays."""
         parts = [self, *self.nodes, *self.needs]
         arrays = [value for part in parts for value in vars(part).values()] + self.relative_m
         return sum(array.nbytes for array in arrays if isinstance(array, np.ndarray))
 
     def stride(self, level: int) -> int:
-        """Return how many lines a subimage of a stage has at most."""
+        """Return the largest number of virtual channels of a stage's subimages."""
         need = self.needs[level]
         return int((need.last - need.first).max())
 
     def positions_m(self, level: int) -> NDArray[np.float64]:
-        """Return the virtual channels of a stage from the middles of their roots."""
+        """Return virtual channels of a stage relative to the centres of their roots."""
         return self.nodes[level].position_m - self.root_m[:, None]
 
 
 class Geometry:
-    """How lines see the roots of a plan, in float64; channels are in the order of the track.
+    """Geometry of a plan's lines and roots in float64, with channels in the order of the track.
 
     It serves any number of images, and holds no samples.
 
     Attributes
     ----------
     kept : dict
-        What else was found out that does not depend on samples.
+        Other results that do not depend on samples.
     channels : int [channels]
-        Which line each is.
+        Lines in the order of the track.
     division : Division
     drift : float64 [3]
+        See `clsas.factorized.aperture.drift`.
     ramps : bool
-        Whether channels' phases are turned along their lines.
+        True if the first stage turns the phase of channels along their lines.
     samples_per_m, cycles_per_m : float
-        Of the upsampled lines.
+        Samples and phase of the upsampled lines per metre of range.
+
+    Raises
+    ------
+    ValueError
+        If all channels are at one place.
     """
 
     def __init__(self, lines: RangeLines, surface: Surface, chosen: Plan) -> None:
         self.lines, self.surface, self.plan = lines.without_samples(), surface, chosen
+        image, beam = chosen.factorization, chosen.beam
+        self.factorization, self.beam = image, beam
         self.kept: dict[Hashable, Any] = {}
-        self.samples_per_m = chosen.resampling.samples_per_m(lines)
-        self.cycles_per_m = chosen.resampling.cycles_per_m(lines)
-        self.division = Division(surface, chosen.sides)
+        self.samples_per_m = image.resampling.samples_per_m(lines)
+        self.cycles_per_m = image.resampling.cycles_per_m(lines)
+        self.division = Division(surface, image.sides)
         track = mean_track(lines)
+        if track is None:
+            raise ValueError(
+                "lines must have channels at more than one place for a plan that divides"
+            )
         self.channels = np.argsort(track.place, kind="stable")
         self.track = replace(track, place=track.place[self.channels])
-        self.along = None
-        if chosen.beam is not None:
-            along = chosen.beam.directions(lines)[self.channels]
+        self.along: NDArray[np.float64] | None = None
+        if beam is not None:
+            along = beam.directions(lines)[self.channels]
             self.along = tree.beam_directions(along, self.track, track.samples)
         self.phase_centres_m = lines.phase_centres_m[self.channels]
         self.drift, own = drift(lines), own_drift(lines)
         self.own_drift = own if own is None else own[self.channels]
-        self._seen = Division(surface, (chosen.sides[0], self._together(), chosen.sides[-1]))
-        # The thesis's method has none; on the track itself there is nothing to make up for.
+        self._seen = Division(surface, (image.sides[0], self._together(), image.sides[-1]))
+        # On the track itself there is nothing to align.
         off_m = np.abs(self.phase_centres_m - self.track.positions_m(self.track.place)).max()
         wavelength_m = lines.sound_speed_m_s / max(lines.carrier_hz, 1.0)
         if own is not None:
             off_m += np.linalg.norm(own, axis=1).max() * np.abs(lines.last_range_m).max()
         apart = lines.rx_velocity_m_s is not None or not np.array_equal(lines.tx_m, lines.rx_m)
         away = apart or off_m > _ON_TRACK * wavelength_m
-        self.ramps = bool(away and not chosen.nearest)
+        self.ramps = bool(away and image.aperture.aligns_phases)
         # From elsewhere a channel off the track appears at another place.
         way_m = np.linalg.norm(self.track.sampled_m[1], axis=1)
         self._slack = 2 * off_m / max(way_m.min(), 1e-9)
 
     @property
     def roots(self) -> NDArray[np.int64]:
-        """Roots in the order in which they are formed, [roots, 2].
+        """First pixels of roots in the order in which they are formed, [roots, 2].
 
-        With a beam, so that those come together which the same channels see.
+        With a beam, roots that the same channels see follow each other.
         """
         roots = self.division.roots
-        if self.plan.limits is None:
+        if self.along is None:
             return roots
         along = np.abs(self.surface.steps_m[:2] @ self.along.mean(axis=0))
-        slow = int(np.argmax(along * self.plan.sides[0]))
+        slow = int(np.argmax(along * self.factorization.sides[0]))
         return roots[np.lexsort((roots[:, 1 - slow], roots[:, slow]))]
 
     @functools.cached_property
     def nearest_m(self) -> float:
-        """Least distance of a channel from a root's middle."""
+        """Least distance between a channel and the centre of a root."""
         root_m = self.division.centres_m(0, self.division.roots)
         return float(cdist(root_m, self.phase_centres_m).min())
 
     def rms(self, lines: RangeLines) -> float:
-        """Return the rms value of lines' samples, of some of them, from about where pixels lie."""
-        some = some_channels(lines.channels, _SOME_LINES)
+        """Return the rms of samples at ranges where pixels lie, over some of the lines."""
+        some = some_channels(lines.channels, _SAMPLED_LINES)
         root_m = self.division.centres_m(0, self.division.roots)
         away_m = cdist(root_m, lines.phase_centres_m[some])
-        radius_m = self.surface.radius_m(self.plan.sides[0])
+        radius_m = self.surface.radius_m(self.factorization.sides[0])
         near_m, far_m = away_m.min(axis=0) - radius_m, away_m.max(axis=0) + radius_m
         total, count = 0.0, 0
         for i, near, far in zip(some, near_m, far_m, strict=True):
             limits = (np.array([near, far]) - lines.first_range_m[i]) / lines.range_step_m
             first, last = np.clip(limits, 0, lines.length).astype(np.int64)
             seen = lines.samples[i, first : last + 1].astype(np.complex128)
-            total += np.vdot(seen, seen).real
+            total += float(np.vdot(seen, seen).real)
             count += last + 1 - first
         return math.sqrt(total / max(count, 1))
 
     def _together(self) -> tuple[int, int]:
-        """Return the size of rectangles of leaves for all of which it is decided who sees them.
+        """Return the size of rectangles of leaves whose visibility is found together.
 
-        They lie within a leaf's parent, and add little to what the beam covers.
+        They lie within a leaf's parent, and are hardly visible from further along the track than
+        one leaf.
         """
-        leaf, parent = self.plan.sides[-1], self.plan.sides[max(len(self.plan.sides) - 2, 0)]
-        if self.plan.beam is None:
+        sides = self.factorization.sides
+        leaf, parent = sides[-1], sides[max(len(sides) - 2, 0)]
+        limits = self.factorization.limits
+        if self.along is None or limits is None:
             return parent
-        most_m = OF_BEAM * self.nearest_m * np.ptp(np.clip(self.plan.limits, -1, 1))
+        most_m = BEAM_MARGIN * self.nearest_m * np.ptp(np.clip(limits, -1, 1))
         along_m = np.abs(self.surface.steps_m[:2] @ self.along.T)
 
         def fits(side: tuple[int, int]) -> bool:
@@ -180,7 +195,7 @@ class Geometry:
         return side
 
     def sectors(self, first: int, most: int) -> Iterator[Sector]:
-        """Yield all roots, some together: `first`, for a device to begin with, then more.
+        """Yield all roots in sectors: of `first` roots, for a device to begin with, then more.
 
         They are kept for the next image, unless they take much memory.
         """
@@ -201,9 +216,9 @@ class Geometry:
             self.kept["sectors"] = found
 
     def sector(self, roots: NDArray[np.int64]) -> Sector:
-        """Return the geometry of some roots, given by their first pixels [roots, 2]."""
-        division, chosen, track, surface = self.division, self.plan, self.track, self.surface
-        sides, last = chosen.sides, len(chosen.sides) - 1
+        """Return the geometry of some roots, given by their first pixels, [roots, 2]."""
+        division, track, surface = self.division, self.track, self.surface
+        sides, aperture = self.factorization.sides, self.factorization.aperture
         root_m = division.centres_m(0, roots)
         corners = [division.corners(level, roots) for level in range(len(sides))]
         relative_m = [
@@ -213,58 +228,47 @@ class Geometry:
         seen_m = self._seen.centres_m(1, self._seen.corners(1, roots))
         half_m = surface.extents_in(together, sides[0], roots).max(axis=0) / 2
         half_m = half_m[:, None] * surface.steps_m
-        seen = tree.seen_from(chosen.limits, track, self.along, seen_m, half_m)
-        seen = tuple(each[:, self._seen.parents(2)] for each in seen)
+        begin, end = (
+            each[:, self._seen.parents(2)]
+            for each in tree.seen_from(self.factorization.limits, track, self.along, seen_m, half_m)
+        )
         inside = surface.holds(sides[-1], corners[-1])
-        channels = self._used(*(each[inside] for each in seen))
+        channels = aperture.used_channels(track.place, begin[inside], end[inside], self._slack)
         centres_m = self.phase_centres_m[channels]
         some = replace(track, place=track.place[channels])
         own = None if self.own_drift is None else self.own_drift[channels]
-        seen_at = place = some.places_seen_from(root_m, centres_m, own)
-        nodes = []
-        if chosen.nearest:
-            position_m = np.broadcast_to(centres_m, (*place.shape, 3))
-            for factor in chosen.nearest:
-                nodes.append(tree.nearest_nodes(place, position_m, factor))
-                place, position_m = nodes[-1].place, nodes[-1].position_m
-        else:
-            rates = cycles_per_extent(
-                track,
-                surface,
-                root_m,
-                surface.extents_in(sides[0], sides[0], roots).max(axis=0),
-                chosen.highest_cycles_per_m,
-                min(surface.radius_m(sides[-1]), chosen.closest_m),
-                chosen.limits,
-                self.along,
-            )
-            for level, side in enumerate(sides):
-                extents = chosen.crowding[level] * surface.extents_in(side, sides[0], roots)
-                rate = np.einsum("ra,ars->rs", extents, rates)
-                if chosen.beam is not None and level == last:
-                    rate += chosen.beam_cycles * tree.beam_rate(
-                        chosen.beam, track, self.along, root_m
-                    )
-                nodes.append(tree.interpolated_nodes(track, rate, place, chosen.aperture))
-                place = nodes[-1].place
-        needs = tree.ranges(division, nodes, seen_at, seen, inside)
-        return Sector(roots, root_m, channels, relative_m, nodes, needs, seen_at)
+        place = some.places_seen_from(root_m, centres_m, own)
+        nodes = aperture.virtual_channels(self, roots, root_m, place, centres_m)
+        needs = tree.ranges(division, nodes, place, (begin, end), inside)
+        return Sector(roots, root_m, channels, relative_m, nodes, needs, place)
 
-    def _used(self, start: NDArray[np.float64], stop: NDArray[np.float64]) -> slice:
-        """Return the channels at places on the track from where leaves are seen; one at least."""
-        seen, place = stop > start, self.track.place
-        if self.plan.nearest or not seen.any():
-            return slice(0, len(place) if self.plan.nearest else 1)
-        first = np.searchsorted(place, start[seen].min() - self._slack, "left")
-        last = np.searchsorted(place, stop[seen].max() + self._slack, "right")
-        return slice(int(min(first, len(place) - 1)), int(max(last, first + 1)))
+    def phase_rates(
+        self, roots: NDArray[np.int64], root_m: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Return the largest phase rates of subimages in some roots: see `cycles_per_extent`."""
+        image, surface = self.factorization, self.surface
+        return cycles_per_extent(
+            self.track,
+            surface,
+            root_m,
+            surface.extents_in(image.sides[0], image.sides[0], roots).max(axis=0),
+            image.highest_cycles_per_m,
+            min(surface.radius_m(image.sides[-1]), image.closest_m),
+            image.limits,
+            self.along,
+        )
 
     def references(self, sector: Sector) -> dict[str, NDArray]:
-        """Return how roots see the raw channels, in the order of their nodes, [roots, channels].
+        """Return how roots align the raw channels, in the order of their nodes, [roots, channels].
 
-        The line, its first sample, the place between samples, phase in cycles and its ramp.
+        By name: the line, its first sample, the position between samples, the phase in cycles and
+        its change per sample.
         """
-        lines, resampling, half = self.lines, self.plan.resampling, self.plan.half_lengths[0]
+        lines, resampling, half = (
+            self.lines,
+            self.factorization.resampling,
+            self.factorization.half_lengths[0],
+        )
         nodes = sector.nodes[0]
         channels = self.channels[sector.channels]
         range_m = pairwise_range_m(sector.root_m, *self._antennas(sector))
@@ -276,7 +280,7 @@ class Geometry:
         place *= resampling.ratio
         place += MARGIN - resampling.first - half
         lower = np.floor(place)
-        start = np.clip(lower + 1 - self.plan.align.taps // 2, -_FAR, _FAR)
+        start = np.clip(lower + 1 - self.factorization.align.taps // 2, -_FAR, _FAR)
         channel = np.broadcast_to(channels, place.shape)
         references = {
             "order": nodes.ordered(channel).astype(np.int32),
@@ -289,17 +293,20 @@ class Geometry:
         return references
 
     def _antennas(self, sector: Sector) -> tuple:
-        """Return what `pairwise_range_m` takes of the channels of a sector."""
+        """Return antennas, velocities and sound speed of a sector's channels."""
         lines, channels = self.lines, self.channels[sector.channels]
         velocity = lines.rx_velocity_m_s
         moving = velocity if velocity is None else velocity[channels]
         return lines.tx_m[channels], lines.rx_m[channels], moving, lines.sound_speed_m_s
 
     def _ramp(self, sector: Sector) -> NDArray[np.float64]:
-        """Return by how many cycles per sample the phase of channels grows beyond their place's."""
+        """Return cycles per sample by which channels' phases grow faster than their stand-ins'."""
         virtual_m = self.track.positions_m(sector.place)
-        antennas, plane = self._antennas(sector), self.surface.plane
-        stretch = stretches(*antennas, self.drift, plane, sector.root_m, virtual_m)
+        tx_m, rx_m, velocity, speed = self._antennas(sector)
+        plane = self.surface.plane
+        stretch = stretches(
+            tx_m, rx_m, velocity, speed, self.drift, plane, sector.root_m, virtual_m
+        )
         return stretch * self.cycles_per_m / self.samples_per_m
 
 

@@ -1,23 +1,106 @@
-"""Factorized backprojection with nearest beams: the formulas of THESIS chapter 4."""
+"""Factorized backprojection with nearest beams: the method and the formulas of THESIS chapter 4."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from pydantic import Field
+from pydantic.dataclasses import dataclass
 
 from clsas.core.geometry import pairwise_range_m
 from clsas.core.grid import Grid
 from clsas.core.lines import RangeLines
+from clsas.factorized import tree
 from clsas.factorized.aperture import mean_track
-from clsas.factorized.plan import Plan
+from clsas.factorized.estimates import StageChannels
+from clsas.factorized.fields import CONFIG, Whole
+from clsas.factorized.interpolated import VisiblePhases
 from clsas.factorized.surface import surface_of
-from clsas.factorized.tree import Division
+from clsas.factorized.tree import Division, Nodes
+from clsas.signal.interpolation import Gain, Interpolator
+
+if TYPE_CHECKING:
+    from clsas.factorized.plan import Plan
+    from clsas.factorized.sector import Geometry
 
 Stages = Sequence[tuple[int, int]]
 """(QR, QI) of every stage: how many lines are summed, and the division of either image side."""
+
+
+@dataclass(frozen=True, config=CONFIG)
+class NearestBeams:
+    """Virtual channels that are sums of neighbours as they are, at their mean position [43].
+
+    Methods as those of `clsas.factorized.interpolated.InterpolatedAperture`, the other way to
+    choose virtual channels.
+
+    Attributes
+    ----------
+    factors : tuple of int
+        Neighbours that are summed into one beam, QR, stage by stage.
+    """
+
+    factors: Annotated[tuple[Whole, ...], Field(min_length=1)]
+    method: Literal["nearest"] = "nearest"
+
+    filter: ClassVar[Interpolator] = Interpolator(1, 1.0, np.zeros((0, 2, 0)), -math.inf, -math.inf)
+    """A single tap of weight 1."""
+    band: ClassVar[None] = None
+    """Linear interpolation takes any band."""
+    aligns_phases: ClassVar[bool] = False
+    splits_leaves: ClassVar[bool] = True
+    """Leaves as large as the stages ask for are backprojected in tiles."""
+
+    @property
+    def stages(self) -> int:
+        """Number of stages."""
+        return len(self.factors)
+
+    def describe(self) -> str:
+        """Return the sums in words."""
+        return f"sums of {', '.join(map(str, self.factors))} neighbours"
+
+    def lines_gain(self, align: Interpolator, final: Interpolator, ratio: float) -> Gain | None:
+        """Return None: the thesis leaves lines as they are."""
+
+    def used_channels(
+        self,
+        place: NDArray[np.float64],
+        start: NDArray[np.float64],
+        stop: NDArray[np.float64],
+        slack: float,
+    ) -> slice:
+        """Return all channels: which of them are neighbours does not depend on the sector."""
+        return slice(0, len(place))
+
+    def virtual_channels(
+        self,
+        geometry: Geometry,
+        roots: NDArray[np.int64],
+        root_m: NDArray[np.float64],
+        place: NDArray[np.float64],
+        channels_m: NDArray[np.float64],
+    ) -> list[Nodes]:
+        """Return the beams of some roots, stage by stage."""
+        nodes, position_m = [], np.broadcast_to(channels_m, (*place.shape, 3))
+        for factor in self.factors:
+            nodes.append(tree.nearest_nodes(place, position_m, factor))
+            place, position_m = nodes[-1].place, nodes[-1].position_m
+        return nodes
+
+    def predicted_channels(
+        self, view: VisiblePhases, sides: tuple[tuple[int, int], ...]
+    ) -> list[StageChannels]:
+        """Return the beams of a subimage, stage by stage."""
+        found, channels = [], view.lines.channels
+        for factor in self.factors:
+            used, channels = channels, math.ceil(channels / factor)
+            found.append(StageChannels(used, channels, factor, channels, channels))
+        return found
 
 
 def range_error_m(
@@ -135,16 +218,19 @@ def plan_errors_m(
     [42] and [43] applied to every channel: in each stage its line is shifted so that the range of
     the subimage's centre is right for the mean of its neighbours, which then stands for it.
     """
-    order = np.argsort(mean_track(lines).place, kind="stable")
+    track, image = mean_track(lines), plan.factorization
+    if track is None or not isinstance(image.aperture, NearestBeams) or not grid.is_planar:
+        raise ValueError("plan must be one of stages, for lines and a plane that it was made for")
+    order = np.argsort(track.place, kind="stable")
     ends_m = lines.tx_m[order], lines.rx_m[order]
-    division = Division(surface_of(grid), plan.sides)
-    pixels = np.asarray(pixels)
-    points_m = grid.origin_m + pixels[:, :1] * grid.row_step_m + pixels[:, 1:] * grid.column_step_m
+    division = Division(surface_of(grid), image.sides)
+    index = np.asarray(pixels, np.int64)
+    points_m = np.asarray(grid.origin_m) + index @ division.surface.steps_m
     errors_m = -pairwise_range_m(points_m, *ends_m)
     position_m = lines.phase_centres_m[order]
     beam = np.arange(lines.channels)  # of the stage before, that holds each channel
-    for level, (side, beams) in enumerate(zip(plan.sides, plan.nearest, strict=True)):
-        centres_m = division.centres_m(level, pixels // side * side)
+    for level, (side, beams) in enumerate(zip(image.sides, image.aperture.factors, strict=True)):
+        centres_m = division.centres_m(level, index // side * side)
         errors_m += pairwise_range_m(centres_m, *ends_m)[:, beam]
         starts = np.arange(0, len(position_m), beams)
         counts = np.diff(np.append(starts, len(position_m)))

@@ -6,8 +6,8 @@ import json
 from dataclasses import asdict
 from typing import Any
 
+from clsas.core.digests import grid_digest
 from clsas.core.grid import Grid
-from clsas.factorized.plan import grid_digest
 from clsas.mosaics.survey import Survey
 from clsas.sonar.beam import BeamWindow
 

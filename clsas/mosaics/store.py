@@ -23,11 +23,11 @@ from numpy.typing import NDArray
 
 from clsas.core import reprs, validate
 from clsas.core.atomic import sync_folder
+from clsas.core.digests import grid_digest
 from clsas.core.extras import install_command
 from clsas.core.grid import Grid
 from clsas.core.image import Image
 from clsas.core.reading import check_ordinary
-from clsas.factorized.plan import grid_digest
 from clsas.mosaics.documents import (
     DamageError,
     read_document,

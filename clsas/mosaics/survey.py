@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsas.core import validate
+from clsas.core.digests import lines_digest
 from clsas.core.lines import RangeLines
-from clsas.factorized.plan import lines_digest
 from clsas.files.hdf5 import FileFormatError, read_geometry, read_samples
 
 END = "end"

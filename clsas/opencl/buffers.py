@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pyopencl as cl
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 
 from clsas.core.lines import RangeLines, wavelength_m
 from clsas.core.threads import in_threads
@@ -25,12 +27,41 @@ VECTOR_ROOM = 16
 _LINES_AT_ONCE = 32  # upsampled together: what stays in a core's cache
 
 
-GIVEN_BYTES = 64 << 20
-"""Of lines as they come, at most, that are on a device at once to be upsampled."""
 MARGIN = 32
 """Zeros on either side of an upsampled line: what lies further out is moved into them."""
 GUARD = 16
 """Zeros on either side of a virtual channel's line, which the last stage's lookup may touch."""
+
+
+@dataclass(frozen=True)
+class Buffer:
+    """Shape of a buffer, and the type of its numbers."""
+
+    shape: tuple[int, ...]
+    dtype: DTypeLike
+
+    @property
+    def nbytes(self) -> int:
+        """Size of the buffer."""
+        return math.prod(self.shape) * np.dtype(self.dtype).itemsize
+
+    def holding(self, values: NDArray) -> NDArray:
+        """Return an array of this shape and type that begins with values.
+
+        Only the last axis may be longer. There the last value is repeated: kernels compute whole
+        vectors, also of what is left out of their sums, and must not divide by zero.
+        """
+        count = values.shape[-1]
+        if count == self.shape[-1]:
+            return np.ascontiguousarray(values.reshape(self.shape), self.dtype)
+        padded = np.empty(self.shape, self.dtype)
+        padded[..., :count] = values
+        padded[..., count:] = values[..., -1:] if count else 0
+        return padded
+
+
+Buffers = dict[str, Buffer]
+"""Buffers by name."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,11 +77,11 @@ class BeamTable:
     """
 
     per_sine: float
-    arguments: dict[str, object]
+    arguments: dict[str, Any]
 
     @property
-    def origin(self) -> dict[str, object]:
-        """What `expand_tiles` takes of them."""
+    def origin(self) -> dict[str, Any]:
+        """The arguments of `expand_tiles`."""
         name = "beam_origin"
         return {name: self.arguments[name]} if self.arguments else {}
 
@@ -148,9 +179,9 @@ def slices(whole: slice, most: int) -> Iterator[slice]:
         yield slice(start, min(start + most, whole.stop))
 
 
-def sample_bytes(half_precision: bool) -> int:
-    """Return the bytes of a complex sample that stages hand on."""
-    return 4 if half_precision else 8
+def lines_buffer(lines: int, pitch: int, half_precision: bool) -> Buffer:
+    """Return the buffer of lines that stages take up, and hand on."""
+    return Buffer((lines, pitch, 2), np.float16 if half_precision else np.float32)
 
 
 def padded_length(resampling: Resampling) -> int:

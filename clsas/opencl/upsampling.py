@@ -9,11 +9,22 @@ import pyopencl as cl
 from numpy.typing import NDArray
 
 from clsas.opencl import phases
-from clsas.opencl.buffers import GIVEN_BYTES, MARGIN, phase_polynomials, sample_bytes
+from clsas.opencl.buffers import MARGIN, Buffer, Buffers, lines_buffer, phase_polynomials
 from clsas.opencl.device import Device
 from clsas.signal.interpolation import PHASES, Resampling, Upsampler
 
 _GROUP = 64  # work-items that share a line where each has one lane
+GIVEN_BYTES = 64 << 20
+"""Lines as they come that are on a device at once, at most."""
+
+
+def upsampling_buffers(channels: int, length: int, pitch: int, half_precision: bool) -> Buffers:
+    """Return the buffers that upsampling lines of some length takes: both kinds of lines."""
+    at_once = min(max(GIVEN_BYTES // (8 * length), 1), channels)
+    return {
+        "lines": lines_buffer(channels, pitch, half_precision),
+        "given": Buffer((at_once, length), np.complex64),
+    }
 
 
 def upsample(
@@ -54,8 +65,9 @@ def upsample(
         shift["frequency"] = np.uint32(cycles).astype(np.int32)
         shift["phase_polynomials"] = phase_polynomials(device, phases.PRECISE_TERMS)
     channels, count = samples.shape
-    lines = device.buffer(sample_bytes(half_precision) * channels * pitch)
-    at_once = max(GIVEN_BYTES // (8 * count), 1)
+    buffers = upsampling_buffers(channels, count, pitch, half_precision)
+    lines = device.buffer(buffers["lines"].nbytes)
+    at_once = buffers["given"].shape[0]
     for start in range(0, channels, at_once):
         some = samples[start : start + at_once]
         event = device.run(

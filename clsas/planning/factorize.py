@@ -11,7 +11,8 @@ from clsas.core.grid import Grid
 from clsas.core.image import Image
 from clsas.core.lines import RangeLines
 from clsas.exact.checks import check_accumulate
-from clsas.factorized.plan import Plan, without_left_out
+from clsas.factorized.left_out import without_left_out
+from clsas.factorized.plan import Plan
 from clsas.factorized.run import form
 from clsas.opencl.device import Device, open_device
 from clsas.planning.planner import BEST_TOLERANCE_DB, WORST_TOLERANCE_DB, plan
@@ -75,10 +76,10 @@ def factorize(
     Aligned on a subimage's centre c, channel n's steering function exp(j 2 k (rho_n(x) - rho_n(c)))
     varies slowly along the track, and is interpolated from those of fewer, virtual channels:
     f_n ~ sum_m a_nm f_m. Hence sum_n s_n f_n ~ sum_m (sum_n a_nm s_n) f_m: the virtual channels'
-    lines are weighted sums of aligned lines, and so again from stage to stage. Where the plan says
-    so, these lines are held in half precision; what is added up is single.
+    lines are weighted sums of aligned lines, and so on from stage to stage. A plan may hold these
+    lines in half precision; sums are single.
 
-    A plan keeps the geometry that its first image found out, in `Plan.kept`, for those after it.
+    A plan keeps the geometry of its first image, in `Plan.kept`, for the images after it.
     """
     validate.instance("lines", lines, RangeLines)
     validate.instance("grid", grid, Grid)
@@ -111,17 +112,17 @@ def factorize(
 
 def _check_band(lines: RangeLines, chosen: Plan) -> None:
     """Warn where a plan was made for lines of another band."""
-    known = chosen.kept.get("lines")
-    if chosen.band is None or (known is not None and known() is lines):
+    known, band, tolerance_db = chosen.kept.get("lines"), chosen.image.band, chosen.tolerance_db
+    if band is None or tolerance_db is None or (known is not None and known() is lines):
         return
     for channels in (FEW_CHANNELS, MEASURED_CHANNELS):
-        outside_db = in_db(power_outside(lines, *chosen.band, channels))
-        if outside_db <= chosen.tolerance_db:
+        outside_db = in_db(power_outside(lines, *band, channels))
+        if outside_db <= tolerance_db:
             chosen.kept["lines"] = weakref.ref(lines)
             return
     if lines.samples.any():
         validate.warn(
             f"the lines hold {outside_db:.0f} dB of their power outside the band that the plan was "
-            f"made for, so that the error may be more than {chosen.tolerance_db:g} dB: plan anew "
+            f"made for, so that the error may be more than {tolerance_db:g} dB: plan anew "
             "with clsas.plan"
         )

@@ -14,27 +14,31 @@ from dataclasses import dataclass, field, replace
 from clsas.core.decibels import in_db, power
 from clsas.factorized.estimates import ErrorBudget
 from clsas.factorized.filters import Choice, Filters, steering_spectrum
+from clsas.factorized.interpolated import InterpolatedAperture
 from clsas.factorized.plan import Plan
 from clsas.opencl import phases
-from clsas.opencl.device import Device
-from clsas.planning import forecast
 from clsas.planning.beam_coverage import trimmed
 from clsas.planning.channels import frequencies
-from clsas.planning.costs import Costs
 from clsas.planning.errors import Errors, other_errors, root_error
-from clsas.planning.exact_image import Exact
-from clsas.planning.forecast import Candidate, margin_db
+from clsas.planning.prediction import (
+    OUTSIDE,
+    Candidate,
+    Conditions,
+    band_of,
+    margin_db,
+    predicted_plan,
+)
 from clsas.planning.search import Allowed, Tree, root_limits, search
 from clsas.planning.spacing_errors import spacing_error
 from clsas.planning.visibility_model import VisibilityModel
 
 # Shares of the error power allowed: for roots, for the spacing of all stages' virtual channels, for
-# edges of the beam that are left out, and for what is always there.
+# the beam's edges that are left out, and for errors that every plan has.
 _ROOTS_SHARE, _SPACING_SHARE, _EDGES_SHARE, _RESERVED_SHARE = 0.25, 0.2, 0.03, 0.08
 _MOST_SPENT = 0.9  # of the error power allowed, before filters
-_LEAST_DENSER, _MOST_DENSITY = 1.05, 2.0  # virtual channels: at a time, and altogether
-_DENSITY_POWER = 0.08  # of an error that denser virtual channels are to mend
-_LEAST_STEP, _OVERSHOOT = 0.02, 1.3  # of the error allowed, and of what was too much
+_LEAST_DENSER, _MOST_OVERSAMPLING = 1.05, 2.0  # factors of one step, and of all together
+_DENSITY_POWER = 0.08  # exponent: how much denser for a relative excess of the error
+_LEAST_STEP, _OVERSHOOT = 0.02, 1.3  # shares of the allowed error, and of the excess
 _LEAST_BEAM_CYCLES, _MOST_BEAM_CYCLES = 0.5, 64.0
 
 
@@ -46,22 +50,21 @@ class _Problem:
     ----------
     view : VisibilityModel
         Without the edges of the beam, if there is one.
-    tolerance_db : float
-    exact : Exact
-        The image to beat.
-    device, costs, memory_bytes
-        What there is to work with.
+    conditions : Conditions
     designs : dict
         Filters designed before.
     """
 
     view: VisibilityModel
-    tolerance_db: float
-    exact: Exact
-    device: Device
-    costs: Costs
-    memory_bytes: int
+    conditions: Conditions
     designs: dict[tuple[Choice, int, float], Filters] = field(default_factory=dict)
+
+    @property
+    def tolerance_db(self) -> float:
+        """Relative rms error asked for."""
+        tolerance_db = self.conditions.tolerance_db
+        assert tolerance_db is not None  # with given stages there is nothing to search
+        return tolerance_db
 
     @property
     def allowed(self) -> float:
@@ -98,14 +101,14 @@ class _Trial:
     most_root : (rows, columns)
         The largest roots.
     beam_cycles : float
-        See `Plan`.
+        See `InterpolatedAperture`.
     reserved : float
         Error power that is kept for what neither filters nor roots add.
     least_leaf_pixels : int
     tree : Tree or None
         The tree, once it was searched for.
-    density : tuple of float
-        How much denser than the band limit asks for its virtual channels are, stage by stage.
+    oversampling : tuple of float
+        How much denser than the filter needs its virtual channels are, stage by stage.
     """
 
     choices: Allowed
@@ -114,44 +117,38 @@ class _Trial:
     reserved: float
     least_leaf_pixels: int = 1
     tree: Tree | None = None
-    density: tuple[float, ...] = ()
+    oversampling: tuple[float, ...] = ()
 
 
 def fastest(
-    view: VisibilityModel,
-    tolerance_db: float,
-    exact: Exact,
-    seconds: float,
-    device: Device,
-    costs: Costs,
-    memory_bytes: int,
-    choices: Allowed,
+    view: VisibilityModel, conditions: Conditions, seconds: float, choices: Allowed
 ) -> tuple[Plan | None, float]:
     """Return the fastest plan within a tolerance, if it takes less than some seconds.
 
     Beside it, where there is none, the least memory of those that did not fit.
     """
-    view_trimmed = trimmed(view, _EDGES_SHARE * power(tolerance_db))
-    problem = _Problem(view_trimmed, tolerance_db, exact, device, costs, memory_bytes)
-    most_root = root_limits(view_trimmed, _ROOTS_SHARE * problem.allowed)
+    problem = _Problem(view, conditions)
+    problem = replace(problem, view=trimmed(view, _EDGES_SHARE * problem.allowed))
+    most_root = root_limits(problem.view, _ROOTS_SHARE * problem.allowed)
     needed, trial = math.inf, None
     if most_root is not None:
         beam_cycles = 0.0 if view.beam is None else _LEAST_BEAM_CYCLES
         trial = _Trial(choices, most_root, beam_cycles, problem.reserved)
     while trial is not None:
-        if trial.tree is None:
+        tree = trial.tree
+        if tree is None:
             trial = _searched(problem, trial)
             continue
-        filters = _filters(problem, trial)
+        filters = _filters(problem, trial, tree)
         if filters is None:
-            trial = _with_fewer_stages(problem, trial)
+            trial = _with_fewer_stages(problem, trial, tree)
             continue
-        errors, found = _estimated(problem, trial, filters)
+        errors, found = _estimated(problem, trial, tree, filters)
         if found.predicted_seconds >= seconds:
             break
-        if found.predicted_error_db > tolerance_db:
+        if found.predicted_error_db > problem.tolerance_db:
             trial = _more_accurate(problem, trial, errors, found)
-        elif found.memory_bytes > memory_bytes:
+        elif found.memory_bytes > conditions.memory_bytes:
             needed = min(needed, found.memory_bytes)
             rows, columns = found.sides[0]
             smaller = (rows // 2, columns) if rows > columns else (rows, columns // 2)
@@ -172,21 +169,23 @@ def _searched(problem: _Problem, trial: _Trial) -> _Trial | None:
         trial.most_root,
         trial.least_leaf_pixels,
         trial.beam_cycles,
-        problem.device,
-        problem.costs,
+        problem.conditions.device,
+        problem.conditions.costs,
         trial.choices,
     )
-    return tree and replace(trial, tree=tree, density=(1.0,) * len(tree.sides))
+    return (
+        None if tree is None else replace(trial, tree=tree, oversampling=(1.0,) * len(tree.sides))
+    )
 
 
-def _filters(problem: _Problem, trial: _Trial) -> Filters | None:
-    """Return the filters of a trial's tree, None where they cannot err by as little as is left."""
+def _filters(problem: _Problem, trial: _Trial, tree: Tree) -> Filters | None:
+    """Return the filters of a trial's tree; None if none are accurate enough."""
     # Roots are often smaller than they might be, and leave more to filters.
-    filters_db = problem.filters_db(trial.reserved, trial.tree.sides[0])
+    filters_db = problem.filters_db(trial.reserved, tree.sides[0])
     if filters_db is None:
         return None
-    view, stages = problem.view, len(trial.tree.sides)
-    choice = trial.tree.filters(view.spectrum, filters_db)
+    view, stages = problem.view, len(tree.sides)
+    choice = tree.filters(view.spectrum, filters_db)
     if choice is None:
         return None
     key = choice, stages, filters_db
@@ -197,12 +196,21 @@ def _filters(problem: _Problem, trial: _Trial) -> Filters | None:
     return problem.designs[key]
 
 
-def _estimated(problem: _Problem, trial: _Trial, filters: Filters) -> tuple[Errors, Plan]:
-    """Return what a candidate errs by beside its filters, and its plan."""
-    sides, roots = trial.tree.sides, root_error(problem.view, trial.tree.sides[0])
+def _estimated(
+    problem: _Problem, trial: _Trial, tree: Tree, filters: Filters
+) -> tuple[Errors, Plan]:
+    """Return the errors of a candidate that its filters do not account for, and its plan."""
+    sides, roots = tree.sides, root_error(problem.view, tree.sides[0])
     within = problem.view.within(sides[0])
+    conditions = problem.conditions
     errors = other_errors(
-        within, sides, roots, filters.aperture, trial.density, trial.beam_cycles, problem.device
+        within,
+        sides,
+        roots,
+        filters.aperture,
+        trial.oversampling,
+        trial.beam_cycles,
+        conditions.device,
     )
     budget = ErrorBudget(
         roots=errors.roots,
@@ -210,27 +218,30 @@ def _estimated(problem: _Problem, trial: _Trial, filters: Filters) -> tuple[Erro
         leaves=errors.leaves,
         beam_edges=problem.beam_edges,
     )
-    candidate = Candidate(sides, filters, crowding=trial.density, beam_cycles=trial.beam_cycles)
-    found = forecast.factorized(
-        within,
-        candidate,
-        budget,
-        problem.tolerance_db,
-        problem.exact,
-        problem.device,
-        problem.costs,
-        problem.memory_bytes,
+    aperture = InterpolatedAperture(
+        filter=filters.aperture,
+        oversampling=trial.oversampling,
+        beam_cycles=trial.beam_cycles,
+        band=band_of(within, OUTSIDE * problem.allowed),
     )
-    return errors, found
+    candidate = Candidate(
+        sides=sides,
+        tile=sides[-1],
+        align=filters.align,
+        final=filters.final,
+        aperture=aperture,
+        margin=power(margin_db(within)),
+    )
+    return errors, predicted_plan(within, candidate, budget, conditions)
 
 
-def _with_fewer_stages(problem: _Problem, trial: _Trial) -> _Trial | None:
+def _with_fewer_stages(problem: _Problem, trial: _Trial, tree: Tree) -> _Trial | None:
     """Return a trial of fewer stages: their subimages are larger, with more virtual channels.
 
     That helps where virtual channels are as dense as they may be; else there is nothing left.
     """
-    fewer = tuple(n for n in trial.choices.stages if n < len(trial.tree.sides))
-    if not fewer or _MOST_DENSITY not in trial.density[:-1]:
+    fewer = tuple(n for n in trial.choices.stages if n < len(tree.sides))
+    if not fewer or _MOST_OVERSAMPLING not in trial.oversampling[:-1]:
         return None
     choices = replace(trial.choices, stages=fewer)
     return replace(trial, choices=choices, tree=None, reserved=problem.reserved)
@@ -239,8 +250,8 @@ def _with_fewer_stages(problem: _Problem, trial: _Trial) -> _Trial | None:
 def _more_accurate(problem: _Problem, trial: _Trial, errors: Errors, found: Plan) -> _Trial | None:
     """Return a trial that errs by less than a candidate that missed the tolerance.
 
-    What uneven spacing and a beam add falls with the density of virtual channels; filters must make
-    up for the rest.
+    Denser virtual channels reduce the errors of uneven spacing and of a beam. Filters make up for
+    the rest.
     """
     allowed, last = problem.allowed, found.sides[-1]
     share = _SPACING_SHARE * allowed / len(found.sides)
@@ -248,28 +259,34 @@ def _more_accurate(problem: _Problem, trial: _Trial, errors: Errors, found: Plan
     beam_cycles = trial.beam_cycles
     if excess[-1] and beam_cycles > 0:
         within = problem.view.within(found.sides[0])
-        without_beam = spacing_error(within, last, found.aperture, trial.density[-1], None)
+        without_beam = spacing_error(
+            within, last, found.factorization.aperture.filter, trial.oversampling[-1], None
+        )
         if 2 * without_beam < errors.spacing[-1]:  # most of it is the beam's
             if beam_cycles >= _MOST_BEAM_CYCLES:
                 return None  # no virtual channels follow a step
             beam_cycles, excess[-1] = 2 * beam_cycles, 0.0
             return replace(
-                trial, beam_cycles=beam_cycles, density=_denser(trial.density, excess, share)
+                trial,
+                beam_cycles=beam_cycles,
+                oversampling=_denser(trial.oversampling, excess, share),
             )
-    if excess[-1] and trial.density[-1] == _MOST_DENSITY:
+    if excess[-1] and trial.oversampling[-1] == _MOST_OVERSAMPLING:
         # Smaller leaves have fewer virtual channels, less evenly spaced.
         return replace(trial, least_leaf_pixels=2 * math.prod(last), tree=None)
-    if any(excess) and max(trial.density) < _MOST_DENSITY:
-        return replace(trial, density=_denser(trial.density, excess, share))
+    if any(excess) and max(trial.oversampling) < _MOST_OVERSAMPLING:
+        return replace(trial, oversampling=_denser(trial.oversampling, excess, share))
     too_much = power(-margin_db(problem.view)) * (power(found.predicted_error_db) - allowed)
     return replace(trial, reserved=trial.reserved + _OVERSHOOT * too_much + _LEAST_STEP * allowed)
 
 
-def _denser(density: tuple[float, ...], excess: list[float], share: float) -> tuple[float, ...]:
-    """Return how dense virtual channels are next, where their errors exceed a share."""
+def _denser(
+    oversampling: tuple[float, ...], excess: list[float], share: float
+) -> tuple[float, ...]:
+    """Return the next oversampling of virtual channels: more where errors exceed their share."""
     return tuple(
-        min(each * max((1 + over / share) ** _DENSITY_POWER, _LEAST_DENSER), _MOST_DENSITY)
+        min(each * max((1 + over / share) ** _DENSITY_POWER, _LEAST_DENSER), _MOST_OVERSAMPLING)
         if over
         else each
-        for each, over in zip(density, excess, strict=True)
+        for each, over in zip(oversampling, excess, strict=True)
     )

@@ -15,22 +15,29 @@ from clsas.core.grid import Grid
 from clsas.core.lines import RangeLines
 from clsas.exact.backprojection import ACCURACY_DB
 from clsas.factorized.estimates import ErrorBudget
-from clsas.factorized.filters import ALIGN_TAPS, Filters
-from clsas.factorized.plan import Plan, with_left_out
+from clsas.factorized.filters import ALIGN_TAPS
+from clsas.factorized.left_out import with_left_out
+from clsas.factorized.plan import Plan
+from clsas.factorized.thesis import NearestBeams
 from clsas.opencl.device import Device, open_device
-from clsas.planning import forecast
 from clsas.planning.beam_coverage import coverage, partly_visible_share, sweeps_once
 from clsas.planning.costs import Costs
 from clsas.planning.costs import defaults as default_costs
 from clsas.planning.costs import measured as measured_costs
-from clsas.planning.errors import nearest_errors
+from clsas.planning.errors import leaf_error, nearest_errors
 from clsas.planning.exact_image import Exact, expect
 from clsas.planning.fastest import fastest
-from clsas.planning.forecast import MARGIN_DB, OUTSIDE, Candidate
+from clsas.planning.prediction import (
+    MARGIN_DB,
+    OUTSIDE,
+    Candidate,
+    Conditions,
+    exact_plan,
+    predicted_plan,
+)
 from clsas.planning.search import MOST_STAGES, Allowed
 from clsas.planning.visibility_model import VisibilityModel
 from clsas.signal import interpolation
-from clsas.signal.interpolation import Interpolator
 from clsas.sonar.beam import BeamWindow
 from clsas.sonar.coverage import warn_unreached
 from clsas.sonar.simplify import Model, simplify
@@ -40,15 +47,15 @@ BEST_TOLERANCE_DB = -75.0
 WORST_TOLERANCE_DB = -10.0
 
 TOLERANCE_DB = -50.0
-"""What is taken where nothing is asked of an image."""
+"""Tolerance of images for which none is asked."""
 
 NEAREST_UPSAMPLING = 8.0
-"""By how much lines are upsampled before the linear interpolation of given stages."""
+"""Upsampling of lines before the linear interpolation of given stages."""
 
-_WORTH = 0.95  # of the time of an exact image
+_WORTH = 0.95  # of the time of an exact image, at most: less gain is within predictions' scatter
 _SEARCH_S = 0.05  # that a search takes at least: 0.05 to 0.12 s on a core of 2.5 GHz
-_LEAST_COVERED = 0.25  # of the sum of weights at the best covered pixel
-_LEAST_SHARE_COVERED, _LEAST_PARTIAL = 0.1, 0.25  # of an image
+_LEAST_COVERED = 0.25  # least sum of weights, relative to that at the best covered pixel
+_LEAST_SHARE_COVERED, _LEAST_PARTIAL = 0.1, 0.25  # shares of an image
 
 
 def plan(
@@ -66,53 +73,52 @@ def plan(
     depth: int | None = None,
     full_model: bool = False,
 ) -> Plan:
-    """Choose the fastest way to an image of a given error.
+    """Plan the fastest image whose error keeps a tolerance.
 
     Exactly one of `tolerance_db`, `tolerance_wavelengths` and `stages` must be given.
 
     Parameters
     ----------
     lines : RangeLines
-        What to image.
+        Lines to image. Of their samples only the spectrum and the fading at the ends matter.
     grid : Grid
-        Where.
+        Pixels of the image.
     tolerance_db : float
-        Wanted relative rms error against the exact image, dB, from -75 to -10.
+        Requested relative rms error against the exact image, dB, from -75 to -10.
     tolerance_wavelengths : float
-        The same as a range error, in wavelengths of the carrier: that which is spread evenly
-        between minus and plus so much, 4 pi/sqrt(3) radians rms per wavelength.
+        The same as a range error in wavelengths of the carrier. Errors that are spread evenly
+        between minus and plus this value make 4 pi/sqrt(3) radians rms per wavelength.
     stages : sequence of (QR, QI)
-        Form the image as THESIS chapter 4 does: in every stage QR neighbouring lines are summed
-        and the subimages divided by QI along either side; then the last ones are backprojected.
-        No stage is plain backprojection. Range is interpolated linearly.
+        Form the image as THESIS chapter 4 does. Every stage sums QR neighbouring lines and divides
+        subimages by QI along either side; then the last subimages are backprojected. An empty
+        sequence is plain backprojection. Range is interpolated linearly.
     beam : BeamWindow, optional
         Weights of the channels.
     device : Device, str or int, optional
-        Whose costs count; see `clsas.opencl.device.choose`.
+        Device that forms the image; see `clsas.opencl.device.choose`.
     memory_bytes : int, optional
-        Device memory that may be used. Unless given it is half of the device's, or as much as
-        plain backprojection takes.
+        Device memory that may be used. By default half of the device's, or as much as plain
+        backprojection takes.
     costs : Costs, optional
-        Instead of those stored for the device.
+        Costs in place of those stored for the device.
     taps : (range, aperture), optional
-        For study, with a tolerance: take filters of so many taps, 4, 6 or 8, however long the
-        image takes, instead of the fastest.
+        For study, with a tolerance: numbers of taps, 4, 6 or 8, in place of the fastest.
     depth : int, optional
-        The same of the number of stages, 1 to 5.
+        For study, with a tolerance: number of stages, 1 to 5, in place of the fastest.
     full_model : bool
         For study: model every effect, also those whose error lies far below the tolerance.
 
     Returns
     -------
     Plan
-        With empty `sides`, plain backprojection, where nothing is faster: near the aperture, with
-        few channels or pixels, or much relief.
+        An exact image if nothing is faster: near the aperture, with few channels or pixels, or much
+        relief.
 
     Raises
     ------
     TypeError, ValueError
-        If an argument is not what is allowed, or no way to the image fits the memory: the message
-        names what the least demanding one needs.
+        If an argument is not allowed, or no plan fits the memory: the message names what the least
+        demanding one needs.
     DeviceError
         If there is no such device.
 
@@ -162,17 +168,14 @@ def plan(
         aliasing=view.ambiguity.aliasing,
         left_out=model.error,
     )
-    found = replace(
-        found,
-        tolerance_db=tolerance_db,
-        predicted_error_db=errors.total_db,
-        errors=errors,
-        calibrated=calibrated,
+    prediction = replace(
+        found.prediction, error_db=errors.total_db, errors=errors, calibrated=calibrated
     )
+    found = replace(found, tolerance_db=tolerance_db, prediction=prediction)
     if model.left_out:
         found = with_left_out(found, model, lines, grid, beam)
     found.kept["lines"] = weakref.ref(lines)
-    # Who forms the image next need not warn again.
+    # The image need not warn again.
     found.kept["warned"] = warn_unreached(lines, grid, beam, view.channels_along)
     return found
 
@@ -189,34 +192,32 @@ def _chosen(
     """Return the plan of checked arguments."""
     beam = view.beam
     exact = expect(view, ACCURACY_DB if tolerance_db is None else tolerance_db - MARGIN_DB, device)
-    # Backprojection keeps within a device by itself.
+    # Exact imaging divides itself to fit a device.
     room = device.info.memory_bytes // 2 if memory_bytes is None else memory_bytes
     exact_fits = memory_bytes is None or exact.memory_bytes <= memory_bytes
+    conditions = Conditions(tolerance_db, exact, device, costs, room)
     least: float = exact.memory_bytes
     if stages:
         if view.track is None:
             raise ValueError("lines must have channels at more than one place for stages")
         if beam is not None and beam.normalise:
             raise ValueError("beam must not normalise with stages; clsas.backproject does")
-        found = _nearest(view, stages, exact, device, costs, room)
+        found = _nearest(view, stages, conditions)
         if found.memory_bytes <= room:
             return found
         exact_fits, least = False, found.memory_bytes
     elif stages is None and _worth_a_search(exact, costs, exact_fits, allowed) and _divisible(view):
-        # What is gained must be worth an error, and more than predictions scatter.
         to_beat = _WORTH * costs.seconds(exact.work) if exact_fits and allowed is None else math.inf
-        found, needed = fastest(
-            view, tolerance_db, exact, to_beat, device, costs, room, allowed or Allowed()
-        )
-        if found is not None:
-            return found
+        faster, needed = fastest(view, conditions, to_beat, allowed or Allowed())
+        if faster is not None:
+            return faster
         least = min(least, needed)
     if not exact_fits:
         raise ValueError(
             f"memory_bytes must be at least {math.ceil(10 * least / 2**20) / 10:.1f} MiB for this "
             f"image, got {room / 2**20:.3g} MiB"
         )
-    return forecast.plain(view, tolerance_db, exact, device, costs)
+    return exact_plan(view, conditions)
 
 
 def tolerance_in_db(
@@ -238,7 +239,7 @@ def tolerance_in_db(
 
 
 def _allowed(taps: tuple[int, int] | None, depth: int | None) -> Allowed | None:
-    """Return the filters and stages asked for, None where the search is free."""
+    """Return the requested filters and stages, None if the search is free."""
     if taps is None and depth is None:
         return None
     fields = {}
@@ -257,7 +258,7 @@ def _allowed(taps: tuple[int, int] | None, depth: int | None) -> Allowed | None:
 
 
 def _worth_a_search(exact: Exact, costs: Costs, exact_fits: bool, allowed: Allowed | None) -> bool:
-    """Return whether something faster than the exact image is needed, or worth a search."""
+    """Return whether a search may pay, or is needed because the exact image does not fit."""
     return not exact_fits or allowed is not None or costs.seconds(exact.work) > _SEARCH_S
 
 
@@ -267,13 +268,13 @@ def _divisible(view: VisibilityModel) -> bool:
         return False
     if view.beam is None:
         return True
-    # What is normalised is amplified with its errors where hardly anything is seen.
+    # Normalising divides by a small sum at the beam's edge, and amplifies errors there.
     if view.beam.normalise and coverage(view, 1).min() < _LEAST_COVERED:
         return False
-    # Steps of a window that are seen from few pixels cost these more than is expected of all.
+    # If few pixels see a step of the beam, their error exceeds the prediction for all.
     if view.beam.jumps and 0 < partly_visible_share(view) < _LEAST_PARTIAL:
         return False
-    # Where hardly any pixel sees anything there is as little to gain as is known about errors.
+    # If hardly any pixel is visible there is little to gain, and errors are not predictable.
     return float(coverage(view, 2).mean()) >= _LEAST_SHARE_COVERED
 
 
@@ -283,17 +284,12 @@ def decibels(wavelengths: float) -> float:
 
 
 def wavelengths(decibels: float) -> float:
-    """Return what `decibels` made an error of."""
+    """Return the range error, in wavelengths, that makes an error in decibels."""
     return 10 ** (decibels / 20) * math.sqrt(3) / (4 * math.pi)
 
 
 def _nearest(
-    view: VisibilityModel,
-    stages: Sequence[tuple[int, int]],
-    exact: Exact,
-    device: Device,
-    costs: Costs,
-    memory_bytes: int,
+    view: VisibilityModel, stages: Sequence[tuple[int, int]], conditions: Conditions
 ) -> Plan:
     """Return the plan of THESIS chapter 4: nearest beams, linear interpolation in range."""
     rows, columns = view.grid.shape
@@ -305,21 +301,37 @@ def _nearest(
         sides.append(leaf)
         leaf = leaf[0] * divisions, leaf[1] * divisions
     linear = interpolation.design(2, NEAREST_UPSAMPLING, view.spectrum)
-    filters = Filters(linear, Interpolator(1, 1.0, np.zeros((0, 2, 0)), 0.0, 0.0), linear)
-    candidate = Candidate(tuple(sides[::-1]), filters, nearest=tuple(beams for beams, _ in stages))
+    candidate = Candidate(
+        sides=tuple(sides[::-1]),
+        tile=_tile(view, sides[0], conditions.device),
+        align=linear,
+        final=linear,
+        aperture=NearestBeams(factors=tuple(beams for beams, _ in stages)),
+    )
     error, by_stage = nearest_errors(view, stages)
-    errors = ErrorBudget(nearest_beams=error)
-    found = forecast.factorized(view, candidate, errors, None, exact, device, costs, memory_bytes)
+    found = predicted_plan(view, candidate, ErrorBudget(nearest_beams=error), conditions)
     *divided, last = found.stages
     divided = [
         replace(stage, error_db=in_db(power(stage.error_db) + of_beams))
         for stage, of_beams in zip(divided, by_stage, strict=True)
     ]
-    return replace(found, stages=(*divided, last))
+    return replace(found, prediction=replace(found.prediction, stages=(*divided, last)))
+
+
+def _tile(view: VisibilityModel, leaf: tuple[int, int], device: Device) -> tuple[int, int]:
+    """Return the largest tiles of a leaf that may be expanded about their centres."""
+    parts = [
+        (rows, columns)
+        for rows in range(16, min(leaf[0], 64) + 1, 16)
+        for columns in range(4, min(leaf[1], 64) + 1, 4)
+        if leaf[0] % rows == 0 and leaf[1] % columns == 0
+    ]
+    fit = [part for part in parts if leaf_error(view, np.array([part]), device)[0] < 1e-8]
+    return max(fit or parts[:1], key=math.prod)
 
 
 def checked_pairs(stages: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
-    """Return (QR, QI) of every stage, or raise what is wrong with any of them."""
+    """Return (QR, QI) of every stage; raises TypeError or ValueError if one is wrong."""
     try:
         pairs = [(stage[0], stage[1]) for stage in stages if len(stage) == 2]
         whole = len(pairs) == len(stages)
@@ -334,7 +346,7 @@ def checked_pairs(stages: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
 
 
 def _checked_stages(stages: Sequence[tuple[int, int]], lines: RangeLines, grid: Grid) -> list:
-    """Return (QR, QI) of every stage, or raise what these lines and this grid do not allow."""
+    """Return (QR, QI) of every stage; raises ValueError if lines or grid do not allow them."""
     pairs = checked_pairs(stages)
     if not pairs:
         return pairs

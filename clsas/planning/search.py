@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsas.core.decibels import in_db, power
+from clsas.factorized.buffers import LEAST_BATCH
 from clsas.factorized.estimates import Work, backprojecting_leaves, combining, upsampling
 from clsas.factorized.filters import ALIGN_TAPS, APERTURE_TAPS, UPSAMPLING_SHARE, Choice, choose
-from clsas.factorized.plan import LEAST_BATCH
 from clsas.opencl.device import Device
 from clsas.planning.caching import cached
 from clsas.planning.costs import Costs

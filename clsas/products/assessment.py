@@ -20,8 +20,8 @@ from clsas.factorized.plan import Plan
 from clsas.opencl.device import Device, open_device
 from clsas.planning.costs import Costs
 from clsas.planning.factorize import factorize
-from clsas.planning.forecast import half_precision_error
 from clsas.planning.planner import BEST_TOLERANCE_DB, TOLERANCE_DB, WORST_TOLERANCE_DB, plan
+from clsas.planning.prediction import half_precision_error
 from clsas.products.effects import (
     BEAM,
     ENDS,
@@ -267,7 +267,7 @@ def assess(
     seconds = {name: image.plan.predicted_seconds for name, image in images.items()}
     if repeats:
         if full.half_precision:
-            images[SINGLE] = replace(images[_FULL], plan=replace(full, half_precision=False))
+            images[SINGLE] = replace(images[_FULL], plan=full.changed(half_precision=False))
         seconds = _measured(images, device, repeats)
     errors, modelled = errors_without(survey), survey.modelled
     if not full.is_exact and device.info.half_precision:
@@ -383,7 +383,7 @@ class _Image:
             self.lines,
             self.grid,
             device=device,
-            accuracy_db=self.plan.accuracy_db,
+            accuracy_db=self.plan.image.accuracy_db,
             beam=self.beam,
             full_model=self.full_model,
         )

@@ -377,11 +377,11 @@ def summary(chosen: Plan) -> str:
     if chosen.is_exact:
         return "plain backprojection"
     sides = ", ".join(f"{rows}x{columns}" for rows, columns in chosen.sides)
-    if chosen.nearest:
-        along = f"sums of {', '.join(map(str, chosen.nearest))} lines"
-    else:
-        along = f"{chosen.aperture.taps} along the aperture"
-    return f"{sides}; {chosen.align.taps} taps in range, {chosen.final.taps} at the end, {along}"
+    image = chosen.factorization
+    return (
+        f"{sides}; {image.align.taps} taps in range, {image.final.taps} at the end, "
+        f"{image.aperture.describe()}"
+    )
 
 
 def _feasible(

@@ -177,6 +177,7 @@ def row(
             "measured": chapter6.fraction(max(map(scene.measured_m, patches))),
         }
     plans = [patch.record.plan for patch in patches]
+    stages = [1 + len(plan["image"]["sides"]) if plan else 1 for plan in plans]
     other = image is exact or ALL in way.name  # not to be compared
     error_db = None if other else clsas.relative_error_db(image, exact)
     mast_db = chapter6.mast_db(image)
@@ -185,7 +186,7 @@ def row(
         "pixels": " x ".join(map(str, image.grid.shape)),
         "lines": scene.lines.channels,
         "image": way.name,
-        "stages": max(1 + len(plan["sides"]) if plan else 1 for plan in plans) if plans else "",
+        "stages": max(stages, default=""),
         **worst,
         "seconds": "",
         "error dB": "" if error_db is None else f"{error_db:.1f}",

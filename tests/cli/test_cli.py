@@ -240,11 +240,11 @@ def test_plan(made):
     assert stderr == ""
     plan = clsas.Plan.from_json(text)
     assert plan.describe() + "\n" == run(*args)[0]
-    assert plan.nearest == (2,)
+    assert plan.factorization.aperture.factors == (2,)
     short = run_json(*args)
     assert "coefficients" not in json.dumps(short)
-    assert short["align"]["taps"] == 2
-    assert short["predicted_error_db"] == plan.predicted_error_db
+    assert short["image"]["align"]["taps"] == 2
+    assert short["prediction"]["error_db"] == plan.predicted_error_db
     assert "--filters requires --json" in run(*args, "--filters", code=2)[1]
     assert not (made[0] / "plan.json").exists()
 

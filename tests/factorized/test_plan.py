@@ -1,5 +1,6 @@
 import dataclasses
 import json
+import re
 
 import numpy as np
 import pytest
@@ -16,9 +17,10 @@ from factorizing import (
     swaying,
 )
 
+from clsas.core.digests import grid_digest, lines_digest
 from clsas.core.grid import Grid
 from clsas.exact.backprojection import backproject
-from clsas.factorized.plan import Plan, grid_digest, lines_digest
+from clsas.factorized.plan import VERSION, Plan
 from clsas.opencl.device import open_device
 from clsas.planning import costs
 from clsas.planning.planner import plan
@@ -55,12 +57,28 @@ def changeable(plan):
     return values
 
 
+def replaced(plan, path, value):
+    """A plan's JSON with another value at a path such as "image.sides"."""
+    values = changeable(plan)
+    *tables, name = path.split(".")
+    table = values
+    for each in tables:
+        table = table[each]
+    table[name] = value
+    return json.dumps(values)
+
+
 def test_text_gives_the_same_plan(any_plan):
     again = Plan.from_json(any_plan.to_json())
     assert again.to_json() == any_plan.to_json()
-    for field in dataclasses.fields(Plan):
-        if field.name not in ("align", "aperture", "final", "upsampler", "beam"):
-            assert getattr(again, field.name) == getattr(any_plan, field.name), field.name
+    for one, other in ((again, any_plan), (again.image, any_plan.image)):
+        for field in dataclasses.fields(other):
+            value = getattr(other, field.name)
+            if not dataclasses.is_dataclass(value):
+                assert getattr(one, field.name) == value, field.name
+    for field in dataclasses.fields(any_plan.prediction):
+        name = field.name
+        assert getattr(again.prediction, name) == getattr(any_plan.prediction, name), name
 
 
 @pytest.mark.parametrize("along", [None, [1.0, 0.1, 0], "every channel"])
@@ -87,64 +105,126 @@ def test_text_that_is_no_plan_is_refused(text):
 @pytest.mark.parametrize(
     ("field", "value"),
     [
-        ("sides", "ab"),
-        ("sides", [[0, 0]]),
-        ("sides", [[64, 64], [48, 16]]),
-        ("sides", None),
-        ("tile", [3, 3]),
-        ("tile", [16]),
-        ("align", "filter"),
-        ("align", None),
-        ("aperture", None),
-        ("final", None),
-        ("resampling", None),
-        ("resampling", {}),
-        ("upsampler", 3),
-        ("upsampler", {}),
-        ("upsampler", {"step": 0, "coefficients": [[0.0] * 16] * 32, "error_db": -60.0}),
-        ("upsampler", {"step": 20, "coefficients": [[0.0] * 16] * 31, "error_db": -60.0}),
-        ("upsampler", {"step": 20, "coefficients": [[float("nan")] * 16] * 32, "error_db": 0.0}),
-        ("half_precision", 1),
-        ("half_precision", None),
-        ("limits", [0.1, 0.2]),
-        ("crowding", [1e9, 1e9, 1e9]),
-        ("beam_cycles", 1e9),
-        ("tile", [16, 4]),
-        ("half_lengths", []),
-        ("half_lengths", "ab"),
-        ("half_lengths", [-5, -5, -5]),
-        ("highest_cycles_per_m", "many"),
-        ("roots_at_once", 0),
-        ("stages", [1]),
+        ("image", None),
+        ("image", {}),
+        ("image.method", "exact"),
+        ("image.method", "guess"),
+        ("image.sides", "ab"),
+        ("image.sides", []),
+        ("image.sides", [[0, 0]]),
+        ("image.sides", [[64, 64], [48, 16]]),
+        ("image.sides", None),
+        ("image.tile", [3, 3]),
+        ("image.tile", [16]),
+        ("image.align", "filter"),
+        ("image.align", None),
+        ("image.aperture", None),
+        ("image.aperture.filter", None),
+        ("image.aperture.filter.taps", 1),
+        ("image.aperture.filter.taps", 10),
+        ("image.align.upsampling", 0.5),
+        ("image.final", None),
+        ("image.resampling", None),
+        ("image.resampling", {}),
+        ("image.resampling.length", 0),
+        ("image.resampling.period", 2**31),
+        ("image.resampling.shift", 2**40),
+        ("image.resampling.first", -(2**21)),
+        ("image.resampling.lead", -1),
+        ("image.resampling.upsampled_period", 7),
+        ("image.upsampler", 3),
+        ("image.upsampler", {}),
+        ("image.upsampler", {"step": 0, "coefficients": [[0.0] * 16] * 32, "error_db": -60.0}),
+        ("image.upsampler", {"step": 20, "coefficients": [[0.0] * 16] * 31, "error_db": -60.0}),
+        (
+            "image.upsampler",
+            {"step": 20, "coefficients": [[float("nan")] * 16] * 32, "error_db": 0.0},
+        ),
+        ("image.half_precision", 1),
+        ("image.half_precision", None),
+        ("image.limits", [0.1, 0.2]),
+        ("image.aperture.oversampling", [1e9, 1e9, 1e9]),
+        ("image.aperture.oversampling", [1.0]),
+        ("image.aperture.oversampling", [float("nan")] * 3),
+        ("image.aperture.beam_cycles", 1e9),
+        ("image.aperture.band", None),
+        ("image.aperture.band", [0.0, 3.0]),
+        ("image.aperture", {"method": "nearest", "factors": ["x"]}),
+        ("image.aperture", {"method": "nearest", "factors": [0, 0]}),
+        ("image.aperture", {"method": "nearest", "factors": [2]}),
+        ("image.tile", [16, 4]),
+        ("image.half_lengths", []),
+        ("image.half_lengths", "ab"),
+        ("image.half_lengths", [-5, -5, -5]),
+        ("image.most_channels", [1]),
+        ("image.highest_cycles_per_m", "many"),
+        ("image.closest_m", float("inf")),
+        ("image.roots_at_once", 0),
+        ("image.roots_at_once", True),
+        ("image.roots_prepared", 2**40),
+        ("prediction.stages", [1]),
+        ("prediction.memory_bytes", -1),
+        ("prediction.error_db", "low"),
+        ("prediction.error_db", float("nan")),
+        ("prediction.work.leaf", -1.0),
+        ("prediction.errors", {"bad luck": 1.0}),
         ("beam", 7),
-        ("predicted_error_db", "low"),
+        ("beam", {"width_deg": -1.0}),
+        ("beam", {"colour": "red"}),
         ("tolerance_db", "low"),
         ("tolerance_db", []),
-        ("nearest", ["x"]),
+        ("left_out", ["gravity"]),
     ],
 )
 def test_a_plan_with_a_wrong_value_is_refused(chosen, field, value):
-    """Before a device reads what is not there."""
-    values = changeable(chosen)
-    with pytest.raises((ValueError, TypeError)):
-        Plan.from_json(json.dumps(values | {field: value}))
+    """Before a device reads what is not there; the message names the field."""
+    with pytest.raises(ValueError, match=r"^text must be a plan as of Plan\.to_json: ") as refused:
+        Plan.from_json(replaced(chosen, field, value))
+    named = re.findall(r"\w+", str(refused.value))
+    assert any(part in named for part in field.split(".")), refused.value
+    assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "message"),
+    [
+        ("image.roots_at_once", 0, "image.roots_at_once must be greater than or equal to 1, got 0"),
+        ("image.half_precision", 1, "image.half_precision must be a valid boolean, got 1"),
+        ("image.colour", 1, "image.colour is unknown"),
+        (
+            "image.half_lengths",
+            [1],
+            r"image: half_lengths must be \d numbers, one for each stage, ",
+        ),
+    ],
+)
+def test_what_is_wrong_is_told(chosen, field, value, message):
+    with pytest.raises(ValueError, match=message):
+        Plan.from_json(replaced(chosen, field, value))
+
+
+@pytest.mark.parametrize("version", [1, VERSION + 1, "2"])
+def test_a_plan_of_another_version_is_refused(chosen, version):
+    values = changeable(chosen) | {"version": version}
+    if version == 1:  # its fields were flat, and had no number
+        values = values["image"] | {"tolerance_db": -50.0}
+    with pytest.raises(ValueError, match=r"made by .*: make it anew with clsas\.plan"):
+        Plan.from_json(json.dumps(values))
 
 
 @pytest.mark.parametrize("coefficients", ["none", [[1.0]], [[[None]]], []])
-@pytest.mark.parametrize("name", ["align", "aperture", "final"])
+@pytest.mark.parametrize("name", ["align", "aperture.filter", "final"])
 def test_a_filter_that_is_none_is_refused(chosen, name, coefficients):
-    values = changeable(chosen)
-    values[name]["coefficients"] = coefficients
-    with pytest.raises((ValueError, TypeError)):
-        Plan.from_json(json.dumps(values))
+    with pytest.raises(ValueError, match="coefficients"):
+        Plan.from_json(replaced(chosen, f"image.{name}.coefficients", coefficients))
 
 
 def test_a_plan_with_a_field_too_many_or_too_few_is_refused(chosen):
     values = changeable(chosen)
     with pytest.raises(ValueError, match="unknown"):
         Plan.from_json(json.dumps(values | {"unknown": 1}))
-    del values["sides"]
-    with pytest.raises(ValueError, match="sides"):
+    del values["image"]["sides"]
+    with pytest.raises(ValueError, match="image lacks 'sides'"):
         Plan.from_json(json.dumps(values))
 
 
@@ -155,8 +235,14 @@ def test_it_is_immutable(any_plan):
     with pytest.raises(dataclasses.FrozenInstanceError):
         any_plan.tolerance_db = -20.0
     for each in (any_plan, Plan.from_json(any_plan.to_json())):
-        for name in ("sides", "tile", "nearest", "half_lengths", "stages"):
-            assert isinstance(getattr(each, name), tuple), name
+        for part in (each, each.image, each.prediction):
+            with pytest.raises(dataclasses.FrozenInstanceError):
+                part.method = "guess"
+        assert isinstance(each.sides, tuple)
+        assert isinstance(each.stages, tuple)
+        if not each.is_exact:
+            for name in ("tile", "half_lengths", "most_channels"):
+                assert isinstance(getattr(each.image, name), tuple), name
 
 
 def test_a_changed_number_is_found(chosen):
@@ -175,11 +261,17 @@ def test_other_text_is_no_plan(text):
         Plan.from_json(text)
 
 
-@pytest.mark.parametrize("name", ["align", "aperture", "final"])
-def test_its_filters_are_read_only(chosen, name):
+def test_its_filters_are_read_only(chosen):
     for each in (chosen, Plan.from_json(chosen.to_json())):
-        with pytest.raises(ValueError, match="read-only"):
-            getattr(each, name).coefficients[...] = 0
+        image = each.factorization
+        for filter_ in (image.align, image.aperture.filter, image.final):
+            with pytest.raises(ValueError, match="read-only"):
+                filter_.coefficients[...] = 0
+
+
+def test_only_a_plan_that_divides_has_a_factorization(exact):
+    with pytest.raises(TypeError, match="must divide the image"):
+        _ = exact.factorization
 
 
 def test_its_stages_divide_those_before(chosen, given_stages):
@@ -189,7 +281,7 @@ def test_its_stages_divide_those_before(chosen, given_stages):
         ):
             assert rows % fewer_rows == columns % fewer_columns == 0
             assert (rows, columns) != (fewer_rows, fewer_columns)
-        assert each.sides[-1][0] % each.tile[0] == each.sides[-1][1] % each.tile[1] == 0
+        assert np.all(np.array(each.sides[-1]) % each.factorization.tile == 0)
 
 
 def test_it_describes_itself(chosen):
@@ -298,28 +390,29 @@ def test_it_says_whether_times_are_of_this_device(chosen, monkeypatch, tmp_path)
     lines, grid = made(straight)
     monkeypatch.setenv("CLSAS_CACHE", str(tmp_path))
     usual = plan(lines, grid, tolerance_db=-50)
-    assert not usual.calibrated
+    assert not usual.prediction.calibrated
     words = "Times follow from default costs, not from any measured on this device: `clsas calib"
     assert words in usual.describe()
     assert words in plan(lines, grid, stages=[]).describe()
     device = open_device()
     costs.save(device, costs.defaults(device))
     measured = plan(lines, grid, tolerance_db=-50)
-    assert measured.calibrated
+    assert measured.prediction.calibrated
     assert "default costs" not in measured.describe()
-    assert Plan.from_json(usual.to_json()).calibrated is False
+    assert Plan.from_json(usual.to_json()).prediction.calibrated is False
 
 
 def test_json_may_leave_out_filters(chosen):
     short, whole = chosen.to_json(filters=False), chosen.to_json()
     assert len(short) < 0.5 * len(whole)
-    left_out = {"coefficients"}
+
+    def without(values):
+        if not isinstance(values, dict):
+            return values
+        return {key: without(part) for key, part in values.items() if key != "coefficients"}
+
     values = json.loads(whole)
     del values["digest"]  # which is of whole plans
-    assert values.keys() == json.loads(short).keys()
-    for name, value in values.items():
-        if isinstance(value, dict):
-            value = {key: part for key, part in value.items() if key not in left_out}
-        assert json.loads(short)[name] == value
-    with pytest.raises(ValueError, match=r"a plan as of Plan\.to_json: it lacks 'coef"):
+    assert json.loads(short) == without(values)
+    with pytest.raises(ValueError, match=r"a plan as of Plan\.to_json: image\.\S+ lacks 'coef"):
         Plan.from_json(short)

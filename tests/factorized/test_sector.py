@@ -118,7 +118,7 @@ def test_leaves_are_seen_from_wherever_they_are_seen_alone():
     half_m = np.array(geometry.plan.sides[-1])[:, None] / 2
     half_m = half_m * [grid.row_step_m, grid.column_step_m]
     start, stop = tree.seen_from(
-        chosen.limits,
+        chosen.factorization.limits,
         geometry.track,
         geometry.along,
         geometry.division.centres_m(last, leaves),
@@ -142,13 +142,13 @@ def test_leaves_are_seen_from_wherever_they_are_seen_alone():
 
 
 def test_references_are_ranges_and_phases(wide):
-    lines, resampling = wide.lines, wide.plan.resampling
+    lines, resampling = wide.lines, wide.factorization.resampling
     sector = wide.sector(wide.division.roots[:3])
     found = wide.references(sector)
     line = found["order"]
     range_m = bistatic_range_m(sector.root_m[:, None], lines.tx_m[line], lines.rx_m[line])
     index = (range_m - lines.first_range_m[line]) / lines.range_step_m
-    centre = found["start"] + found["nu"].astype(float) + (wide.plan.align.taps - 1) / 2
+    centre = found["start"] + found["nu"].astype(float) + (wide.factorization.align.taps - 1) / 2
     # Of two channels the places differ as their ranges do, in upsampled samples.
     away = (centre - centre[:, :1]) / resampling.ratio
     np.testing.assert_allclose(away, index - index[:, :1], atol=1e-4)

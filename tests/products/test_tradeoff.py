@@ -82,7 +82,7 @@ def test_a_study_sweeps_what_the_planner_chooses_from(lines):
     assert "-40 dB, 8+6 taps, 2 stages" in labels
     assert "-40 dB, 4+4 taps, 1 stage" in labels
     assert all(row.error_db <= -39 for row in studied)
-    assert any("8 taps in range" in row.plan and "6 along" in row.plan for row in studied)
+    assert any("8 taps in range" in row.plan and "6 taps along" in row.plan for row in studied)
 
 
 @pytest.mark.slow
@@ -207,6 +207,6 @@ def test_without_matplotlib_the_message_says_how_to_get_it(tmp_path, monkeypatch
 
 def test_summary_of_a_plan(lines):
     text = summary(clsas.plan(lines, GRID, stages=[(2, 2), (4, 2)]))
-    assert text.endswith("; 2 taps in range, 2 at the end, sums of 2, 4 lines")
+    assert text.endswith("; 2 taps in range, 2 at the end, sums of 2, 4 neighbours")
     assert text.startswith("64x48, 32x24; ")
     assert summary(clsas.plan(lines, GRID, stages=[])) == "plain backprojection"

@@ -1,0 +1,136 @@
+"""Pixels off a plane from the virtual channels of leaves, in groups of points."""
+
+from __future__ import annotations
+
+import numpy as np
+import pyopencl as cl
+from numpy.typing import NDArray
+
+from clsas.exact.run import normalising
+from clsas.exact.tiles import BLOCKS, groups_within
+from clsas.factorized.leaves import Finish, Leaves
+from clsas.factorized.sector import MOST_KEPT_BYTES, Sector
+from clsas.opencl.buffers import VECTOR_ROOM, float_pairs
+from clsas.opencl.device import Slot
+
+_ALL = slice(None)
+
+
+class SurfaceLeaves(Leaves):
+    """Leaves off a plane, in groups of points about their centres."""
+
+    def _prepare(self) -> None:
+        device, geometry = self.device, self.geometry
+        division = geometry.division
+        roots, last = geometry.roots, len(division.sides) - 1
+        corners = division.corners(last, roots)
+        key = "groups", self.width
+        if key in geometry.kept:
+            self.groups, self.leaf, held = geometry.kept[key]
+        else:
+            middles_m = division.centres_m(last, corners).reshape(-1, 3)
+            leaf, place = (each.ravel()[self.surface.cell] for each in self._cells(corners))
+            grid = self.surface.grid
+            self.groups, self.leaf = groups_within(grid, leaf, place, middles_m, self.width)
+            held = np.bincount(leaf // corners.shape[1], minlength=len(roots))
+            if self.groups.index.nbytes + self.groups.offset_m.nbytes <= MOST_KEPT_BYTES:
+                geometry.kept[key] = self.groups, self.leaf, held
+        self.number = {tuple(root): n for n, root in enumerate(roots)}
+        self.ends = np.searchsorted(self.leaf, np.arange(len(roots) + 1) * corners.shape[1])
+        self.pixels_before = np.concatenate([[0], np.cumsum(held)])
+        options = self._options(self.groups)
+        self.backproject = device.kernel("backproject_points", **options)
+
+    def _cells(self, corners: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Return the leaf of every cell, and the cell's number in it, [rows, columns] each.
+
+        Leaves are numbered in the order of their corners, [roots, leaves, 2], cells block by block.
+        """
+        side = self.geometry.division.sides[-1]
+        number = np.empty(corners.max(axis=(0, 1)) // side + 1, np.int64)
+        count = corners[..., 0].size
+        number[tuple(np.moveaxis(corners // side, -1, 0))] = np.arange(count).reshape(
+            corners.shape[:-1]
+        )
+        row, column = (np.arange(n) for n in self.surface.plane.shape)
+        height, width = BLOCKS[self.width]
+        down = row % side[0] // height * side[1] * height + row % height * width
+        across = column % side[1] // width * height * width + column % width
+        leaf = number[np.ix_(row // side[0], column // side[1])]
+        return leaf, down[:, None] + across
+
+    def _roots(self, sector: Sector, batch: slice = _ALL) -> slice:
+        """Return the numbers of a sector's roots, or of some of these, among all roots."""
+        first = self.number[tuple(sector.roots[0])]
+        some = range(first, first + len(sector.roots))[batch]
+        return slice(some.start, some.stop)
+
+    def _groups(self, roots: slice) -> slice:
+        """Return the groups of some roots."""
+        return slice(int(self.ends[roots.start]), int(self.ends[roots.stop]))
+
+    def _parts(self, sector: Sector) -> dict[str, NDArray]:
+        roots = self._roots(sector)
+        groups = self._groups(roots)
+        root, leaf = np.divmod(self.leaf[groups], sector.relative_m[-1].shape[1])
+        root -= roots.start
+        return {
+            "ranges": self._ranges(sector, root, leaf),
+            "centres": float_pairs(sector.relative_m[-1][root, leaf]),
+            "offsets": self.groups.offset_m[groups].reshape(-1, 3).T,
+        }
+
+    def form(self, tables: Slot, sector: Sector, batch: slice, samples: cl.Buffer) -> Finish:
+        """Start forming the pixels of some roots; see `Leaves.form`."""
+        first = self._groups(self._roots(sector)).start
+        roots = self._roots(sector, batch)
+        groups = self._groups(roots)
+        count, size = self.groups.index[groups].shape
+        formed = [np.empty((count, size), np.complex64) for _ in range(1 + self.normalise)]
+        ready = []
+        if count:
+            pixels = self._pixels(tables, count * size)
+            self.device.run(
+                self.backproject,
+                (count,),
+                lines=samples,
+                ranges=tables["ranges"],
+                first_range=groups.start - first,
+                centre_sample=self.level.centre,
+                drift=self.geometry.drift,
+                geometry=tables["geometry"],
+                geometry_pitch=sector.nodes[-1].place.size + VECTOR_ROOM,
+                centres=tables["centres"],
+                offsets=tables["offsets"],
+                points=size * (self._groups(self._roots(sector)).stop - first),
+                samples_per_m=self.geometry.samples_per_m,
+                **self.arguments,
+                **pixels,
+                first_group=0,
+                wait_for=tables.filled,
+            )
+            buffers = [pixels[name] for name in ("pixels", "weight_sums") if name in pixels]
+            ready = [
+                cl.enqueue_copy(self.device.queue, each, buffer, is_blocking=False)
+                for each, buffer in zip(formed, buffers, strict=True)
+            ]
+            self.slot.busy = ready[-1]
+            self.device.queue.flush()
+
+        def finish() -> int:
+            for event in ready:
+                event.wait()
+            for sums in formed[1:]:
+                formed[0] *= normalising(sums.real, self.lines.channels)
+            return self._put(roots, formed[0])
+
+        return finish
+
+    def blank(self, sector: Sector, batch: slice) -> Finish:
+        """Return a function that sets pixels to 0; see `Leaves.blank`."""
+        return lambda: self._put(self._roots(sector, batch), np.complex64(0))
+
+    def _put(self, roots: slice, pixels: NDArray[np.complex64] | np.complex64) -> int:
+        """Set the pixels of some roots; return their number."""
+        self.image.reshape(-1)[self.groups.index[self._groups(roots)]] = pixels
+        return int(self.pixels_before[roots.stop] - self.pixels_before[roots.start])

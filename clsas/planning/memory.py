@@ -1,0 +1,153 @@
+"""Device memory of a candidate, and how many roots are formed together within it.
+
+Predicted sizes go into the same lists of buffers from which a run allocates.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from clsas.exact.tiles import STACK
+from clsas.factorized.buffers import (
+    LEAST_BATCH,
+    leaf_tables,
+    pixel_buffers,
+    stage_lines,
+    stage_tables,
+    tile_buffers,
+)
+from clsas.opencl.buffers import Buffer, Buffers, lines_buffer
+from clsas.opencl.device import Device
+from clsas.opencl.upsampling import upsampling_buffers
+from clsas.planning.visibility_model import VisibilityModel
+from clsas.sonar.beam import INTERVALS
+
+_CACHED_BYTES, _BATCH_BYTES = 16 << 20, 256 << 20  # of a batch, on CPUs and elsewhere
+_MOST_TABLE_BYTES = 64 << 20
+_ROOTS_PREPARED = 16  # together, so that arrays are few and large
+
+
+@dataclass(frozen=True, eq=False)
+class BufferSizes:
+    """Predicted sizes of a candidate's buffers.
+
+    Attributes
+    ----------
+    view : VisibilityModel
+    width : int
+        Lanes of the device.
+    sides, tile
+        As those of `Factorization`.
+    pitches : tuple of int
+        Samples of a line with zeros around it, stage by stage.
+    root_channels : tuple of int
+        Virtual channels of a root along the whole aperture, at most, stage by stage.
+    most_channels : tuple of int
+        Virtual channels of a subimage, at most, stage by stage.
+    line_pitch : int
+        Samples of an upsampled line with zeros around it.
+    filtered : bool
+        True if a device upsamples the lines.
+    half_precision : bool
+    """
+
+    view: VisibilityModel
+    width: int
+    sides: tuple[tuple[int, int], ...]
+    tile: tuple[int, int]
+    pitches: tuple[int, ...]
+    root_channels: tuple[int, ...]
+    most_channels: tuple[int, ...]
+    line_pitch: int
+    filtered: bool
+    half_precision: bool
+
+    def constant(self) -> Buffers:
+        """Return the buffers that do not depend on the number of roots."""
+        lines = self.view.lines
+        buffers = {"lines": lines_buffer(lines.channels, self.line_pitch, self.half_precision)}
+        if self.filtered:
+            buffers = upsampling_buffers(
+                lines.channels, lines.length, self.line_pitch, self.half_precision
+            )
+        if self.view.beam is not None:
+            buffers["beam_table"] = Buffer((INTERVALS, 4), np.float32)
+        return buffers
+
+    def tables(self, roots: int) -> Buffers:
+        """Return the tables of some roots."""
+        channels, tables = self.view.lines.channels, Buffers()
+        for level, side in enumerate(self.sides):
+            subimages = self._divided(side)
+            tables |= stage_tables(level, roots, subimages, channels, ramps=True)
+            channels = self.root_channels[level]
+        parts, pixels = self._parts()
+        points = None if self.view.surface.is_plane else roots * pixels
+        return tables | leaf_tables(roots * channels, roots * parts, points, self.view.beam)
+
+    def work(self, roots: int) -> Buffers:
+        """Return the buffers in which some roots are formed together."""
+        buffers, beam = Buffers(), self.view.beam
+        for level, side in enumerate(self.sides):
+            subimages, pitch = roots * self._divided(side), self.pitches[level]
+            most, half = self.most_channels[level], self.half_precision
+            buffers |= stage_lines(level, subimages, most, pitch, half_precision=half)
+        parts, pixels = self._parts()
+        if self.view.surface.is_plane:
+            aligned = self.tile == self.sides[-1]
+            buffers |= tile_buffers(roots * parts, most, beam, aligned=aligned)
+            buffers["tile_centres"] = Buffer((roots * parts, 6), np.float32)
+        return buffers | pixel_buffers(roots * pixels, beam)
+
+    def _divided(self, side: tuple[int, int]) -> int:
+        """Return the subimages of a size in a root."""
+        return math.prod(a // b for a, b in zip(self.sides[0], side, strict=True))
+
+    def _parts(self) -> tuple[int, int]:
+        """Return the tiles or groups of a root, and its pixels, at most."""
+        if self.view.surface.is_plane:
+            return self._divided(self.tile), math.prod(self.sides[0])
+        pixels = self.view.most_padded_pixels(self.sides[-1], self.sides[0], self.width)
+        return pixels // (STACK * self.width), pixels
+
+
+@dataclass(frozen=True)
+class Batches:
+    """Roots that are formed together, and whose geometry is prepared together.
+
+    Attributes
+    ----------
+    at_once, prepared : int
+    memory_bytes : int
+        Device memory that the image takes.
+    """
+
+    at_once: int
+    prepared: int
+    memory_bytes: int
+
+
+def batches_within(sizes: BufferSizes, roots: int, device: Device, memory_bytes: int) -> Batches:
+    """Return batches that fill the cache or the memory, whichever is less; at least one root."""
+    constant = total_bytes(sizes.constant())
+    of_root, of_tables = total_bytes(sizes.work(1)), total_bytes(sizes.tables(1))
+    room = memory_bytes - constant
+    batch_bytes = _CACHED_BYTES if device.info.kind == "cpu" else _BATCH_BYTES
+    at_once = max(batch_bytes // of_root, LEAST_BATCH)
+    # One set of tables is filled while the other is in use.
+    at_once = min(room // (of_root + 2 * of_tables), at_once)
+    at_once = min(max(at_once, 1), roots)
+    room = min(room - at_once * of_root, _MOST_TABLE_BYTES)
+    most = max(room // (2 * at_once * of_tables), 1)
+    prepared = at_once * min(most, -(-_ROOTS_PREPARED // at_once))
+    tables = 2 * total_bytes(sizes.tables(min(prepared, roots)))
+    needed = constant + total_bytes(sizes.work(at_once)) + tables
+    return Batches(at_once, prepared, needed)
+
+
+def total_bytes(buffers: Buffers) -> int:
+    """Return the size of all buffers."""
+    return sum(buffer.nbytes for buffer in buffers.values())

@@ -1,0 +1,348 @@
+"""Plans of candidates, with their predicted error, time and memory."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from clsas.core.decibels import in_db, power
+from clsas.core.digests import grid_digest, lines_digest
+from clsas.factorized.buffers import CHUNK, Level
+from clsas.factorized.estimates import (
+    ErrorBudget,
+    StageChannels,
+    Work,
+    backprojecting_leaves,
+    combining,
+    upsampling,
+)
+from clsas.factorized.factorization import ExactImage, Factorization
+from clsas.factorized.filters import UPSAMPLING_SHARE
+from clsas.factorized.interpolated import InterpolatedAperture
+from clsas.factorized.plan import Plan, Prediction, Stage
+from clsas.factorized.thesis import NearestBeams
+from clsas.opencl import phases
+from clsas.opencl.buffers import padded_length
+from clsas.opencl.device import Device
+from clsas.planning.channels import peak_density
+from clsas.planning.costs import Costs
+from clsas.planning.exact_image import Exact
+from clsas.planning.memory import BufferSizes, batches_within
+from clsas.planning.visibility_model import VisibilityModel
+from clsas.signal import interpolation
+from clsas.signal.interpolation import PHASES, Interpolator, Resampling, Upsampler
+
+HALF_ROUNDING = 4e-8
+"""Power of the error that rounding lines to half precision once adds: 2^-11/sqrt(6) rms."""
+MARGIN_DB = 1.0
+"""Margin of predicted errors for the scatter of measured ones."""
+OUTSIDE = 0.1
+"""Share of the allowed error power that may come from outside the nominal band."""
+_ROUNDING_SHARE = 0.1  # of an image's error power, for half precision
+_MOST_CHUNKS = 16  # in a sum that is rounded to half precision
+_FEW_CHANNELS = 7.0, 30.0  # per pixel, that double the scatter of errors; the latter with steps
+_ROOM = 1.06  # spare room of buffers over the largest predicted number of virtual channels
+
+
+@dataclass(frozen=True)
+class Conditions:
+    """Requirements of a plan, and the exact image that it competes with.
+
+    Attributes
+    ----------
+    tolerance_db : float or None
+        None where stages were given.
+    exact : Exact
+    device : Device
+    costs : Costs
+    memory_bytes : int
+        Device memory that may be used.
+    """
+
+    tolerance_db: float | None
+    exact: Exact
+    device: Device
+    costs: Costs
+    memory_bytes: int
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """A factorization that the planner considers.
+
+    Attributes
+    ----------
+    sides, tile, align, final, aperture
+        As those of `clsas.factorized.plan.Factorization`.
+    margin : float
+        Factor of the predicted error power, for the scatter of measured errors.
+    """
+
+    sides: tuple[tuple[int, int], ...]
+    tile: tuple[int, int]
+    align: Interpolator
+    final: Interpolator
+    aperture: InterpolatedAperture | NearestBeams
+    margin: float = 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class _Lines:
+    """Upsampled lines.
+
+    Attributes
+    ----------
+    upsampler, resampling
+        As those of `Factorization`.
+    align_db : float
+        Error of an interpolation between their samples.
+    errors : ErrorBudget
+        Contributions of all filters, and those given.
+    """
+
+    upsampler: Upsampler | None
+    resampling: Resampling
+    align_db: float
+    errors: ErrorBudget
+
+
+def predicted_plan(
+    view: VisibilityModel, candidate: Candidate, other_errors: ErrorBudget, conditions: Conditions
+) -> Plan:
+    """Return the plan of a candidate, with its predicted error, time and memory.
+
+    Parameters
+    ----------
+    view : VisibilityModel
+        That within the candidate's roots, where the aperture is interpolated.
+    candidate : Candidate
+    other_errors : ErrorBudget
+        Contributions that the filters do not account for.
+    conditions : Conditions
+    """
+    sides, device, costs = candidate.sides, conditions.device, conditions.costs
+    lines = _upsampled(view, candidate, other_errors)
+    half_lengths = view.half_lengths(sides, candidate.align, candidate.final, lines.resampling)
+    channels = candidate.aperture.predicted_channels(view, sides)
+    levels = [Level.of(half, device.info.width) for half in half_lengths]
+    stages, work = _stages(view, candidate, lines, levels, channels, device, costs)
+    errors, half_precision = _with_arithmetic(view, lines, channels, conditions)
+    sizes = BufferSizes(
+        view=view,
+        width=device.info.width,
+        sides=sides,
+        tile=candidate.tile,
+        pitches=tuple(level.pitch for level in levels),
+        root_channels=tuple(math.ceil(each.everywhere) for each in channels),
+        most_channels=tuple(math.ceil(_ROOM * each.most) for each in channels),
+        line_pitch=padded_length(lines.resampling),
+        filtered=lines.upsampler is not None,
+        half_precision=half_precision,
+    )
+    roots = stages[0].subimages
+    batches = batches_within(sizes, roots, device, conditions.memory_bytes)
+    work += Work(batch=float(-(-roots // batches.at_once) * len(sides)))
+    errors = errors.times(candidate.margin)
+    image = Factorization(
+        sides=sides,
+        tile=candidate.tile,
+        aperture=candidate.aperture,
+        align=candidate.align,
+        final=candidate.final,
+        resampling=lines.resampling,
+        upsampler=lines.upsampler,
+        half_precision=half_precision,
+        half_lengths=half_lengths,
+        most_channels=sizes.most_channels,
+        highest_cycles_per_m=view.highest_cycles_per_m,
+        closest_m=view.nearest_m,
+        limits=view.limits,
+        roots_at_once=batches.at_once,
+        roots_prepared=batches.prepared,
+    )
+    return _plan(view, image, conditions, batches.memory_bytes, stages, work, errors)
+
+
+def exact_plan(view: VisibilityModel, conditions: Conditions) -> Plan:
+    """Return the plan of the exact image."""
+    exact = conditions.exact
+    image = ExactImage(accuracy_db=exact.accuracy_db)
+    errors = ErrorBudget(exact=power(exact.accuracy_db))
+    plan = _plan(view, image, conditions, exact.memory_bytes, [], exact.work, errors)
+    return replace(plan, prediction=replace(plan.prediction, error_db=exact.accuracy_db))
+
+
+def margin_db(view: VisibilityModel) -> float:
+    """Return the margin of predicted errors, dB, which covers the scatter of measured ones.
+
+    Errors scatter more if few channels see a pixel: they depend on the positions of these between
+    virtual channels, and relative to a step of the beam. They also scatter more if the lines'
+    power lies at few frequencies.
+    """
+    channels = view.lines.channels * view.visible_share((16, 16))
+    few = _FEW_CHANNELS[view.beam is not None and view.beam.jumps]
+    return MARGIN_DB + in_db(view.spectrum.scatter * (1 + few / max(channels, 1.0)))
+
+
+def band_of(view: VisibilityModel, outside: float) -> tuple[float, float]:
+    """Return the centre and half width of the band that holds all but a share of the power."""
+    spectrum = view.spectrum
+    bins = np.searchsorted(np.cumsum(spectrum.share), 1 - outside)
+    return spectrum.centre, float(min((bins + 1) / (2 * len(spectrum.power)), 0.5))
+
+
+def half_precision_error(stages: int) -> float:
+    """Return the least error power that half precision adds through some stages.
+
+    It is more if virtual channels are sums of many: see `_half_rounding`.
+    """
+    return HALF_ROUNDING * (1 + 1.5 * stages)
+
+
+def _plan(
+    view: VisibilityModel,
+    image: Factorization | ExactImage,
+    conditions: Conditions,
+    memory_bytes: int,
+    stages: Sequence[Stage],
+    work: Work,
+    errors: ErrorBudget,
+) -> Plan:
+    """Return an image with its prediction."""
+    costs = conditions.costs
+    prediction = Prediction(
+        error_db=errors.total_db,
+        seconds=float(costs.seconds(work)),
+        exact_seconds=float(costs.seconds(conditions.exact.work)),
+        memory_bytes=memory_bytes,
+        device=conditions.device.info.label,
+        stages=tuple(stages),
+        work=work,
+        errors=errors,
+    )
+    return Plan(
+        tolerance_db=conditions.tolerance_db,
+        image=image,
+        prediction=prediction,
+        beam=view.beam,
+        lines_digest=lines_digest(view.lines),
+        grid_digest=grid_digest(view.grid),
+    )
+
+
+def _upsampled(view: VisibilityModel, candidate: Candidate, other_errors: ErrorBudget) -> _Lines:
+    """Return how lines are upsampled, and the errors of all filters.
+
+    A gain that makes up for the range filters' attenuation leaves only their scatter.
+    """
+    align, final, aperture = candidate.align, candidate.final, candidate.aperture
+    stages, samples = len(candidate.sides), view.lines.length
+    step = max(int(PHASES / align.upsampling), 1)
+    gain = aperture.lines_gain(align, final, PHASES / step)
+    align_db = align.error_db if gain is None else align.scatter_db
+    errors = replace(
+        other_errors,
+        range_filters=stages * power(align_db) + power(final.scatter_db),
+        aperture_filters=stages * power(aperture.filter.error_db),
+    )
+    if gain is not None:
+        most_db = in_db(UPSAMPLING_SHARE * errors.total)
+        upsampler = interpolation.upsampler(view.spectrum, step, gain, most_db)
+        if upsampler is not None:
+            resampling = upsampler.resampling(samples, align.taps // 2, view.spectrum)
+            errors = replace(errors, upsampling=power(upsampler.error_db))
+            return _Lines(upsampler, resampling, align_db, errors)
+    resampling = interpolation.resampling(samples, align, view.spectrum)
+    return _Lines(None, resampling, align_db, errors)
+
+
+def _stages(
+    view: VisibilityModel,
+    candidate: Candidate,
+    lines: _Lines,
+    levels: Sequence[Level],
+    channels: Sequence[StageChannels],
+    device: Device,
+    costs: Costs,
+) -> tuple[list[Stage], Work]:
+    """Return the prediction of every stage and of the leaves, and the work of all."""
+    width, aperture = device.info.width, candidate.aperture.filter
+    taps = candidate.align.taps + aperture.taps
+    error_db = in_db(power(lines.align_db) + power(aperture.error_db))
+    stages, total = [], Work(call=1.0)
+
+    def add(side: tuple[int, int], count: int, samples: int, work: Work, **figures: Any) -> None:
+        nonlocal total
+        total += work
+        rows, columns = side
+        seconds = float(costs.seconds(work))
+        stages.append(Stage(rows, columns, count, samples=samples, seconds=seconds, **figures))
+
+    for level, (side, of_stage) in enumerate(zip(candidate.sides, channels, strict=True)):
+        count = view.subimages(side)
+        samples = levels[level].length
+        combined = count * of_stage.used
+        work = combining(combined, samples, taps, given=level == 0) + Work(subimage=count)
+        if level == 0:
+            upsampled = view.lines.channels * lines.resampling.length
+            work += Work(reference=count * view.lines.channels)
+            work += upsampling(upsampled, filtered=lines.upsampler is not None)
+        add(
+            side,
+            count,
+            samples,
+            work,
+            channels=round(of_stage.count),
+            operations=combined * samples,
+            error_db=error_db,
+        )
+    pixels, backprojected = view.padded_pixels(side, width), count * of_stage.count
+    tiled, weighted = view.surface.is_plane, view.beam is not None
+    taps = candidate.final.taps
+    work = backprojecting_leaves(backprojected, pixels, taps, tiled=tiled, weighted=weighted)
+    if not tiled:
+        work += Work(group=count * pixels)
+    add(
+        side,
+        count,
+        samples,
+        work,
+        channels=round(of_stage.count),
+        operations=count * pixels * of_stage.count,
+        error_db=candidate.final.scatter_db,
+    )
+    return stages, total
+
+
+def _with_arithmetic(
+    view: VisibilityModel, lines: _Lines, channels: Sequence[StageChannels], conditions: Conditions
+) -> tuple[ErrorBudget, bool]:
+    """Add the errors of polynomials and rounding; return whether lines have half precision."""
+    tolerance_db, errors = conditions.tolerance_db, lines.errors
+    if tolerance_db is None:
+        return errors, False
+    errors = replace(errors, phases=phases.error(phases.terms_within(tolerance_db)) ** 2)
+    if lines.upsampler is None or not conditions.device.info.half_precision:
+        return errors, False
+    rounding = _half_rounding(view, [stage.summed for stage in channels])
+    if rounding > _ROUNDING_SHARE * power(tolerance_db):
+        return errors, False
+    return replace(errors, half_precision=rounding), True
+
+
+def _half_rounding(view: VisibilityModel, summed: Sequence[float]) -> float:
+    """Return the error power of rounding lines to half precision.
+
+    `summed` is the number of channels that a virtual one sums, stage by stage. Upsampled lines are
+    rounded once. Lines of a stage are rounded once per chunk of channels, while the sum still
+    grows, which counts as half. A sum of very many chunks loses what is added last.
+    """
+    chunks = np.array(summed) / CHUNK
+    chunks[0] *= peak_density(view)
+    if chunks.max() > _MOST_CHUNKS:
+        return np.inf
+    return HALF_ROUNDING * (1 + float(np.sum(1 + chunks / 2)))

@@ -1,0 +1,91 @@
+"""The buffers that a run allocates are those that its prediction of memory adds up."""
+
+import pytest
+from factorizing import (
+    BEAMS,
+    EXACT_IS_SLOW,
+    hills,
+    made,
+    moving_array,
+    peak_device_bytes,
+    straight,
+)
+
+from clsas.opencl.device import Slot
+from clsas.planning import memory, prediction
+from clsas.planning.factorize import factorize
+from clsas.planning.planner import plan
+from clsas.sonar.beam import BeamWindow
+
+TOLERANCE = {"tolerance_db": -40, "costs": EXACT_IS_SLOW}
+NORMALISING = BeamWindow(20, "hann", normalise=True)
+CASES = {
+    "plane": (straight, TOLERANCE),
+    "relief": (hills, TOLERANCE),
+    "moving receivers": (moving_array, TOLERANCE),
+    "beam": (straight, TOLERANCE | {"beam": BEAMS[0]}),
+    "normalising beam": (straight, TOLERANCE | {"beam": NORMALISING}),
+    "normalising beam, relief": (hills, TOLERANCE | {"beam": NORMALISING}),
+    "stages": (straight, {"stages": [(4, 2)]}),
+}
+
+
+@pytest.fixture(params=CASES.values(), ids=CASES)
+def case(request, monkeypatch):
+    """Lines, grid, plan, and the sizes of its buffers that were predicted."""
+    make, request_ = request.param
+    predicted = {}
+
+    def batches_within(sizes, *others):
+        batches = memory.batches_within(sizes, *others)
+        predicted[batches.memory_bytes] = sizes
+        return batches
+
+    monkeypatch.setattr(prediction, "batches_within", batches_within)
+    lines, grid = made(make)
+    chosen = plan(lines, grid, **request_)
+    assert not chosen.is_exact
+    return lines, grid, chosen, predicted[chosen.memory_bytes]
+
+
+def sizes_of(buffers):
+    return {name: buffer.nbytes for name, buffer in buffers.items()}
+
+
+def test_a_run_allocates_what_was_predicted(case, monkeypatch):
+    lines, grid, chosen, sizes = case
+    allocated, at_least = {}, Slot._at_least
+
+    def recorded(self, name, bytes_, make):
+        allocated[name] = max(allocated.get(name, 0), bytes_)
+        return at_least(self, name, bytes_, make)
+
+    monkeypatch.setattr(Slot, "_at_least", recorded)
+    factorize(lines, grid, chosen)
+    image = chosen.factorization
+    work = sizes_of(sizes.work(image.roots_at_once))
+    tables = sizes_of(sizes.tables(image.roots_prepared))
+    # On a CPU pixels may be set in the image itself, and a sonar at one place needs no ramp.
+    needless = {"tile_centres", "pixels", "ramp"}
+    assert allocated.keys() - needless == (work | tables).keys() - needless
+    for name, bytes_ in allocated.items():
+        assert bytes_ <= (work | tables)[name], name
+    for level in range(len(chosen.sides)):
+        assert allocated[f"lines{level}"] == work[f"lines{level}"]
+
+
+def test_the_predicted_memory_is_an_upper_bound(case, monkeypatch):
+    lines, grid, chosen, _ = case
+    peak = peak_device_bytes(monkeypatch, lambda: factorize(lines, grid, chosen), grid.shape)
+    assert 0.5 * chosen.memory_bytes <= peak <= chosen.memory_bytes
+
+
+def test_memory_is_the_sum_of_all_buffers(case):
+    *_, chosen, sizes = case
+    image = chosen.factorization
+    total = memory.total_bytes(sizes.constant()) + memory.total_bytes(
+        sizes.work(image.roots_at_once)
+    )
+    roots = min(image.roots_prepared, chosen.stages[0].subimages)
+    total += 2 * memory.total_bytes(sizes.tables(roots))
+    assert chosen.memory_bytes == total
