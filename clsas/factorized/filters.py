@@ -152,5 +152,5 @@ def _least(taps: int, wanted_db: float, spectrum: Spectrum, error: str) -> float
 def _errors_db(taps: int, error: str, frequency: bytes, power: bytes) -> NDArray[np.float64]:
     """Return the errors of filters at all `_RATES`."""
     spectrum = Spectrum(0.0, np.frombuffer(frequency), np.frombuffer(power))
-    found = [getattr(interpolation.design(taps, rate, spectrum), error) for rate in _RATES]
+    found = [getattr(each, error) for each in interpolation.designs(taps, _RATES, spectrum)]
     return np.minimum.accumulate(found)

@@ -33,7 +33,7 @@ _Cycles = Annotated[float, Field(ge=-0.5, le=0.5)]
 
 
 class VisiblePhases(Protocol):
-    """Visibility and phase cycles of subimages, as `clsas.planning.view.View` predicts them."""
+    """Visibility and phases of subimages, as a `VisibilityModel` of the planner predicts them."""
 
     @property
     def lines(self) -> RangeLines:
@@ -47,22 +47,24 @@ class VisiblePhases(Protocol):
     def beam_rates(self) -> NDArray[np.float64]:
         """Cycles of the beam's weights per unit of the aperture coordinate."""
 
-    def seen(self, side: tuple[int, int]) -> NDArray[np.bool_]:
-        """Return which samples of the track see any of a subimage."""
+    def visible(self, side: tuple[int, int]) -> NDArray[np.bool_]:
+        """Return which track samples touch a subimage with their beam."""
 
-    def share_seen(self, side: tuple[int, int]) -> float:
-        """Return the mean share of the channels that see any of a subimage."""
+    def visible_share(self, side: tuple[int, int]) -> float:
+        """Return the mean fraction of channels whose beam touches a subimage."""
 
-    def turns(self, side: tuple[int, int], seen: NDArray[np.bool_], *, most: bool = False) -> float:
-        """Return the cycles of phase of a subimage while it is seen, their mean or maximum."""
-
-    def cycles(
-        self, rates: NDArray[np.float64], seen: NDArray[np.bool_], *, most: bool = False
+    def subimage_phase_cycles(
+        self, side: tuple[int, int], visible: NDArray[np.bool_], *, most: bool = False
     ) -> float:
-        """Return the integral of rates over what is seen, its mean or maximum."""
+        """Return the visible phase cycles of subimages of a size, their mean or maximum."""
 
-    def channels(self, taps: int, density: float, turns: float) -> Any:
-        """Return the number of virtual channels for phases that turn by some cycles."""
+    def visible_phase_cycles(
+        self, rates: NDArray[np.float64], visible: NDArray[np.bool_], *, most: bool = False
+    ) -> float:
+        """Return the phase accumulated along the visible aperture, its mean or maximum."""
+
+    def virtual_channels(self, taps: Any, density: float, phase_cycles: Any) -> Any:
+        """Return the number of virtual channels for some phase cycles."""
 
 
 @dataclass(frozen=True, eq=False, config=CONFIG)
@@ -174,24 +176,28 @@ class InterpolatedAperture:
         """Predict the virtual channels of subimages, stage by stage."""
         taps, density = self.filter.taps, 2 * self.filter.upsampling
         found: list[StageChannels] = []
-        everywhere_seen = np.ones_like(view.seen(sides[0]))
-        used = view.lines.channels * view.share_seen(sides[0])
+        everywhere_seen = np.ones_like(view.visible(sides[0]))
+        used = view.lines.channels * view.visible_share(sides[0])
         for level, (oversampling, side) in enumerate(zip(self.oversampling, sides, strict=True)):
-            seen = view.seen(side)
+            seen = view.visible(side)
             if level:
-                turns = self.oversampling[level - 1] * view.turns(sides[level - 1], seen)
-                used = min(found[-1].count, view.channels(taps, density, turns))
-            turns = oversampling * view.turns(side, seen)
+                turns = self.oversampling[level - 1] * view.subimage_phase_cycles(
+                    sides[level - 1], seen
+                )
+                used = min(found[-1].count, view.virtual_channels(taps, density, turns))
+            turns = oversampling * view.subimage_phase_cycles(side, seen)
             everywhere, most = (
-                density * oversampling * view.turns(side, where, most=True) + taps + 2
+                density * oversampling * view.subimage_phase_cycles(side, where, most=True)
+                + taps
+                + 2
                 for where in (everywhere_seen, seen)
             )
             if view.beam is not None:
                 if level == len(sides) - 1:
-                    turns += self.beam_cycles * view.cycles(view.beam_rates, seen)
-                    beam_cycles = view.cycles(view.beam_rates, seen, most=True)
+                    turns += self.beam_cycles * view.visible_phase_cycles(view.beam_rates, seen)
+                    beam_cycles = view.visible_phase_cycles(view.beam_rates, seen, most=True)
                     most += density * self.beam_cycles * beam_cycles
                 most *= 1 + BEAM_MARGIN
-            count = view.channels(taps, density, turns)
+            count = view.virtual_channels(taps, density, turns)
             found.append(StageChannels(used, count, taps * used / count, everywhere, most))
         return found

@@ -111,12 +111,21 @@ class Surface:
         """Pixels of the smallest subimages, and the least and the most that these lie off."""
         rows, columns = self.plane.shape
         shape = -(-rows // LEAST_SIDE[0]), -(-columns // LEAST_SIDE[1])
-        if self.is_plane:
-            counts = [
+        if self.is_plane or self.grid.height_m is not None:
+            cells = [
                 np.minimum(side, n - side * np.arange(many))
                 for many, side, n in zip(shape, LEAST_SIDE, self.plane.shape, strict=True)
             ]
-            return np.outer(*counts), np.zeros(shape), np.zeros(shape)
+            counts = np.outer(*cells)
+            if self.is_plane:
+                return counts, np.zeros(shape), np.zeros(shape)
+            # A height map has one pixel in every cell.
+            off_m = self.off_m.reshape(self.plane.shape)
+            low_m, high_m = (
+                within_roots(reduce, off_m, (1, 1), LEAST_SIDE)
+                for reduce in (np.minimum, np.maximum)
+            )
+            return counts, low_m, high_m
         row, column = np.divmod(self.cell, columns)
         index = row // LEAST_SIDE[0] * shape[1] + column // LEAST_SIDE[1]
         low_m, high_m = np.full(math.prod(shape), np.inf), np.full(math.prod(shape), -np.inf)
@@ -125,6 +134,18 @@ class Surface:
         counts = np.bincount(index, minlength=math.prod(shape))
         return counts.reshape(shape), low_m.reshape(shape), high_m.reshape(shape)
 
+    @staticmethod
+    def _part(side: tuple[int, int]) -> tuple[int, int]:
+        """Return half a subimage of a size, if it divides into such; else the smallest."""
+        (rows, columns), (least_rows, least_columns) = side, LEAST_SIDE
+        if columns // least_columns > rows // least_rows:
+            part = rows, columns // 2
+        else:
+            part = rows // 2, columns
+        divides = all(n == 2 * p or n == p for n, p in zip(side, part, strict=True))
+        whole = all(p % least == 0 for p, least in zip(part, LEAST_SIDE, strict=True))
+        return part if divides and whole else LEAST_SIDE
+
     @functools.cached_property
     def _known(self) -> dict[tuple[int, int], tuple[NDArray, NDArray, NDArray]]:
         return {}
@@ -132,15 +153,17 @@ class Surface:
     def _held(self, side: tuple[int, int]) -> tuple[NDArray, NDArray, NDArray]:
         """Return how many pixels subimages hold, and the least and the most these lie off."""
         if side not in self._known:
-            counts, low_m, high_m = (
-                within_roots(reduce, values, LEAST_SIDE, side)
-                for reduce, values in zip(
-                    (np.add, np.minimum, np.maximum), self._smallest, strict=True
-                )
-            )
+            if side == LEAST_SIDE:
+                counts, low_m, high_m = self._smallest
+            else:
+                part = self._part(side)
+                parts = self._held(part)
+                empty = parts[0] == 0
+                counts = within_roots(np.add, parts[0], part, side)
+                low_m = within_roots(np.minimum, np.where(empty, np.inf, parts[1]), part, side)
+                high_m = within_roots(np.maximum, np.where(empty, -np.inf, parts[2]), part, side)
             empty = counts == 0
-            low_m[empty] = high_m[empty] = 0
-            self._known[side] = counts, low_m, high_m
+            self._known[side] = counts, np.where(empty, 0, low_m), np.where(empty, 0, high_m)
         return self._known[side]
 
 

@@ -1,4 +1,4 @@
-"""Measuring what the parts of imaging cost on a device."""
+"""Measurement of the costs of imaging on a device, from the times of some images."""
 
 from __future__ import annotations
 
@@ -24,32 +24,34 @@ from clsas.planning.costs import Costs
 from clsas.planning.exact_image import Exact, expect
 from clsas.planning.factorize import factorize
 from clsas.planning.planner import plan
-from clsas.planning.view import View
+from clsas.planning.visibility_model import VisibilityModel
 from clsas.simulation.scenes import PointTargets
 from clsas.simulation.simulator import simulate_lines
 from clsas.sonar.beam import BeamWindow
 
 _SIZES = ((500, 768), (1500, 512))
-"""Channels, and pixels along a side, of the images that are formed in every way."""
+"""Channels, and pixels along either side, of the images that are formed exactly and factorized."""
 _SMALL_SIZES = ((100, 128), (400, 256))
-"""Those of what is backprojected only."""
+"""The same of images that are formed exactly only."""
 _TOLERANCES_DB = (-25.0, -45.0, -60.0)
-# Plans differ with what they are told that things cost: these have shallow trees and deep ones.
-_TOLD = (Costs(pixel_ns=1e3, point_ns=1e3), Costs(pixel_ns=1e3, leaf_ns=10.0))
+# With these costs the planner chooses shallow trees, and deep ones: their times differ enough to
+# tell the costs apart.
+_PLANNED_WITH = (Costs(pixel_ns=1e3, point_ns=1e3), Costs(pixel_ns=1e3, leaf_ns=10.0))
 _EXACT_DB = -50.0
-_WIDE = BeamWindow(120.0, "hann")  # every channel sees every pixel
+_WIDE = BeamWindow(120.0, "hann")  # touches every pixel from every channel
 _PIXEL_M = 0.02
 
 _ROUNDS = 4
+"""Timed runs of every image; the fastest counts."""
 _PRIOR = 0.3
-"""What a cost that is not as expected counts, by its relative size, against images' times."""
-_MOST_SCATTER = 0.2  # of times between halves of the rounds: rms of the logarithm
-_MOST_MISFIT = 0.35  # of times from those that the costs make
+"""Weight of a cost's relative deviation from the default, against relative misfits of times."""
+_MOST_SCATTER = 0.2  # rms log ratio of the best times of even and odd runs; else not stored
+_MOST_MISFIT = 0.35  # rms log ratio of predicted and measured times; else not stored
 
 
 @dataclass(frozen=True, eq=False)
 class _Image:
-    """One way to an image, what it should take, and what it took."""
+    """An image that is timed: how to form it, its predicted work, and its times."""
 
     form: Callable[[], object]
     channels: int
@@ -59,7 +61,7 @@ class _Image:
     kernels: list[dict[str, float]] = field(default_factory=list)
 
     def run(self, device: Device) -> None:
-        """Form the image once more, timed as a whole and kernel by kernel."""
+        """Form the image once more; time the whole and every kernel."""
         with device.profile() as times:
             start = time.perf_counter()
             self.form()
@@ -68,28 +70,28 @@ class _Image:
 
     @property
     def in_stages(self) -> float:
-        """Least seconds that the stages' kernels took."""
+        """Least time of the stages' kernels, seconds."""
         return min(each.get("stage", 0.0) for each in self.kernels)
 
     @property
     def in_pixels(self) -> float:
-        """Least seconds that the backprojecting kernels took."""
+        """Least time of the backprojecting kernels, seconds."""
         names = ("backproject_tiles", "backproject_points")
         return min(sum(each.get(name, 0.0) for name in names) for each in self.kernels)
 
     @property
     def scatter(self) -> float:
-        """Logarithm of the ratio between the least times of two halves of the runs."""
+        """Repeatability: log ratio of the best times of even and odd runs."""
         return math.log(min(self.seconds[::2]) / min(self.seconds[1::2]))
 
     def work(self, names: Sequence[str]) -> list[float]:
-        """Return how often it does what some costs are of."""
+        """Return the amounts of work that some costs are for."""
         work = self.expected.work
         return [float(getattr(work, name.removesuffix("_ns"))) for name in names]
 
     @property
     def pixel_work(self) -> float:
-        """Pixels times channels, as many as take as long with 4 taps."""
+        """Pixels times channels, in units of the time with 4 taps."""
         return sum(self.work(_PIXELS))
 
 
@@ -111,7 +113,7 @@ def calibrate(
     *,
     progress: Callable[[int, int], None] | None = None,
 ) -> Costs:
-    """Measure what imaging costs on a device, and store it for `clsas.plan`.
+    """Measure the costs of imaging on a device, and store them for `clsas.plan`.
 
     Parameters
     ----------
@@ -123,9 +125,9 @@ def calibrate(
     Returns
     -------
     Costs
-        None below zero, fitted with least relative squares to the times of some images of a
-        built-in scene, the least of some runs of each, which take turns. What these times cannot
-        tell apart is divided as in `clsas.planning.costs.defaults`.
+        Non-negative least-squares fit to the times of images of a built-in scene, in relative
+        terms. Images take turns, and the fastest run of each counts. Costs that these times cannot
+        tell apart keep the proportions of `clsas.planning.costs.defaults`.
 
     Raises
     ------
@@ -137,8 +139,8 @@ def calibrate(
     Warns
     -----
     ClsasWarning
-        If times differ much from run to run, or from what the costs make them: then the costs are
-        returned, but not stored, and those of before stay.
+        If times scatter from run to run, or differ from those that the costs predict. The costs are
+        then returned but not stored, and those stored before stay.
     """
     validate.progress(progress)
     device = open_device(device)
@@ -177,17 +179,17 @@ def _images(device: Device) -> list[_Image]:
     images = []
 
     def backprojected(lines: RangeLines, grid: Grid, beam: BeamWindow | None = None) -> None:
-        expected = expect(View(lines, grid, beam), _EXACT_DB, device)
+        expected = expect(VisibilityModel(lines, grid, beam), _EXACT_DB, device)
         form = partial(backproject, lines, grid, device=device, accuracy_db=_EXACT_DB, beam=beam)
         images.append(_Image(form, lines.channels, expected, expected.tiled))
 
-    def factorized(lines: RangeLines, grid: Grid, tolerance_db: float, told: Costs) -> None:
-        chosen = plan(lines, grid, tolerance_db=tolerance_db, device=device, costs=told)
+    def factorized(lines: RangeLines, grid: Grid, tolerance_db: float, planned_with: Costs) -> None:
+        chosen = plan(lines, grid, tolerance_db=tolerance_db, device=device, costs=planned_with)
         if chosen.is_exact:
             return
 
         def form() -> Image:
-            """Form the first image of the plan: a copy has kept nothing."""
+            """Form the image with an empty cache, as the first image of a plan."""
             return factorize(lines, grid, replace(chosen), device=device)
 
         images.append(_Image(form, lines.channels, chosen, grid.is_planar))
@@ -196,10 +198,12 @@ def _images(device: Device) -> list[_Image]:
         lines, grid = _scene(channels, pixels)
         backprojected(lines, grid)
         backprojected(lines, grid, _WIDE)
-        for tolerance_db, told in product(_TOLERANCES_DB, _TOLD):
-            factorized(lines, grid, tolerance_db, told)
-            if told is _TOLD[0]:
-                factorized(lines, grid.with_height(np.zeros(grid.shape)), tolerance_db, told)
+        for tolerance_db, planned_with in product(_TOLERANCES_DB, _PLANNED_WITH):
+            factorized(lines, grid, tolerance_db, planned_with)
+            if planned_with is _PLANNED_WITH[0]:
+                factorized(
+                    lines, grid.with_height(np.zeros(grid.shape)), tolerance_db, planned_with
+                )
     for channels, pixels in _SMALL_SIZES:
         lines, grid = _scene(channels, pixels)
         backprojected(lines, grid)
@@ -227,7 +231,7 @@ def _scene(channels: int, pixels: int) -> tuple[RangeLines, Grid]:
 
 
 def _fitted(images: list[_Image], usual: Costs) -> Costs:
-    """Return the costs that make the least times of some images, in `usual` proportions."""
+    """Fit costs to the best times of some images, close to `usual` proportions."""
     plans = [image for image in images if isinstance(image.expected, Plan)]
     exact = [image for image in images if isinstance(image.expected, Exact)]
     tiled = [image for image in plans if image.tiled]
@@ -272,10 +276,11 @@ def _fitted(images: list[_Image], usual: Costs) -> Costs:
 def _least_squares(
     usual: Costs, names: tuple[str, ...], work: list[list[float]], seconds: list[float]
 ) -> dict[str, float]:
-    """Return the costs, ns, of least relative error: work times costs is seconds."""
+    """Return the costs in nanoseconds for which work times costs is nearest to `seconds`."""
     usual_ns = np.array([getattr(usual, name) for name in names])
     rows = 1e-9 * np.array(work) * usual_ns / np.maximum(seconds, 1e-6)[:, None]
-    # Costs over the usual ones, on average over the images; each is like it but for good reason.
+    # The device's speed relative to the usual costs. Single costs deviate from it only if the times
+    # say so.
     faster = 1 / np.exp(np.mean(np.log(rows.sum(axis=1))))
     rows = np.concatenate([rows * faster, _PRIOR * np.eye(len(names))])
     wanted = np.concatenate([np.ones(len(seconds)), np.full(len(names), _PRIOR)])

@@ -1,4 +1,4 @@
-"""Costs of the things that imaging does on a device: measured once, stored in the cache."""
+"""Costs of each kind of work on a device: measured once, stored in the user's cache."""
 
 from __future__ import annotations
 
@@ -18,9 +18,10 @@ from clsas.opencl.device import Device
 
 @dataclass(frozen=True)
 class Costs:
-    """Time of each thing that imaging does, nanoseconds; `Work` says what these are.
+    """Time of each kind of work, nanoseconds per unit of the field of that name in `Work`.
 
-    The defaults are of 2 AVX-512 cores with PoCL; `defaults` returns those for a device.
+    The defaults were measured with PoCL on 2 AVX-512 cores (`clsas calibrate`); `defaults` returns
+    those for a device.
     """
 
     call_ns: float = 1.2e7
@@ -47,10 +48,7 @@ class Costs:
             validate.number(field.name, getattr(self, field.name), "ns", least=0.0)
 
     def seconds(self, work: Work) -> Any:
-        """Return the time that work takes: amounts times costs, added up.
-
-        That is a float, or an array if amounts are arrays.
-        """
+        """Return the time of some work, the sum of amounts times costs: an array if these are."""
         total_ns: Any = 0.0
         for name, amount in vars(work).items():
             if isinstance(amount, np.ndarray) or amount:
@@ -77,25 +75,25 @@ _AVX2 = Costs(
 
 
 def defaults(device: Device) -> Costs:
-    """Return the costs of a device that nothing was measured on.
+    """Return the costs of a device without a measurement of its own.
 
-    Those of 8 lanes are of 2 AVX2 cores with PoCL.
+    For 8 lanes these are the costs of 2 AVX2 cores with PoCL.
     """
     return _AVX2 if device.info.width == 8 else Costs()
 
 
 def path() -> Path:
-    """Return the file that holds what was measured."""
+    """Return the file that holds the measured costs."""
     return cache_folder() / "costs.json"
 
 
 def load(device: Device) -> Costs:
-    """Return what was measured for a device and its driver, or else `defaults`."""
+    """Return the measured costs of a device and its driver, or else `defaults`."""
     return measured(device) or defaults(device)
 
 
 def measured(device: Device) -> Costs | None:
-    """Return what was measured for a device and its driver, if anything was."""
+    """Return the measured costs of a device and its driver, None without any."""
     names = {field.name for field in fields(Costs)}
     try:
         stored = reading.parse_json(reading.read_bytes(path()))[_key(device)]
@@ -105,12 +103,12 @@ def measured(device: Device) -> Costs | None:
 
 
 def save(device: Device, costs: Costs) -> Path:
-    """Store what was measured for a device; return where."""
+    """Store the measured costs of a device; return the file."""
     file = path()
     try:
         stored = dict(reading.parse_json(reading.read_bytes(file)))
     except (OSError, ValueError, TypeError):
-        stored = {}  # none yet, or not ours
+        stored = {}  # no file yet, or not one of clsas
     stored[_key(device)] = asdict(costs)
     file.parent.mkdir(parents=True, exist_ok=True)
     with replacing(file) as temporary:

@@ -9,12 +9,14 @@ import numpy as np
 
 from clsas.exact.decision import decide
 from clsas.exact.run import Blocks, band_parts, blocks_of
-from clsas.exact.tiles import GroupsEstimate, Tiles
+from clsas.exact.tiles import Groups, GroupsEstimate, Tiles
 from clsas.factorized.estimates import Work, backprojecting, upsampling
 from clsas.opencl.buffers import VECTOR_ROOM, channel_pitch
 from clsas.opencl.device import Device
-from clsas.planning.view import View
+from clsas.planning.visibility_model import SMALL, VisibilityModel
 from clsas.sonar.beam import INTERVALS
+
+_LARGE = (64, 64)  # rows and columns of a subimage that holds any part of an exact image
 
 
 @dataclass(frozen=True)
@@ -29,8 +31,8 @@ class Exact:
         True where pixels lie in tiles of a plane, not in groups; where a beam weighs them.
     parts, part_pixels : int
         Number of tiles or groups, and of pixels in each.
-    channels, seen : int, float
-        Number of channels, and mean number that sees a part.
+    channels, visible_channels : int, float
+        Number of channels, and mean number whose beam touches a part.
     taps, samples : int
         Of the interpolator, and of an upsampled line.
     memory_bytes : int
@@ -43,7 +45,7 @@ class Exact:
     parts: int
     part_pixels: int
     channels: int
-    seen: float
+    visible_channels: float
     taps: int
     samples: int
     memory_bytes: int
@@ -55,7 +57,7 @@ class Exact:
         pixels = backprojecting(
             self.parts,
             self.part_pixels,
-            self.seen,
+            self.visible_channels,
             self.taps,
             tiled=self.tiled,
             weighted=self.weighted,
@@ -63,25 +65,25 @@ class Exact:
         return Work(call=1.0) + lines + pixels
 
 
-def expect(view: View, accuracy_db: float, device: Device) -> Exact:
+def expect(model: VisibilityModel, accuracy_db: float, device: Device) -> Exact:
     """Predict an exact image, by the same decision that forms it."""
-    lines, beam = view.lines, view.beam
+    lines, beam = model.lines, model.beam
     decision = decide(
         lines,
-        view.grid,
+        model.grid,
         device=device,
         accuracy_db=accuracy_db,
-        spectrum=view.spectrum,
-        left_open=view.ambiguity,
+        spectrum=model.spectrum,
+        left_open=model.ambiguity,
         beam=beam,
-        along=view.channels_along,
+        along=model.channels_along,
         estimate=True,
     )
     layout, interpolator, resampling = decision.layout, decision.interpolator, decision.resampling
     tiled = isinstance(layout, Tiles)
     share = most = 1.0
-    if beam is not None and view.track is not None:
-        share, most = view.share_seen((16, 16)), view.share_seen((64, 64), most=True)
+    if beam is not None and model.track is not None:
+        share, most = model.visible_share(SMALL), model.visible_share(_LARGE, most=True)
     blocks = blocks_of(
         device,
         lines,
@@ -99,32 +101,32 @@ def expect(view: View, accuracy_db: float, device: Device) -> Exact:
         parts=layout.parts,
         part_pixels=layout.part_pixels,
         channels=lines.channels,
-        seen=share * lines.channels,
+        visible_channels=share * lines.channels,
         taps=interpolator.taps,
         samples=resampling.length,
-        memory_bytes=_memory_bytes(view, device, blocks, layout, most),
+        memory_bytes=_memory_bytes(model, device, blocks, layout, most),
     )
 
 
 def _memory_bytes(
-    view: View,
+    model: VisibilityModel,
     device: Device,
     blocks: Blocks,
-    layout: Tiles | GroupsEstimate,
+    layout: Tiles | Groups | GroupsEstimate,
     most: float,
 ) -> int:
-    """Return the device memory that `backproject.execute` takes.
+    """Return the device memory that `clsas.exact.run.execute` takes.
 
-    Of a part's, a block's and a band's buffers there are two where there are two jobs. `most` is
-    the largest share of the channels that a part sees.
+    Buffers of parts, blocks and bands come in two sets if there are two jobs. `most` is the largest
+    fraction of the channels whose beam touches a part.
     """
-    lines, beam = view.lines, view.beam
+    lines, beam = model.lines, model.beam
     parts, part_pixels = layout.parts, layout.part_pixels
     normalise = beam is not None and beam.normalise
     of_band = min(band_parts(device, part_pixels, layout.across, normalise), parts)
     of_job = min(blocks.parts_at_once, of_band)
     bands, jobs_of_set = -(-parts // of_band), -(-of_band // of_job)
-    # Channels of the first set, and of the other that there is room for.
+    # Channels of the first set, and of the second one, which holds what is left.
     first = min(blocks.channels_at_once, lines.channels)
     rest = lines.channels - first if bands == 1 else first
     sets = [first, min(first, rest)]
@@ -132,14 +134,14 @@ def _memory_bytes(
     moving = lines.rx_velocity_m_s is not None
     bistatic = moving or not np.array_equal(lines.tx_m, lines.rx_m)
     rows = 6 + 6 * bistatic + 3 * moving + 3 * (beam is not None)
-    seen = [channel_pitch(min(n, math.ceil(most * lines.channels))) for n in sets]
+    visible = [channel_pitch(min(n, math.ceil(most * lines.channels))) for n in sets]
     if jobs_of_set > 1:
-        seen[1] = seen[0]
+        visible[1] = visible[0]
     part_bytes = 36 + (0 if blocks.terms else 12 * part_pixels)
     line_bytes = sum(
         8 * n * blocks.pitch + 4 * rows * (channel_pitch(n) + VECTOR_ROOM) for n in sets if n
     )
-    job_bytes = sum(of_job * (part_bytes + n * (12 + 4 * blocks.terms)) for n in seen if n)
+    job_bytes = sum(of_job * (part_bytes + n * (12 + 4 * blocks.terms)) for n in visible if n)
     band_bytes = 8 * (1 + normalise) * of_band * part_pixels
     table_bytes = 0 if beam is None else 16 * INTERVALS
     return int(min(bands, 2) * band_bytes + line_bytes + job_bytes + table_bytes)

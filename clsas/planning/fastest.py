@@ -17,7 +17,9 @@ from clsas.factorized.filters import Choice, Filters, steering_spectrum
 from clsas.factorized.interpolated import InterpolatedAperture
 from clsas.factorized.plan import Plan
 from clsas.opencl import phases
-from clsas.planning.errors import Errors, excess_error, other_errors, root_error
+from clsas.planning.beam_coverage import trimmed
+from clsas.planning.channels import frequencies
+from clsas.planning.errors import Errors, other_errors, root_error
 from clsas.planning.prediction import (
     OUTSIDE,
     Candidate,
@@ -27,7 +29,8 @@ from clsas.planning.prediction import (
     predicted_plan,
 )
 from clsas.planning.search import Allowed, Tree, root_limits, search
-from clsas.planning.view import View
+from clsas.planning.spacing_errors import spacing_error
+from clsas.planning.visibility_model import VisibilityModel
 
 # Shares of the error power allowed: for roots, for the spacing of all stages' virtual channels, for
 # the beam's edges that are left out, and for errors that every plan has.
@@ -45,14 +48,14 @@ class _Problem:
 
     Attributes
     ----------
-    view : View
+    view : VisibilityModel
         Without the edges of the beam, if there is one.
     conditions : Conditions
     designs : dict
         Filters designed before.
     """
 
-    view: View
+    view: VisibilityModel
     conditions: Conditions
     designs: dict[tuple[Choice, int, float], Filters] = field(default_factory=dict)
 
@@ -118,14 +121,14 @@ class _Trial:
 
 
 def fastest(
-    view: View, conditions: Conditions, seconds: float, choices: Allowed
+    view: VisibilityModel, conditions: Conditions, seconds: float, choices: Allowed
 ) -> tuple[Plan | None, float]:
     """Return the fastest plan within a tolerance, if it takes less than some seconds.
 
     Beside it, where there is none, the least memory of those that did not fit.
     """
     problem = _Problem(view, conditions)
-    problem = replace(problem, view=view.trimmed(_EDGES_SHARE * problem.allowed))
+    problem = replace(problem, view=trimmed(view, _EDGES_SHARE * problem.allowed))
     most_root = root_limits(problem.view, _ROOTS_SHARE * problem.allowed)
     needed, trial = math.inf, None
     if most_root is not None:
@@ -187,8 +190,8 @@ def _filters(problem: _Problem, trial: _Trial, tree: Tree) -> Filters | None:
         return None
     key = choice, stages, filters_db
     if key not in problem.designs:
-        frequencies, share = view.frequencies
-        steering = steering_spectrum(frequencies / view.highest_cycles_per_m, share)
+        cycles_per_m, share = frequencies(view)
+        steering = steering_spectrum(cycles_per_m / view.highest_cycles_per_m, share)
         problem.designs[key] = choice.design(view.spectrum, steering, stages, filters_db)
     return problem.designs[key]
 
@@ -211,7 +214,7 @@ def _estimated(
     )
     budget = ErrorBudget(
         roots=errors.roots,
-        spacing=sum(errors.nodes),
+        spacing=sum(errors.spacing),
         leaves=errors.leaves,
         beam_edges=problem.beam_edges,
     )
@@ -252,14 +255,14 @@ def _more_accurate(problem: _Problem, trial: _Trial, errors: Errors, found: Plan
     """
     allowed, last = problem.allowed, found.sides[-1]
     share = _SPACING_SHARE * allowed / len(found.sides)
-    excess = [max(of_stage - share, 0.0) for of_stage in errors.nodes]
+    excess = [max(of_stage - share, 0.0) for of_stage in errors.spacing]
     beam_cycles = trial.beam_cycles
     if excess[-1] and beam_cycles > 0:
         within = problem.view.within(found.sides[0])
-        without_beam = excess_error(
+        without_beam = spacing_error(
             within, last, found.factorization.aperture.filter, trial.oversampling[-1], None
         )
-        if 2 * without_beam < errors.nodes[-1]:  # most of it is the beam's
+        if 2 * without_beam < errors.spacing[-1]:  # most of it is the beam's
             if beam_cycles >= _MOST_BEAM_CYCLES:
                 return None  # no virtual channels follow a step
             beam_cycles, excess[-1] = 2 * beam_cycles, 0.0

@@ -22,7 +22,7 @@ from clsas.factorized.buffers import (
 from clsas.opencl.buffers import Buffer, Buffers, lines_buffer
 from clsas.opencl.device import Device
 from clsas.opencl.upsampling import upsampling_buffers
-from clsas.planning.view import View
+from clsas.planning.visibility_model import VisibilityModel
 from clsas.sonar.beam import INTERVALS
 
 _CACHED_BYTES, _BATCH_BYTES = 16 << 20, 256 << 20  # of a batch, on CPUs and elsewhere
@@ -36,7 +36,7 @@ class BufferSizes:
 
     Attributes
     ----------
-    view : View
+    view : VisibilityModel
     width : int
         Lanes of the device.
     sides, tile
@@ -54,7 +54,7 @@ class BufferSizes:
     half_precision : bool
     """
 
-    view: View
+    view: VisibilityModel
     width: int
     sides: tuple[tuple[int, int], ...]
     tile: tuple[int, int]
@@ -110,7 +110,7 @@ class BufferSizes:
         """Return the tiles or groups of a root, and its pixels, at most."""
         if self.view.surface.is_plane:
             return self._divided(self.tile), math.prod(self.sides[0])
-        pixels = self.view.most_slots(self.sides[-1], self.sides[0], self.width)
+        pixels = self.view.most_padded_pixels(self.sides[-1], self.sides[0], self.width)
         return pixels // (STACK * self.width), pixels
 
 

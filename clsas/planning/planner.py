@@ -20,6 +20,7 @@ from clsas.factorized.left_out import with_left_out
 from clsas.factorized.plan import Plan
 from clsas.factorized.thesis import NearestBeams
 from clsas.opencl.device import Device, open_device
+from clsas.planning.beam_coverage import coverage, partly_visible_share, sweeps_once
 from clsas.planning.costs import Costs
 from clsas.planning.costs import defaults as default_costs
 from clsas.planning.costs import measured as measured_costs
@@ -35,7 +36,7 @@ from clsas.planning.prediction import (
     predicted_plan,
 )
 from clsas.planning.search import MOST_STAGES, Allowed
-from clsas.planning.view import View
+from clsas.planning.visibility_model import VisibilityModel
 from clsas.signal import interpolation
 from clsas.sonar.beam import BeamWindow
 from clsas.sonar.coverage import warn_unreached
@@ -153,7 +154,9 @@ def plan(
     if memory_bytes is not None:
         memory_bytes = validate.count("memory_bytes", memory_bytes)
     model = Model(lines, grid, beam) if full_model else simplify(lines, grid, beam, tolerance_db)
-    view = View(model.lines, model.grid, model.beam, OUTSIDE * power(tolerance_db or 0.0))
+    view = VisibilityModel(
+        model.lines, model.grid, model.beam, OUTSIDE * power(tolerance_db or 0.0)
+    )
     rest_db = tolerance_db
     if tolerance_db is not None:
         view.ambiguity.warn("tolerance_db", tolerance_db)
@@ -178,7 +181,7 @@ def plan(
 
 
 def _chosen(
-    view: View,
+    view: VisibilityModel,
     tolerance_db: float | None,
     stages: list[tuple[int, int]] | None,
     device: Device,
@@ -259,20 +262,20 @@ def _worth_a_search(exact: Exact, costs: Costs, exact_fits: bool, allowed: Allow
     return not exact_fits or allowed is not None or costs.seconds(exact.work) > _SEARCH_S
 
 
-def _divisible(view: View) -> bool:
+def _divisible(view: VisibilityModel) -> bool:
     """Return whether an image can be factorized at all."""
-    if view.track is None or view.grid.size == 1 or not view.sweeps_once:
+    if view.track is None or view.grid.size == 1 or not sweeps_once(view):
         return False
     if view.beam is None:
         return True
     # Normalising divides by a small sum at the beam's edge, and amplifies errors there.
-    if view.beam.normalise and view.coverage(1).min() < _LEAST_COVERED:
+    if view.beam.normalise and coverage(view, 1).min() < _LEAST_COVERED:
         return False
     # If few pixels see a step of the beam, their error exceeds the prediction for all.
-    if view.beam.jumps and 0 < view.share_partial < _LEAST_PARTIAL:
+    if view.beam.jumps and 0 < partly_visible_share(view) < _LEAST_PARTIAL:
         return False
     # If hardly any pixel is visible there is little to gain, and errors are not predictable.
-    return float(view.coverage(2).mean()) >= _LEAST_SHARE_COVERED
+    return float(coverage(view, 2).mean()) >= _LEAST_SHARE_COVERED
 
 
 def decibels(wavelengths: float) -> float:
@@ -285,7 +288,9 @@ def wavelengths(decibels: float) -> float:
     return 10 ** (decibels / 20) * math.sqrt(3) / (4 * math.pi)
 
 
-def _nearest(view: View, stages: Sequence[tuple[int, int]], conditions: Conditions) -> Plan:
+def _nearest(
+    view: VisibilityModel, stages: Sequence[tuple[int, int]], conditions: Conditions
+) -> Plan:
     """Return the plan of THESIS chapter 4: nearest beams, linear interpolation in range."""
     rows, columns = view.grid.shape
     division = math.prod(divisions for _, divisions in stages)
@@ -313,7 +318,7 @@ def _nearest(view: View, stages: Sequence[tuple[int, int]], conditions: Conditio
     return replace(found, prediction=replace(found.prediction, stages=(*divided, last)))
 
 
-def _tile(view: View, leaf: tuple[int, int], device: Device) -> tuple[int, int]:
+def _tile(view: VisibilityModel, leaf: tuple[int, int], device: Device) -> tuple[int, int]:
     """Return the largest tiles of a leaf that may be expanded about their centres."""
     parts = [
         (rows, columns)

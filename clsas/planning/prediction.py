@@ -28,10 +28,11 @@ from clsas.factorized.thesis import NearestBeams
 from clsas.opencl import phases
 from clsas.opencl.buffers import padded_length
 from clsas.opencl.device import Device
+from clsas.planning.channels import peak_density
 from clsas.planning.costs import Costs
 from clsas.planning.exact_image import Exact
 from clsas.planning.memory import BufferSizes, batches_within
-from clsas.planning.view import View
+from clsas.planning.visibility_model import VisibilityModel
 from clsas.signal import interpolation
 from clsas.signal.interpolation import PHASES, Interpolator, Resampling, Upsampler
 
@@ -110,13 +111,13 @@ class _Lines:
 
 
 def predicted_plan(
-    view: View, candidate: Candidate, other_errors: ErrorBudget, conditions: Conditions
+    view: VisibilityModel, candidate: Candidate, other_errors: ErrorBudget, conditions: Conditions
 ) -> Plan:
     """Return the plan of a candidate, with its predicted error, time and memory.
 
     Parameters
     ----------
-    view : View
+    view : VisibilityModel
         That within the candidate's roots, where the aperture is interpolated.
     candidate : Candidate
     other_errors : ErrorBudget
@@ -166,7 +167,7 @@ def predicted_plan(
     return _plan(view, image, conditions, batches.memory_bytes, stages, work, errors)
 
 
-def exact_plan(view: View, conditions: Conditions) -> Plan:
+def exact_plan(view: VisibilityModel, conditions: Conditions) -> Plan:
     """Return the plan of the exact image."""
     exact = conditions.exact
     image = ExactImage(accuracy_db=exact.accuracy_db)
@@ -175,19 +176,19 @@ def exact_plan(view: View, conditions: Conditions) -> Plan:
     return replace(plan, prediction=replace(plan.prediction, error_db=exact.accuracy_db))
 
 
-def margin_db(view: View) -> float:
+def margin_db(view: VisibilityModel) -> float:
     """Return the margin of predicted errors, dB, which covers the scatter of measured ones.
 
     Errors scatter more if few channels see a pixel: they depend on the positions of these between
     virtual channels, and relative to a step of the beam. They also scatter more if the lines'
     power lies at few frequencies.
     """
-    channels = view.lines.channels * view.share_seen((16, 16))
+    channels = view.lines.channels * view.visible_share((16, 16))
     few = _FEW_CHANNELS[view.beam is not None and view.beam.jumps]
     return MARGIN_DB + in_db(view.spectrum.scatter * (1 + few / max(channels, 1.0)))
 
 
-def band_of(view: View, outside: float) -> tuple[float, float]:
+def band_of(view: VisibilityModel, outside: float) -> tuple[float, float]:
     """Return the centre and half width of the band that holds all but a share of the power."""
     spectrum = view.spectrum
     bins = np.searchsorted(np.cumsum(spectrum.share), 1 - outside)
@@ -203,7 +204,7 @@ def half_precision_error(stages: int) -> float:
 
 
 def _plan(
-    view: View,
+    view: VisibilityModel,
     image: Factorization | ExactImage,
     conditions: Conditions,
     memory_bytes: int,
@@ -233,7 +234,7 @@ def _plan(
     )
 
 
-def _upsampled(view: View, candidate: Candidate, other_errors: ErrorBudget) -> _Lines:
+def _upsampled(view: VisibilityModel, candidate: Candidate, other_errors: ErrorBudget) -> _Lines:
     """Return how lines are upsampled, and the errors of all filters.
 
     A gain that makes up for the range filters' attenuation leaves only their scatter.
@@ -260,7 +261,7 @@ def _upsampled(view: View, candidate: Candidate, other_errors: ErrorBudget) -> _
 
 
 def _stages(
-    view: View,
+    view: VisibilityModel,
     candidate: Candidate,
     lines: _Lines,
     levels: Sequence[Level],
@@ -299,7 +300,7 @@ def _stages(
             operations=combined * samples,
             error_db=error_db,
         )
-    pixels, backprojected = view.slots(side, width), count * of_stage.count
+    pixels, backprojected = view.padded_pixels(side, width), count * of_stage.count
     tiled, weighted = view.surface.is_plane, view.beam is not None
     taps = candidate.final.taps
     work = backprojecting_leaves(backprojected, pixels, taps, tiled=tiled, weighted=weighted)
@@ -318,7 +319,7 @@ def _stages(
 
 
 def _with_arithmetic(
-    view: View, lines: _Lines, channels: Sequence[StageChannels], conditions: Conditions
+    view: VisibilityModel, lines: _Lines, channels: Sequence[StageChannels], conditions: Conditions
 ) -> tuple[ErrorBudget, bool]:
     """Add the errors of polynomials and rounding; return whether lines have half precision."""
     tolerance_db, errors = conditions.tolerance_db, lines.errors
@@ -333,7 +334,7 @@ def _with_arithmetic(
     return replace(errors, half_precision=rounding), True
 
 
-def _half_rounding(view: View, summed: Sequence[float]) -> float:
+def _half_rounding(view: VisibilityModel, summed: Sequence[float]) -> float:
     """Return the error power of rounding lines to half precision.
 
     `summed` is the number of channels that a virtual one sums, stage by stage. Upsampled lines are
@@ -341,7 +342,7 @@ def _half_rounding(view: View, summed: Sequence[float]) -> float:
     grows, which counts as half. A sum of very many chunks loses what is added last.
     """
     chunks = np.array(summed) / CHUNK
-    chunks[0] *= view.densest
+    chunks[0] *= peak_density(view)
     if chunks.max() > _MOST_CHUNKS:
         return np.inf
     return HALF_ROUNDING * (1 + float(np.sum(1 + chunks / 2)))

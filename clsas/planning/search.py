@@ -1,10 +1,15 @@
-"""The fastest tree of subimages whose filters err by no more than allowed."""
+"""The fastest tree of subimages whose filters err by no more than allowed.
+
+For every root, number of stages and choice of filters, the fastest division down to the leaves is a
+shortest path over the sizes of subimages (dynamic programming). Roots are tried in the order of a
+lower bound of their time, until none of the others can be faster.
+"""
 
 from __future__ import annotations
 
 import functools
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import product
 
 import numpy as np
@@ -15,15 +20,21 @@ from clsas.factorized.buffers import LEAST_BATCH
 from clsas.factorized.estimates import Work, backprojecting_leaves, combining, upsampling
 from clsas.factorized.filters import ALIGN_TAPS, APERTURE_TAPS, UPSAMPLING_SHARE, Choice, choose
 from clsas.opencl.device import Device
+from clsas.planning.caching import cached
 from clsas.planning.costs import Costs
 from clsas.planning.errors import leaf_error, root_error
-from clsas.planning.view import View
+from clsas.planning.visibility_model import Side, VisibilityModel, mean_over_points
 from clsas.signal.interpolation import PHASES, upsampler
 from clsas.signal.spectrum import Spectrum
 
-_ROWS = (16, 32, 64, 128, 256, 512, 1024, 2048)  # of subimages
+_ROWS = (16, 32, 64, 128, 256, 512, 1024, 2048)  # of subimages, from whole work-items on
 _COLUMNS = (4, 8, 16, 32, 64, 128, 256, 512, 1024, 2048)
 MOST_STAGES = 5
+"""Most stages of a tree. More add errors without saving work."""
+# Share of the filters' error power that expanding a leaf may add. Half of it leaves some near grids
+# without a leaf, so that they are imaged exactly; twice gains 3 % of time.
+_LEAF_SHARE = 0.25
+_SPARE_SAMPLES = 16  # of a line, for filters and padding; twice moves times by 3 % at most
 
 
 @dataclass(frozen=True)
@@ -37,9 +48,9 @@ class Allowed:
 
 @dataclass(frozen=True)
 class Tree:
-    """Sizes of subimages, and taps of the filters between them."""
+    """Sizes of subimages from the roots to the leaves, and taps of the filters between them."""
 
-    sides: tuple[tuple[int, int], ...]
+    sides: tuple[Side, ...]
     align_taps: int
     aperture_taps: int
 
@@ -49,183 +60,248 @@ class Tree:
 
 
 @dataclass(frozen=True, eq=False)
-class _Sizes:
-    """Subimages of every size, [sizes] each.
+class Sizes:
+    """Subimages of every size that the search considers, [sizes] each.
 
     Attributes
     ----------
-    view : View
-    sides : int [sizes, 2]
+    model : VisibilityModel
+    sides : int64 [sizes, 2]
         Rows and columns.
-    counts : int
+    counts : float64
         Number that hold a pixel.
-    slots : float
-        Mean number of pixels, padded to whole work-items.
-    share : float
-        Share of the channels that see any of one.
-    reach_m : float
+    padded_pixels : float64
+        Mean pixel count, padded to whole work-items.
+    visible_share : float64
+        Mean fraction of the channels whose beam touches one.
+    half_range_extent_m : float64
         Largest difference in range between a pixel and the centre.
-    beam_turns : float
-        Cycles of the beam's weights that virtual channels of a leaf must follow.
-    leaf : bool
-        True where leaves may have this size.
+    beam_cycles : float64
+        Phase cycles of a beam's weights along the visible aperture; see `tree.beam_rate`.
+    leaf_error : float64
+        Error power that expanding a leaf of this size adds.
     """
 
-    view: View
+    model: VisibilityModel
     sides: NDArray[np.int64]
-    counts: NDArray[np.int64]
-    slots: NDArray[np.float64]
-    share: NDArray[np.float64]
-    reach_m: NDArray[np.float64]
-    beam_turns: NDArray[np.float64]
-    leaf: NDArray[np.bool_]
+    counts: NDArray[np.float64]
+    padded_pixels: NDArray[np.float64]
+    visible_share: NDArray[np.float64]
+    half_range_extent_m: NDArray[np.float64]
+    beam_cycles: NDArray[np.float64]
+    leaf_error: NDArray[np.float64]
+    _in_roots: dict[int, Division] = field(default_factory=dict, init=False)
 
     @functools.cached_property
-    def pairs(self) -> list[tuple[int, int]]:
+    def pairs(self) -> tuple[Side, ...]:
         """`sides` as pairs of int."""
-        return [(int(rows), int(columns)) for rows, columns in self.sides]
+        return tuple((int(rows), int(columns)) for rows, columns in self.sides)
 
     @functools.cached_property
-    def inside(self) -> NDArray[np.bool_]:
+    def divides(self) -> NDArray[np.bool_]:
         """True where subimages of one size divide into those of another, [sizes, sizes]."""
         return (self.sides[:, None] % self.sides == 0).all(axis=-1)
 
-    def cycles(
-        self, root: tuple[int, int], within: NDArray[np.int64] | slice = slice(None)
-    ) -> NDArray[np.float64]:
-        """Return the cycles that phases turn by in a root.
+    @functools.cached_property
+    def anywhere(self) -> Division:
+        """All sizes, with the phases at the sample points: lower bounds of those in a root."""
+        return self._division((0, 0), np.arange(len(self.sides)))
 
-        Entry [i, j]: while a subimage of size i is seen, the phases of one of size j.
-        """
-        sides = [tuple(side) for side in self.sides[within].tolist()]
-        extents = [self.view.extents(side, root=root if any(root) else None) for side in sides]
-        return self.view.cycles_in_root(root, sides) @ np.stack(extents).T
+    def in_root(self, root: int) -> Division:
+        """Return the sizes that divide a root, with the largest phases in it."""
+        if root not in self._in_roots:
+            index = np.flatnonzero(self.divides[root])
+            self._in_roots[root] = self._division(self.pairs[root], index)
+        return self._in_roots[root]
 
-    def in_root(self, root: int) -> _Within:
-        """Return the sizes that divide a root."""
-        within = np.flatnonzero(self.inside[root])
-        return _Within.of(self, within, self.cycles(self.pairs[root], within))
+    def _division(self, root: Side, index: NDArray[np.int64]) -> Division:
+        """Return some sizes with their phases in a root, whose rows are 0 for sample points."""
+        if self.model.surface.is_plane:
+            extents = self.sides[index].astype(np.float64)
+        else:
+            of_root = root if any(root) else None
+            extents = np.stack([self.model.extents(self.pairs[i], root=of_root) for i in index])
+        cycles = self.model.phase_cycles_in_root(root, self.pairs)[index] @ extents.T
+        smaller = self.divides[np.ix_(index, index)].T & (index[:, None] != index)
+        return Division(index, cycles, np.where(smaller, 0.0, np.inf))
 
 
 @dataclass(frozen=True, eq=False)
-class _Within:
-    """The sizes that divide a root.
+class Division:
+    """Sizes that subimages in a root may have.
 
     Attributes
     ----------
-    sizes : int [n]
-        Their indices.
-    turns, of_leaf : float [n, n], [n]
-        Cycles of a parent of size j that a child of size i uses; and those of leaves.
-    step_s : float [n, n]
+    index : int64 [n]
+        Which of the `Sizes`.
+    cycles : float64 [n, n]
+        Phase of a parent of size j, accumulated where a child of size i is visible.
+    divisible_s : float64 [n, n]
         0 where a parent of size j may divide into children of size i, else infinite.
     """
 
-    sizes: NDArray[np.int64]
-    turns: NDArray[np.float64]
-    of_leaf: NDArray[np.float64]
-    step_s: NDArray[np.float64]
-
-    @classmethod
-    def of(cls, sizes: _Sizes, within: NDArray[np.int64], turns: NDArray[np.float64]) -> _Within:
-        smaller = sizes.inside[np.ix_(within, within)].T & (within[:, None] != within)
-        of_leaf = np.diag(turns) + sizes.beam_turns[within]
-        return cls(within, turns, of_leaf, np.where(smaller, 0.0, np.inf))
+    index: NDArray[np.int64]
+    cycles: NDArray[np.float64]
+    divisible_s: NDArray[np.float64]
 
 
-def _sizes(
-    view: View, device: Device, filters_db: float, leaf_pixels: int, beam_cycles: float
-) -> _Sizes:
-    """Return all sizes of subimages that a grid may be divided into."""
+@cached
+def all_sizes(model: VisibilityModel, most: Side, device: Device) -> Sizes:
+    """Return the sizes of subimages up to `most` rows and columns."""
     rows, columns = (
-        [side for side in sides if side < 2 * max(n, min(sides))]
-        for sides, n in zip((_ROWS, _COLUMNS), view.surface.plane.shape, strict=True)
+        [side for side in sides if side <= limit and side < 2 * max(n, min(sides))]
+        for sides, n, limit in zip((_ROWS, _COLUMNS), model.surface.plane.shape, most, strict=True)
     )
-    pairs = list(product(rows, columns))
-    sides = np.array(pairs)
-    beam_turns = np.zeros(len(sides))
-    if view.beam is not None:
-        beam_turns[:] = [view.cycles(view.beam_rates, view.seen(side)) for side in pairs]
-    curved = leaf_error(view, sides, device) > 0.25 * power(filters_db)
-    return _Sizes(
-        view,
+    pairs = tuple(product(rows, columns))
+    sides = np.array(pairs, np.int64).reshape(-1, 2)
+    if not pairs:
+        return Sizes(model, sides, *np.zeros((6, 0)))
+    visible = model.visible_by_size(pairs)
+    share = mean_over_points(visible.sum(axis=-1)) / np.count_nonzero(model.on_track)
+    beam_cycles = np.zeros(len(sides))
+    if model.beam is not None:
+        rates = model.beam_rates * model.spacing
+        beam_cycles = mean_over_points(np.einsum("nps,ps->np", visible, rates))
+    return Sizes(
+        model,
         sides,
-        counts=np.array([view.subimages(side) for side in pairs]),
-        slots=np.array([view.slots(side, device.info.width) for side in pairs]),
-        share=np.array([view.share_seen(side) for side in pairs]),
-        reach_m=np.array([view.reach_m(side) for side in pairs]),
-        beam_turns=beam_cycles * beam_turns,
-        leaf=~curved & (np.prod(sides, axis=1) >= leaf_pixels),
+        counts=np.array([float(model.subimages(side)) for side in pairs]),
+        padded_pixels=np.array([model.padded_pixels(side, device.info.width) for side in pairs]),
+        visible_share=share,
+        half_range_extent_m=model.half_range_extents_m(pairs),
+        beam_cycles=beam_cycles,
+        leaf_error=leaf_error(model, sides, device),
     )
 
 
 @dataclass(frozen=True, eq=False)
-class _Option:
-    """Filters for a number of stages, and the time that things take with them.
+class Options:
+    """Choices of filters and numbers of stages, and the time that things take with each.
 
     Attributes
     ----------
-    choice : Choice
-    stages : int
-    channel_s : float [sizes]
-        Of every channel of all subimages of a size, in stages after the first.
-    subimages_s : float [sizes]
-        Of these subimages besides.
-    leaves_s : float [sizes]
-        Of every virtual channel of all leaves of a size; infinite where leaves may not have it.
-    roots_s : float [sizes]
-        Of the first stage with roots of a size, and of all that does not depend on the division.
+    choices : list of Choice, [options]
+    stages : int64 [options]
+        Never increasing.
+    density, ends : float64 [options, 1, 1]
+        Virtual channels per cycle, and those besides; see `VisibilityModel.virtual_channels`.
+    channel_s : float64 [options, sizes]
+        Each channel of all subimages of a size, in stages after the first.
+    subimages_s : float64 [sizes]
+        These subimages themselves.
+    leaves_s : float64 [options, sizes]
+        Each virtual channel of all leaves of a size; infinite where leaves may not have it.
+    roots_s : float64 [options, sizes]
+        The first stage with roots of a size, and all that does not depend on the division.
+    leaf_beam_cycles : float64 [sizes]
+        Phase cycles that the beam's weights add to those of a leaf.
     """
 
-    choice: Choice
-    stages: int
+    choices: list[Choice]
+    stages: NDArray[np.int64]
+    density: NDArray[np.float64]
+    ends: NDArray[np.float64]
     channel_s: NDArray[np.float64]
     subimages_s: NDArray[np.float64]
     leaves_s: NDArray[np.float64]
     roots_s: NDArray[np.float64]
+    leaf_beam_cycles: NDArray[np.float64]
 
-    def channels(self, view: View, turns: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the virtual channels of subimages whose phases turn by so many cycles."""
-        return view.channels(self.choice.aperture_taps, 2 * self.choice.density, turns)
+    def onward_s(
+        self, division: Division, some: NDArray[np.int64]
+    ) -> tuple[list[NDArray[np.float64]], NDArray[np.float64]]:
+        """Least time from subimages of every size to their pixels, with some options [m].
+
+        Returns
+        -------
+        list of float64 [m, n]
+            Seconds with 1, 2, ... stages left; the last is that of the roots.
+        float64 [m, n, n]
+            Seconds of a step to children of size i from parents of size j.
+        """
+        index = division.index
+        density, ends = self.density[some], self.ends[some]
+        # A child uses those of its parent's channels whose beam touches it.
+        step_s = density * division.cycles
+        step_s += ends
+        step_s *= self.channel_s[some][:, index, None]
+        step_s += self.subimages_s[index, None]
+        step_s += division.divisible_s
+        leaf_cycles = np.diag(division.cycles) + self.leaf_beam_cycles[index]
+        onward_s = (density[..., 0] * leaf_cycles + ends[..., 0]) * self.leaves_s[some][:, index]
+        by_stages = [onward_s]
+        for left in range(2, int(self.stages[some].max()) + 1):
+            more = int(np.count_nonzero(self.stages[some] >= left))
+            onward_s = onward_s.copy()
+            onward_s[:more] = (step_s[:more] + onward_s[:more, :, None]).min(axis=1)
+            by_stages.append(onward_s)
+        return by_stages, step_s
+
+    def path(self, division: Division, option: int, root: int) -> list[int]:
+        """Return the sizes of the fastest tree from a root, as indices into `Sizes`."""
+        by_stages, step_s = self.onward_s(division, np.array([option]))
+        path = [int(np.searchsorted(division.index, root))]
+        for onward_s in by_stages[-2::-1]:
+            path.append(int((step_s[0, :, path[-1]] + onward_s[0]).argmin()))
+        return [int(division.index[each]) for each in path]
 
 
-def _options(sizes: _Sizes, filters_db: float, costs: Costs, allowed: Allowed) -> list[_Option]:
-    """Return all choices of filters, and the time that things take with each."""
-    view, options = sizes.view, []
-    counts, channels = sizes.counts, view.lines.channels
-    batches = np.maximum(counts / LEAST_BATCH, 1.0)
+def all_options(
+    sizes: Sizes,
+    filters_db: float,
+    leaf_pixels: int,
+    beam_cycles: float,
+    costs: Costs,
+    allowed: Allowed,
+) -> Options | None:
+    """Return all choices of filters that err by no more than `filters_db`; None without any."""
+    model, counts, channels = sizes.model, sizes.counts, sizes.model.lines.channels
+    choices, stages = [], []
+    most_first = sorted(allowed.stages, reverse=True)
+    for number, align, aperture in product(most_first, allowed.align_taps, allowed.aperture_taps):
+        choice = choose(model.spectrum, align, aperture, number, filters_db)
+        if choice is not None:
+            choices.append(choice)
+            stages.append(number)
+    if not choices:
+        return None
+    numbers = [(c.rate, c.final_taps, c.align_taps + c.aperture_taps) for c in choices]
+    rate, final_taps, taps = np.array(numbers).T[..., None]
+    samples = 2 * sizes.half_range_extent_m * rate / model.lines.range_step_m
+    samples += final_taps + _SPARE_SAMPLES
+    roots = combining(counts * sizes.visible_share * channels, samples, taps, given=True)
+    batches = np.maximum(counts / LEAST_BATCH, 1.0) * np.array(stages)[:, None]
+    roots += Work(reference=counts * channels, subimage=counts, batch=batches)
     most_db = filters_db + in_db(UPSAMPLING_SHARE)
-    filtered = upsampler(view.spectrum, PHASES // 2, np.ones_like, most_db) is not None
-    tiled, weighted = view.surface.is_plane, view.beam is not None
-    for stages, *taps in product(allowed.stages, allowed.align_taps, allowed.aperture_taps):
-        choice = choose(view.spectrum, *taps, stages, filters_db)
-        if choice is None:
-            continue
-        samples = 2 * sizes.reach_m * choice.rate / view.lines.range_step_m
-        samples += choice.final_taps + 16
-        leaves = backprojecting_leaves(
-            counts, sizes.slots, choice.final_taps, tiled=tiled, weighted=weighted
-        )
-        of_roots = combining(counts * sizes.share * channels, samples, sum(taps), given=True)
-        of_roots += Work(reference=counts * channels, subimage=counts, batch=batches * stages)
-        of_roots += upsampling(view.lines.samples.size * choice.rate, filtered=filtered)
-        options.append(
-            _Option(
-                choice,
-                stages,
-                channel_s=costs.seconds(combining(counts, samples, sum(taps), given=False)),
-                subimages_s=costs.seconds(Work(subimage=counts)),
-                leaves_s=np.where(sizes.leaf, costs.seconds(leaves), np.inf),
-                roots_s=costs.seconds(of_roots),
-            )
-        )
-    return options
+    filtered = upsampler(model.spectrum, PHASES // 2, np.ones_like, most_db) is not None
+    roots += upsampling(model.lines.samples.size * rate, filtered=filtered)
+    tiled, weighted = model.surface.is_plane, model.beam is not None
+    pixels = sizes.padded_pixels
+    leaves_s = {
+        n: costs.seconds(backprojecting_leaves(counts, pixels, n, tiled=tiled, weighted=weighted))
+        for n in {choice.final_taps for choice in choices}
+    }
+    leaf = sizes.leaf_error <= _LEAF_SHARE * power(filters_db)
+    leaf &= np.prod(sizes.sides, axis=1) >= leaf_pixels
+    density = np.array([2 * choice.density for choice in choices])
+    aperture_taps = np.array([choice.aperture_taps for choice in choices])
+    return Options(
+        choices,
+        np.array(stages),
+        density[:, None, None],
+        np.array(model.virtual_channels(aperture_taps, 0.0, 0.0))[:, None, None],
+        channel_s=np.asarray(costs.seconds(combining(counts, samples, taps, given=False))),
+        subimages_s=np.asarray(costs.seconds(Work(subimage=counts))),
+        leaves_s=np.where(leaf, np.array([leaves_s[c.final_taps] for c in choices]), np.inf),
+        roots_s=np.asarray(costs.seconds(roots)),
+        leaf_beam_cycles=beam_cycles * sizes.beam_cycles,
+    )
 
 
 def search(
-    view: View,
+    model: VisibilityModel,
     filters_db: float,
-    most: tuple[int, int],
+    most: Side,
     leaf_pixels: int,
     beam_cycles: float,
     device: Device,
@@ -236,75 +312,47 @@ def search(
 
     None where there is none with roots of `most` rows and columns and leaves of `leaf_pixels` at
     least.
-
-    For every root, number of stages and choice of filters, the fastest way to the leaves is a
-    shortest path over the sizes that subimages may have. Those are tried first that could be
-    fastest, until none of the others can be.
     """
-    sizes = _sizes(view, device, filters_db, leaf_pixels, beam_cycles)
-    options = _options(sizes, filters_db, costs, allowed)
-    roots = np.flatnonzero((sizes.sides <= most).all(axis=1))
-    if not options or not roots.size:
+    sizes = all_sizes(model, most, device)
+    options = all_options(sizes, filters_db, leaf_pixels, beam_cycles, costs, allowed)
+    if options is None or not sizes.pairs:
         return None
-    # In a root phases turn no less than in the middle of it.
-    anywhere = _Within.of(sizes, np.arange(len(sizes.sides)), sizes.cycles((0, 0)))
-    roots_s = np.array([option.roots_s for option in options])
-    least_s = np.array([_onward(view, option, anywhere)[0] for option in options])
-    least_s = (roots_s + least_s)[:, roots]
-    in_root = functools.cache(sizes.in_root)
-    best_s, best = math.inf, None
-    for place in np.argsort(least_s, axis=None, kind="stable"):
-        if least_s.flat[place] >= best_s:
+    # The phase rate is lowest at a root's centre, so these are lower bounds.
+    every = np.arange(len(options.choices))
+    bound_s = options.roots_s + options.onward_s(sizes.anywhere, every)[0][-1]
+    least_s = bound_s.min(axis=0)
+    best_s, best = math.inf, (0, 0)
+    for root in map(int, np.argsort(least_s, kind="stable")):
+        if least_s[root] >= best_s:
             break
-        index, root = place // len(roots), int(roots[place % len(roots)])
-        within = in_root(root)
-        onward_s, children = _onward(view, options[index], within)
-        size = int(np.searchsorted(within.sizes, root))
-        cost_s = roots_s[index, root] + onward_s[size]
-        if cost_s < best_s:
-            path = [size]
-            for each in children:
-                path.append(int(each[path[-1]]))
-            choice = options[index].choice
-            sides = tuple(sizes.pairs[within.sizes[size]] for size in path)
-            best_s, best = cost_s, Tree(sides, choice.align_taps, choice.aperture_taps)
-    return best
+        division = sizes.in_root(root)
+        some = np.flatnonzero(bound_s[:, root] < best_s)
+        size = int(np.searchsorted(division.index, root))
+        cost_s = options.roots_s[some, root] + options.onward_s(division, some)[0][-1][:, size]
+        fastest = int(cost_s.argmin())
+        if cost_s[fastest] < best_s:
+            best_s, best = float(cost_s[fastest]), (int(some[fastest]), root)
+    if best_s == math.inf:
+        return None
+    option, root = best
+    path = options.path(sizes.in_root(root), option, root)
+    choice = options.choices[option]
+    return Tree(tuple(sizes.pairs[i] for i in path), choice.align_taps, choice.aperture_taps)
 
 
-def _onward(
-    view: View, option: _Option, within: _Within
-) -> tuple[NDArray[np.float64], list[NDArray[np.int64]]]:
-    """Return the seconds from subimages of each size to pixels, in the stages left.
-
-    Beside it, stage by stage, the best size of children (an index into `within.sizes`).
-    """
-    # To a child of size i from a parent of size j: the channels of the parent that it uses.
-    step_s = option.channels(view, within.turns)
-    step_s *= option.channel_s[within.sizes, None]
-    step_s += option.subimages_s[within.sizes, None]
-    step_s += within.step_s
-    onward_s = option.channels(view, within.of_leaf) * option.leaves_s[within.sizes]
-    children = []
-    for _ in range(option.stages - 1):
-        through_s = step_s + onward_s[:, None]
-        children.append(best := through_s.argmin(axis=0))
-        onward_s = through_s[best, np.arange(len(best))]
-    return onward_s, children[::-1]
-
-
-def root_limits(view: View, allowed: float) -> tuple[int, int] | None:
+def root_limits(model: VisibilityModel, allowed: float) -> Side | None:
     """Return the largest rows and columns of roots that keep their errors within a power.
 
     None where there are none.
     """
     rows, columns = (
         min((side for side in sides if side >= n), default=sides[-1])
-        for sides, n in zip((_ROWS, _COLUMNS), view.surface.plane.shape, strict=True)
+        for sides, n in zip((_ROWS, _COLUMNS), model.surface.plane.shape, strict=True)
     )
-    while root_error(view, (rows, columns)) > allowed:
+    while root_error(model, (rows, columns)) > allowed:
         smaller = [(rows // 2, columns), (rows, columns // 2)]
         smaller = [side for side in smaller if side[0] >= _ROWS[0] and side[1] >= _COLUMNS[0]]
         if not smaller:
             return None
-        rows, columns = min(smaller, key=functools.partial(root_error, view))
+        rows, columns = min(smaller, key=functools.partial(root_error, model))
     return rows, columns

@@ -22,15 +22,15 @@ from clsas.sonar.beam import BeamWindow
 from clsas.sonar.visibility import sines
 
 _AT_END = 0.03  # error near an end over its power; measured on noise in 40 to 90 % of the band
-_END = 4  # samples whose mean power is that of an end
-_NEAR_END = 5  # samples around an end within which interpolators differ
-_CUT, _FADING = (
-    0.01,
-    16,
-)  # an end fades if its power is below 1 % of the last 16 samples'
+_END = 4  # samples whose mean power is that of an end: the taps on one side of a filter
+_NEAR_END = 5  # samples around an end within which interpolators differ: half of 8 taps, and one
+_CUT = 0.01  # an end fades if its power is below this share of that of the last samples
+_FADING = 16  # these samples
 _THIN = 0.42  # half bandwidth, cycles per sample, up to which a cut only affects `_NEAR_END`
-_CHANNELS, _POINTS = 64, 16  # sampled channels, and sample points along either side of the grid
-_MOST, _LEAST = 0.5, 1e-3  # shares of the allowed error power: above, warn; below, ignore
+_CHANNELS = 64  # sampled; half or twice as many change nothing
+_POINTS = 16  # sampled along either side of the grid
+_MOST = 0.5  # share of the allowed error power above which to warn: 3 dB more than requested
+_LEAST = 1e-3  # share of the allowed error power below which to ignore it
 
 
 @dataclass(frozen=True)
@@ -146,23 +146,25 @@ def ends_error(
     steepness = np.tan(np.pi * half_width) - np.tan(np.pi * _THIN)
     inside = steepness / (4 * np.pi**3 * half_width)
     last = lines.length - 1
-    at_ends, total = 0.0, 0.0
-    for samples, near, far in zip(part.samples, nearest, farthest, strict=True):
-        line = samples.astype(np.complex128)
-        within = line[int(np.clip(near, 0, last)) : int(np.clip(far, -1, last)) + 1]
-        if not within.size:
-            continue
-        total += _mean_square(within) * len(within)
-        # Samples from either end on, and the distances of the nearest and the farthest pixel.
-        for end, first, beyond in ((line, near, far), (line[::-1], last - far, last - near)):
-            share = _AT_END if first < _NEAR_END and beyond > -_NEAR_END else 0.0
-            if _mean_square(end[:1]) > _CUT * _mean_square(end[:_FADING]):
-                first = max(first, _NEAR_END)
-                share += inside * max(1 / first - 1 / max(beyond, first), 0.0)
-            at_ends += share * _mean_square(end[:_END])
-    return at_ends / total if total else 0.0
-
-
-def _mean_square(samples: NDArray[np.complex128]) -> float:
-    """Mean square of samples."""
-    return float(np.vdot(samples, samples).real) / len(samples)
+    first = np.clip(nearest, 0, last).astype(np.int64)
+    end = np.clip(farthest, -1, last).astype(np.int64) + 1
+    square = part.samples.real.astype(np.float64) ** 2
+    square += part.samples.imag.astype(np.float64) ** 2
+    imaged = end > first
+    if not imaged.any():
+        return 0.0
+    at_ends = np.zeros(len(some))
+    # Samples from either end on, and the distances of the nearest and the farthest pixel.
+    for samples, near, far in (
+        (square, nearest, farthest),
+        (square[:, ::-1], last - farthest, last - nearest),
+    ):
+        share = np.where((near < _NEAR_END) & (far > -_NEAR_END), _AT_END, 0.0)
+        ends_loudly = samples[:, 0] > _CUT * samples[:, :_FADING].mean(axis=1)
+        near = np.maximum(near, _NEAR_END)
+        share += ends_loudly * inside * np.maximum(1 / near - 1 / np.maximum(far, near), 0.0)
+        at_ends += share * samples[:, :_END].mean(axis=1)
+    index = np.arange(lines.length)
+    within = (index >= first[:, None]) & (index < end[:, None])
+    total = square.sum(where=within)
+    return float(at_ends[imaged].sum() / total) if total else 0.0

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import scipy.fft
 from numpy.typing import NDArray
-from scipy.linalg import lstsq
+from scipy.linalg import cho_factor, cho_solve, toeplitz
 
 from clsas.core import reprs, validate
 from clsas.core.lines import RangeLines
@@ -27,8 +28,10 @@ _UPSAMPLING_COST = 40.0  # host time of one upsampled sample, in units of `COST`
 Gain = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 """Spectral gain as a function of the distance from the spectral centre, cycles per sample."""
 
-_POSITIONS = 17  # between two samples, at which filters are fitted
-_SCATTER_DB = 0.5  # margin for the scatter of measured errors around the predicted one
+_NOISE_FLOOR = 1e-13  # of the power, in every bin: keeps fits regular where the band is empty
+_POSITIONS = 17  # between two samples, at which filters are fitted; half or twice: 0.3 dB
+_SINGULAR = np.finfo(np.float64).eps  # relative singular values below this are rounding
+_SCATTER_DB = 0.5  # margin for the scatter of measured errors, of exact images too
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,34 +111,63 @@ def design(taps: int, upsampling: float, spectrum: Spectrum) -> Interpolator:
     Its real and imaginary parts are two separate least-squares problems in the coefficients of the
     polynomials, weighted by the power at f. Linear interpolation is fixed: E = 1/2, O = 1.
     """
-    f = spectrum.frequency / upsampling
-    nu = np.linspace(-0.5, 0.5, _POSITIONS)
-    turns = 2 * np.pi * np.outer(f, np.arange(taps // 2) + 0.5)
-    even = nu[:, None] ** (2 * np.arange(taps // 2)[::-1])
-    aims = np.cos(2 * np.pi * np.outer(f, nu)), np.sin(2 * np.pi * np.outer(f, nu))
-    bases = (2 * np.cos(turns), even), (2 * np.sin(turns), nu[:, None] * even)
+    return designs(taps, [upsampling], spectrum)[0]
+
+
+def designs(taps: int, upsamplings: Sequence[float], spectrum: Spectrum) -> list[Interpolator]:
+    """Return what `design` returns for each of some upsamplings, in one go."""
+    rate = np.array(upsamplings, np.float64)[:, None, None]
+    f = spectrum.frequency[:, None] / rate  # [rates, frequencies, 1]
+    nu, of_position, from_positions = _positions(taps)
+    turns = 2 * np.pi * f * (np.arange(taps // 2) + 0.5)
+    aims = np.cos(2 * np.pi * f * nu), np.sin(2 * np.pi * f * nu)
     # A noise floor keeps the problem regular where the band is empty.
-    share = np.sqrt(spectrum.power + 1e-13)[:, None]
-    coefficients = np.empty((taps // 2, 2, taps // 2))
+    share = np.sqrt(spectrum.power + _NOISE_FLOOR)[:, None]
+    coefficients = np.empty((len(rate), taps // 2, 2, taps // 2))
     residuals = []
-    for part, (aim, (of_frequency, of_position)) in enumerate(zip(aims, bases, strict=True)):
+    for part, (aim, basis) in enumerate(zip(aims, (np.cos(turns), np.sin(turns)), strict=True)):
+        of_frequency = 2 * basis
         if taps == 2:
-            solution = np.array([[(0.5, 1.0)[part]]])
+            coefficients[:, :, part] = (0.5, 1.0)[part]
         else:
             # The basis is a product of functions of f and of nu, so they are fitted one by one.
-            at_positions = lstsq(share * of_frequency, share * aim, lapack_driver="gelsy")[0]
-            solution = lstsq(of_position, at_positions.T, lapack_driver="gelsy")[0].T
-        coefficients[:, part] = solution
-        residuals.append(of_frequency @ solution @ of_position.T - aim)
-    # With the phase of the position removed, the error is the response minus 1; its mean is real.
-    turned = aims[0] - 1j * aims[1]
-    error = (residuals[0] + 1j * residuals[1]) * turned
-    scatter = (error - (bias := error.mean(axis=1, keepdims=True).real)) / (1 + bias)
+            q, r = np.linalg.qr(share * of_frequency)
+            aim_in_basis = q.swapaxes(1, 2) @ (share * aim)
+            at_positions = np.linalg.pinv(r, rcond=_SINGULAR) @ aim_in_basis
+            coefficients[:, :, part] = at_positions @ from_positions[part].T
+        residuals.append(of_frequency @ coefficients[:, :, part] @ of_position[part].T - aim)
+    # With the phase of the position removed, the error is the response minus 1. Its mean over
+    # positions is real, since errors at nu and -nu are conjugates.
+    mean = np.array([1.0, *np.full(len(nu) - 1, 2.0)]) / (2 * len(nu) - 1)
+    even, odd = residuals
+    square = (even**2 + odd**2) @ mean
+    bias = (even * aims[0] + odd * aims[1]) @ mean
+    scatter = np.maximum(square - bias**2, 0.0) / (1 + bias) ** 2
     error_db, scatter_db = (
-        10 * np.log10(max(float(spectrum.power @ np.mean(np.abs(e) ** 2, axis=1)), 1e-30))
-        for e in (error, scatter)
+        10 * np.log10(np.maximum(each @ spectrum.power, 1e-30)) for each in (square, scatter)
     )
-    return Interpolator(taps, upsampling, coefficients, error_db, scatter_db)
+    return [
+        Interpolator(taps, *each)
+        for each in zip(
+            upsamplings, coefficients, error_db.tolist(), scatter_db.tolist(), strict=True
+        )
+    ]
+
+
+@functools.cache
+def _positions(taps: int) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Positions at which filters are fitted, the polynomials there, and their least-squares fit.
+
+    Positions nu >= 0 are enough: E is even in nu, nu O odd. Polynomials are [part, positions,
+    powers] and their fit from values at the positions [part, powers, positions].
+    """
+    nu = np.linspace(0, 0.5, _POSITIONS // 2 + 1)
+    even = nu[:, None] ** (2 * np.arange(taps // 2)[::-1])
+    basis = np.stack([even, nu[:, None] * even])
+    # All but the middle stand for two positions.
+    weight = np.sqrt([1.0, *np.full(len(nu) - 1, 2.0)])
+    fit = np.linalg.pinv(weight[:, None] * basis, rcond=_SINGULAR) * weight
+    return nu, basis, fit.astype(np.float64, copy=False)
 
 
 def choose(
@@ -186,8 +218,7 @@ def choose(
     rates: Sequence[float] = UPSAMPLINGS if upsampling is None else (upsampling,)
     candidates = []
     for each_taps in TAPS if taps is None else (taps,):
-        for rate in rates:
-            found = design(each_taps, rate, spectrum)
+        for found in designs(each_taps, rates, spectrum):
             if found.error_db <= target_db:
                 candidates.append(found)
                 break
@@ -353,24 +384,36 @@ def upsampler(spectrum: Spectrum, step: int, gain: Gain, most_db: float) -> Upsa
     Notes
     -----
     Least-squares fit for every phase: sum_t h_t exp(j 2 pi f x_t) ~ gain(f), weighted by the power
-    at f, with x_t the position of a tap relative to the upsampled sample.
+    at f, with x_t the position of a tap relative to the upsampled sample. The normal equations are
+    exact enough: rounding adds less than 1e-15 of the power, whatever their condition, since their
+    errors lie where lines hold next to nothing.
     """
-    frequency = spectrum.frequency
-    aim = gain(frequency)
-    weight = np.sqrt(spectrum.power + 1e-13)[:, None]
-    phase = np.arange(PHASES // 2 + 1)[:, None, None] / PHASES
+    aim = gain(spectrum.frequency)
+    weight = spectrum.power + _NOISE_FLOOR
+    # cos(2 pi f x) at multiples of 1/PHASES samples. Sines cancel between positive and negative f.
+    table = _cosines(spectrum.frequency.tobytes())
+    of_taps, of_aim = weight @ table.T[:, ::PHASES], (weight * aim) @ table.T
+    wanted = float(weight @ aim**2)
+    first_half = np.arange(PHASES // 2 + 1)
     for taps in UPSAMPLING_TAPS:
-        angle = 2 * np.pi * frequency[:, None] * (np.arange(taps) + 1 - taps // 2 - phase)
-        matrix = np.concatenate([weight * np.cos(angle), weight * np.sin(angle)], axis=1)
-        target = np.concatenate([weight[:, 0] * aim, np.zeros(len(aim))])
-        q, r = np.linalg.qr(matrix)
-        coefficients = np.linalg.solve(r, np.einsum("pft,f->pt", q, target)[..., None])[..., 0]
-        residual = np.einsum("pft,pt->pf", matrix, coefficients) - target
-        # The filters of the second half mirror those of the first.
-        coefficients = np.concatenate([coefficients, coefficients[-2:0:-1, ::-1]])
-        of_phases = np.sum(residual**2, axis=1)
-        power = (of_phases.sum() + of_phases[1:-1].sum()) / PHASES / (spectrum.power @ aim**2)
-        error_db = 10 * np.log10(max(float(power), 1e-30))
+        # Position of every tap relative to the upsampled sample, in phases.
+        position = np.abs(PHASES * (np.arange(taps) + 1 - taps // 2)[:, None] - first_half)
+        right = of_aim[position]
+        # The normal equations have one matrix for all phases: it depends on distances of taps only.
+        coefficients = cho_solve(cho_factor(toeplitz(of_taps[:taps])), right).T
+        # Power that the best fit leaves, by phase.
+        residual = np.maximum(wanted - np.einsum("pt,tp->p", coefficients, right), 0.0)
+        total = (residual.sum() + residual[1:-1].sum()) / PHASES / (spectrum.power @ aim**2)
+        error_db = 10 * np.log10(max(float(total), 1e-30))
         if error_db <= most_db:
+            # The filters of the second half mirror those of the first.
+            coefficients = np.concatenate([coefficients, coefficients[-2:0:-1, ::-1]])
             return Upsampler(step, coefficients, error_db)
     return None
+
+
+@functools.lru_cache(maxsize=4)
+def _cosines(frequency: bytes) -> NDArray[np.float64]:
+    """Cosines at the frequencies of a spectrum, [multiples of 1/PHASES samples, frequencies]."""
+    positions = np.arange(max(UPSAMPLING_TAPS) * PHASES) / PHASES
+    return np.cos(2 * np.pi * np.outer(positions, np.frombuffer(frequency)))

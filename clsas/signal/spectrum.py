@@ -14,21 +14,25 @@ from clsas.core.geometry import pairwise_range_m
 from clsas.core.grid import Grid
 from clsas.core.lines import RangeLines, some_channels
 
-MEASURED_CHANNELS = 256  # sampled for an accurate spectrum
-FEW_CHANNELS = 32  # sampled for a quick estimate
+MEASURED_CHANNELS = 128
+"""Channels sampled for a spectrum. Twice as many move predicted errors by less than 0.05 dB."""
+FEW_CHANNELS = 32
+"""Channels sampled for a quick estimate of the power outside a band."""
 NEEDED_OVERSAMPLING = 1.05
 """Sample rate over occupied bandwidth above which a guard band separates the band's edges."""
-_FREQUENCIES = 128
+_FREQUENCIES = 128  # bins; with half as many measured errors move by 0.2 dB, with twice by 0.1 dB
 _FLOOR_WIDTH = 1 / 64  # cycles per sample; the quietest part of this width is taken as noise
 _FLOOR_MARGIN = 2.0  # scatter of the mean of a few periodograms
 _NOISE_LEFT = 0.1  # share of the noise's power in peaks above that margin
 _OUTSIDE_BAND = (1e-8, 1e-6, 1e-4)  # of the signal's power, in tails of windows and finite lines
 _CLOSING = 1 / 300  # cycles per sample around the opposite of the centre, which may alias
 _COHERENT_CYCLES = 2.0  # phase over the aperture up to which common parts add coherently
-_COHERENT_CHANNELS, _COHERENT_POINTS, _COHERENT_FREQUENCIES = 128, 3, 256  # sampled
-_FEW_FREQUENCIES = 4.0  # with power at a single frequency errors are up to 5 times the predicted
-_LOUDEST = 16  # loudest channels, sampled in addition to those spread evenly
-_SUMMABLE = 1e-20, 1e38  # energies that float32 squares and sums without loss
+_COHERENT_POINTS = 3  # sampled along either side of the grid; twice as many change nothing
+_COHERENT_FREQUENCIES = 256  # the strongest of those that may add up; half change nothing
+_FEW_FREQUENCIES = 4.0  # errors of a single frequency are up to 5 times the predicted power
+_LOUDEST = 16  # channels, sampled in addition to those spread evenly: clicks are in few lines
+_SUMMABLE = (1e-20, 1e38)  # energies that float32 squares and sums without loss
+_RESOLVED = 1024  # samples that resolve the edges of a band; shorter lines are padded
 _LINES_TOGETHER = 8  # transformed together, so that they stay in the processor's caches
 
 
@@ -200,23 +204,22 @@ def _mean_power(
     multiplies every line.
     """
     largest = _largest_part(samples) or samples.real.dtype.type(1)
-    length = scipy.fft.next_fast_len(max(2 * samples.shape[1], 4))
+    padding = 1 if samples.shape[1] >= _RESOLVED else 2
+    length = scipy.fft.next_fast_len(max(padding * samples.shape[1], 4))
     power, faded = np.zeros(length), np.zeros(length)
     parts = samples.view(samples.real.dtype)
     blocks = -(-len(parts) // _LINES_TOGETHER)
     for block, scale in zip(
         np.array_split(parts, blocks), np.array_split(factor, blocks), strict=True
     ):
-        scaled = block / largest * scale[:, None]
-        amplitude = scipy.fft.fft(scaled.view(samples.dtype), length)
+        amplitude = scipy.fft.fft((block / largest * scale[:, None]).view(samples.dtype), length)
+        # A Hann window over the part of the FFT's length where the lines lie.
+        ends = amplitude[:, -padding:], amplitude[:, :padding]
+        around = np.concatenate([ends[0], amplitude, ends[1]], axis=1)
+        windowed = (around[:, : -2 * padding] + around[:, 2 * padding :]) * np.float32(-0.5)
+        windowed += amplitude
         power += _column_power(amplitude)
-        # A Hann window over half of the FFT's length, where the lines lie.
-        around = np.empty_like(amplitude)
-        np.add(amplitude[:, :-4], amplitude[:, 4:], out=around[:, 2:-2])
-        around[:, :2] = amplitude[:, -2:] + amplitude[:, 2:4]
-        around[:, -2:] = amplitude[:, -4:-2] + amplitude[:, :2]
-        around *= 0.5
-        faded += _column_power(np.subtract(amplitude, around, out=around))
+        faded += _column_power(windowed)
     frequency = scipy.fft.fftfreq(length)
     if not power.any():
         power[:] = 1.0
@@ -226,8 +229,10 @@ def _mean_power(
 
 
 def _column_power(amplitude: NDArray[np.complexfloating]) -> NDArray[np.float64]:
-    """Power of every column, summed in double precision."""
-    return np.sum(amplitude.real**2 + amplitude.imag**2, axis=0, dtype=np.float64)
+    """Power of every column; overwrites the amplitudes of a few lines."""
+    parts = amplitude.view(amplitude.real.dtype)
+    squares = np.multiply(parts, parts, out=parts).sum(axis=0)
+    return squares.astype(np.float64).reshape(-1, 2).sum(axis=1)
 
 
 def _image_power(
@@ -240,7 +245,7 @@ def _image_power(
     of channels, that of echoes from all over the scene with the number. The gain is measured by
     coherent summation of some channels at some pixels, and extrapolated to all channels.
     """
-    some = some_channels(lines.channels, _COHERENT_CHANNELS)
+    some = some_channels(lines.channels)
     if len(some) < 2:
         return power
     part = lines.select(some)

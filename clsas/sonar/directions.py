@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import correlate1d
 
 from clsas.core.lines import RangeLines
 
@@ -77,6 +78,14 @@ def _tangents(centres_m: NDArray[np.float64], pings: int) -> NDArray[np.float64]
     window = min(2 * (pings // 2) + 1, count - 1 + count % 2)
     if window < 2:
         return np.diff(centres_m, axis=0).repeat(2, axis=0)
-    from scipy.signal import savgol_filter  # slow to import
-
-    return savgol_filter(centres_m, window, min(3, window - 1), deriv=1, axis=0, mode="interp")
+    # scipy.signal has this filter, but takes longer to import than most images to plan.
+    half = window // 2
+    powers = np.vander(np.arange(-half, half + 1), min(3, window - 1) + 1, increasing=True)
+    fit = np.linalg.pinv(powers.astype(np.float64))  # coefficients of the cubic, from positions
+    tangents = correlate1d(centres_m, fit[1], axis=0)
+    # The first and the last cubic also serve the pings before and after their middles.
+    orders = np.arange(powers.shape[1])
+    slopes = orders[1:] * np.vander(np.arange(-half, half + 1), len(orders) - 1, increasing=True)
+    tangents[: half + 1] = slopes[: half + 1] @ (fit @ centres_m[:window])[1:]
+    tangents[-half - 1 :] = slopes[half:] @ (fit @ centres_m[-window:])[1:]
+    return tangents

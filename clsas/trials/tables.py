@@ -9,7 +9,7 @@ import multiprocessing
 import resource
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
@@ -40,7 +40,7 @@ SHADOW_LEVELS_DB = (
 SIZES = (256, 512, 1024, 2048, 4096, 8192)
 
 
-def table(header: Sequence[str], rows: Sequence[Sequence[object]]) -> None:
+def table(header: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
     """Print a Markdown table."""
     print("|", " | ".join(header), "|")
     print("|", " | ".join("---" for _ in header), "|")

@@ -1,5 +1,7 @@
 import dataclasses
 import re
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -24,9 +26,11 @@ from factorizing import (
 from clsas.core.grid import Grid
 from clsas.factorized.plan import Plan
 from clsas.planning import fastest, planner
+from clsas.planning.beam_coverage import trimmed
+from clsas.planning.channels import frequencies
 from clsas.planning.costs import Costs
 from clsas.planning.planner import plan
-from clsas.planning.view import View
+from clsas.planning.visibility_model import VisibilityModel
 from clsas.sonar.beam import BeamWindow
 from clsas.sonar.visibility import sines
 
@@ -213,7 +217,7 @@ def test_planning_ends_whatever_is_tried_in_vain(monkeypatch):
 
     def hopeless(*arguments):
         found = measured(*arguments)
-        return dataclasses.replace(found, nodes=(1e-2, *found.nodes[1:]))
+        return dataclasses.replace(found, spacing=(1e-2, *found.spacing[1:]))
 
     monkeypatch.setattr(fastest, "other_errors", hopeless)
     wish = {"tolerance_db": -40, "costs": EXACT_IS_SLOW}
@@ -285,7 +289,7 @@ def test_next_to_nothing_of_a_beam_is_left_out(beam_deg, share):
     grid = around(0, 40, pixel_m=(0.03, 0.3), shape=(50, 60))
     lines, _ = over(grid, along_x(200, 0.014))
     beam = BeamWindow(beam_deg, "hann")
-    low, high = View(lines, grid, beam).trimmed(share).limits
+    low, high = trimmed(VisibilityModel(lines, grid, beam), share).limits
     sine = sines(grid.positions_m().reshape(-1, 3), lines.phase_centres_m, beam.directions(lines))
     weights = beam.weights(sine) ** 2
     left_out = weights[(sine < low) | (sine > high)].sum() / weights.sum()
@@ -443,8 +447,8 @@ def test_the_highest_frequency_leaves_out_as_little_as_is_allowed():
     noisy = dataclasses.replace(lines, samples=lines.samples + floor)
     highest, bin_m = [], 1 / (256 * lines.range_step_m)
     for outside in (1e-6, 1e-9, 1e-11):
-        view = View(noisy, grid, None, outside)
-        cycles_per_m, share = view.frequencies
+        view = VisibilityModel(noisy, grid, None, outside)
+        cycles_per_m, share = frequencies(view)
         assert share[cycles_per_m > view.highest_cycles_per_m + bin_m].sum() <= outside
         highest.append(view.highest_cycles_per_m)
     assert highest[2] > highest[0]
@@ -489,3 +493,20 @@ def test_no_search_where_the_exact_image_is_formed_sooner(monkeypatch):
     assert plan(lines, grid, tolerance_db=-40, costs=Costs()).is_exact
     with pytest.raises(pytest.fail.Exception):  # but those who ask for a factorization get one
         plan(lines, grid, tolerance_db=-40, costs=Costs(), taps=(4, 4))
+
+
+def test_planning_with_a_beam_imports_nothing_slow():
+    """scipy.signal takes longer to import than planning an image of any size."""
+    code = """
+import sys
+import numpy as np
+import clsas
+from clsas.planning.costs import Costs
+along = np.arange(200)[:, None] * [0.05, 0, 0]
+lines = clsas.RangeLines(np.ones((200, 512), complex), 40.0, 0.02, along, along, 120e3, 1500.0)
+grid = clsas.Grid.plane((0, 5, 256), (41, 46, 256))
+costs = Costs(pixel_ns=1e3, point_ns=1e3)
+clsas.plan(lines, grid, tolerance_db=-40, beam=clsas.BeamWindow(20.0), costs=costs)
+sys.exit("scipy.signal" in sys.modules)
+"""
+    assert not subprocess.run([sys.executable, "-c", code], check=False).returncode

@@ -9,44 +9,56 @@ from clsas.opencl.device import open_device
 from clsas.planning import search
 from clsas.planning.costs import Costs
 from clsas.planning.search import Allowed
-from clsas.planning.view import View
+from clsas.planning.visibility_model import VisibilityModel
 
 
-def everything_tried(view, filters_db, most, leaf_pixels, beam_cycles, device, costs, allowed):
+def priced(view, filters_db, most, leaf_pixels, beam_cycles, device, costs, allowed):
+    """All sizes, and the options with the time of what they do."""
+    sizes = search.all_sizes(view, most, device)
+    return sizes, search.all_options(sizes, filters_db, leaf_pixels, beam_cycles, costs, allowed)
+
+
+def everything_tried(*arguments):
     """The least cost of all roots and options."""
-    sizes = search._sizes(view, device, filters_db, leaf_pixels, beam_cycles)
+    sizes, options = priced(*arguments)
     best = math.inf
-    for option in search._options(sizes, filters_db, costs, allowed):
-        for root in np.flatnonzero((sizes.sides <= most).all(axis=1)):
-            within = sizes.in_root(root)
-            onward_s, _ = search._onward(view, option, within)
-            place = np.searchsorted(within.sizes, root)
-            best = min(best, option.roots_s[root] + onward_s[place])
+    for option in range(len(options.choices)):
+        for root in range(len(sizes.pairs)):
+            division = sizes.in_root(root)
+            onward_s = options.onward_s(division, np.array([option]))[0][-1]
+            place = np.searchsorted(division.index, root)
+            best = min(best, options.roots_s[option, root] + onward_s[0, place])
     return best
 
 
 @pytest.fixture(scope="module", params=[None, BEAMS[0]], ids=["wide", "beam"])
 def view(request):
     grid = around(0, 40, shape=(500, 700))
-    return View(over(grid)[0], grid, request.param)
+    return VisibilityModel(over(grid)[0], grid, request.param)
 
 
 def cost_of(tree, view, filters_db, most, leaf_pixels, beam_cycles, device, costs, allowed):
     """What a tree costs, stage by stage."""
-    sizes = search._sizes(view, device, filters_db, leaf_pixels, beam_cycles)
     taps = (tree.align_taps,), (tree.aperture_taps,)
     allowed = Allowed(*taps, stages=(len(tree.sides),))
-    (option,) = search._options(sizes, filters_db, costs, allowed)
+    sizes, options = priced(
+        view, filters_db, most, leaf_pixels, beam_cycles, device, costs, allowed
+    )
+    (choice,) = options.choices
     path = [sizes.pairs.index(side) for side in tree.sides]
-    within = sizes.in_root(path[0])
-    turns, place = within.turns, {int(size): index for index, size in enumerate(within.sizes)}
-    total = option.roots_s[path[0]]
+    division = sizes.in_root(path[0])
+    cycles, place = division.cycles, {int(size): n for n, size in enumerate(division.index)}
+
+    def channels(phase_cycles):
+        return view.virtual_channels(choice.aperture_taps, 2 * choice.density, phase_cycles)
+
+    total = options.roots_s[0, path[0]]
     for parent, child in pairwise(path):
-        used = option.channels(view, turns[place[child], place[parent]])
-        total += used * option.channel_s[child] + option.subimages_s[child]
+        used = channels(cycles[place[child], place[parent]])
+        total += used * options.channel_s[0, child] + options.subimages_s[child]
     leaf = path[-1]
-    turned = turns[place[leaf], place[leaf]] + sizes.beam_turns[leaf]
-    return total + option.channels(view, turned) * option.leaves_s[leaf]
+    of_leaf = cycles[place[leaf], place[leaf]] + beam_cycles * sizes.beam_cycles[leaf]
+    return total + channels(of_leaf) * options.leaves_s[0, leaf]
 
 
 @pytest.mark.slow

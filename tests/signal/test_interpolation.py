@@ -6,11 +6,14 @@ from cases import burst, flat, noise
 
 from clsas.core.image_error import relative_error_db
 from clsas.signal.interpolation import (
+    PHASES,
     TAPS,
     UPSAMPLINGS,
     choose,
     design,
+    designs,
     resampling,
+    upsampler,
 )
 
 NU = np.linspace(-0.5, 0.5, 101)
@@ -168,3 +171,30 @@ def test_channels_are_resampled_alone():
     np.testing.assert_allclose(
         r.apply(samples), np.concatenate([r.apply(line[None]) for line in samples]), atol=1e-13
     )
+
+
+@pytest.mark.parametrize("taps", TAPS)
+def test_designing_for_many_rates_is_designing_for_each(taps):
+    rates, spectrum = (1.0, 2.5, 12.0), flat(0.8)
+    for rate, found in zip(rates, designs(taps, rates, spectrum), strict=True):
+        alone = design(taps, rate, spectrum)
+        assert found.upsampling == rate
+        np.testing.assert_allclose(found.coefficients, alone.coefficients, atol=1e-9)
+        assert found.error_db == pytest.approx(alone.error_db, abs=1e-6)
+        assert found.scatter_db == pytest.approx(alone.scatter_db, abs=1e-6)
+
+
+@pytest.mark.parametrize("most_db", [-40.0, -75.0])
+def test_upsampling_filters_are_least_squares_fits(most_db):
+    """Of exp(j 2 pi f x) by taps, at every phase, weighted by the power."""
+    spectrum = flat(0.7)
+    found = upsampler(spectrum, 16, np.ones_like, most_db)
+    weight = np.sqrt(spectrum.power + 1e-13)
+    target = np.append(weight, np.zeros(len(weight)))
+    for phase in range(PHASES):
+        position = np.arange(found.taps) + 1 - found.taps // 2 - phase / PHASES
+        angle = 2 * np.pi * np.outer(spectrum.frequency, position)
+        matrix = np.concatenate([weight[:, None] * np.cos(angle), weight[:, None] * np.sin(angle)])
+        best = np.linalg.lstsq(matrix, target, rcond=None)[0]
+        least = np.sum((matrix @ best - target) ** 2)
+        assert np.sum((matrix @ found.coefficients[phase] - target) ** 2) < 1.001 * least + 1e-15

@@ -1,9 +1,11 @@
 import numpy as np
 import pytest
 from cases import along_x, track_lines
+from scipy.signal import savgol_filter
 
 from clsas.core.lines import RangeLines
 from clsas.sonar.beam import BeamWindow
+from clsas.sonar.directions import _tangents
 
 X = (1.0, 0, 0)
 DEGREE = np.pi / 180
@@ -60,3 +62,12 @@ def test_directions_of_legs():
     directions = BeamWindow(10).directions(lines)
     expected = np.repeat([[1, 0, 0], [-1, 0, 0], [0, 1, 0]], 60, axis=0)
     np.testing.assert_allclose(directions, expected, atol=1e-9)
+
+
+@pytest.mark.parametrize("pings", [3, 4, 6, 20, 300])
+@pytest.mark.parametrize("span", [5, 25, 101])
+def test_tangents_are_those_of_a_savitzky_golay_filter(pings, span):
+    centres_m = np.cumsum(np.random.default_rng(0).standard_normal((pings, 3)), axis=0)
+    window = min(2 * (span // 2) + 1, pings - 1 + pings % 2)
+    expected = savgol_filter(centres_m, window, min(3, window - 1), deriv=1, axis=0, mode="interp")
+    np.testing.assert_allclose(_tangents(centres_m, span), expected, atol=1e-12)

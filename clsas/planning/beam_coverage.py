@@ -1,0 +1,107 @@
+"""How a beam sweeps over a grid: what of it an image needs, and whether a factorization follows."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsas.core.lines import some_channels, wavelength_m
+from clsas.planning.caching import shared
+from clsas.planning.visibility_model import VisibilityModel
+from clsas.sonar.visibility import sines
+
+_SAMPLED_POINTS = np.linspace(0, 1, 17)  # fractions of rows and columns; their sines are smooth
+_BINS = 512  # of power by aspect angle; half or twice as many change nothing
+# Largest change of direction from one channel to the next, over the beam's width. At a kink a beam
+# swings past pixels between two channels, which no virtual channel can follow.
+_MOST_TURNED = 1 / 16
+
+
+def trimmed(model: VisibilityModel, share: float) -> VisibilityModel:
+    """Return a model without the outermost edges of the beam.
+
+    An image of noise loses `share` of its power.
+    """
+    if model.beam is None or model.limits is None:
+        return model
+    low, high = np.clip(model.limits, -1, 1)
+    on_track, bounds = model.on_track, []
+    of_track = sines(_points_m(model), model.track_m[on_track], model.along[on_track])
+    # The channels alone do not suffice: the track may have gaps, into which filters extend. Neither
+    # does one point: a pixel sees but a small part of the beam from a short aperture.
+    for sine in (_sines_of_channels(model), of_track):
+        sine = sine[(sine > low) & (sine < high)]
+        power = model.beam.weights(sine, wavelength_m(model.lines)) ** 2
+        index = np.minimum((sine - low) * (_BINS / (high - low)), _BINS - 1).astype(np.int64)
+        total = np.bincount(index, power, _BINS).cumsum()
+        bounds.append(np.searchsorted(total, np.array([share / 2, 1 - share / 2]) * total[-1]))
+    first, last = np.min(bounds, axis=0)[0], np.max(bounds, axis=0)[1]
+    if not 0 < first <= last:
+        return model
+    edges = np.linspace(low, high, _BINS + 1)
+    return model.with_limits(float(edges[first]), float(edges[min(last + 1, _BINS)]))
+
+
+def sweeps_once(model: VisibilityModel) -> bool:
+    """Return whether the beam sweeps once, at an even rate, over every sample point.
+
+    Virtual channels cannot follow a beam that swings as fast as it sweeps. Seen from a point, the
+    sine of the aspect angle changes along a straight track by (1 - sine^2)/distance. Rates between
+    half and one and a half times the mean are followed.
+    """
+    if model.beam is None:
+        return True
+    # Neighbours on the track must look in much the same direction. At a kink the beam may swing
+    # past a point within a few channels, and a track may lead back beside itself.
+    along = model.channels_along[np.argsort(model.track.place, kind="stable")]
+    turned = np.linalg.norm(np.diff(along, axis=0), axis=1)
+    if turned.max(initial=0.0) > _MOST_TURNED * np.ptp(np.clip(model.beam.limits, -1, 1)):
+        return False
+    on_track = model.on_track
+    position = model.track_m[on_track]
+    along_m = np.concatenate([[0], np.linalg.norm(np.diff(position, axis=0), axis=1).cumsum()])
+    sine = np.einsum("psi,si->ps", model.sight[:, on_track], model.along[on_track])
+    along_m += 1e-9 * np.arange(len(along_m))  # a track may stand still
+    rate = -np.gradient(sine, along_m, axis=1)
+    rate *= model.distance_m[:, on_track] / np.maximum(1 - sine**2, 1e-3)
+    low, high = model.beam.limits
+    visible = (sine > low) & (sine < high)
+    count = np.maximum(visible.sum(axis=1), 1)
+    mean = rate.sum(axis=1, where=visible) / count
+    fastest = rate.max(axis=1, where=visible, initial=-np.inf)
+    slowest = rate.min(axis=1, where=visible, initial=np.inf)
+    return not (visible.any(axis=1) & (fastest - slowest > np.abs(mean))).any()
+
+
+def coverage(model: VisibilityModel, power: int) -> NDArray[np.float64]:
+    """Return sums over channels of a power of the beam's weights, over the largest, [points].
+
+    At points all over the grid; 0 if the beam touches none of them.
+    """
+    assert model.beam is not None
+    weights = model.beam.weights(_sines_of_channels(model), wavelength_m(model.lines))
+    sums = (weights**power).sum(axis=0)
+    return sums / max(sums.max(), 1e-30)
+
+
+def partly_visible_share(model: VisibilityModel) -> float:
+    """Fraction of the image's points that some channels receive from, and others do not."""
+    assert model.beam is not None
+    low, high = model.beam.limits
+    sine = _sines_of_channels(model)
+    visible = ((sine > low) & (sine < high)).mean(axis=0)
+    return float(((visible > 0) & (visible < 1)).mean())
+
+
+def _points_m(model: VisibilityModel) -> NDArray[np.float64]:
+    found: NDArray[np.float64] = model.from_cache(
+        "points of beam coverage", lambda: model.pixels_m(_SAMPLED_POINTS)
+    )
+    return found
+
+
+@shared
+def _sines_of_channels(model: VisibilityModel) -> NDArray[np.float64]:
+    """Sines of the aspect angle at points all over the grid, [channels, points]."""
+    some = some_channels(model.lines.channels)
+    return sines(_points_m(model), model.lines.phase_centres_m[some], model.channels_along[some])

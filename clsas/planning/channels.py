@@ -1,0 +1,63 @@
+"""The channels of a visibility model: their density, track errors and frequencies."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsas.factorized import aperture
+from clsas.planning.caching import shared
+from clsas.planning.visibility_model import VisibilityModel
+from clsas.signal.spectrum import cycles_per_m_at
+
+_NEIGHBOURS = 64  # channels over which density is measured; half or twice: no change
+_LEAST_FREQUENCY = 1e-3  # of the highest: virtual channels sample a phase that hardly turns
+
+
+def frequencies(model: VisibilityModel) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the phase per metre of range at the lines' frequencies, cycles, and shares of power.
+
+    The phase is positive, whatever its sign in the lines.
+    """
+    found, power = model.spectrum.frequency, model.spectrum.share
+    found = model.spectrum.centre + np.concatenate([-found[::-1], found])
+    cycles_per_m = np.abs(cycles_per_m_at(model.lines, found))
+    share = np.concatenate([power[::-1], power]) / 2
+    return np.maximum(cycles_per_m, _LEAST_FREQUENCY * model.highest_cycles_per_m), share
+
+
+def carriers(model: VisibilityModel, count: int) -> NDArray[np.float64]:
+    """Return some of these frequencies, each of which stands for the same power."""
+    cycles_per_m, share = frequencies(model)
+    index = np.interp((np.arange(count) + 0.5) / count, np.cumsum(share), np.arange(len(share)))
+    return np.interp(index, np.arange(len(share)), cycles_per_m)
+
+
+@shared
+def track_error_m(model: VisibilityModel) -> NDArray[np.float64]:
+    """Distances of channels from the mean track, [channels].
+
+    The motion of receivers that differs from the mean is added, as it acts at the median range.
+    """
+    away_m = model.lines.phase_centres_m - model.track.positions_m(model.track.place)
+    error_m = np.linalg.norm(away_m, axis=1)
+    drift = own_drift(model)
+    if drift is not None:
+        error_m += np.linalg.norm(drift, axis=1) * np.median(model.distance_m)
+    return error_m
+
+
+@shared
+def own_drift(model: VisibilityModel) -> NDArray[np.float64] | None:
+    """See `clsas.factorized.aperture.own_drift`."""
+    return aperture.own_drift(model.lines)
+
+
+@shared
+def peak_density(model: VisibilityModel) -> float:
+    """Peak channel density along the aperture, relative to the mean."""
+    place = np.sort(model.track.place)
+    some = min(_NEIGHBOURS, len(place) - 1)
+    closest = float((place[some:] - place[:-some]).min())
+    average = float(place[-1] - place[0]) * some / (len(place) - 1)
+    return average / closest if closest > 0 else np.inf

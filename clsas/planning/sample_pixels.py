@@ -1,0 +1,53 @@
+"""Sampled pixels of subimages, for errors that are averaged over them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsas.planning.visibility_model import Side, VisibilityModel
+
+SAMPLED_PIXELS = 16
+"""Pixels sampled of every subimage. Half as many move predicted errors by 0.05 dB at most."""
+
+SPREAD_POINTS = (0, 7, 14, 16, 23)
+"""Of the model's 5 by 5 sample points, one in every row and column."""
+
+
+def pixels_m(
+    model: VisibilityModel, extents: NDArray[np.float64], point: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return sampled pixels of a subimage, from its centre, [n + 1, 3]; the centre is first.
+
+    The second array holds one more number from 0 to 1 for each pixel. All numbers come from a
+    Kronecker sequence (multiples of powers of an irrational number), which spreads evenly; every
+    sample point has its own stretch of it.
+    """
+    dimensions = len(extents) + 1
+    ratio = 1.0
+    for _ in range(20):  # towards x^(dimensions + 1) = x + 1
+        ratio = (1 + ratio) ** (1 / (dimensions + 1))
+    index = point * SAMPLED_PIXELS + np.arange(SAMPLED_PIXELS)[:, None]
+    numbers = (0.5 + index * ratio ** -np.arange(1.0, dimensions + 1)) % 1
+    offsets_m = ((numbers[:, :-1] - 0.5) * extents) @ model.surface.steps_m
+    return np.concatenate([np.zeros((1, 3)), offsets_m]), numbers[:, -1]
+
+
+def mean_over_relief(
+    model: VisibilityModel, side: Side, error: Callable[[NDArray[np.float64]], float]
+) -> float:
+    """Return the mean over the grid of an error that depends on the extents of subimages.
+
+    It is evaluated without relief and at the largest relief. Errors grow at least with the square
+    of the relief, so that subimages with less of it are interpolated by its square.
+    """
+    surface = model.surface
+    flat = error(surface.extents(side))
+    relief_m = surface.relief_m(side, model.root)
+    largest_m = float(relief_m.max())
+    if largest_m <= 0:
+        return flat
+    share = np.average((relief_m / largest_m) ** 2, weights=surface.counts(model.root or side))
+    return flat + max(error(surface.extents(side, largest_m)) - flat, 0.0) * float(share)

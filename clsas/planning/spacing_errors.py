@@ -1,0 +1,200 @@
+"""Error of virtual channels whose spacing changes, and of beam weights that change between them.
+
+The aperture's filter takes virtual channels as equally spaced and weights as constant. Here the
+steering functions of sampled pixels are interpolated between the virtual channels of a candidate,
+and compared with the exact ones.
+"""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
+
+from clsas.core.decibels import power
+from clsas.core.lines import wavelength_m
+from clsas.factorized.tree import interpolated_directions, interpolated_nodes
+from clsas.planning.caching import cached
+from clsas.planning.channels import carriers
+from clsas.planning.sample_pixels import SAMPLED_PIXELS, SPREAD_POINTS, mean_over_relief, pixels_m
+from clsas.planning.visibility_model import Side, VisibilityModel
+from clsas.signal.interpolation import Interpolator
+
+_Pixels = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]
+
+_SAMPLED_PLACES = 96  # along the visible aperture; half as many move the error by 3 dB at most
+
+
+@cached
+def spacing_error(
+    model: VisibilityModel,
+    side: Side,
+    aperture: Interpolator,
+    oversampling: float,
+    beam_cycles: float | None,
+) -> float:
+    """Error power that uneven spacing adds to that of the aperture's filter, for one stage.
+
+    Parameters
+    ----------
+    model : VisibilityModel
+        Within roots of the candidate's size.
+    side : (rows, columns)
+        Size of the stage's subimages.
+    aperture : Interpolator
+    oversampling : float
+        Density of virtual channels over that which the filter asks for.
+    beam_cycles : float or None
+        Phase cycles that an edge of the beam counts for. With None steering functions are not
+        weighted by the beam.
+    """
+    error = functools.partial(
+        _interpolation_error, model, side, aperture, oversampling, beam_cycles
+    )
+    return mean_over_relief(model, side, error)
+
+
+def _interpolation_error(
+    model: VisibilityModel,
+    side: Side,
+    aperture: Interpolator,
+    oversampling: float,
+    beam_cycles: float | None,
+    extents: NDArray[np.float64],
+) -> float:
+    """Error power of interpolated steering functions, less that of the filter.
+
+    The error is 1, as large as the image, if no beam touches a subimage.
+    """
+    weighted = model.beam is not None and beam_cycles is not None
+    samples = _samples(model, side, weighted, tuple(extents))
+    if samples is None:
+        return 1.0
+    rates = oversampling * np.tensordot(extents, model.rates[:, samples.points], 1)
+    if weighted:
+        rates = rates + beam_cycles * model.beam_rates[samples.points]
+    nodes = interpolated_nodes(model.track, rates, samples.place, aperture)
+    of_nodes = _steering(model, samples.pixels, weighted, nodes.place)
+    # One sparse matrix interpolates at all aperture coordinates of all subimages.
+    index = nodes.base[..., None] + np.arange(nodes.taps)
+    index += nodes.place.shape[1] * np.arange(len(index))[:, None, None]
+    weights = nodes.weights.astype(np.float32).ravel()
+    rows = np.arange(0, weights.size + 1, nodes.taps)
+    of_nodes = of_nodes.reshape(-1, of_nodes.shape[-1])
+    interpolate = csr_array((weights, index.ravel(), rows), shape=(len(rows) - 1, len(of_nodes)))
+    wrong = (interpolate @ of_nodes).reshape(samples.exact.shape) - samples.exact
+    error, total = (
+        samples.count @ np.einsum("nsp,nsp->n", each, each, dtype=np.float64)
+        for each in (wrong, samples.exact)
+    )
+    return float(max(error / max(total, 1e-30) - power(aperture.error_db), 0.0))
+
+
+@dataclass(frozen=True, eq=False)
+class _Samples:
+    """Sampled subimages of a size, and the steering functions of sampled pixels in them.
+
+    Attributes
+    ----------
+    points : int64 [n]
+        The sample points that they lie at.
+    count : int64 [n]
+        Number of channels whose beam touches each.
+    place : float64 [n, places]
+        Aperture coordinates, ascending, distributed as those of the channels.
+    pixels : (centres_m, offsets_m, cycles_per_m)
+        See `_steering`.
+    exact : float32 [n, places, 2 pixels]
+        The steering functions.
+    """
+
+    points: NDArray[np.int64]
+    count: NDArray[np.int64]
+    place: NDArray[np.float64]
+    pixels: _Pixels
+    exact: NDArray[np.float32]
+
+
+@cached
+def _samples(
+    model: VisibilityModel, side: Side, weighted: bool, extents: tuple[float, ...]
+) -> _Samples | None:
+    """Return the samples for subimages of a size, None if no beam touches any."""
+    channels, first, count = _visible_channels(model, side)
+    if not count.any():
+        return None
+    points = np.flatnonzero(count)
+    # A step of the beam's weights crosses only some points: these may not be left out.
+    steps = weighted and model.beam is not None and model.beam.jumps
+    if not steps and np.isin(points, SPREAD_POINTS).any():
+        points = np.intersect1d(points, SPREAD_POINTS)
+    first, count = first[points], count[points]
+    # One channel more on either side: the edge of visibility lies in between.
+    number = np.linspace(first - 1, first + count, _SAMPLED_PLACES, axis=1)
+    number = np.clip(number, 0, len(channels) - 1)
+    place = np.interp(number, np.arange(len(channels)), channels)
+    cycles_per_m = carriers(model, SAMPLED_PIXELS)
+    found = [pixels_m(model, np.array(extents), point) for point in points.tolist()]
+    offsets_m = np.stack([each_m for each_m, _ in found])
+    chosen = np.stack([cycles_per_m[(share * SAMPLED_PIXELS).astype(int)] for _, share in found])
+    pixels = model.points_m[points], offsets_m, chosen
+    return _Samples(points, count, place, pixels, _steering(model, pixels, weighted, place))
+
+
+def _visible_channels(
+    model: VisibilityModel, side: Side
+) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.int64]]:
+    """Return which channels' beams touch subimages of a size at the sample points.
+
+    The channels' aperture coordinates, ascending; then for each point the first channel, and the
+    number of channels, 0 where the track has a gap. The edges of visibility lie between samples of
+    the track, so the range is one sample wider on either side.
+    """
+    places, samples = np.sort(model.track.place), model.track.samples
+    visible = model.visible(side)
+    begin = samples[np.maximum(visible.argmax(axis=1) - 1, 0)]
+    last = visible.shape[1] - visible[:, ::-1].argmax(axis=1)
+    end = samples[np.minimum(last, len(samples) - 1)]
+    end[~visible.any(axis=1)] = -np.inf
+    first = np.searchsorted(places, begin)
+    return places, first, np.maximum(np.searchsorted(places, end, "right") - first, 0)
+
+
+def _steering(
+    model: VisibilityModel,
+    pixels: _Pixels,
+    weighted: bool,
+    at: NDArray[np.float64],
+) -> NDArray[np.float32]:
+    """Return steering functions at aperture coordinates, float32 [n, places, 2 pixels].
+
+    The real parts of all pixels come first, then the imaginary ones.
+
+    Parameters
+    ----------
+    pixels : (centres_m, offsets_m, cycles_per_m)
+        Centres of subimages, float64 [n, 3]; from these the reference point and then the pixels,
+        [n, pixels + 1, 3]; phase per metre of range of each pixel, [n, pixels].
+    weighted : bool
+        Multiply by the beam's weights.
+    at : float64 [n, places]
+    """
+    centres_m, offsets_m, cycles_per_m = pixels
+    sight = centres_m[:, None] - model.track.positions_m(at)
+    offsets_m = offsets_m.swapaxes(1, 2)
+    square = np.einsum("nsi,nsi->ns", sight, sight)[..., None] + 2 * sight @ offsets_m
+    square += np.einsum("nip,nip->np", offsets_m, offsets_m)[:, None]
+    range_m = np.sqrt(np.maximum(square, 1e-18))
+    turns = cycles_per_m[:, None] * (range_m[..., 1:] - range_m[..., :1])
+    angle = (2 * np.pi * (turns - np.rint(turns))).astype(np.float32)
+    result = np.concatenate([np.cos(angle), np.sin(angle)], axis=-1)
+    if weighted and model.beam is not None:
+        along = interpolated_directions(model.track.samples, model.along, at)
+        sine = np.einsum("nsi,nsi->ns", sight, along)[..., None]
+        sine = (sine + along @ offsets_m[..., 1:]) / range_m[..., 1:]
+        weights = model.beam.weights(sine, wavelength_m(model.lines)).astype(np.float32)
+        result *= np.concatenate([weights, weights], axis=-1)
+    return result

@@ -1,0 +1,403 @@
+"""Geometry between track and grid, sampled: the cost and error models are evaluated on it."""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Callable, Hashable, Sequence
+from itertools import product
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import KDTree
+
+from clsas.core.grid import Grid
+from clsas.core.lines import RangeLines
+from clsas.exact.tiles import STACK
+from clsas.factorized.aperture import cycles_per_extent, mean_track
+from clsas.factorized.surface import LEAST_SIDE, surface_of, within_roots
+from clsas.factorized.tree import beam_directions, beam_rate
+from clsas.planning.caching import cached, shared
+from clsas.signal.ambiguity import Ambiguity, ambiguity
+from clsas.signal.interpolation import Interpolator, Resampling
+from clsas.signal.spectrum import cycles_per_m_at, measure_spectrum
+from clsas.sonar.beam import BeamWindow
+from clsas.sonar.visibility import Visibility
+
+Side = tuple[int, int]
+"""Rows and columns of a subimage."""
+
+_POINTS = (0.02, 0.25, 0.5, 0.75, 0.98)  # sample points, as fractions of the rows and columns
+_WEIGHTS = np.array([0.135, 0.24, 0.25, 0.24, 0.135])  # of these in means over the grid
+_POINT_WEIGHTS = np.outer(_WEIGHTS, _WEIGHTS).ravel() / _WEIGHTS.sum() ** 2
+_INNER = np.arange(len(_POINTS) ** 2).reshape(len(_POINTS), -1)[1:-1, 1:-1].ravel()
+_DENSE = 65  # points along either side, for the least distance of the grid; half: 0.05 dB
+_MOST_OUTSIDE = 1e-6  # share of power above the highest frequency; half or twice: no change
+_SEARCH_STEP = 8  # the search uses every eighth sample of the track; a fourth chose the same trees
+
+SMALL = (16, 16)
+"""Rows and columns of a subimage that stands for a pixel."""
+
+
+class VisibilityModel:
+    """Geometry between track and grid, sampled at 25 grid points.
+
+    Errors and costs of candidates are evaluated on these samples. `outside` is the share of the
+    lines' power that may lie above `highest_cycles_per_m`.
+
+    Attributes
+    ----------
+    lines, grid, beam
+        What is imaged.
+    spectrum : Spectrum
+        Of the lines, with the weight that frequencies have in the image.
+    highest_cycles_per_m, rms_cycles_per_m : float
+        Phase per metre of range, cycles: at the band's edge, and rms about the band's centre.
+    track : MeanTrack or None
+        None if all channels lie at one place. The attributes below are then missing.
+    channels_along : float64 [channels, 3] or None
+        Unit directions of the track at the channels, with a beam.
+    surface : Surface
+        Positions of the grid's pixels.
+    points_m : float64 [points, 3]
+        Sample points all over the grid, also near its corners.
+    track_m : float64 [samples, 3]
+        Positions at `track.samples`.
+    along : float64 [samples, 3] or None
+        Unit directions of the track there, with a beam.
+    spacing : float64 [samples]
+        Weight of each sample in integrals over the track's parameter.
+    on_track : bool [samples]
+        False past the track's ends.
+    distance_m, sight : float64 [points, samples], [points, samples, 3]
+        Distance and unit vector from every track sample to every point.
+    nearest_m : float
+        Lower bound of the distance between pixels and channels.
+    beam_rates : float64 [points, samples]
+        Change of the beam's weights along the track as a phase rate; see `tree.beam_rate`.
+    limits : (low, high) or None
+        Sines of the aspect angle between which weights are not 0.
+    root : (rows, columns) or None
+        Size of the roots within which `rates` holds; None for the sample points alone.
+    """
+
+    limits: tuple[float, float] | None
+    root: Side | None
+    along: Any
+    channels_along: Any
+    beam_rates: Any
+
+    def __init__(
+        self,
+        lines: RangeLines,
+        grid: Grid,
+        beam: BeamWindow | None,
+        outside: float = _MOST_OUTSIDE,
+    ) -> None:
+        self.lines, self.grid, self.beam = lines, grid, beam
+        self._cache: dict[Hashable, Any] = {}
+        self.spectrum = measure_spectrum(lines, grid)
+        outside = min(outside, _MOST_OUTSIDE)
+        occupied = self.spectrum.frequency[np.cumsum(self.spectrum.share) < 1 - outside]
+        half_band = (occupied[-1] if len(occupied) else 0.5) / lines.range_step_m
+        centre = cycles_per_m_at(lines, self.spectrum.centre)
+        self.highest_cycles_per_m = float(abs(centre) + half_band)
+        mean_square = self.spectrum.share @ self.spectrum.frequency**2
+        self.rms_cycles_per_m = float(np.sqrt(mean_square)) / lines.range_step_m
+        self.track: Any = mean_track(lines)
+        self.limits, self.root = None if beam is None else beam.limits, None
+        self.along, self.channels_along = None, None if beam is None else beam.directions(lines)
+        if self.track is None:
+            return
+        self.surface = surface_of(grid)
+        self.points_m = self.pixels_m(_POINTS)
+        self.track_m, _ = self.track.sampled_m
+        self.spacing = _spacing(self.track.samples)
+        sight = self.points_m[:, None] - self.track_m
+        self.distance_m = np.maximum(np.linalg.norm(sight, axis=-1), 1e-9)
+        self.sight = sight / self.distance_m[..., None]
+        self.on_track = np.abs(self.track.samples - 0.5) <= 0.5
+        self.nearest_m = self._nearest_m()
+        if beam is not None:
+            self.along = beam_directions(self.channels_along, self.track, self.track.samples)
+            self.beam_rates = beam_rate(beam, self.track, self.along, self.points_m)
+
+    def _nearest_m(self) -> float:
+        """Lower bound of the distance between pixels and channels."""
+        dense_m = self.pixels_m(np.linspace(0, 1, _DENSE))
+        # Pixels between the dense points may be closer; half a step bounds by how much.
+        steps_m = np.linalg.norm(self.surface.steps_m[:2], axis=1)
+        step_m = steps_m @ (np.array(self.surface.plane.shape) - 1) / (_DENSE - 1)
+        between_m = (step_m + self.surface.relief_m(LEAST_SIDE).max()) / 2
+        nearest_m = KDTree(dense_m).query(self.lines.phase_centres_m)[0].min() - between_m
+        return max(float(nearest_m), 1e-9)
+
+    def from_cache(self, key: Hashable, find: Callable[[], Any]) -> Any:
+        """Return the value cached under a key; `find` computes it the first time."""
+        if key not in self._cache:
+            self._cache[key] = find()
+        return self._cache[key]
+
+    def _with(self, **changes: Any) -> VisibilityModel:
+        """Return this model with other limits or another root."""
+        model = copy.copy(self)
+        vars(model).update(changes)
+        return model
+
+    def with_limits(self, low: float, high: float) -> VisibilityModel:
+        """Return this model with a narrower beam: sines of the aspect angle where it ends."""
+        return self._with(limits=(low, high))
+
+    def within(self, root: Side) -> VisibilityModel:
+        """Return this model with the phase rates of subimages in roots of a size."""
+        return self._with(root=root)
+
+    @property
+    @shared
+    def ambiguity(self) -> Ambiguity:
+        """Errors that the lines themselves leave open."""
+        return ambiguity(self.lines, self.grid, self.spectrum, self.beam, self.channels_along)
+
+    # The grid and its subimages.
+
+    def pixels_m(self, fractions: Sequence[float] | NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return positions at some fractions of the rows and columns, [n, 3]."""
+        index = np.stack(np.meshgrid(fractions, fractions, indexing="ij"), axis=-1).reshape(-1, 2)
+        index = index * (np.array(self.surface.plane.shape) - 1)
+        origin_m: Any = self.surface.plane.origin_m
+        plane_m = origin_m + index @ self.surface.steps_m[:2]
+        if self.surface.is_plane:
+            return plane_m
+        # As far off the plane as the pixels around.
+        around = (index // LEAST_SIDE * LEAST_SIDE).astype(np.int64)
+        middle = around + (np.array(LEAST_SIDE) - 1) / 2
+        off_m = self.surface.middles_m(LEAST_SIDE, around) - origin_m
+        return plane_m + off_m - middle @ self.surface.steps_m[:2]
+
+    def subimages(self, side: Side) -> int:
+        """Return how many subimages of a size hold a pixel."""
+        if self.surface.is_plane:
+            shape = self.surface.plane.shape
+            return math.prod(-(-n // s) for n, s in zip(shape, side, strict=True))
+        return int((self.surface.counts(side) > 0).sum())
+
+    def padded_pixels(self, side: Side, width: int) -> float:
+        """Return the mean pixel count of a subimage after padding to whole work-items.
+
+        On a plane these are all its pixels; elsewhere groups of blocks of `width` pixels.
+        """
+        if self.surface.is_plane:
+            return float(math.prod(side))
+        padded = self._padded(side, width)
+        return float(padded.sum() / (padded > 0).sum())
+
+    def most_padded_pixels(self, side: Side, root: Side, width: int) -> int:
+        """Return the largest padded pixel count of all leaves of a root together."""
+        return int(within_roots(np.add, self._padded(side, width), side, root).max())
+
+    def _padded(self, side: Side, width: int) -> NDArray[np.int64]:
+        size = STACK * width
+        return -(-self.surface.counts(side) // size) * size
+
+    def extents(
+        self, side: Side, root: Side | None = None, *, most: bool = False
+    ) -> NDArray[np.float64]:
+        """Return the extents of subimages of a size, [axes].
+
+        Their relief is the largest in each root, of this model's size unless given: its mean over
+        the roots, or the largest.
+        """
+        if self.surface.is_plane:
+            return self.surface.extents(side)
+        root = root or self.root or side
+        mean_m, largest_m = self.from_cache(
+            ("relief", side, root), lambda: _mean_and_max(self._relief_m(side, root))
+        )
+        return self.surface.extents(side, largest_m if most else mean_m)
+
+    def _relief_m(self, side: Side, root: Side) -> NDArray[np.float64]:
+        """Largest relief of the subimages of a size in every root, [down, across]."""
+        if root == side:
+            return self.surface.relief_m(side)
+        # Half as large a root, already known in most cases, leaves two values to compare.
+        axis = 0 if root[0] // side[0] > root[1] // side[1] else 1
+        half = (root[0] // 2, root[1]) if axis == 0 else (root[0], root[1] // 2)
+        if root[axis] % 2 or half[axis] % side[axis]:
+            return self.surface.relief_m(side, root)
+        of_half = self.from_cache(("reliefs", side, half), lambda: self._relief_m(side, half))
+        return np.maximum.reduceat(of_half, np.arange(0, of_half.shape[axis], 2), axis=axis)
+
+    def half_range_extents_m(self, sides: Sequence[Side]) -> NDArray[np.float64]:
+        """Return the largest differences in range between pixels and subimages' centres, [sizes].
+
+        The sides of subimages project onto the line of sight; within near subimages ranges bend.
+        """
+        steps_m = self.surface.steps_m
+        boxes = np.stack([self.extents(side, root=side, most=True) for side in sides])
+        corners = np.array(list(product((-0.5, 0.5), repeat=len(steps_m))))
+        radius_m = np.linalg.norm((boxes[:, None] * corners) @ steps_m, axis=-1).max(axis=1)
+        bend_m = radius_m**2 / (2 * np.maximum(self.nearest_m, radius_m))
+        return np.minimum(boxes @ self._range_slopes_m / 2 + bend_m, radius_m)
+
+    @property
+    @cached
+    def _range_slopes_m(self) -> NDArray[np.float64]:
+        """Largest change of range per row, column and metre of relief, [axes]."""
+        visible = self.visible(SMALL)
+        slopes = np.abs(self.sight @ self.surface.steps_m.T)
+        slopes = slopes[visible] if visible.any() else slopes.reshape(-1, slopes.shape[-1])
+        return 1.02 * slopes.max(axis=0)
+
+    def half_lengths(
+        self, sides: Sequence[Side], align: Interpolator, final: Interpolator, to: Resampling
+    ) -> tuple[int, ...]:
+        """Return the samples that the lines of each stage hold on either side of a centre.
+
+        `to` is the resampling of the lines before the first stage.
+        """
+        samples_per_m = to.samples_per_m(self.lines)
+        return tuple(
+            math.ceil(extent_m * samples_per_m)
+            + (len(sides) - 1 - level) * (align.taps // 2 + 1)
+            + final.taps // 2
+            + 1
+            for level, extent_m in enumerate(self.half_range_extents_m(sides))
+        )
+
+    # What is visible through the beam.
+
+    @cached
+    def visible(self, side: Side) -> NDArray[np.bool_]:
+        """Return which track samples touch a subimage with their beam, bool [points, samples]."""
+        if self.limits is None:
+            return np.broadcast_to(self.on_track, self.distance_m.shape)
+        return self.visible_by_size((side,))[0]
+
+    @cached
+    def visible_by_size(self, sides: tuple[Side, ...]) -> NDArray[np.bool_]:
+        """Return `visible` of subimages of some sizes, bool [sizes, points, samples]."""
+        shape = len(sides), *self.distance_m.shape
+        if self.limits is None:
+            return np.broadcast_to(self.on_track, shape)
+        half = np.stack([self.extents(side, most=True) for side in sides]) / 2
+        boxes, (low, high) = self._boxes, self.limits
+        radius_m = np.linalg.norm(half @ np.abs(boxes.axes_m), axis=1)
+        # Depth of the boxes in the beam, as of `Visibility.overlap`, for all sizes at once.
+        factors = np.column_stack([half, radius_m**2])
+        slopes = np.stack([*boxes.slopes, boxes.inverse_m**2]).reshape(factors.shape[1], -1)
+        outside = np.abs(boxes.sine - (low + high) / 2) - (high - low) / 2
+        return self.on_track & ((factors @ slopes).reshape(shape) > outside)
+
+    @property
+    @shared
+    def _boxes(self) -> Visibility:
+        """Boxes of cells at the sample points, seen from the track."""
+        origin_m = self.points_m[0]
+        return Visibility.of(
+            self.points_m - origin_m, self.surface.steps_m, self.track_m - origin_m, self.along
+        )
+
+    def visible_share(self, side: Side, *, most: bool = False) -> float:
+        """Fraction of channels whose beam touches a subimage: mean over the points, or maximum."""
+        count = np.count_nonzero(self.visible(side), axis=1)
+        return _over_points(count / np.count_nonzero(self.on_track), most)
+
+    @property
+    @cached
+    def visible_track_ends(self) -> float:
+        """Mean number of the track's ends whose beam touches a sample point."""
+        ends = np.flatnonzero(self.on_track)[[0, -1]]
+        return float(self.visible(SMALL)[:, ends].sum(axis=1).mean())
+
+    # Phases along the aperture.
+
+    @property
+    @cached
+    def rates(self) -> NDArray[np.float64]:
+        """Cycles per row, column and metre of relief, and per unit of the track's parameter.
+
+        float64 [axes, points, samples]; the largest within roots of the model's size, if it has
+        any.
+        """
+        if self.root is None:
+            extents = np.zeros(len(self.surface.steps_m))
+        else:
+            extents = self.extents(self.root, most=True)
+        return self._rates(extents, self.points_m)
+
+    def visible_phase_cycles(
+        self, rates: NDArray[np.float64], visible: NDArray[np.bool_], *, most: bool = False
+    ) -> float:
+        """Phase accumulated along the visible part of the aperture, cycles.
+
+        The mean over the sample points, or the maximum; `rates` is [points, samples].
+        """
+        return _over_points(np.where(visible, rates, 0.0) @ self.spacing, most)
+
+    def subimage_phase_cycles(
+        self, side: Side, visible: NDArray[np.bool_], *, most: bool = False
+    ) -> float:
+        """Return `visible_phase_cycles` of the fastest phase in subimages of a size."""
+        rates = np.tensordot(self.extents(side, most=most), self.rates, 1)
+        return self.visible_phase_cycles(rates, visible, most=most)
+
+    def virtual_channels(self, taps: Any, density: float, phase_cycles: Any) -> Any:
+        """Return the number of virtual channels of a subimage, from its phase in cycles.
+
+        All may be arrays. `taps` and `density`, virtual channels per cycle, are the aperture
+        filter's. The filter extends beyond the track's ends.
+        """
+        return density * phase_cycles + 1 + self.visible_track_ends * (taps / 2 - 0.5)
+
+    def phase_cycles_in_root(self, root: Side, sides: tuple[Side, ...]) -> NDArray[np.float64]:
+        """Estimate the phase per row, column and metre of relief in a root, cycles [sizes, axes].
+
+        Accumulated along the part of the aperture where a subimage of each size is visible; the
+        mean over the inner sample points. With a root of 0 rows, at the points themselves.
+        """
+        extents = self.extents(root, most=True) if any(root) else self.surface.extents(root)
+        rates = self._rates(extents, self.points_m[_INNER], _SEARCH_STEP)
+        return self._visible_spacing(sides) @ rates.reshape(len(rates), -1).T
+
+    @cached
+    def _visible_spacing(self, sides: tuple[Side, ...]) -> NDArray[np.float64]:
+        """Weights of track samples at inner points, 0 where a size is invisible, [sizes, n]."""
+        visible = self.visible_by_size(sides)[:, _INNER, ::_SEARCH_STEP]
+        spacing = _spacing(self.track.samples[::_SEARCH_STEP]) / len(_INNER)
+        return (visible * spacing).reshape(len(sides), -1)
+
+    def _rates(
+        self, extents: NDArray[np.float64], centres_m: NDArray[np.float64], every: int = 1
+    ) -> NDArray[np.float64]:
+        return cycles_per_extent(
+            self.track,
+            self.surface,
+            centres_m,
+            extents,
+            self.highest_cycles_per_m,
+            self.nearest_m,
+            self.limits,
+            self.along,
+            every,
+        )
+
+
+def mean_over_points(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return means over the grid of values at the sample points, [..., points]."""
+    return values @ _POINT_WEIGHTS
+
+
+def _over_points(values: NDArray[np.float64], most: bool) -> float:
+    """Return the largest of values at the sample points, or their mean over the grid."""
+    return float(values.max() if most else mean_over_points(values))
+
+
+def _mean_and_max(values: NDArray[np.float64]) -> tuple[float, float]:
+    return float(values.mean()), float(values.max())
+
+
+def _spacing(samples: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the weights of samples in an integral over them (trapezoidal rule)."""
+    halves = np.diff(samples) / 2
+    return np.concatenate([halves, [0.0]]) + np.concatenate([[0.0], halves])
