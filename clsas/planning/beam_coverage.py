@@ -53,7 +53,7 @@ def sweeps_once(model: VisibilityModel) -> bool:
         return True
     # Neighbours on the track must look in much the same direction. At a kink the beam may swing
     # past a point within a few channels, and a track may lead back beside itself.
-    along = model.channels_along[np.argsort(model.track.place, kind="stable")]
+    along = model.channels_along[np.argsort(model.track.coordinate, kind="stable")]
     turned = np.linalg.norm(np.diff(along, axis=0), axis=1)
     if turned.max(initial=0.0) > _MOST_TURNED * np.ptp(np.clip(model.beam.limits, -1, 1)):
         return False

@@ -39,7 +39,7 @@ def track_error_m(model: VisibilityModel) -> NDArray[np.float64]:
 
     The motion of receivers that differs from the mean is added, as it acts at the median range.
     """
-    away_m = model.lines.phase_centres_m - model.track.positions_m(model.track.place)
+    away_m = model.lines.phase_centres_m - model.track.positions_m(model.track.coordinate)
     error_m = np.linalg.norm(away_m, axis=1)
     drift = own_drift(model)
     if drift is not None:
@@ -56,7 +56,7 @@ def own_drift(model: VisibilityModel) -> NDArray[np.float64] | None:
 @shared
 def peak_density(model: VisibilityModel) -> float:
     """Peak channel density along the aperture, relative to the mean."""
-    place = np.sort(model.track.place)
+    place = np.sort(model.track.coordinate)
     some = min(_NEIGHBOURS, len(place) - 1)
     closest = float((place[some:] - place[:-some]).min())
     average = float(place[-1] - place[0]) * some / (len(place) - 1)

@@ -13,10 +13,11 @@ from scipy.spatial.distance import cdist
 
 from clsas.core.geometry import pairwise_range_m
 from clsas.core.lines import SAMPLED_CHANNELS, some_channels, wavelength_m
-from clsas.exact.tiles import BLOCKS, ROUNDING
+from clsas.exact.layout import ROUNDING
+from clsas.exact.tiles import BLOCKS
 from clsas.factorized.aperture import drift, stretches
 from clsas.factorized.thesis import stage_errors_m
-from clsas.factorized.tree import interpolated_directions
+from clsas.factorized.visibility import interpolated_directions
 from clsas.opencl.device import Device
 from clsas.planning.caching import cached
 from clsas.planning.channels import own_drift, track_error_m
@@ -117,15 +118,15 @@ def _mean_track_error(model: VisibilityModel, side: Side, extents: NDArray[np.fl
     lines, track = model.lines, model.track
     points = np.array(SPREAD_POINTS)
     visible = model.visible(side)[points]
-    candidates = np.flatnonzero(np.interp(track.place, track.samples, visible.any(axis=0)))
+    candidates = np.flatnonzero(np.interp(track.coordinate, track.samples, visible.any(axis=0)))
     index, counts = _sampled_channels(model, candidates)
-    part = replace(track, place=track.place[index])
+    part = replace(track, coordinate=track.coordinate[index])
     tx_m, rx_m, middle_m = (each[index] for each in (lines.tx_m, lines.rx_m, lines.phase_centres_m))
     velocity, drifts = lines.rx_velocity_m_s, own_drift(model)
     moving = velocity if velocity is None else velocity[index]
     own = drifts if drifts is None else drifts[index]
     antennas = tx_m, rx_m, moving, lines.sound_speed_m_s
-    visible = np.stack([np.interp(part.place, track.samples, each) for each in visible]) > 0
+    visible = np.stack([np.interp(part.coordinate, track.samples, each) for each in visible]) > 0
     touched = visible.any(axis=1)
     points, visible = points[touched], visible[touched]
     if not points.size:
@@ -135,7 +136,7 @@ def _mean_track_error(model: VisibilityModel, side: Side, extents: NDArray[np.fl
     points_m = model.points_m[points, None] + offsets_m
     centres_m, all_m = points_m[:, 0], points_m.reshape(-1, 3)
     range_m = pairwise_range_m(all_m, *antennas).reshape(*points_m.shape[:2], -1)
-    virtual_m = track.positions_m(part.places_seen_from(centres_m, middle_m, own))
+    virtual_m = track.positions_m(part.apparent_coordinates(centres_m, middle_m, own))
     virtual_range_m = np.stack([cdist(*each) for each in zip(points_m, virtual_m, strict=True)])
     virtual_range_m -= (points_m @ drift(lines))[..., None]
     change_m, virtual_change_m = (each[:, 1:] - each[:, :1] for each in (range_m, virtual_range_m))
@@ -147,7 +148,7 @@ def _mean_track_error(model: VisibilityModel, side: Side, extents: NDArray[np.fl
     wrong += (2 * np.pi * model.rms_cycles_per_m * stretched_m) ** 2
     weights = np.ones_like(wrong)
     if model.beam is not None:
-        directions = interpolated_directions(track.samples, model.along, part.place)
+        directions = interpolated_directions(track.samples, model.along, part.coordinate)
         virtual = [sines(*each, directions) for each in zip(points_m, virtual_m, strict=True)]
         channels = [sines(each, middle_m, model.channels_along[index]) for each in points_m]
         weights, of_virtual = (
@@ -183,7 +184,7 @@ def nearest_errors(
 
     Range errors are taken as spread evenly up to the bound. Those of stages add, not their powers.
     """
-    centres_m = model.lines.phase_centres_m[np.argsort(model.track.place)]
+    centres_m = model.lines.phase_centres_m[np.argsort(model.track.coordinate)]
     spacing_m = np.linalg.norm(np.diff(centres_m, axis=0), axis=1).mean()
     image_m = np.max(np.array(model.grid.shape) * np.linalg.norm(model.surface.steps_m, axis=1))
     errors_m = stage_errors_m(stages, spacing_m, image_m, model.nearest_m)

@@ -18,7 +18,13 @@ from numpy.typing import NDArray
 from clsas.core.decibels import in_db, power
 from clsas.factorized.buffers import LEAST_BATCH
 from clsas.factorized.estimates import Work, backprojecting_leaves, combining, upsampling
-from clsas.factorized.filters import ALIGN_TAPS, APERTURE_TAPS, UPSAMPLING_SHARE, Choice, choose
+from clsas.factorized.filters import (
+    ALIGN_TAPS,
+    APERTURE_TAPS,
+    UPSAMPLING_SHARE,
+    FilterRates,
+    choose,
+)
 from clsas.opencl.device import Device
 from clsas.planning.caching import cached
 from clsas.planning.costs import Costs
@@ -54,7 +60,7 @@ class Tree:
     align_taps: int
     aperture_taps: int
 
-    def filters(self, spectrum: Spectrum, filters_db: float) -> Choice | None:
+    def filters(self, spectrum: Spectrum, filters_db: float) -> FilterRates | None:
         """Return filters whose errors together are no more than `filters_db`; None without any."""
         return choose(spectrum, self.align_taps, self.aperture_taps, len(self.sides), filters_db)
 
@@ -77,7 +83,7 @@ class Sizes:
     half_range_extent_m : float64
         Largest difference in range between a pixel and the centre.
     beam_cycles : float64
-        Phase cycles of a beam's weights along the visible aperture; see `tree.beam_rate`.
+        Phase cycles of a beam's weights along the visible aperture; see `visibility.beam_rate`.
     leaf_error : float64
         Error power that expanding a leaf of this size adds.
     """
@@ -180,7 +186,7 @@ class Options:
 
     Attributes
     ----------
-    choices : list of Choice, [options]
+    choices : list of FilterRates, [options]
     stages : int64 [options]
         Never increasing.
     density, ends : float64 [options, 1, 1]
@@ -197,7 +203,7 @@ class Options:
         Phase cycles that the beam's weights add to those of a leaf.
     """
 
-    choices: list[Choice]
+    choices: list[FilterRates]
     stages: NDArray[np.int64]
     density: NDArray[np.float64]
     ends: NDArray[np.float64]
@@ -265,7 +271,7 @@ def all_options(
             stages.append(number)
     if not choices:
         return None
-    numbers = [(c.rate, c.final_taps, c.align_taps + c.aperture_taps) for c in choices]
+    numbers = [(c.upsampling, c.final_taps, c.align_taps + c.aperture_taps) for c in choices]
     rate, final_taps, taps = np.array(numbers).T[..., None]
     samples = 2 * sizes.half_range_extent_m * rate / model.lines.range_step_m
     samples += final_taps + _SPARE_SAMPLES
@@ -283,7 +289,7 @@ def all_options(
     }
     leaf = sizes.leaf_error <= _LEAF_SHARE * power(filters_db)
     leaf &= np.prod(sizes.sides, axis=1) >= leaf_pixels
-    density = np.array([2 * choice.density for choice in choices])
+    density = np.array([2 * choice.oversampling for choice in choices])
     aperture_taps = np.array([choice.aperture_taps for choice in choices])
     return Options(
         choices,

@@ -16,7 +16,8 @@ from scipy.sparse import csr_array
 
 from clsas.core.decibels import power
 from clsas.core.lines import wavelength_m
-from clsas.factorized.tree import interpolated_directions, interpolated_nodes
+from clsas.factorized.tree import interpolated_channels
+from clsas.factorized.visibility import interpolated_directions
 from clsas.planning.caching import cached
 from clsas.planning.channels import carriers
 from clsas.planning.sample_pixels import SAMPLED_PIXELS, SPREAD_POINTS, mean_over_relief, pixels_m
@@ -76,11 +77,11 @@ def _interpolation_error(
     rates = oversampling * np.tensordot(extents, model.rates[:, samples.points], 1)
     if weighted:
         rates = rates + beam_cycles * model.beam_rates[samples.points]
-    nodes = interpolated_nodes(model.track, rates, samples.place, aperture)
-    of_nodes = _steering(model, samples.pixels, weighted, nodes.place)
+    nodes = interpolated_channels(model.track, rates, samples.coordinate, aperture)
+    of_nodes = _steering(model, samples.pixels, weighted, nodes.coordinate)
     # One sparse matrix interpolates at all aperture coordinates of all subimages.
     index = nodes.base[..., None] + np.arange(nodes.taps)
-    index += nodes.place.shape[1] * np.arange(len(index))[:, None, None]
+    index += nodes.coordinate.shape[1] * np.arange(len(index))[:, None, None]
     weights = nodes.weights.astype(np.float32).ravel()
     rows = np.arange(0, weights.size + 1, nodes.taps)
     of_nodes = of_nodes.reshape(-1, of_nodes.shape[-1])
@@ -103,7 +104,7 @@ class _Samples:
         The sample points that they lie at.
     count : int64 [n]
         Number of channels whose beam touches each.
-    place : float64 [n, places]
+    coordinate : float64 [n, places]
         Aperture coordinates, ascending, distributed as those of the channels.
     pixels : (centres_m, offsets_m, cycles_per_m)
         See `_steering`.
@@ -113,7 +114,7 @@ class _Samples:
 
     points: NDArray[np.int64]
     count: NDArray[np.int64]
-    place: NDArray[np.float64]
+    coordinate: NDArray[np.float64]
     pixels: _Pixels
     exact: NDArray[np.float32]
 
@@ -153,7 +154,7 @@ def _visible_channels(
     number of channels, 0 where the track has a gap. The edges of visibility lie between samples of
     the track, so the range is one sample wider on either side.
     """
-    places, samples = np.sort(model.track.place), model.track.samples
+    places, samples = np.sort(model.track.coordinate), model.track.samples
     visible = model.visible(side)
     begin = samples[np.maximum(visible.argmax(axis=1) - 1, 0)]
     last = visible.shape[1] - visible[:, ::-1].argmax(axis=1)

@@ -17,7 +17,7 @@ from clsas.core.lines import RangeLines
 from clsas.exact.tiles import STACK
 from clsas.factorized.aperture import cycles_per_extent, mean_track
 from clsas.factorized.surface import LEAST_SIDE, surface_of, within_roots
-from clsas.factorized.tree import beam_directions, beam_rate
+from clsas.factorized.visibility import beam_directions, beam_rate
 from clsas.planning.caching import cached, shared
 from clsas.signal.ambiguity import Ambiguity, ambiguity
 from clsas.signal.interpolation import Interpolator, Resampling
@@ -75,7 +75,7 @@ class VisibilityModel:
     nearest_m : float
         Lower bound of the distance between pixels and channels.
     beam_rates : float64 [points, samples]
-        Change of the beam's weights along the track as a phase rate; see `tree.beam_rate`.
+        Change of the beam's weights along the track as a phase rate; see `visibility.beam_rate`.
     limits : (low, high) or None
         Sines of the aspect angle between which weights are not 0.
     root : (rows, columns) or None

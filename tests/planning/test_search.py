@@ -50,7 +50,7 @@ def cost_of(tree, view, filters_db, most, leaf_pixels, beam_cycles, device, cost
     cycles, place = division.cycles, {int(size): n for n, size in enumerate(division.index)}
 
     def channels(phase_cycles):
-        return view.virtual_channels(choice.aperture_taps, 2 * choice.density, phase_cycles)
+        return view.virtual_channels(choice.aperture_taps, 2 * choice.oversampling, phase_cycles)
 
     total = options.roots_s[0, path[0]]
     for parent, child in pairwise(path):
