@@ -15,11 +15,11 @@ from pydantic.dataclasses import dataclass
 
 from clsas.core import reprs
 from clsas.core.lines import RangeLines
-from clsas.factorized import tree
+from clsas.factorized import tree, visibility
 from clsas.factorized.estimates import StageChannels
 from clsas.factorized.fields import CONFIG, RangeFilter
 from clsas.factorized.filters import edges_gain
-from clsas.factorized.tree import Nodes
+from clsas.factorized.tree import VirtualChannels
 from clsas.signal.interpolation import Gain, Interpolator
 from clsas.sonar.beam import BeamWindow
 
@@ -142,7 +142,7 @@ class InterpolatedAperture:
         root_m: NDArray[np.float64],
         place: NDArray[np.float64],
         channels_m: NDArray[np.float64],
-    ) -> list[Nodes]:
+    ) -> list[VirtualChannels]:
         """Return the virtual channels of some roots, stage by stage.
 
         Parameters
@@ -156,16 +156,16 @@ class InterpolatedAperture:
             Their positions.
         """
         sides, surface, track = geometry.factorization.sides, geometry.surface, geometry.track
-        rates, nodes = geometry.phase_rates(roots, root_m), list[Nodes]()
+        rates, nodes = geometry.phase_rates(roots, root_m), list[VirtualChannels]()
         for oversampling, side in zip(self.oversampling, sides, strict=True):
             extents = oversampling * surface.extents_in(side, sides[0], roots)
             rate = np.einsum("ra,ars->rs", extents, rates)
             last = len(nodes) == len(sides) - 1
             if last and geometry.beam is not None and geometry.along is not None:
-                beam_rate = tree.beam_rate(geometry.beam, track, geometry.along, root_m)
+                beam_rate = visibility.beam_rate(geometry.beam, track, geometry.along, root_m)
                 rate += self.beam_cycles * beam_rate
-            nodes.append(tree.interpolated_nodes(track, rate, place, self.filter))
-            place = nodes[-1].place
+            nodes.append(tree.interpolated_channels(track, rate, place, self.filter))
+            place = nodes[-1].coordinate
         return nodes
 
     def predicted_channels(

@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 
 from clsas.core.decibels import power
 from clsas.core.lines import RangeLines, wavelength_m
+from clsas.exact.groups import Groups
 from clsas.exact.lookup import lookup_options
-from clsas.exact.tiles import Groups, Tiles
-from clsas.factorized import tree
+from clsas.exact.tiles import Tiles
+from clsas.factorized import visibility
 from clsas.factorized.buffers import Level, leaf_tables, pixel_buffers
 from clsas.factorized.sector import Geometry, Sector
 from clsas.opencl.buffers import (
@@ -103,8 +104,8 @@ class Leaves:
         position_m = sector.positions_m(-1)
         rows = [float_pairs(position_m.reshape(-1, 3))]
         if self.geometry.along is not None:
-            along = tree.interpolated_directions(
-                self.geometry.track.samples, self.geometry.along, sector.nodes[-1].place
+            along = visibility.interpolated_directions(
+                self.geometry.track.samples, self.geometry.along, sector.nodes[-1].coordinate
             )
             rows.append((along * self.beam.per_sine).astype(np.float32).reshape(-1, 3))
         values = {"geometry": np.concatenate(rows, axis=1).T} | self._parts(sector)
@@ -147,7 +148,7 @@ class Leaves:
     ) -> NDArray[np.int32]:
         """Return virtual channels of tiles or groups, and the first line, [..., 3]."""
         need = sector.needs[-1]
-        node = root * sector.nodes[-1].place.shape[1]
+        node = root * sector.nodes[-1].coordinate.shape[1]
         in_batch = root % self.factorization.roots_at_once * need.first.shape[1] + leaf
         ranges = [
             node + need.first[root, leaf],
@@ -174,9 +175,9 @@ def _represented(sector: Sector) -> NDArray[np.float32]:
     Cubics interpolate the beam's weights, which are smooth along the track. The stages' filters err
     as little on average, but with the same sign on a function so smooth.
     """
-    nodes = sector.nodes[-1].place
+    nodes = sector.nodes[-1].coordinate
     shares = np.empty(nodes.shape)
-    for root, (at, place) in enumerate(zip(nodes, sector.place, strict=True)):
+    for root, (at, place) in enumerate(zip(nodes, sector.coordinate, strict=True)):
         first = np.clip(np.searchsorted(at, place) - 2, 0, len(at) - 4)
         index = first[:, None] + np.arange(4)
         near = at[index]

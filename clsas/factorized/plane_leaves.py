@@ -9,7 +9,6 @@ import pyopencl as cl
 from numpy.typing import NDArray
 
 from clsas.core.geometry import bistatic_range_m
-from clsas.exact.run import normalising
 from clsas.exact.tiles import STACK, Tiles
 from clsas.factorized.buffers import tile_buffers
 from clsas.factorized.leaves import Finish, Leaves
@@ -17,6 +16,7 @@ from clsas.factorized.sector import Sector
 from clsas.factorized.tree import Division
 from clsas.opencl.buffers import VECTOR_ROOM, channel_pitch, expansion_kernel, float_pairs
 from clsas.opencl.device import Slot
+from clsas.sonar.beam import normalising
 
 _EVERYTHING = slice(None), slice(None)
 
@@ -95,7 +95,7 @@ class PlaneLeaves(Leaves):
             (pitch // self.width, tiles),
             **expanded,
             geometry=tables["geometry"],
-            geometry_pitch=sector.nodes[-1].place.size + VECTOR_ROOM,
+            geometry_pitch=sector.nodes[-1].coordinate.size + VECTOR_ROOM,
             centres=self.centres,
             column_step=column_m,
             row_step=row_m,

@@ -14,12 +14,12 @@ from scipy.spatial.distance import cdist
 
 from clsas.core.geometry import pairwise_range_m
 from clsas.core.lines import RangeLines, some_channels
-from clsas.factorized import tree
+from clsas.factorized import tree, visibility
 from clsas.factorized.aperture import cycles_per_extent, drift, mean_track, own_drift, stretches
 from clsas.factorized.interpolated import BEAM_MARGIN
 from clsas.factorized.plan import Plan
 from clsas.factorized.surface import Surface
-from clsas.factorized.tree import Division, Nodes, Ranges
+from clsas.factorized.tree import ChannelRanges, Division, VirtualChannels
 from clsas.opencl.buffers import MARGIN
 
 _ON_TRACK = 1e-4  # wavelengths; closer, channels lie on the mean track
@@ -43,11 +43,11 @@ class Sector:
         Raw channels, in the order of the track, that see any of them.
     relative_m : list of float64 [roots, subimages, 3]
         Centres of subimages relative to those of their roots, stage by stage.
-    nodes : list of Nodes
+    nodes : list of VirtualChannels
         Virtual channels, stage by stage.
     needs : list of Ranges
         Virtual channels of each subimage, and the channels that it combines, stage by stage.
-    place : float64 [roots, channels]
+    coordinate : float64 [roots, channels]
         Aperture coordinates of the raw channels.
     """
 
@@ -55,9 +55,9 @@ class Sector:
     root_m: NDArray[np.float64]
     channels: slice
     relative_m: list[NDArray[np.float64]]
-    nodes: list[Nodes]
-    needs: list[Ranges]
-    place: NDArray[np.float64]
+    nodes: list[VirtualChannels]
+    needs: list[ChannelRanges]
+    coordinate: NDArray[np.float64]
 
     @property
     def nbytes(self) -> int:
@@ -114,18 +114,18 @@ class Geometry:
             raise ValueError(
                 "lines must have channels at more than one place for a plan that divides"
             )
-        self.channels = np.argsort(track.place, kind="stable")
-        self.track = replace(track, place=track.place[self.channels])
+        self.channels = np.argsort(track.coordinate, kind="stable")
+        self.track = replace(track, coordinate=track.coordinate[self.channels])
         self.along: NDArray[np.float64] | None = None
         if beam is not None:
             along = beam.directions(lines)[self.channels]
-            self.along = tree.beam_directions(along, self.track, track.samples)
+            self.along = visibility.beam_directions(along, self.track, track.samples)
         self.phase_centres_m = lines.phase_centres_m[self.channels]
         self.drift, own = drift(lines), own_drift(lines)
         self.own_drift = own if own is None else own[self.channels]
         self._seen = Division(surface, (image.sides[0], self._together(), image.sides[-1]))
         # On the track itself there is nothing to align.
-        off_m = np.abs(self.phase_centres_m - self.track.positions_m(self.track.place)).max()
+        off_m = np.abs(self.phase_centres_m - self.track.positions_m(self.track.coordinate)).max()
         wavelength_m = lines.sound_speed_m_s / max(lines.carrier_hz, 1.0)
         if own is not None:
             off_m += np.linalg.norm(own, axis=1).max() * np.abs(lines.last_range_m).max()
@@ -230,16 +230,18 @@ class Geometry:
         half_m = half_m[:, None] * surface.steps_m
         begin, end = (
             each[:, self._seen.parents(2)]
-            for each in tree.seen_from(self.factorization.limits, track, self.along, seen_m, half_m)
+            for each in visibility.visible_stretches(
+                self.factorization.limits, track, self.along, seen_m, half_m
+            )
         )
         inside = surface.holds(sides[-1], corners[-1])
-        channels = aperture.used_channels(track.place, begin[inside], end[inside], self._slack)
+        channels = aperture.used_channels(track.coordinate, begin[inside], end[inside], self._slack)
         centres_m = self.phase_centres_m[channels]
-        some = replace(track, place=track.place[channels])
+        some = replace(track, coordinate=track.coordinate[channels])
         own = None if self.own_drift is None else self.own_drift[channels]
-        place = some.places_seen_from(root_m, centres_m, own)
+        place = some.apparent_coordinates(root_m, centres_m, own)
         nodes = aperture.virtual_channels(self, roots, root_m, place, centres_m)
-        needs = tree.ranges(division, nodes, place, (begin, end), inside)
+        needs = tree.channel_ranges(division, nodes, place, (begin, end), inside)
         return Sector(roots, root_m, channels, relative_m, nodes, needs, place)
 
     def phase_rates(
@@ -301,7 +303,7 @@ class Geometry:
 
     def _ramp(self, sector: Sector) -> NDArray[np.float64]:
         """Return cycles per sample by which channels' phases grow faster than their stand-ins'."""
-        virtual_m = self.track.positions_m(sector.place)
+        virtual_m = self.track.positions_m(sector.coordinate)
         tx_m, rx_m, velocity, speed = self._antennas(sector)
         plane = self.surface.plane
         stretch = stretches(

@@ -6,12 +6,13 @@ import numpy as np
 import pyopencl as cl
 from numpy.typing import NDArray
 
-from clsas.exact.run import normalising
-from clsas.exact.tiles import BLOCKS, groups_within
+from clsas.exact.groups import groups_within
+from clsas.exact.tiles import BLOCKS
 from clsas.factorized.leaves import Finish, Leaves
 from clsas.factorized.sector import MOST_KEPT_BYTES, Sector
 from clsas.opencl.buffers import VECTOR_ROOM, float_pairs
 from clsas.opencl.device import Slot
+from clsas.sonar.beam import normalising
 
 _ALL = slice(None)
 
@@ -99,7 +100,7 @@ class SurfaceLeaves(Leaves):
                 centre_sample=self.level.centre,
                 drift=self.geometry.drift,
                 geometry=tables["geometry"],
-                geometry_pitch=sector.nodes[-1].place.size + VECTOR_ROOM,
+                geometry_pitch=sector.nodes[-1].coordinate.size + VECTOR_ROOM,
                 centres=tables["centres"],
                 offsets=tables["offsets"],
                 points=size * (self._groups(self._roots(sector)).stop - first),

@@ -20,7 +20,7 @@ from clsas.factorized.estimates import StageChannels
 from clsas.factorized.fields import CONFIG, Whole
 from clsas.factorized.interpolated import VisiblePhases
 from clsas.factorized.surface import surface_of
-from clsas.factorized.tree import Division, Nodes
+from clsas.factorized.tree import Division, VirtualChannels
 from clsas.signal.interpolation import Gain, Interpolator
 
 if TYPE_CHECKING:
@@ -84,12 +84,12 @@ class NearestBeams:
         root_m: NDArray[np.float64],
         place: NDArray[np.float64],
         channels_m: NDArray[np.float64],
-    ) -> list[Nodes]:
+    ) -> list[VirtualChannels]:
         """Return the beams of some roots, stage by stage."""
         nodes, position_m = [], np.broadcast_to(channels_m, (*place.shape, 3))
         for factor in self.factors:
             nodes.append(tree.nearest_nodes(place, position_m, factor))
-            place, position_m = nodes[-1].place, nodes[-1].position_m
+            place, position_m = nodes[-1].coordinate, nodes[-1].position_m
         return nodes
 
     def predicted_channels(
@@ -221,7 +221,7 @@ def plan_errors_m(
     track, image = mean_track(lines), plan.factorization
     if track is None or not isinstance(image.aperture, NearestBeams) or not grid.is_planar:
         raise ValueError("plan must be one of stages, for lines and a plane that it was made for")
-    order = np.argsort(track.place, kind="stable")
+    order = np.argsort(track.coordinate, kind="stable")
     ends_m = lines.tx_m[order], lines.rx_m[order]
     division = Division(surface_of(grid), image.sides)
     index = np.asarray(pixels, np.int64)

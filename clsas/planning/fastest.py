@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 
 from clsas.core.decibels import in_db, power
 from clsas.factorized.estimates import ErrorBudget
-from clsas.factorized.filters import Choice, Filters, steering_spectrum
+from clsas.factorized.filters import FilterRates, Filters, steering_spectrum
 from clsas.factorized.interpolated import InterpolatedAperture
 from clsas.factorized.plan import Plan
 from clsas.opencl import phases
@@ -54,7 +54,7 @@ class _Problem:
 
     view: View
     conditions: Conditions
-    designs: dict[tuple[Choice, int, float], Filters] = field(default_factory=dict)
+    designs: dict[tuple[FilterRates, int, float], Filters] = field(default_factory=dict)
 
     @property
     def tolerance_db(self) -> float:
