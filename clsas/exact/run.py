@@ -36,9 +36,10 @@ from clsas.opencl.device import Device, Slot
 from clsas.signal.interpolation import Resampling
 from clsas.sonar.beam import INTERVALS, LEAST_WEIGHT_SUM, BeamWindow
 from clsas.sonar.coverage import warn_unseen
-from clsas.sonar.visibility import channel_ranges
+from clsas.sonar.visibility import BeamTrack
 
 _CHANNELS_AT_ONCE = 512  # bounds a float32 partial sum; lines that stay in a CPU's cache
+_SINE_ROUNDING = 1e-5  # more than the device's rounding error of a sine
 _PART_BYTES = 64 << 20  # device memory for one set of parts: a job of some tenths of a second
 
 
@@ -249,13 +250,10 @@ class _Run:
         count = channels.stop - channels.start
         if p.beam is None:
             return np.tile(np.array([0, count], np.int32), (band.stop - band.start, 1))
-        lines, along = p.lines.select(channels), p.along[channels]
-        return np.concatenate(
-            [
-                channel_ranges(p.beam, lines, along, p.layout.centres_m(parts), self.radius_m)
-                for parts in slices(band, self.parts_at_once)
-            ]
-        )
+        low, high = p.beam.limits
+        limits = low - _SINE_ROUNDING, high + _SINE_ROUNDING
+        track = BeamTrack(limits, p.lines.phase_centres_m[channels], p.along[channels])
+        return track.spans(p.layout.boxes(band)).ranges
 
     def _launch(
         self,

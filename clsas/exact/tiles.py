@@ -16,6 +16,7 @@ from scipy.spatial import KDTree
 
 from clsas.core.grid import Grid
 from clsas.sonar.beam import BeamWindow
+from clsas.sonar.visibility import Boxes
 
 STACK = 4
 """Blocks per work-item, one below the other (cl/pixels.h)."""
@@ -153,6 +154,11 @@ class Tiles:
             + (across * self.side + middle) * self.grid.column_step_m
         )
 
+    def boxes(self, parts: slice) -> Boxes:
+        """Return the boxes around the pixel centres of some tiles."""
+        steps_m = np.stack([self.grid.row_step_m, self.grid.column_step_m])
+        return Boxes.equal(self.centres_m(parts), (self.side - 1) / 2 * steps_m)
+
     def collect(self, pixels: NDArray[np.complex64]) -> NDArray[np.complex64]:
         """Return the image of pixels [parts * part_pixels], rows of the padded plane."""
         padded = pixels.reshape(self.down * self.side, self.across * self.side)
@@ -237,6 +243,25 @@ class Groups:
     def centres_m(self, parts: slice) -> NDArray[np.float64]:
         """Return the centres of some groups, float64 [parts, 3]."""
         return self.centre_m[parts]
+
+    def boxes(self, parts: slice) -> Boxes:
+        """Return boxes around the pixels and the centres of some groups.
+
+        Their sides lie along the grid's rows and columns, or along the coordinate axes for points.
+        """
+        axes, half_m = self._box
+        return Boxes(self.centre_m[parts], axes, half_m[parts])
+
+    @functools.cached_property
+    def _box(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Directions of the boxes' sides, [axes, 3], and half their lengths, [parts, axes]."""
+        axes = np.eye(3)
+        if self.grid.points_m is None:
+            steps_m = [self.grid.column_step_m, self.grid.row_step_m, *axes[2:]]
+            axes = np.linalg.qr(np.stack(steps_m[: 2 if self.grid.is_planar else 3], axis=1))[0].T
+        extent_m = np.abs(self.offset_m.reshape(-1, 3) @ axes.T.astype(np.float32))
+        half_m = extent_m.reshape(self.parts, -1, len(axes)).max(axis=1).astype(np.float64)
+        return axes, 1.00001 * half_m  # more than float32 rounds off
 
     def collect(self, pixels: NDArray[np.complex64]) -> NDArray[np.complex64]:
         """Return the image of pixels [parts * part_pixels]."""

@@ -13,13 +13,12 @@ from clsas.factorized.aperture import MeanTrack, turned
 from clsas.factorized.surface import Surface
 from clsas.signal.interpolation import Interpolator
 from clsas.sonar.beam import BeamWindow
-from clsas.sonar.visibility import Visibility, touches_boxes
+from clsas.sonar.visibility import BeamTrack, Boxes
 
 _EVEN_NODES = 2.5  # over how many nodes their spacing is smoothed, rms
 _LEAST_RATE = 0.3  # of the mean over the track
 _LEAST_NODES = 2.0  # between the track's ends
 _COARSER = 2  # of the track's samples those at which it is decided what they see
-_RUN = 8  # of these, tried together
 _LESS = 0.2  # of the way between two: a margin for what lies between
 
 
@@ -275,60 +274,41 @@ def seen_from(
     shape = centres_m.shape[:-1]
     if limits is None:
         return np.full(shape, -np.inf), np.full(shape, np.inf)
-    samples = track.samples
-    on_track = np.flatnonzero(np.abs(samples - 0.5) <= 0.5)[::_COARSER]
-    places, along = samples[on_track], along[on_track]
-    position_m = track.sampled_m[0][on_track]
-    origin_m = position_m[0]
-    position_m, centres_m = position_m - origin_m, centres_m.reshape(-1, 3) - origin_m
-    # Runs of places first, each the one in its middle with what is around it; then single ones.
-    starts, run = np.arange(0, len(places), _RUN), np.arange(len(places)) // _RUN
-    middle = np.minimum(starts + _RUN // 2, len(places) - 1)
-    around_m, spread = (
-        np.maximum.reduceat(np.linalg.norm(values - values[middle[run]], axis=1), starts)
-        for values in (position_m, along)
-    )
-    seen = touches_boxes(
-        limits, centres_m, half_m, position_m[middle], along[middle], around_m, spread
-    )
-    ever = seen.any(axis=1)
-    of_first, of_last = seen.argmax(axis=1), len(starts) - 1 - seen[:, ::-1].argmax(axis=1)
+    on_track = np.flatnonzero(np.abs(track.samples - 0.5) <= 0.5)[::_COARSER]
+    places = track.samples[on_track]
+    beam = BeamTrack(limits, track.sampled_m[0][on_track], along[on_track])
+    boxes = Boxes.equal(centres_m.reshape(-1, 3), half_m)
+    spans = beam.spans(boxes)
+    begin, end = np.full(len(boxes), -np.inf), np.full(len(boxes), -np.inf)
+    # What no single sample sees may be seen from between samples.
     bounds = np.concatenate([[-np.inf], places[1:-1], [np.inf]])
-    widest = (
-        bounds[np.maximum(_RUN * of_first - 1, 0)],
-        bounds[np.minimum(_RUN * (of_last + 1), len(places) - 1)],
-    )
-    begin, end = np.full(len(ever), np.inf), np.full(len(ever), -np.inf)
-    halves, inward = np.ones(len(half_m)), np.arange(-1, _RUN + 1)
-    for edge, outermost, at, last, step in (
-        (begin, widest[0], of_first.copy(), of_last, 1),
-        (end, widest[1], of_last.copy(), of_first, -1),
-    ):
-        some = np.flatnonzero(ever)
-        while some.size:
-            # With the places beside them; at the track's ends that is their first or last one.
-            index = _RUN * at[some, None] + (inward if step > 0 else _RUN - 1 - inward)
-            index = np.clip(index, 0, len(places) - 1)
-            visibility = Visibility.of(centres_m[some], half_m, position_m, along, index)
-            inside_by = visibility.overlap(limits, halves)
-            inside = inside_by[:, :-1] > 0
-            whole = some[inside[:, 0]]
-            edge[whole] = outermost[whole]
-            # Between two places it changes nearly evenly, unless it has its most there.
-            found = np.flatnonzero(inside.any(axis=1) & ~inside[:, 0])
-            inner = inside[found].argmax(axis=1)
-            before, after, later = (inside_by[found, inner + n] for n in (-1, 0, 1))
-            share = np.where(later > after, before / (before - after) - _LESS, 0.0).clip(0)
-            before, after = places[index[found, inner - 1]], places[index[found, inner]]
-            edge[some[found]] = before + share * (after - before)
-            # On to the next run, if there is one.
-            some = some[~inside.any(axis=1) & (at[some] != last[some])]
-            at[some] += step
-    # What no single place sees may be seen from between them.
-    between = begin > end
-    begin[between], end[between] = widest[0][between], widest[1][between]
-    begin[~ever] = end[~ever] = -np.inf
+    ever = spans.earliest <= spans.latest
+    begin[ever] = bounds[np.maximum(spans.earliest[ever] - 1, 0)]
+    end[ever] = bounds[np.minimum(spans.latest[ever] + 1, len(places) - 1)]
+    found = np.flatnonzero(spans.first <= spans.last)
+    for edge, outermost, outward in ((begin, spans.first[found], -1), (end, spans.last[found], 1)):
+        edge[found] = _crossing(beam, places, boxes[found], outermost, outward)
     return begin.reshape(shape), end.reshape(shape)
+
+
+def _crossing(
+    beam: BeamTrack,
+    places: NDArray[np.float64],
+    boxes: Boxes,
+    outermost: NDArray[np.int64],
+    outward: int,
+) -> NDArray[np.float64]:
+    """Return where the beam begins to touch each box, beyond its outermost sample, [boxes]."""
+    beyond = (outermost == 0) if outward < 0 else (outermost == len(places) - 1)
+    index = outermost[:, None] + outward * np.array([1, 0, -1])
+    index = index.clip(0, len(places) - 1)
+    outside, inside, further = beam.depth(boxes, index).T
+    # The depth changes nearly evenly between two samples, unless it is largest there.
+    even = (further > inside) & (outside <= 0)
+    share = np.divide(outside, outside - inside, out=np.full(len(boxes), _LESS), where=even)
+    share = (share - _LESS).clip(0)
+    crossing = places[index[:, 0]] + share * (places[outermost] - places[index[:, 0]])
+    return np.where(beyond, outward * np.inf, crossing)
 
 
 @dataclass(frozen=True, eq=False)

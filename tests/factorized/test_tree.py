@@ -17,7 +17,7 @@ from clsas.planning.planner import plan
 from clsas.signal import interpolation
 from clsas.signal.spectrum import Spectrum
 from clsas.sonar.beam import BeamWindow
-from clsas.sonar.visibility import touches_boxes
+from clsas.sonar.visibility import Visibility
 
 FLAT = Spectrum(0.0, (np.arange(64) + 0.5) / 128, np.full(64, 1 / 64))
 
@@ -242,13 +242,9 @@ def test_boxes_are_seen_from_where_they_are_and_from_hardly_more(beam, range_m):
     half_m = range_m * np.array([[0.02, 0, 0], [0, 0.01, 0]])
     begin, end = tree.seen_from(beam.limits, track, along, centres_m, half_m)
     place, spacing = np.linspace(0, 1, 4001), 2 / 256  # of those that are looked at
-    seen = touches_boxes(
-        beam.limits,
-        centres_m,
-        half_m,
-        track.positions_m(place),
-        tree.interpolated_directions(track.samples, along, place),
-    )
+    direction = tree.interpolated_directions(track.samples, along, place)
+    visibility = Visibility.of(centres_m, half_m, track.positions_m(place), direction)
+    seen = visibility.overlap(beam.limits, np.ones(2)) > 0
     ever = seen.any(axis=1)
     assert 50 < np.count_nonzero(ever) < 300
     first = place[seen.argmax(axis=1)][ever]
