@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from clsas.core.decibels import power
 from clsas.core.geometry import bistatic_range_m
 from clsas.core.lines import RangeLines, wavelength_m
+from clsas.exact.groups import Groups, groups_within
 from clsas.exact.lookup import lookup_options
-from clsas.exact.run import normalising
-from clsas.exact.tiles import BLOCKS, STACK, Groups, Tiles, groups_within
+from clsas.exact.tiles import BLOCKS, STACK, Tiles
 from clsas.factorized import tree
 from clsas.factorized.sector import MOST_KEPT_BYTES, Geometry, Sector
 from clsas.factorized.tree import Division
@@ -31,7 +31,7 @@ from clsas.opencl.buffers import (
     phase_polynomials,
 )
 from clsas.opencl.device import Device, Slot
-from clsas.sonar.beam import INTERVALS
+from clsas.sonar.beam import INTERVALS, normalising
 from clsas.sonar.visibility import sines
 
 _ALL = slice(None)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pyopencl as cl
@@ -46,10 +47,10 @@ class BeamTable:
     """
 
     per_sine: float
-    arguments: dict[str, object]
+    arguments: dict[str, Any]
 
     @property
-    def origin(self) -> dict[str, object]:
+    def origin(self) -> dict[str, Any]:
         """What `expand_tiles` takes of them."""
         name = "beam_origin"
         return {name: self.arguments[name]} if self.arguments else {}

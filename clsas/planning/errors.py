@@ -15,7 +15,8 @@ from scipy.spatial.distance import cdist
 from clsas.core.decibels import power
 from clsas.core.geometry import pairwise_range_m
 from clsas.core.lines import some_channels, wavelength_m
-from clsas.exact.tiles import BLOCKS, ROUNDING
+from clsas.exact.layout import ROUNDING
+from clsas.exact.tiles import BLOCKS
 from clsas.factorized.aperture import drift, stretches
 from clsas.factorized.thesis import stage_errors_m
 from clsas.factorized.tree import interpolated_directions, interpolated_nodes

@@ -7,9 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from clsas.exact.blocks import Blocks, band_parts, blocks_of
 from clsas.exact.decision import decide
-from clsas.exact.run import Blocks, band_parts, blocks_of
-from clsas.exact.tiles import GroupsEstimate, Tiles
+from clsas.exact.groups import GroupsEstimate
+from clsas.exact.tiles import Tiles
 from clsas.factorized.estimates import Work, backprojecting, upsampling
 from clsas.opencl.buffers import VECTOR_ROOM, channel_pitch
 from clsas.opencl.device import Device

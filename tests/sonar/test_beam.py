@@ -25,9 +25,10 @@ from clsas.core.image_error import relative_error_db
 from clsas.core.lines import RangeLines
 from clsas.core.validate import ClsasWarning
 from clsas.exact.backprojection import backproject, form_exactly, prepare
+from clsas.exact.groups import Groups
 from clsas.exact.reference import ideal, same_interpolator
 from clsas.exact.run import execute
-from clsas.exact.tiles import Groups, Tiles
+from clsas.exact.tiles import Tiles
 from clsas.simulation.scenes import PointTargets
 from clsas.simulation.simulator import simulate_lines
 from clsas.sonar.beam import INTERVALS, SHAPES, BeamWindow
