@@ -16,7 +16,7 @@ from clsas.core.lines import RangeLines, wavelength_m
 from clsas.exact.groups import Groups, groups_within
 from clsas.exact.lookup import lookup_options
 from clsas.exact.tiles import BLOCKS, STACK, Tiles
-from clsas.factorized import tree
+from clsas.factorized import visibility
 from clsas.factorized.sector import MOST_KEPT_BYTES, Geometry, Sector
 from clsas.factorized.tree import Division
 from clsas.opencl.buffers import (
@@ -129,8 +129,8 @@ class Leaves:
         position_m = sector.positions_m(-1)
         rows = [float_pairs(position_m.reshape(-1, 3))]
         if self.plan.beam is not None:
-            along = tree.interpolated_directions(
-                self.geometry.track.samples, self.geometry.along, sector.nodes[-1].place
+            along = visibility.interpolated_directions(
+                self.geometry.track.samples, self.geometry.along, sector.nodes[-1].coordinate
             )
             rows.append((along * self.beam.per_sine).astype(np.float32).reshape(-1, 3))
         slot.fill("geometry", _padded(np.concatenate(rows, axis=1).T))
@@ -168,7 +168,7 @@ class Leaves:
     ) -> NDArray[np.int32]:
         """Return the nodes of parts of some leaves, and the first one's line, [..., 3]."""
         need = sector.needs[-1]
-        node = root * sector.nodes[-1].place.shape[1]
+        node = root * sector.nodes[-1].coordinate.shape[1]
         in_batch = root % self.plan.roots_at_once * need.first.shape[1] + leaf
         ranges = [
             node + need.first[root, leaf],
@@ -239,7 +239,7 @@ class PlaneLeaves(Leaves):
             (pitch // self.width, tiles),
             **expanded,
             geometry=tables["geometry"],
-            geometry_pitch=sector.nodes[-1].place.size + VECTOR_ROOM,
+            geometry_pitch=sector.nodes[-1].coordinate.size + VECTOR_ROOM,
             centres=self.centres,
             column_step=steps_m[0],
             row_step=steps_m[1],
@@ -443,7 +443,7 @@ class SurfaceLeaves(Leaves):
                 centre_sample=self.level.centre,
                 drift=self.geometry.drift,
                 geometry=tables["geometry"],
-                geometry_pitch=sector.nodes[-1].place.size + VECTOR_ROOM,
+                geometry_pitch=sector.nodes[-1].coordinate.size + VECTOR_ROOM,
                 centres=tables["centres"],
                 offsets=tables["offsets"],
                 points=size * (self._groups(self._roots(sector)).stop - first),
@@ -487,9 +487,9 @@ def _represented(sector: Sector) -> NDArray[np.float32]:
     Their weights by the beam, a smooth function along the track, are interpolated by cubics: the
     stages' filters, which err as little on average, all err alike on something so smooth.
     """
-    nodes = sector.nodes[-1].place
+    nodes = sector.nodes[-1].coordinate
     shares = np.empty(nodes.shape)
-    for root, (at, place) in enumerate(zip(nodes, sector.place, strict=True)):
+    for root, (at, place) in enumerate(zip(nodes, sector.coordinate, strict=True)):
         first = np.clip(np.searchsorted(at, place) - 2, 0, len(at) - 4)
         index = first[:, None] + np.arange(4)
         near = at[index]

@@ -14,11 +14,11 @@ from scipy.spatial.distance import cdist
 
 from clsas.core.geometry import pairwise_range_m
 from clsas.core.lines import RangeLines, some_channels
-from clsas.factorized import tree
+from clsas.factorized import tree, visibility
 from clsas.factorized.aperture import cycles_per_extent, drift, mean_track, own_drift, stretches
 from clsas.factorized.plan import Plan
 from clsas.factorized.surface import Surface
-from clsas.factorized.tree import Division, Nodes, Ranges
+from clsas.factorized.tree import ChannelRanges, Division, VirtualChannels
 from clsas.opencl.buffers import MARGIN
 
 _ON_TRACK = 1e-4  # wavelengths
@@ -44,10 +44,10 @@ class Sector:
         Which of the raw channels, in the order of the track, see any of them.
     relative_m : list of float64 [roots, subimages, 3]
         Those of subimages from that of their root, stage by stage.
-    nodes : list of Nodes
+    nodes : list of VirtualChannels
         Stage by stage.
     needs : list of Ranges
-    place : float64 [roots, channels]
+    coordinate : float64 [roots, channels]
         Where these raw channels appear on the track.
     """
 
@@ -55,9 +55,9 @@ class Sector:
     root_m: NDArray[np.float64]
     channels: slice
     relative_m: list[NDArray[np.float64]]
-    nodes: list[Nodes]
-    needs: list[Ranges]
-    place: NDArray[np.float64]
+    nodes: list[VirtualChannels]
+    needs: list[ChannelRanges]
+    coordinate: NDArray[np.float64]
 
     @property
     def nbytes(self) -> int:
@@ -102,18 +102,18 @@ class Geometry:
         self.cycles_per_m = chosen.resampling.cycles_per_m(lines)
         self.division = Division(surface, chosen.sides)
         track = mean_track(lines)
-        self.channels = np.argsort(track.place, kind="stable")
-        self.track = replace(track, place=track.place[self.channels])
+        self.channels = np.argsort(track.coordinate, kind="stable")
+        self.track = replace(track, coordinate=track.coordinate[self.channels])
         self.along = None
         if chosen.beam is not None:
             along = chosen.beam.directions(lines)[self.channels]
-            self.along = tree.beam_directions(along, self.track, track.samples)
+            self.along = visibility.beam_directions(along, self.track, track.samples)
         self.phase_centres_m = lines.phase_centres_m[self.channels]
         self.drift, own = drift(lines), own_drift(lines)
         self.own_drift = own if own is None else own[self.channels]
         self._seen = Division(surface, (chosen.sides[0], self._together(), chosen.sides[-1]))
         # The thesis's method has none; on the track itself there is nothing to make up for.
-        off_m = np.abs(self.phase_centres_m - self.track.positions_m(self.track.place)).max()
+        off_m = np.abs(self.phase_centres_m - self.track.positions_m(self.track.coordinate)).max()
         wavelength_m = lines.sound_speed_m_s / max(lines.carrier_hz, 1.0)
         if own is not None:
             off_m += np.linalg.norm(own, axis=1).max() * np.abs(lines.last_range_m).max()
@@ -213,20 +213,20 @@ class Geometry:
         seen_m = self._seen.centres_m(1, self._seen.corners(1, roots))
         half_m = surface.extents_in(together, sides[0], roots).max(axis=0) / 2
         half_m = half_m[:, None] * surface.steps_m
-        seen = tree.seen_from(chosen.limits, track, self.along, seen_m, half_m)
+        seen = visibility.visible_stretches(chosen.limits, track, self.along, seen_m, half_m)
         seen = tuple(each[:, self._seen.parents(2)] for each in seen)
         inside = surface.holds(sides[-1], corners[-1])
         channels = self._used(*(each[inside] for each in seen))
         centres_m = self.phase_centres_m[channels]
-        some = replace(track, place=track.place[channels])
+        some = replace(track, coordinate=track.coordinate[channels])
         own = None if self.own_drift is None else self.own_drift[channels]
-        seen_at = place = some.places_seen_from(root_m, centres_m, own)
+        seen_at = place = some.apparent_coordinates(root_m, centres_m, own)
         nodes = []
         if chosen.nearest:
             position_m = np.broadcast_to(centres_m, (*place.shape, 3))
             for factor in chosen.nearest:
                 nodes.append(tree.nearest_nodes(place, position_m, factor))
-                place, position_m = nodes[-1].place, nodes[-1].position_m
+                place, position_m = nodes[-1].coordinate, nodes[-1].position_m
         else:
             rates = cycles_per_extent(
                 track,
@@ -242,17 +242,17 @@ class Geometry:
                 extents = chosen.crowding[level] * surface.extents_in(side, sides[0], roots)
                 rate = np.einsum("ra,ars->rs", extents, rates)
                 if chosen.beam is not None and level == last:
-                    rate += chosen.beam_cycles * tree.beam_rate(
+                    rate += chosen.beam_cycles * visibility.beam_rate(
                         chosen.beam, track, self.along, root_m
                     )
-                nodes.append(tree.interpolated_nodes(track, rate, place, chosen.aperture))
-                place = nodes[-1].place
-        needs = tree.ranges(division, nodes, seen_at, seen, inside)
+                nodes.append(tree.interpolated_channels(track, rate, place, chosen.aperture))
+                place = nodes[-1].coordinate
+        needs = tree.channel_ranges(division, nodes, seen_at, seen, inside)
         return Sector(roots, root_m, channels, relative_m, nodes, needs, seen_at)
 
     def _used(self, start: NDArray[np.float64], stop: NDArray[np.float64]) -> slice:
         """Return the channels at places on the track from where leaves are seen; one at least."""
-        seen, place = stop > start, self.track.place
+        seen, place = stop > start, self.track.coordinate
         if self.plan.nearest or not seen.any():
             return slice(0, len(place) if self.plan.nearest else 1)
         first = np.searchsorted(place, start[seen].min() - self._slack, "left")
@@ -297,7 +297,7 @@ class Geometry:
 
     def _ramp(self, sector: Sector) -> NDArray[np.float64]:
         """Return by how many cycles per sample the phase of channels grows beyond their place's."""
-        virtual_m = self.track.positions_m(sector.place)
+        virtual_m = self.track.positions_m(sector.coordinate)
         antennas, plane = self._antennas(sector), self.surface.plane
         stretch = stretches(*antennas, self.drift, plane, sector.root_m, virtual_m)
         return stretch * self.cycles_per_m / self.samples_per_m

@@ -135,7 +135,7 @@ def plan_errors_m(
     [42] and [43] applied to every channel: in each stage its line is shifted so that the range of
     the subimage's centre is right for the mean of its neighbours, which then stands for it.
     """
-    order = np.argsort(mean_track(lines).place, kind="stable")
+    order = np.argsort(mean_track(lines).coordinate, kind="stable")
     ends_m = lines.tx_m[order], lines.rx_m[order]
     division = Division(surface_of(grid), plan.sides)
     pixels = np.asarray(pixels)

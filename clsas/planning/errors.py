@@ -19,7 +19,8 @@ from clsas.exact.layout import ROUNDING
 from clsas.exact.tiles import BLOCKS
 from clsas.factorized.aperture import drift, stretches
 from clsas.factorized.thesis import stage_errors_m
-from clsas.factorized.tree import interpolated_directions, interpolated_nodes
+from clsas.factorized.tree import interpolated_channels
+from clsas.factorized.visibility import interpolated_directions
 from clsas.opencl.device import Device
 from clsas.planning.view import View, kept
 from clsas.signal.interpolation import Interpolator
@@ -134,15 +135,15 @@ def _off_track(view: View, side: tuple[int, int], extents: NDArray[np.float64]) 
     lines, track = view.lines, view.track
     points = np.array(_SOME_POINTS)
     seen = view.seen(side)[points]
-    candidates = np.flatnonzero(np.interp(track.place, track.samples, seen.any(axis=0)))
+    candidates = np.flatnonzero(np.interp(track.coordinate, track.samples, seen.any(axis=0)))
     index, counts = _some_off_track(view, candidates)
-    part = replace(track, place=track.place[index])
+    part = replace(track, coordinate=track.coordinate[index])
     tx_m, rx_m, middle_m = (each[index] for each in (lines.tx_m, lines.rx_m, lines.phase_centres_m))
     velocity = lines.rx_velocity_m_s
     moving = velocity if velocity is None else velocity[index]
     own = view.own_drift if view.own_drift is None else view.own_drift[index]
     antennas = tx_m, rx_m, moving, lines.sound_speed_m_s
-    seen = np.stack([np.interp(part.place, track.samples, each) for each in seen]) > 0
+    seen = np.stack([np.interp(part.coordinate, track.samples, each) for each in seen]) > 0
     sees_any = seen.any(axis=1)
     points, seen = points[sees_any], seen[sees_any]
     if not points.size:
@@ -153,7 +154,7 @@ def _off_track(view: View, side: tuple[int, int], extents: NDArray[np.float64]) 
     centres_m, all_m = points_m[:, 0], points_m.reshape(-1, 3)
     range_m = pairwise_range_m(all_m, *antennas)
     range_m = range_m.reshape(*points_m.shape[:2], -1)
-    virtual_m = track.positions_m(part.places_seen_from(centres_m, middle_m, own))
+    virtual_m = track.positions_m(part.apparent_coordinates(centres_m, middle_m, own))
     on_track_m = np.stack([cdist(*each) for each in zip(points_m, virtual_m, strict=True)])
     on_track_m -= (points_m @ drift(lines))[..., None]
     range_m, on_track_m = (each[:, 1:] - each[:, :1] for each in (range_m, on_track_m))
@@ -164,7 +165,7 @@ def _off_track(view: View, side: tuple[int, int], extents: NDArray[np.float64]) 
     wrong += (2 * np.pi * view.rms_cycles_per_m * stretched_m) ** 2
     weights = np.ones_like(wrong)
     if view.beam is not None:
-        directions = interpolated_directions(track.samples, view.along, part.place)
+        directions = interpolated_directions(track.samples, view.along, part.coordinate)
         virtual = [sines(*each, directions) for each in zip(points_m, virtual_m, strict=True)]
         channels = [sines(each, middle_m, view.channels_along[index]) for each in points_m]
         weights, of_virtual = (
@@ -232,11 +233,11 @@ def _between_nodes(
     rates = crowding * np.tensordot(extents, view.rates[:, samples.points], 1)
     if weighted:
         rates = rates + beam_cycles * view.beam_rates[samples.points]
-    nodes = interpolated_nodes(view.track, rates, samples.place, aperture)
-    of_nodes = _steering(view, *samples.pixels, weighted, nodes.place)
+    nodes = interpolated_channels(view.track, rates, samples.coordinate, aperture)
+    of_nodes = _steering(view, *samples.pixels, weighted, nodes.coordinate)
     # A matrix that interpolates at all aperture coordinates of one subimage after the other.
     index = nodes.base[..., None] + np.arange(nodes.taps)
-    index += nodes.place.shape[1] * np.arange(len(index))[:, None, None]
+    index += nodes.coordinate.shape[1] * np.arange(len(index))[:, None, None]
     weights = nodes.weights.astype(np.float32).ravel()
     rows = np.arange(0, weights.size + 1, nodes.taps)
     of_nodes = of_nodes.reshape(-1, of_nodes.shape[-1])
@@ -259,7 +260,7 @@ class _Samples:
         The sample points that they lie at.
     count : int64 [n]
         Number of channels that see each.
-    place : float64 [n, places]
+    coordinate : float64 [n, places]
         Aperture coordinates, ascending, distributed as those of the channels.
     pixels : (centres_m, pixels_m, carriers)
         Arguments of `_steering`.
@@ -269,7 +270,7 @@ class _Samples:
 
     points: NDArray[np.int64]
     count: NDArray[np.int64]
-    place: NDArray[np.float64]
+    coordinate: NDArray[np.float64]
     pixels: tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]
     exact: NDArray[np.float32]
 
@@ -308,7 +309,7 @@ def _channels_seen(
     and the number of channels that do: none where the track has a gap. The edges of visibility lie
     between the track's samples.
     """
-    places, samples = np.sort(view.track.place), view.track.samples
+    places, samples = np.sort(view.track.coordinate), view.track.samples
     seen = view.seen(side)
     begin = samples[np.maximum(seen.argmax(axis=1) - 1, 0)]
     end = samples[np.minimum(seen.shape[1] - seen[:, ::-1].argmax(axis=1), len(samples) - 1)]
@@ -382,7 +383,7 @@ def nearest_errors(view: View, stages: Sequence[tuple[int, int]]) -> tuple[float
 
     Range errors of stages add, not their powers.
     """
-    centres_m = view.lines.phase_centres_m[np.argsort(view.track.place)]
+    centres_m = view.lines.phase_centres_m[np.argsort(view.track.coordinate)]
     spacing_m = np.linalg.norm(np.diff(centres_m, axis=0), axis=1).mean()
     image_m = np.max(np.array(view.grid.shape) * np.linalg.norm(view.surface.steps_m, axis=1))
     errors_m = stage_errors_m(stages, spacing_m, image_m, view.nearest_m)

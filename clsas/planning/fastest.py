@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 
 from clsas.core.decibels import in_db, power
 from clsas.factorized.estimates import ErrorBudget
-from clsas.factorized.filters import Choice, Filters, steering_spectrum
+from clsas.factorized.filters import FilterRates, Filters, steering_spectrum
 from clsas.factorized.plan import Plan
 from clsas.opencl import phases
 from clsas.opencl.device import Device
@@ -58,7 +58,7 @@ class _Problem:
     device: Device
     costs: Costs
     memory_bytes: int
-    designs: dict[tuple[Choice, int, float], Filters] = field(default_factory=dict)
+    designs: dict[tuple[FilterRates, int, float], Filters] = field(default_factory=dict)
 
     @property
     def allowed(self) -> float:

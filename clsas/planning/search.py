@@ -12,7 +12,13 @@ from numpy.typing import NDArray
 
 from clsas.core.decibels import in_db, power
 from clsas.factorized.estimates import Work, backprojecting_leaves, combining, upsampling
-from clsas.factorized.filters import ALIGN_TAPS, APERTURE_TAPS, UPSAMPLING_SHARE, Choice, choose
+from clsas.factorized.filters import (
+    ALIGN_TAPS,
+    APERTURE_TAPS,
+    UPSAMPLING_SHARE,
+    FilterRates,
+    choose,
+)
 from clsas.factorized.plan import LEAST_BATCH
 from clsas.opencl.device import Device
 from clsas.planning.costs import Costs
@@ -43,7 +49,7 @@ class Tree:
     align_taps: int
     aperture_taps: int
 
-    def filters(self, spectrum: Spectrum, filters_db: float) -> Choice | None:
+    def filters(self, spectrum: Spectrum, filters_db: float) -> FilterRates | None:
         """Return filters whose errors together are no more than `filters_db`; None without any."""
         return choose(spectrum, self.align_taps, self.aperture_taps, len(self.sides), filters_db)
 
@@ -165,7 +171,7 @@ class _Option:
 
     Attributes
     ----------
-    choice : Choice
+    choice : FilterRates
     stages : int
     channel_s : float [sizes]
         Of every channel of all subimages of a size, in stages after the first.
@@ -177,7 +183,7 @@ class _Option:
         Of the first stage with roots of a size, and of all that does not depend on the division.
     """
 
-    choice: Choice
+    choice: FilterRates
     stages: int
     channel_s: NDArray[np.float64]
     subimages_s: NDArray[np.float64]
@@ -186,7 +192,7 @@ class _Option:
 
     def channels(self, view: View, turns: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the virtual channels of subimages whose phases turn by so many cycles."""
-        return view.channels(self.choice.aperture_taps, 2 * self.choice.density, turns)
+        return view.channels(self.choice.aperture_taps, 2 * self.choice.oversampling, turns)
 
 
 def _options(sizes: _Sizes, filters_db: float, costs: Costs, allowed: Allowed) -> list[_Option]:
@@ -201,14 +207,14 @@ def _options(sizes: _Sizes, filters_db: float, costs: Costs, allowed: Allowed) -
         choice = choose(view.spectrum, *taps, stages, filters_db)
         if choice is None:
             continue
-        samples = 2 * sizes.reach_m * choice.rate / view.lines.range_step_m
+        samples = 2 * sizes.reach_m * choice.upsampling / view.lines.range_step_m
         samples += choice.final_taps + 16
         leaves = backprojecting_leaves(
             counts, sizes.slots, choice.final_taps, tiled=tiled, weighted=weighted
         )
         of_roots = combining(counts * sizes.share * channels, samples, sum(taps), given=True)
         of_roots += Work(reference=counts * channels, subimage=counts, batch=batches * stages)
-        of_roots += upsampling(view.lines.samples.size * choice.rate, filtered=filtered)
+        of_roots += upsampling(view.lines.samples.size * choice.upsampling, filtered=filtered)
         options.append(
             _Option(
                 choice,

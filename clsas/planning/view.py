@@ -21,7 +21,7 @@ from clsas.core.lines import RangeLines, some_channels, wavelength_m
 from clsas.exact.tiles import STACK
 from clsas.factorized.aperture import cycles_per_extent, mean_track, own_drift
 from clsas.factorized.surface import LEAST_SIDE, surface_of, within_roots
-from clsas.factorized.tree import beam_directions, beam_rate
+from clsas.factorized.visibility import beam_directions, beam_rate
 from clsas.signal.ambiguity import Ambiguity, ambiguity
 from clsas.signal.interpolation import Interpolator, Resampling
 from clsas.signal.spectrum import cycles_per_m_at, measure_spectrum
@@ -183,7 +183,7 @@ class View:
             return True
         # Neighbours on the track must look much the same way. At a kink the beam may swing past a
         # point within a few channels, and a track may lead back beside itself.
-        along = self.channels_along[np.argsort(self.track.place, kind="stable")]
+        along = self.channels_along[np.argsort(self.track.coordinate, kind="stable")]
         turned = np.linalg.norm(np.diff(along, axis=0), axis=1)
         if turned.max(initial=0.0) > _MOST_TURNED * np.ptp(np.clip(self.beam.limits, -1, 1)):
             return False
@@ -264,7 +264,7 @@ class View:
     @shared
     def off_track_m(self) -> NDArray[np.float64]:
         """Track errors: distances of channels from the mean track, [channels]."""
-        aalong_m = self.lines.phase_centres_m - self.track.positions_m(self.track.place)
+        aalong_m = self.lines.phase_centres_m - self.track.positions_m(self.track.coordinate)
         off_m = np.linalg.norm(aalong_m, axis=1)
         if self.own_drift is not None:
             off_m += np.linalg.norm(self.own_drift, axis=1) * np.median(self.distance_m)
@@ -280,7 +280,7 @@ class View:
     @shared
     def densest(self) -> float:
         """Largest density of channels along the track, over the mean density."""
-        place = np.sort(self.track.place)
+        place = np.sort(self.track.coordinate)
         some = min(_NEIGHBOURS, len(place) - 1)
         closest = float((place[some:] - place[:-some]).min())
         average = float(place[-1] - place[0]) * some / (len(place) - 1)

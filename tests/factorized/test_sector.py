@@ -3,7 +3,7 @@ import pytest
 from factorizing import BEAMS, EXACT_IS_SLOW, around, over, swaying
 
 from clsas.core.geometry import bistatic_range_m
-from clsas.factorized import tree
+from clsas.factorized import visibility
 from clsas.factorized.sector import Geometry
 from clsas.factorized.surface import surface_of
 from clsas.planning.planner import plan
@@ -66,7 +66,7 @@ def test_both_ends_of_the_track_are_alike(wide):
 
 def test_nothing_is_formed_that_no_channel_reaches(wide):
     sector = wide.sector(wide.division.roots)
-    counts = np.full(len(sector.roots), sector.place.shape[1])
+    counts = np.full(len(sector.roots), sector.coordinate.shape[1])
     for nodes, need in zip(sector.nodes, sector.needs, strict=True):
         assert (need.end <= counts[:, None]).all()
         counts = nodes.base[np.arange(len(counts)), counts - 1] + nodes.taps
@@ -117,15 +117,15 @@ def test_leaves_are_seen_from_wherever_they_are_seen_alone():
     leaves = geometry.division.corners(last, sector.roots)
     half_m = np.array(geometry.plan.sides[-1])[:, None] / 2
     half_m = half_m * [grid.row_step_m, grid.column_step_m]
-    start, stop = tree.seen_from(
+    start, stop = visibility.visible_stretches(
         chosen.limits,
         geometry.track,
         geometry.along,
         geometry.division.centres_m(last, leaves),
         half_m,
     )
-    need, place = sector.needs[-1], sector.nodes[-1].place
-    counts = np.full(len(sector.roots), sector.place.shape[1])
+    need, place = sector.needs[-1], sector.nodes[-1].coordinate
+    counts = np.full(len(sector.roots), sector.coordinate.shape[1])
     for nodes in sector.nodes:  # as far as channels reach
         counts = nodes.base[np.arange(len(counts)), counts - 1] + nodes.taps
     inside = np.all(leaves < grid.shape, axis=-1)
