@@ -32,7 +32,7 @@ _SINE_ROUNDING = 1e-7  # of a sine in float32
 
 @dataclass(frozen=True, eq=False)
 class Conditions:
-    """The scene and the accuracy that a layout depends on, besides the grid.
+    """The scene and the accuracy for which a grid is laid out.
 
     Attributes
     ----------
@@ -82,7 +82,7 @@ class Conditions:
         return max(phase_error, block_error), _SINE_REMAINDER * (radius_m / nearest_m) ** 4
 
     def allowed_sine_error(self, error: float) -> float:
-        """Return by how much a sine may err so that a beam's weights keep an error."""
+        """Return the error of a sine with which a beam's weights keep an error."""
         if self.beam is None:
             return math.inf
         of_width = max(_SINE_ERROR, (error * self.fullness) ** 2)

@@ -203,7 +203,7 @@ class _Run:
     def _upload_lines(self, channels: slice) -> tuple[RangeLines, dict[str, Any], Slot]:
         """Start copying some lines to the device, upsampled, and their antennas' geometry.
 
-        Returns the lines, what kernels take of the geometry, and the slot that holds both.
+        Returns the lines, the kernels' arguments for the geometry, and the slot that holds both.
         """
         p, blocks = self.p, self.blocks
         lines = p.lines.select(channels)
@@ -227,7 +227,7 @@ class _Run:
         ranges: NDArray[np.int32],
         first_part: int,
     ) -> _Job:
-        """Start copying to the device what it needs of some parts."""
+        """Start copying the centres, ranges and references of some parts to the device."""
         slot = next(self.part_slots)
         slot.wait()
         centres_m = self.p.layout.centres_m(parts)

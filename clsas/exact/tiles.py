@@ -132,7 +132,7 @@ class Tiles:
         lengths_m = [float(np.linalg.norm(side)) for side in sides_m]
         if abs(sides_m[0] @ sides_m[1]) > 1e-9 * lengths_m[0] * lengths_m[1]:
             return float(KDTree(antennas_m).query(self.centres_m(slice(None)))[0].min())
-        # The centres lie in a rectangle, whose distance bounds theirs and is quickly found.
+        # The distance of the rectangle around the centres is a lower bound, and quickly found.
         offset_m = antennas_m - self.centres_m(slice(0, 1))
         for side, length in zip(sides_m, lengths_m, strict=True):
             along = np.clip(offset_m @ side / max(length, 1e-150) ** 2, 0, 1)

@@ -105,7 +105,7 @@ class MeanTrack:
         across = np.sum(sight * off_m, axis=-1)
         both = np.sum(tangent * off_m, axis=-1) - along * across / square
         length = np.einsum("ci,ci->c", tangent, tangent)
-        # Where the curve leads towards the point, the direction hardly changes along it.
+        # Where the curve leads towards the point, the direction changes little along it.
         sideways = np.maximum(length - along**2 / square, 0.01 * length)
         return self.coordinate + both / sideways
 

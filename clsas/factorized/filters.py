@@ -18,9 +18,9 @@ ALIGN_TAPS = APERTURE_TAPS = (4, 6, 8)
 _FINAL_TAPS = (2, 4, 6, 8)
 UPSAMPLING_SHARE = 0.03
 """Share of an image's error power that filters for upsampling may add."""
-_MOST_GAIN = 3.0  # bounds the gain at band edges, where lines have hardly any power
-_CORNERS_SHARE = 0.5  # weight of pixels near the corners of a subimage,
-_CORNERS_FROM = 0.7  # whose phase rate is at least this part of the highest
+_MOST_GAIN = 3.0  # limits the gain at band edges, where lines have little power
+_CORNERS_SHARE = 0.5  # weight of pixels near the corners of a subimage:
+_CORNERS_FROM = 0.7  # those with at least this part of the highest phase rate
 _STEPS, _SLOPE_DB, _CLOSE_DB = 3, 12.0, 0.1  # of the iteration to the least oversampling
 _WORST_DB = -22.0  # aperture filters; with worse ones only pixels at the corners err
 _RATES = tuple(np.geomspace(1, 12, 16))  # at which errors of filters are evaluated
@@ -109,7 +109,7 @@ class FilterRates:
     def design(
         self, spectrum: Spectrum, steering: Spectrum, stages: int, most_db: float
     ) -> Filters:
-        """Return filters whose joint error is at most `most_db`, and little less.
+        """Return filters with a joint error of `most_db` or little less.
 
         The upsampling is rounded to whole phases of the filters' tables. The error that range
         filters leave is for the aperture filter.
