@@ -26,7 +26,7 @@ from clsas.opencl.buffers import (
     phase_polynomials,
 )
 from clsas.opencl.device import Device, Slot
-from clsas.sonar.beam import INTERVALS, normalising
+from clsas.sonar.beam import INTERVALS
 from clsas.sonar.visibility import sines
 
 _SHARE = 0.02  # of an image's error power, for one cubic of weights per block of pixels
