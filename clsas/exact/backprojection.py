@@ -5,11 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from clsas.core import validate
 from clsas.core.grid import Grid
 from clsas.core.image import Image
 from clsas.core.lines import RangeLines
-from clsas.exact.checks import check_accumulate, check_numbers
+from clsas.exact.checks import check_accumulate, check_input
 from clsas.exact.decision import decide
 from clsas.exact.preparation import Preparation
 from clsas.exact.run import execute
@@ -17,12 +16,12 @@ from clsas.opencl.device import Device, open_device
 from clsas.signal.ambiguity import ambiguity
 from clsas.signal.spectrum import measure_spectrum
 from clsas.sonar.beam import BeamWindow
-from clsas.sonar.simplify import Model, simplify
+from clsas.sonar.simplify import simplify
 
 BEST_ACCURACY_DB = -85.0
-"""The best accuracy that may be asked for: what float32 allows."""
+"""The best accuracy that may be asked for; float32 allows no better."""
 ACCURACY_DB = -60.0
-"""What is taken where no accuracy is asked for."""
+"""The accuracy of exact images by default."""
 
 
 def backproject(
@@ -48,20 +47,20 @@ def backproject(
     device : Device, str or int, optional
         See `clsas.opencl.device.choose`.
     accuracy_db : float
-        Wanted relative rms error against the ideal sum, dB, from -85 to below 0. It decides how
+        Relative rms error allowed against the ideal sum, dB, from -85 to below 0. It decides how
         the lines are interpolated, from their own spectrum.
     taps : 2, 4, 6 or 8, optional
         Samples per interpolation (2 is linear), instead of the fastest choice.
     upsampling : float, optional
-        By how much lines are upsampled before interpolation, instead of the fastest choice. With
-        `taps` too, `accuracy_db` plays no part.
+        Factor by which lines are upsampled before interpolation, instead of the fastest choice.
+        With `taps` too, `accuracy_db` plays no part.
     beam : BeamWindow, optional
-        Weights of the channels by aspect angle; what a channel does not see costs nothing. Without
-        one every channel weighs 1 everywhere.
+        Weights of the channels by aspect angle. Pixels outside a channel's beam cost nothing.
+        Without a beam every channel weighs 1 everywhere.
     accumulate : Image, optional
-        Image on the same grid that this one is added to, so that data may arrive in pieces.
+        Image on the same grid to which this one is added, so that data may arrive in pieces.
     progress : callable, optional
-        Called as progress(done, total).
+        Called as progress(done, total), in pairs of parts of the image and channels.
 
     Returns
     -------
@@ -71,34 +70,43 @@ def backproject(
     Raises
     ------
     TypeError, ValueError
-        If an argument is not what is allowed, `accumulate` is on another grid or beside a beam
-        that normalises, the beam's track cannot be told from the lines, receivers move
-        faster than 0.05 sound speeds, or numbers are so large or small that float32 sums or
-        float64 phases could not hold them.
+        If an argument is of a wrong kind or out of range; `accumulate` is on another grid, or given
+        with a normalising beam; the beam's track cannot be found from the lines; receivers move
+        faster than 0.05 sound speeds; or numbers are too large or too small for float32 sums or
+        float64 phases.
     DeviceError
         If there is no such device.
 
     Warns
     -----
     ClsasWarning
-        If no pixel lies within any line's range, or the beam, so that the lines add nothing; or if
-        `accuracy_db` may be missed because lines do not fade towards ends that the grid reaches, or
-        because the lines' band fills all that is sampled.
+        If no pixel lies within the range of any line and the beam, so that the image is zero; or if
+        the image may miss `accuracy_db`, because the grid reaches ends of lines that do not fade,
+        or because the lines' band fills the whole sampled band.
 
     Notes
     -----
-    I(x) = sum_i s_i(rho_i(x)) exp(+j 2 k rho_i(x)), with rho half the path from transmitter to
-    pixel to receiver and k = 2 pi carrier/c. The lines are taken as band-limited about their
-    spectral centre and as zero beyond their ends: a pixel outside a line's range (by more than
-    the taps of one interpolation) gets nothing from it. Where a line does not fade towards an end,
-    what pixels next to it get depends on the taps, and the image there on `accuracy_db`.
+    I(x) = sum_i w_i(x) s_i(rho_i(x)) exp(+j 2 k rho_i(x)), with rho half the path from transmitter
+    to pixel to receiver, k = 2 pi carrier/c, and w the beam's weights (1 without a beam) [1]_ [2]_.
+
+    The lines are assumed to be band-limited about their spectral centre, and zero beyond their
+    ends. A line adds nothing to a pixel outside its range, by more than the taps of one
+    interpolation. Where a line does not fade towards an end, the pixels there depend on the taps,
+    and so on `accuracy_db`.
 
     Motion during flight, the distance between transmitter and receiver and a grid's relief are left
     out where the error that this adds lies far below `accuracy_db` (docs/assess.md).
 
-    With a beam each term is multiplied by its weight. With or without one a pixel behind the
-    antennas, at the range of one before them, is its mirror image. Ranges and phases are referred
-    in float64 to centres near the pixels; the device sees float32 differences only.
+    A pixel behind the antennas is the mirror image of the one at the same range before them, with
+    or without a beam. The host computes ranges and phases of centres near the pixels in float64;
+    the device computes differences from them in float32.
+
+    References
+    ----------
+    .. [1] McCorkle, Rofheart, "An order N^2 log(N) backprojector algorithm for focusing wide-angle
+       wide-bandwidth arbitrary-motion synthetic aperture radar", SPIE 2747, 1996.
+    .. [2] Ødegaard, "Fast time domain beamforming for synthetic aperture sonar", thesis,
+       University of Oslo, 2004.
     """
     preparation = prepare(
         lines,
@@ -129,38 +137,27 @@ def prepare(
     beam: BeamWindow | None = None,
     full_model: bool = False,
 ) -> Preparation:
-    """Decide how `backproject` forms an image; parameters and errors are its.
+    """Check the input of `backproject` and decide how to form the image.
 
-    Effects far below `accuracy_db` are left out unless `full_model` is set, or the interpolator is
-    fixed so that `accuracy_db` plays no part.
+    Parameters and errors are those of `backproject`. Effects far below `accuracy_db` are left out,
+    unless `full_model` is set, or `taps` and `upsampling` are given so that `accuracy_db` plays no
+    part.
     """
-    validate.instance("lines", lines, RangeLines)
-    validate.instance("grid", grid, Grid)
-    validate.memory("grid", 8 * grid.size)
-    accuracy_db = validate.number(
-        "accuracy_db", accuracy_db, "dB", least=BEST_ACCURACY_DB, below=0.0
-    )
-    if beam is not None:
-        validate.instance("beam", beam, BeamWindow)
-    check_numbers(lines, beam)
-    fixed = taps is not None and upsampling is not None  # then accuracy_db plays no part
-    given_grid = grid
-    model = Model(lines, grid, beam)
-    if not (fixed or full_model):
-        model = simplify(lines, grid, beam, accuracy_db)
-    lines, grid, beam = model.lines, model.grid, model.beam
-    along = None if beam is None else beam.directions(lines)
+    accuracy_db = check_input(lines, grid, beam, accuracy_db, BEST_ACCURACY_DB)
+    fixed = taps is not None and upsampling is not None
+    model = simplify(lines, grid, beam, None if fixed or full_model else accuracy_db)
+    along = None if model.beam is None else model.beam.directions(model.lines)
     device = open_device(device)
-    spectrum = measure_spectrum(lines, grid)
-    left_open = ambiguity(lines, grid, spectrum, beam, along)
+    spectrum = measure_spectrum(model.lines, model.grid)
+    left_open = ambiguity(model.lines, model.grid, spectrum, model.beam, along)
     decision = decide(
-        lines,
-        grid,
+        model.lines,
+        model.grid,
         device=device,
         accuracy_db=accuracy_db,
         spectrum=spectrum,
         left_open=left_open,
-        beam=beam,
+        beam=model.beam,
         along=along,
         taps=taps,
         upsampling=upsampling,
@@ -168,14 +165,14 @@ def prepare(
     )
     return Preparation(
         device,
-        lines,
-        grid,
+        model.lines,
+        model.grid,
         **vars(decision),
-        beam=beam,
+        beam=model.beam,
         along=along,
-        wanted_db=0.0 if fixed else accuracy_db,
+        requested_db=0.0 if fixed else accuracy_db,
         ambiguity=left_open,
-        given_grid=given_grid,
+        given_grid=grid,
         left_out=model.left_out,
         left_out_error=model.error,
     )
@@ -187,10 +184,17 @@ def form_exactly(
     *,
     progress: Callable[[int, int], None] | None = None,
     warned: bool = False,
-    **wish: Any,
+    **request: Any,
 ) -> Image:
-    """Form an image as `backproject` does, without its warnings of what the lines leave open.
+    """Form an image as `backproject` does, without its warnings of ambiguous lines.
 
-    `warned` is whether an image of zeros has been warned of too.
+    Parameters
+    ----------
+    lines, grid, progress
+        As of `backproject`.
+    warned : bool
+        True if the user has been warned already that no line adds anything to the image.
+    **request
+        As of `prepare`.
     """
-    return execute(prepare(lines, grid, **wish), progress=progress, warned=warned)
+    return execute(prepare(lines, grid, **request), progress=progress, warned=warned)

@@ -1,4 +1,4 @@
-"""Numbers that float32 sums and float64 phases cannot hold, refused before any work."""
+"""Checks of the input: numbers that float32 sums or float64 phases cannot hold are refused."""
 
 from __future__ import annotations
 
@@ -9,19 +9,34 @@ from clsas.core import validate
 from clsas.core.grid import Grid
 from clsas.core.image import Image
 from clsas.core.lines import RangeLines, fastest, wavelength_m
-from clsas.exact.tiles import Groups, Tiles
+from clsas.exact.groups import Groups
+from clsas.exact.tiles import Tiles
 from clsas.sonar.beam import BeamWindow
 
 _LARGEST_DISTANCE_M = 1e9
 _SMALLEST_STEP_M = 1e-9
-_MOST_CYCLES = 1e10  # float64 leaves 1e-6 of a cycle
+_MOST_CYCLES = 1e10  # float64 holds them to 1e-6 of a cycle
 _LARGEST_SUM = 1e37
-_LOOKED_AT = 1 << 18  # numbers of lines at a time
-_FASTEST = 0.05  # of a receiver, in sound speeds: cl/antennas.h iterates on it
+_NUMBERS_AT_ONCE = 1 << 18  # stay in a core's cache between two passes over them
+_FASTEST = 0.05  # receiver, in sound speeds: for faster ones cl/antennas.h iterates too little
+
+
+def check_input(
+    lines: RangeLines, grid: Grid, beam: BeamWindow | None, accuracy_db: float, best_db: float
+) -> float:
+    """Refuse lines, grids, beams and accuracies that cannot be imaged; return the accuracy, dB."""
+    validate.instance("lines", lines, RangeLines)
+    validate.instance("grid", grid, Grid)
+    validate.memory("grid", 8 * grid.size)
+    accuracy_db = validate.number("accuracy_db", accuracy_db, "dB", least=best_db, below=0.0)
+    if beam is not None:
+        validate.instance("beam", beam, BeamWindow)
+    check_numbers(lines, beam)
+    return accuracy_db
 
 
 def check_accumulate(image: Image, grid: Grid, beam: BeamWindow | None) -> None:
-    """Refuse an image that another one on a grid cannot be added to."""
+    """Refuse an image to which another one on a grid cannot be added."""
     validate.instance("accumulate", image, Image)
     if image.grid is not grid and not np.array_equal(image.grid.positions_m(), grid.positions_m()):
         raise ValueError("accumulate must be an image on the same grid")
@@ -30,9 +45,12 @@ def check_accumulate(image: Image, grid: Grid, beam: BeamWindow | None) -> None:
 
 
 def check_numbers(lines: RangeLines, beam: BeamWindow | None) -> float:
-    """Refuse lines whose numbers would leave what float32 sums or float64 phases can hold.
+    """Refuse lines that would overflow float32 sums or lose the phase in float64.
 
-    Return the largest part of a sample.
+    Returns
+    -------
+    float
+        Largest magnitude of the samples' real and imaginary parts.
     """
     heaviest = 1.0
     if beam is not None:
@@ -51,8 +69,7 @@ def check_numbers(lines: RangeLines, beam: BeamWindow | None) -> float:
             f"at {lines.sound_speed_m_s:g} m/s; float64 holds the phase of {_MOST_CYCLES:g}"
         )
     parts = lines.samples.reshape(-1).view(np.float32)  # contiguous, as every RangeLines
-    # Part by part, so that a cache holds them for the second look.
-    spans = [parts[i : i + _LOOKED_AT] for i in range(0, parts.size, _LOOKED_AT)]
+    spans = [parts[i : i + _NUMBERS_AT_ONCE] for i in range(0, parts.size, _NUMBERS_AT_ONCE)]
     largest = float(max(max(span.max(), -span.min()) for span in spans))
     most = _LARGEST_SUM / heaviest / lines.channels
     if largest > most:

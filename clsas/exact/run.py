@@ -1,45 +1,40 @@
-"""A prepared exact image at work on a device."""
+"""The run: a prepared exact image formed on its device."""
 
 from __future__ import annotations
 
 import itertools
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pyopencl as cl
-from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from clsas.core import validate
-from clsas.core.geometry import bistatic_range_m, pairwise_range_m
 from clsas.core.image import Image, holds_any
 from clsas.core.lines import RangeLines
+from clsas.exact.blocks import band_parts, blocks_of
 from clsas.exact.lookup import lookup_options
 from clsas.exact.preparation import Preparation
+from clsas.exact.references import geometry_rows, is_bistatic, references_of
 from clsas.exact.tiles import STACK, Tiles
 from clsas.opencl.buffers import (
-    VECTOR_ROOM,
     beam_table,
-    channel_pitch,
     expansion_kernel,
-    expansion_terms,
     filter_table,
     float_pairs,
     phase_polynomials,
-    round_up,
     slices,
     upsampled_lines,
 )
-from clsas.opencl.device import Device, Slot
-from clsas.signal.interpolation import Resampling
-from clsas.sonar.beam import INTERVALS, LEAST_WEIGHT_SUM, BeamWindow
+from clsas.opencl.device import Slot
+from clsas.opencl.kernels import Kernel
+from clsas.sonar.beam import INTERVALS, normalising
 from clsas.sonar.coverage import warn_unseen
-from clsas.sonar.visibility import channel_ranges
+from clsas.sonar.visibility import BeamTrack
 
-_CHANNELS_AT_ONCE = 512  # bounds a float32 partial sum; lines that stay in a CPU's cache
-_PART_BYTES = 64 << 20  # device memory for one set of parts: a job of some tenths of a second
+_SINE_ROUNDING = 1e-5  # more than the device's rounding error of a sine
 
 
 def execute(
@@ -48,11 +43,19 @@ def execute(
     progress: Callable[[int, int], None] | None = None,
     warned: bool = False,
 ) -> Image:
-    """Form the image that was prepared; `warned` is whether one of zeros has been warned of.
+    """Form the image that was prepared.
 
-    The image is formed in bands that fit the device, each from blocks of channels, each block in
-    jobs of so many (part, channel) pairs; a job is prepared on the host while the one before runs.
-    With a beam only pairs that see each other are prepared.
+    The image is formed band by band, each from blocks of channels, each block in jobs of so many
+    (part, channel) pairs. The host prepares a job while the device runs the one before. With a beam
+    it only prepares pairs that the beam connects.
+
+    Parameters
+    ----------
+    preparation : Preparation
+    progress : callable, optional
+        Called as progress(pairs done, pairs).
+    warned : bool
+        True if the user has been warned already that no line adds anything to the image.
     """
     validate.progress(progress)
     p = preparation
@@ -66,7 +69,7 @@ def execute(
             part = slice(band.start * layout.part_pixels, band.stop * layout.part_pixels)
             names = ["pixels", "weight_sums"] if normalise else ["pixels"]
             on_device = {name: device.zeros(pixels[part].nbytes) for name in names}
-            for channels in slices(slice(0, p.lines.channels), run.channels_at_once):
+            for channels in slices(slice(0, p.lines.channels), run.blocks.channels_at_once):
                 run.add(channels, band, on_device)
             cl.enqueue_copy(device.queue, pixels[part], on_device["pixels"])
             if normalise:
@@ -81,103 +84,73 @@ def execute(
     return image
 
 
-def normalising(sums: NDArray[np.floating], channels: int) -> NDArray[np.floating]:
-    """Return what a normalising beam multiplies pixels by whose weights have these sums."""
-    return (channels / np.maximum(sums, LEAST_WEIGHT_SUM)).astype(sums.dtype)
-
-
-@dataclass(frozen=True)
-class Blocks:
-    """What is on a device at once.
+@dataclass(frozen=True, eq=False)
+class _Job:
+    """Some parts of a band and a block of channels, which the device works on in one go.
 
     Attributes
     ----------
-    reach, margin : int
-        Samples by which a part may reach beyond a line's end, and zeros around lines.
-    pitch : int
-        Samples of a line with these.
-    terms : int
-        Coefficients per (tile, channel); none off a plane.
-    channels_at_once, parts_at_once : int
+    line_slot, slot : Slot
+        Buffers of the lines, and of the parts.
+    geometry, ranges : dict
+        Arguments of the kernels: antennas and centres; the channels that each part needs.
+    parts : slice
+        Parts of the image.
+    first_part : int
+        Number of the first one within the band.
     """
 
-    reach: int
-    margin: int
-    pitch: int
-    terms: int
-    channels_at_once: int
-    parts_at_once: int
+    line_slot: Slot
+    slot: Slot
+    geometry: dict[str, Any]
+    ranges: dict[str, Any]
+    parts: slice
+    first_part: int
 
-
-def blocks_of(
-    device: Device,
-    lines: RangeLines,
-    resampling: Resampling,
-    taps: int,
-    *,
-    radius_m: float,
-    part_pixels: int,
-    tiled: bool,
-    beam: BeamWindow | None,
-) -> Blocks:
-    """Return how much of an image's data is on a device at once.
-
-    That is an eighth of its memory for either set of lines, a sixteenth for either of references.
-    """
-    # Zeros around a line on the device: a part may reach beyond its end by a radius.
-    reach = math.ceil(radius_m * resampling.samples_per_m(lines) * 1.1) + taps
-    margin = 2 * reach + 2 * device.info.width
-    pitch = round_up(resampling.length + 2 * margin, 16)
-    if pitch % 256 == 0:  # lines at equal places in cache sets would evict each other
-        pitch += 16
-    terms = expansion_terms(beam) if tiled else 0
-    line_bytes = 8 * pitch
-    part_bytes = _CHANNELS_AT_ONCE * (16 + 4 * terms) + 12 * part_pixels
-    most = device.info.max_buffer_bytes
-    room = min(most, device.info.memory_bytes // 8)
-    if line_bytes > most:
-        raise ValueError(
-            f"lines of {lines.length} samples need {line_bytes / 2**10:.0f} KiB each when "
-            f"upsampled, more than a buffer of {device.info.label}, {most / 2**10:.0f} KiB"
-        )
-    return Blocks(
-        reach,
-        margin,
-        pitch,
-        terms,
-        channels_at_once=min(_CHANNELS_AT_ONCE, max(room // line_bytes, 1)),
-        parts_at_once=max(min(_PART_BYTES, room // 2) // part_bytes, 1),
-    )
+    @property
+    def filled(self) -> list[cl.Event]:
+        """Copies to the device that kernels have to wait for."""
+        return self.line_slot.filled + self.slot.filled
 
 
 class _Run:
-    """A preparation at work: its kernels, its buffers, and how much it has done."""
+    """A preparation at work: its kernels, its buffers, and how many pairs are done."""
 
     def __init__(
         self, preparation: Preparation, progress: Callable[[int, int], None] | None
     ) -> None:
         p = self.p = preparation
-        device, layout = p.device, p.layout
-        self.tiled = isinstance(layout, Tiles)
-        self.moving = p.lines.rx_velocity_m_s is not None
-        self.bistatic = self.moving or not np.array_equal(p.lines.tx_m, p.lines.rx_m)
-        self.radius_m = layout.radius_m
-        self.origin_m = layout.centres_m(slice(0, 1))[0]
-
-        blocks = blocks_of(
-            device,
+        self.tiled = isinstance(p.layout, Tiles)
+        self.bistatic = is_bistatic(p.lines)
+        self.origin_m = p.layout.centres_m(slice(0, 1))[0]
+        self.blocks = blocks_of(
+            p.device,
             p.lines,
             p.resampling,
             p.interpolator.taps,
-            radius_m=self.radius_m,
-            part_pixels=layout.part_pixels,
+            radius_m=p.layout.radius_m,
+            part_pixels=p.layout.part_pixels,
             tiled=self.tiled,
             beam=p.beam,
         )
-        self.reach, self.margin, self.pitch = blocks.reach, blocks.margin, blocks.pitch
-        self.terms, self.channels_at_once = blocks.terms, blocks.channels_at_once
-        self.parts_at_once = blocks.parts_at_once
+        moving = p.lines.rx_velocity_m_s is not None
+        paths = {"BISTATIC": int(self.bistatic), "MOVING": int(moving)}
+        self.kernel = self._kernel(paths)
+        if self.tiled:
+            self.expand = expansion_kernel(p.device, p.beam, **paths)
+        # While one set of buffers is in use on the device, the other is filled.
+        self.line_slots = itertools.cycle([Slot(p.device), Slot(p.device)])
+        self.part_slots = itertools.cycle([Slot(p.device), Slot(p.device)])
+        self.filter = filter_table(p.device, p.interpolator.coefficients)
+        self.phase_polynomials = phase_polynomials(p.device, p.phase_terms)
+        self.beam = beam_table(p.device, p.beam, p.lines)
+        self.corner = p.device.upload(np.zeros(2, np.int32))
+        self.progress = progress
+        self.done = 0
 
+    def _kernel(self, paths: dict[str, int]) -> Kernel:
+        """Return the backprojecting kernel; `paths` says how transmitters and receivers move."""
+        p, device = self.p, self.p.device
         options = {
             "WIDTH": device.info.width,
             "TAPS": p.interpolator.taps,
@@ -186,254 +159,160 @@ class _Run:
             "NORMALISE": int(p.beam is not None and p.beam.normalise),
             "PHASE_TERMS": p.phase_terms,
         }
-        options |= lookup_options(device, layout, p.lines, p.samples_per_m, p.interpolator.taps)
-        paths = {"BISTATIC": int(self.bistatic), "MOVING": int(self.moving)}
-        if self.tiled:
-            self.expand = expansion_kernel(device, p.beam, **paths)
-            tile = {"TILE_ROWS": layout.side, "TILE_COLUMNS": layout.side}
-            self.kernel = device.kernel("backproject_tiles", **options, **tile)
-        else:
-            self.kernel = device.kernel("backproject_points", **options, **paths)
+        options |= lookup_options(device, p.layout, p.lines, p.samples_per_m, p.interpolator.taps)
+        if not isinstance(p.layout, Tiles):
+            return device.kernel("backproject_points", **options, **paths)
+        tile = {"TILE_ROWS": p.layout.side, "TILE_COLUMNS": p.layout.side}
+        return device.kernel("backproject_tiles", **options, **tile)
 
-        # While one set of buffers is in use on the device, the other is filled.
-        self.line_slots = itertools.cycle([Slot(device), Slot(device)])
-        self.part_slots = itertools.cycle([Slot(device), Slot(device)])
-        self.filter = filter_table(device, p.interpolator.coefficients)
-        self.phase_polynomials = phase_polynomials(device, p.phase_terms)
-        self.beam = beam_table(device, p.beam, p.lines)
-        self.corner = device.upload(np.zeros(2, np.int32))
-        self.progress = progress
-        self.done = 0
-
-    def add(self, channels: slice, band: slice, pixels: dict[str, cl.Buffer]) -> None:
+    def add(self, channels: slice, band: slice, pixels: dict[str, Any]) -> None:
         """Add some channels to the pixels of a band of parts, and to the sums of their weights."""
+        count = channels.stop - channels.start
         ranges = self._ranges(channels, band)
-        seen = ranges[:, 1] > ranges[:, 0]
-        if not seen.any():
-            self._report((band.stop - band.start) * (channels.stop - channels.start))
+        visible = ranges[:, 1] > ranges[:, 0]
+        if not visible.any():
+            self._report((band.stop - band.start) * count)
             return
-        # Lines that no part sees are left out.
-        first, end = int(ranges[seen].min()), int(ranges[seen].max())
-        ranges[seen] -= first
-        of_all = channels.stop - channels.start
-        channels = slice(channels.start + first, channels.start + end)
-        lines = self.p.lines.select(channels)
-        line_slot = next(self.line_slots)
-        line_slot.wait()
-        width, resampling = self.p.device.info.width, self.p.resampling
-        samples = upsampled_lines(lines.samples, resampling, width, self.margin, self.pitch)
-        line_slot.fill("samples", samples)
-        geometry = self._geometry(lines, channels)
-        line_slot.fill("geometry", geometry)
-        for parts in slices(band, self.parts_at_once):
+        # Lines from which no part receives anything are left out.
+        first, end = int(ranges[visible].min()), int(ranges[visible].max())
+        ranges[visible] -= first
+        lines, geometry, line_slot = self._upload_lines(
+            slice(channels.start + first, channels.start + end)
+        )
+        for parts in slices(band, self.blocks.parts_at_once):
             of_parts = ranges[parts.start - band.start : parts.stop - band.start]
             if of_parts.any():
-                slot = next(self.part_slots)
-                slot.wait()
-                centres_m = self.p.layout.centres_m(parts)
-                slot.fill("centres", float_pairs(centres_m - self.origin_m))
-                slot.fill("ranges", np.column_stack([of_parts, of_parts[:, 0]]))
-                references = self._references(centres_m, lines, of_parts)
-                for name, values in references.items():
-                    slot.fill(name, values)
-                pitches = (references["sample"].shape[1], geometry.shape[1])
-                first_part = parts.start - band.start
-                event = self._launch(line_slot, slot, parts, pitches, first_part, pixels)
-                slot.busy = line_slot.busy = event
+                job = self._job(
+                    lines, geometry, line_slot, parts, of_parts, parts.start - band.start
+                )
+                job.slot.busy = line_slot.busy = self._launch(job, pixels)
                 self.p.device.queue.flush()
-            self._report((parts.stop - parts.start) * of_all)
+            self._report((parts.stop - parts.start) * count)
 
     def _ranges(self, channels: slice, band: slice) -> NDArray[np.int32]:
-        """Return which of some channels each part of a band sees, [parts, 2]: first and end."""
+        """Return which of some channels each part of a band needs, [parts, 2]: first and end."""
         p = self.p
-        count = channels.stop - channels.start
-        if p.beam is None:
-            return np.tile(np.array([0, count], np.int32), (band.stop - band.start, 1))
-        lines, along = p.lines.select(channels), p.along[channels]
-        return np.concatenate(
-            [
-                channel_ranges(p.beam, lines, along, p.layout.centres_m(parts), self.radius_m)
-                for parts in slices(band, self.parts_at_once)
-            ]
+        if p.beam is None or p.along is None:
+            every = np.array([0, channels.stop - channels.start], np.int32)
+            return np.tile(every, (band.stop - band.start, 1))
+        low, high = p.beam.limits
+        limits = low - _SINE_ROUNDING, high + _SINE_ROUNDING
+        track = BeamTrack(limits, p.lines.phase_centres_m[channels], p.along[channels])
+        return track.spans(p.layout.boxes(band)).ranges
+
+    def _upload_lines(self, channels: slice) -> tuple[RangeLines, dict[str, Any], Slot]:
+        """Start copying some lines to the device, upsampled, and their antennas' geometry.
+
+        Returns the lines, the kernels' arguments for the geometry, and the slot that holds both.
+        """
+        p, blocks = self.p, self.blocks
+        lines = p.lines.select(channels)
+        slot = next(self.line_slots)
+        slot.wait()
+        samples = upsampled_lines(
+            lines.samples, p.resampling, p.device.info.width, blocks.margin, blocks.pitch
+        )
+        slot.fill("samples", samples)
+        directions = None if p.along is None else p.along[channels] * self.beam.per_sine
+        rows = geometry_rows(lines, self.origin_m, bistatic=self.bistatic, directions=directions)
+        slot.fill("geometry", rows)
+        return lines, {"geometry": slot["geometry"], "geometry_pitch": rows.shape[1]}, slot
+
+    def _job(
+        self,
+        lines: RangeLines,
+        geometry: dict[str, Any],
+        line_slot: Slot,
+        parts: slice,
+        ranges: NDArray[np.int32],
+        first_part: int,
+    ) -> _Job:
+        """Start copying the centres, ranges and references of some parts to the device."""
+        slot = next(self.part_slots)
+        slot.wait()
+        centres_m = self.p.layout.centres_m(parts)
+        slot.fill("centres", float_pairs(centres_m - self.origin_m))
+        slot.fill("ranges", np.column_stack([ranges, ranges[:, 0]]))
+        references = references_of(centres_m, lines, ranges, self.p.resampling, self.blocks)
+        for name, values in references.items():
+            slot.fill(name, values)
+        return _Job(
+            line_slot,
+            slot,
+            geometry | {"centres": slot["centres"], "samples_per_m": self.p.samples_per_m},
+            {
+                "ranges": slot["ranges"],
+                "first_range": 0,
+                "channel_pitch": references["sample"].shape[1],
+            },
+            parts,
+            first_part,
         )
 
-    def _launch(
-        self,
-        line_slot: Slot,
-        slot: Slot,
-        parts: slice,
-        pitches: tuple[int, int],
-        first_part: int,
-        pixels: dict[str, cl.Buffer],
-    ) -> cl.Event:
-        """Run the kernels of one job on buffers that are being filled.
-
-        `pitches` are those of channels in what is held per part, and in the geometry.
-        """
-        p, device, layout = self.p, self.p.device, self.p.layout
-        count = parts.stop - parts.start
-        pitch, geometry_pitch = pitches
-        geometry = {
-            "geometry": line_slot["geometry"],
-            "geometry_pitch": geometry_pitch,
-            "centres": slot["centres"],
-            "samples_per_m": p.samples_per_m,
-        }
-        ranges = {"ranges": slot["ranges"], "first_range": 0}
-        if self.tiled:
-            expansions = slot.buffer("expansions", 4 * self.terms * count * pitch)
-            device.run(
-                self.expand,
-                (pitch // device.info.width, count),
-                **geometry,
-                **ranges,
-                column_step=p.grid.column_step_m,
-                row_step=p.grid.row_step_m,
-                drift=(0.0, 0.0),
-                **self.beam.origin,
-                expansions=expansions,
-                channel_pitch=pitch,
-                wait_for=line_slot.filled + slot.filled,
-            )
-            size = (layout.part_pixels // (device.info.width * STACK), count)
-            positions = {
-                "expansions": expansions,
-                "columns": layout.across * layout.side,
-                "corners": self.corner,
-                "tiles_down": layout.down,
-                "tiles_across": layout.across,
-                "first_tile": first_part,
-            }
+    def _launch(self, job: _Job, pixels: dict[str, Any]) -> cl.Event:
+        """Run the kernels of a job; `pixels` are those of its band, and sums of their weights."""
+        p, layout = self.p, self.p.layout
+        if isinstance(layout, Tiles):
+            size, positions = self._expand(job, layout)
         else:
-            slot.fill("offsets", layout.offset_m[parts].reshape(-1, 3).T)
-            size = (count,)
-            positions = geometry | {
-                "offsets": slot["offsets"],
-                "points": count * layout.part_pixels,
-                "first_group": first_part,
+            offset_m = layout.offset_m[job.parts]
+            job.slot.fill("offsets", offset_m.reshape(-1, 3).T)
+            size = (len(offset_m),)
+            positions = job.geometry | {
+                "offsets": job.slot["offsets"],
+                "points": len(offset_m) * layout.part_pixels,
+                "first_group": job.first_part,
             }
-        return device.run(
+        return p.device.run(
             self.kernel,
             size,
-            lines=line_slot["samples"],
-            line_pitch=self.pitch,
-            **ranges,
-            reference_sample=slot["sample"],
-            reference_fraction=slot["fraction"],
-            reference_phase=slot["phase"],
-            channel_pitch=pitch,
+            lines=job.line_slot["samples"],
+            line_pitch=self.blocks.pitch,
+            **job.ranges,
+            reference_sample=job.slot["sample"],
+            reference_fraction=job.slot["fraction"],
+            reference_phase=job.slot["phase"],
             cycles_per_sample=p.cycles_per_m / p.samples_per_m,
             filter=self.filter,
             phase_polynomials=self.phase_polynomials,
             **positions,
             **self.beam.arguments,
             **pixels,
-            wait_for=line_slot.filled + slot.filled,
+            wait_for=job.filled,
         )
 
-    def _geometry(self, lines: RangeLines, channels: slice) -> NDArray[np.float32]:
-        """Return positions about the origin, velocities over sound speed and directions.
+    def _expand(self, job: _Job, layout: Tiles) -> tuple[tuple[int, ...], dict[str, Any]]:
+        """Expand ranges about the centres of a job's tiles.
 
-        That is float32 [rows, channels]. A vector may begin at any channel.
+        Returns the global size of the backprojecting kernel, and its arguments for the tiles.
         """
-        rows = [float_pairs(lines.tx_m - self.origin_m)]
-        if self.bistatic:
-            rows.append(float_pairs(lines.rx_m - self.origin_m))
-        if self.moving:
-            rows.append((lines.rx_velocity_m_s / lines.sound_speed_m_s).astype(np.float32))
-        if self.p.beam is not None:
-            rows.append((self.p.along[channels] * self.beam.per_sine).astype(np.float32))
-        pitch = channel_pitch(lines.channels) + VECTOR_ROOM
-        geometry = np.concatenate(rows, axis=1).T
-        return np.pad(geometry, ((0, 0), (0, pitch - lines.channels)), mode="edge")
-
-    def _references(
-        self, centres_m: NDArray[np.float64], lines: RangeLines, ranges: NDArray[np.int32]
-    ) -> dict[str, NDArray]:
-        """Return where each centre's echo lies in each line, and its phase, reduced in float64.
-
-        These are [parts, channels], from the first channel in a part's range on.
-        """
-        resampling = self.p.resampling
-        seen = ranges[:, 1] > ranges[:, 0]
-        count = int((ranges[:, 1] - ranges[:, 0]).max())
-        if count == lines.channels and not ranges[:, 0].any():
-            seen[:] = True
-            range_m = pairwise_range_m(
-                centres_m,
-                lines.tx_m,
-                lines.rx_m,
-                lines.rx_velocity_m_s,
-                lines.sound_speed_m_s,
-            )
-            first_range_m = lines.first_range_m
-        else:
-            range_m, first_range_m = _windowed_ranges(
-                centres_m[seen], lines, ranges[seen, 0], count
-            )
-        place = (range_m - first_range_m) / lines.range_step_m + resampling.lead
-        range_m *= lines.carrier_cycles_per_m
-        cycles = range_m + place * resampling.centre_cycles_per_sample
-        cycles -= np.rint(cycles)
-        place *= resampling.ratio
-        place += self.margin - resampling.first
-        nearest = np.rint(place)
-        place -= nearest
-        # A part that lies outside a line altogether is put where it reads zeros only.
-        nearest = np.clip(
-            nearest,
-            self.margin - self.reach,
-            self.margin + resampling.length + self.reach,
+        p, device = self.p, self.p.device
+        count = job.parts.stop - job.parts.start
+        pitch = job.ranges["channel_pitch"]
+        expansions = job.slot.buffer("expansions", 4 * self.blocks.terms * count * pitch)
+        device.run(
+            self.expand,
+            (pitch // device.info.width, count),
+            **job.geometry,
+            **job.ranges,
+            column_step=p.grid.column_step_m,
+            row_step=p.grid.row_step_m,
+            drift=(0.0, 0.0),
+            **self.beam.origin,
+            expansions=expansions,
+            wait_for=job.filled,
         )
-        shape = (len(centres_m), channel_pitch(count))
-        references = {
-            "sample": np.zeros(shape, np.int32),
-            "fraction": np.zeros(shape, np.float32),
-            "phase": np.zeros(shape, np.float32),
+        size = (layout.part_pixels // (device.info.width * STACK), count)
+        return size, {
+            "expansions": expansions,
+            "columns": layout.across * layout.side,
+            "corners": self.corner,
+            "tiles_down": layout.down,
+            "tiles_across": layout.across,
+            "first_tile": job.first_part,
         }
-        for array, values in zip(references.values(), (nearest, place, cycles), strict=True):
-            array[seen, :count] = values
-        return references
 
     def _report(self, pairs: int) -> None:
         self.done += pairs
         if self.progress is not None:
             self.progress(self.done, self.p.layout.parts * self.p.lines.channels)
-
-
-def _windowed_ranges(
-    centres_m: NDArray[np.float64], lines: RangeLines, first: NDArray[np.int32], count: int
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the ranges of centres to `count` channels from each one's first, [centres, count].
-
-    Beside them those of the lines' first samples. The last channel stands for those beyond it.
-    """
-
-    def window(values: NDArray[np.float64]) -> NDArray[np.float64]:
-        return sliding_window_view(np.pad(values, (0, count - 1), mode="edge"), count)[first]
-
-    def distance_m(antennas_m: NDArray[np.float64]) -> NDArray[np.float64]:
-        square = np.zeros((len(first), count))
-        for axis in range(3):
-            offset_m = window(antennas_m[:, axis])
-            offset_m -= centres_m[:, axis, None]
-            offset_m *= offset_m
-            square += offset_m
-        return np.sqrt(square, out=square)
-
-    if lines.rx_velocity_m_s is not None:
-        antennas = (lines.tx_m, lines.rx_m, lines.rx_velocity_m_s)
-        moving = (np.stack([window(axis) for axis in each.T], axis=-1) for each in antennas)
-        range_m = bistatic_range_m(centres_m[:, None], *moving, lines.sound_speed_m_s)
-    else:
-        range_m = distance_m(lines.tx_m)
-        if not np.array_equal(lines.tx_m, lines.rx_m):
-            range_m += distance_m(lines.rx_m)
-            range_m *= 0.5
-    return range_m, window(lines.first_range_m)
-
-
-def band_parts(device: Device, part_pixels: int, across: int, normalise: bool) -> int:
-    """Return how many parts' pixels may be on a device at once: whole rows of tiles."""
-    most = min(device.info.max_buffer_bytes, device.info.memory_bytes // 4)
-    return max(most // (8 * (1 + normalise) * part_pixels) // across, 1) * across

@@ -1,4 +1,7 @@
-"""The aperture as a curve: where channels lie on it, and how densely a subimage must sample it."""
+"""The mean track: a smooth curve along the channels, and phase rates along it.
+
+An aperture coordinate is the curve's parameter: 0 at its first and 1 at its last channel.
+"""
 
 from __future__ import annotations
 
@@ -15,13 +18,13 @@ from clsas.core.grid import Grid
 from clsas.core.lines import RangeLines
 from clsas.factorized.surface import Surface
 
-_POINTS = 257  # along the track, where rates are evaluated
-_MOST_PLACES = 9  # along a side of a box, where rates are evaluated
-_BEYOND = 12  # points past either end, each twice as far as the one before
-_TOGETHER = 1 << 15  # rates that are evaluated together
+_SAMPLES = 257  # of the track, at which rates are evaluated
+_SAMPLES_BEYOND = 12  # past either end, each twice as far as the one before
+_MOST_POINTS = 9  # along a side of a box, at which rates are evaluated
+_RATES_AT_ONCE = 1 << 15  # stay in a core's cache
 _CHANNELS_PER_KNOT = 16
 _MOST_INTERVALS = 64
-_CLOSE_ENOUGH = 0.01  # distance of phase centres from the track, wavelengths rms
+_CLOSE_ENOUGH = 0.01  # distance of phase centres from the curve, wavelengths rms
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,55 +34,55 @@ class MeanTrack:
     Attributes
     ----------
     spline : BSpline
-        Position in metres [3] over the parameter, 0 to 1.
-    place : float64 [channels]
-        Parameter of the point of the curve next to each phase centre.
+        Position in metres [3] over the aperture coordinate, 0 to 1.
+    coordinate : float64 [channels]
+        Aperture coordinate of the point of the curve nearest to each phase centre.
     """
 
     spline: BSpline
-    place: NDArray[np.float64]
+    coordinate: NDArray[np.float64]
 
-    def positions_m(self, place: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the curve's positions, [..., 3]."""
-        inside = np.clip(place, 0, 1)
+    def positions_m(self, coordinate: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the curve's positions at aperture coordinates, [..., 3]."""
+        inside = np.clip(coordinate, 0, 1)
         position_m = self.spline(inside)
-        beyond = inside != place
-        way = (place - inside)[beyond]
-        position_m[beyond] += way[:, None] * self.spline(inside[beyond], 1)
+        beyond = inside != coordinate
+        past = (coordinate - inside)[beyond]
+        position_m[beyond] += past[:, None] * self.spline(inside[beyond], 1)
         return position_m
 
-    def tangents_m(self, place: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the derivative of the position by the parameter, [..., 3]."""
-        return self.spline(np.clip(place, 0, 1), 1)
+    def tangents_m(self, coordinate: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the derivative of the position by the aperture coordinate, [..., 3]."""
+        return self.spline(np.clip(coordinate, 0, 1), 1)
 
     @functools.cached_property
     def samples(self) -> NDArray[np.float64]:
-        """Parameters at which rates along the curve are evaluated, past its ends too, [n]."""
-        beyond = 2.0 ** np.arange(1 - _BEYOND, 1) * 4
-        return np.concatenate([-beyond[::-1], np.linspace(0, 1, _POINTS), 1 + beyond])
+        """Aperture coordinates at which rates are evaluated, past the curve's ends too, [n]."""
+        beyond = 2.0 ** np.arange(1 - _SAMPLES_BEYOND, 1) * 4
+        return np.concatenate([-beyond[::-1], np.linspace(0, 1, _SAMPLES), 1 + beyond])
 
     @functools.cached_property
     def sampled_m(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Positions and tangents at `samples`, [n, 3] each."""
         return self.positions_m(self.samples), self.tangents_m(self.samples)
 
-    def places_seen_from(
+    def apparent_coordinates(
         self,
         points_m: NDArray[np.float64],
         phase_centres_m: NDArray[np.float64],
         own_drift: NDArray[np.float64] | None = None,
     ) -> NDArray[np.float64]:
-        """Return where phase centres appear on the curve when seen from some points.
+        """Return the aperture coordinates at which phase centres appear from some points.
 
-        A channel off the curve is replaced by the point of the curve in the same direction: what
-        is left is a difference of distance, which matters least. What a receiver moves by during
-        flight moves the phase centre by half as much.
+        A channel off the curve is replaced by the point of the curve in the same direction. The
+        remaining difference, of distance, matters least. A receiver's motion during flight moves
+        the phase centre by half as much.
 
         Parameters
         ----------
         points_m : float64 [points, 3]
         phase_centres_m : float64 [channels, 3]
-            The channels of `place`.
+            Those of the channels of `coordinate`.
         own_drift : float64 [channels, 3], optional
             See `own_drift`.
 
@@ -87,12 +90,12 @@ class MeanTrack:
         -------
         float64 [points, channels]
         """
-        curve_m = self.positions_m(self.place)
+        curve_m = self.positions_m(self.coordinate)
         off_m = (phase_centres_m - curve_m)[None]
-        shape = (len(points_m), len(self.place))
+        shape = (len(points_m), len(self.coordinate))
         if own_drift is None and not np.abs(off_m).max() > 1e-9:
-            return np.broadcast_to(self.place, shape)
-        tangent = self.tangents_m(self.place)
+            return np.broadcast_to(self.coordinate, shape)
+        tangent = self.tangents_m(self.coordinate)
         sight = points_m[:, None] - phase_centres_m
         square = np.einsum("pci,pci->pc", sight, sight)
         square = np.maximum(square, 1e-30)
@@ -102,17 +105,17 @@ class MeanTrack:
         across = np.sum(sight * off_m, axis=-1)
         both = np.sum(tangent * off_m, axis=-1) - along * across / square
         length = np.einsum("ci,ci->c", tangent, tangent)
-        # Where the curve leads towards the point, direction says nothing about the place.
-        seen = np.maximum(length - along**2 / square, 0.01 * length)
-        return self.place + both / seen
+        # Where the curve leads towards the point, the direction changes little along it.
+        sideways = np.maximum(length - along**2 / square, 0.01 * length)
+        return self.coordinate + both / sideways
 
 
 def mean_track(lines: RangeLines) -> MeanTrack | None:
-    """Return a curve along the phase centres of lines, or None where they all coincide.
+    """Return a curve along the phase centres of lines, or None if they all coincide.
 
-    The channels may come in any order: as given, along the principal axis and around the middle
-    are tried, and the shortest way through the phase centres is taken. The curve gets as many
-    intervals as it takes to follow them.
+    Channels may be in any order. Three orders are tried: as given, along the principal axis, and
+    around the middle. The one with the shortest path through the phase centres is taken. The
+    curve has as many intervals as it needs to follow them.
     """
     centres_m = lines.phase_centres_m
     order, along = _order(centres_m)
@@ -129,15 +132,17 @@ def mean_track(lines: RangeLines) -> MeanTrack | None:
         if best_m <= close_m:
             break
         intervals *= 2
-    place = np.empty(len(along))
-    place[order] = along
-    track = MeanTrack(best, place)
+    coordinate = np.empty(len(along))
+    coordinate[order] = along
+    track = MeanTrack(best, coordinate)
+    # Newton's steps towards the nearest point of the curve.
     for _ in range(3):
-        tangent = track.tangents_m(place)
-        away = centres_m - track.positions_m(place)
+        tangent = track.tangents_m(coordinate)
+        off_m = centres_m - track.positions_m(coordinate)
         square = np.maximum(np.einsum("ci,ci->c", tangent, tangent), 1e-30)
-        place = place + np.clip(np.einsum("ci,ci->c", away, tangent) / square, -0.1, 0.1)
-        track = MeanTrack(best, place)
+        step = np.einsum("ci,ci->c", off_m, tangent) / square
+        coordinate = coordinate + np.clip(step, -0.1, 0.1)
+        track = MeanTrack(best, coordinate)
     return track
 
 
@@ -151,13 +156,15 @@ def stretches(
     points_m: NDArray[np.float64],
     virtual_m: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """Return by how much faster channels' ranges grow than those of places that stand for them.
+    """Return the stretch of range lines against those from the mean track, [points, channels].
 
-    The range of a channel grows along its gradient, that of a place on the track along the unit
-    vector from there less the drift. Of what these differ by, the part along g, the unit vector
-    within the plane, is a stretch of the range line about the point, and can be made up for;
-    places_seen_from leaves little across it. Of a receiver in motion, where it is when an echo
-    arrives counts, and the later that is the further it has come: with unit vectors u from both,
+    The range of a channel grows along its gradient; that of a position on the track grows along the
+    unit vector from there, less the drift. The component of their difference along g, the unit
+    vector projected into the plane, stretches the range line about the point, and can be
+    compensated. `apparent_coordinates` leaves little across it.
+
+    For a moving receiver its position counts at the time when the echo arrives. With unit vectors
+    u from both antennas,
 
         gradient = (u_tx + u_rx) / 2 / (1 + u_rx . velocity / c).
 
@@ -167,20 +174,18 @@ def stretches(
         Of the channels, as in RangeLines.
     drift : float64 [3]
         See `drift`.
+    plane : Grid
+        The plane of the pixels.
     points_m : float64 [points, 3]
     virtual_m : float64 [points, channels, 3]
-        For every channel a place on the track.
-
-    Returns
-    -------
-    float64 [points, channels]
+        Position on the track of every channel, as it appears from each point.
     """
-    normal = np.cross(plane.row_step_m, plane.column_step_m)
-    normal = normal / max(np.linalg.norm(normal), 1e-300)
+    normal = np.cross(*plane.vectors_m[1:])
+    normal = normal / max(float(np.linalg.norm(normal)), 1e-300)
 
     def sight(from_m: NDArray[np.float64]) -> NDArray[np.float64]:
-        way = points_m[:, None] - from_m
-        return way / np.maximum(np.linalg.norm(way, axis=-1, keepdims=True), 1e-30)
+        offset_m = points_m[:, None] - from_m
+        return offset_m / np.maximum(np.linalg.norm(offset_m, axis=-1, keepdims=True), 1e-30)
 
     along = sight(virtual_m)
     if rx_velocity_m_s is None:
@@ -193,15 +198,14 @@ def stretches(
         more = (sight(tx_m) + from_rx) / 2 / later[..., None] - along + drift
     along = along - (along @ normal)[..., None] * normal
     square = np.einsum("pci,pci->pc", along, along)
-    # Right below the track ranges do not grow at all.
+    # Directly below the track, ranges do not grow at all.
     return np.einsum("pci,pci->pc", more, along) / np.maximum(square, 1e-3)
 
 
 def drift(lines: RangeLines) -> NDArray[np.float64]:
     """Return the mean velocity of the receivers over the sound speed, [3].
 
-    Motion during flight makes the range to a point x smaller by drift.(x - channel), to first
-    order: what lines of one velocity share.
+    To first order, motion during flight shortens the range to a point x by drift.(x - channel).
     """
     if lines.rx_velocity_m_s is None:
         return np.zeros(3)
@@ -209,7 +213,7 @@ def drift(lines: RangeLines) -> NDArray[np.float64]:
 
 
 def own_drift(lines: RangeLines) -> NDArray[np.float64] | None:
-    """Return by how much every channel's drift differs from their mean, [channels, 3], if any."""
+    """Return every channel's drift less the mean, [channels, 3]; None if all are equal."""
     if lines.rx_velocity_m_s is None:
         return None
     own = lines.rx_velocity_m_s / lines.sound_speed_m_s - drift(lines)
@@ -227,60 +231,55 @@ def cycles_per_extent(
     along: NDArray[np.float64] | None = None,
     every: int = 1,
 ) -> NDArray[np.float64]:
-    """Return how fast phases turn along the track for subimages inside larger ones.
+    """Largest phase rates along the track, per extent of subimages within boxes.
 
     A channel's range to a pixel at d from a subimage's centre c exceeds that to c by e.d, with e
-    the direction from the channel to c. Along the track, of tangent t, that changes by
-    -(t - e (e.t)).d / R: for subimages of some extents the phase turns by at most these times the
-    results, in cycles per unit of the track's parameter.
+    the unit vector from the channel to c. Along the track, of tangent t, that changes by
+    -(t - e (e.t)).d / R. The phase of a subimage therefore changes by at most its extents times the
+    results. (Yegulalp 1999 and Ulander, Hellsten and Stenström 2003 bound the same phase
+    to find the sampling of subapertures.)
 
     Parameters
     ----------
+    track : MeanTrack
+    surface : Surface
     centres_m : float64 [n, 3]
-        Middles of boxes of some extents; the result holds everywhere within them.
+        Middles of boxes. The rates hold everywhere within these.
     extents : float64 [axes]
-        See `Surface`.
+        Extents of the boxes; see `Surface`.
     cycles_per_m : float
         Phase per metre of range.
     nearest_m : float
-        Distance below which the track is taken not to come.
+        Lower bound assumed for distances from the track.
     limits : (low, high), optional
-        Sines of the aspect angle beyond which nothing counts.
+        Sines of the aspect angle at which the beam begins and ends; rates beyond are 0.
     along : float64 [samples, 3]
         With limits, the track's unit direction at `track.samples`.
     every : int
-        Of the track's samples only one in so many.
+        Evaluate only one in so many samples of the track.
 
     Returns
     -------
     float64 [axes, n, samples]
-        Per row, per column and per metre of relief, at `track.samples`.
+        Cycles per unit of the aperture coordinate, per row, per column and per metre of relief, at
+        `track.samples`.
     """
     position, tangent = (each[::every] for each in track.sampled_m)
-    along = along if along is None else along[::every]
     steps = surface.steps_m
     sides_m = extents[:, None] * steps
     rates = np.zeros((len(steps), len(centres_m), len(position)))
-    # Products of the sight to a place in a box follow from those of that to its middle.
+    # Products of the line of sight to a point of a box follow from those to its middle.
     sight = centres_m[:, None] - position
     square = np.einsum("psi,psi->ps", sight, sight)
     ahead = np.einsum("psi,si->ps", sight, tangent)
     leaning = np.stack([sight @ step for step in steps])
-    sideways = None if limits is None else np.einsum("psi,si->ps", sight, along)
-    # Places in a box lie closer where it is large against its distance.
-    closest_m = np.sqrt(square.min()) + nearest_m
-    counts = 3 + 2 * np.clip(
-        np.linalg.norm(sides_m, axis=1) / closest_m, 0, _MOST_PLACES // 2 - 1
-    ).astype(int)
-    counts[extents == 0] = 1
-    parts = np.array(
-        list(product(*(np.linspace(-0.5, 0.5, n) if n > 1 else [0.0] for n in counts)))
-    )
-    apart = 1 / np.maximum(counts - 1, 1)
-    between_m = np.linalg.norm(apart @ np.abs(sides_m)) / 2
-    together = max(_TOGETHER // square.size, 1)
-    for start in range(0, len(parts), together):
-        some = parts[start : start + together]
+    if limits is not None and along is not None:
+        (low, high), along = limits, along[::every]
+        sideways = np.einsum("psi,si->ps", sight, along)
+    points, between_m = _points_of_box(sides_m, float(np.sqrt(square.min()) + nearest_m))
+    together = max(_RATES_AT_ONCE // square.size, 1)
+    for start in range(0, len(points), together):
+        some = points[start : start + together]
         offset_m = some @ sides_m
         inverse = np.tensordot(2 * some * extents, leaning, 1)
         inverse += square
@@ -290,11 +289,10 @@ def cycles_per_extent(
         turn = ahead + (offset_m @ tangent.T)[:, None]
         turn *= inverse
         turn *= inverse
-        if limits is not None:
-            low, high = limits
+        if limits is not None and along is not None:
             sine, reach = sideways + (offset_m @ along.T)[:, None], between_m * inverse
             sine *= inverse
-            inverse[(sine + reach < low) | (sine - reach > high)] = 0  # as if far away
+            inverse[(sine + reach < low) | (sine - reach > high)] = 0  # as if infinitely far
         for rate, step, lean in zip(rates, steps, leaning, strict=True):
             here = lean + (offset_m @ step)[:, None, None]
             here *= turn
@@ -304,29 +302,44 @@ def cycles_per_extent(
     return cycles_per_m / 2 * rates
 
 
-def turned(track: MeanTrack, rate: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the integral of rates [..., samples] along the track: cycles at `track.samples`."""
+def _points_of_box(
+    sides_m: NDArray[np.float64], closest_m: float
+) -> tuple[NDArray[np.float64], float]:
+    """Return points of a box, in parts of its sides [n, axes], and half the distance between them.
+
+    A box that is large against its distance gets more points.
+    """
+    lengths_m = np.linalg.norm(sides_m, axis=1)
+    counts = 3 + 2 * np.clip(lengths_m / closest_m, 0, _MOST_POINTS // 2 - 1).astype(int)
+    counts[lengths_m == 0] = 1
+    points = product(*(np.linspace(-0.5, 0.5, n) if n > 1 else [0.0] for n in counts))
+    apart = 1 / np.maximum(counts - 1, 1)
+    return np.array(list(points)), float(np.linalg.norm(apart @ np.abs(sides_m)) / 2)
+
+
+def cumulative_cycles(track: MeanTrack, rate: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the phase at `track.samples`, cycles: the integral of rates [..., samples]."""
     steps = np.diff(track.samples) * (rate[..., 1:] + rate[..., :-1]) / 2
     return np.concatenate([np.zeros((*rate.shape[:-1], 1)), np.cumsum(steps, axis=-1)], axis=-1)
 
 
 def _order(centres_m: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return the order of phase centres along the track, and how far along it each lies, metres."""
+    """Return the order of phase centres along the track, and each one's distance along it, m."""
     if len(centres_m) == 1:
         return np.zeros(1, np.int64), np.zeros(1)
-    away = centres_m - centres_m.mean(axis=0)
-    first, second = np.linalg.svd(away, full_matrices=False)[2][:2] @ away.T
+    offset_m = centres_m - centres_m.mean(axis=0)
+    first, second = np.linalg.svd(offset_m, full_matrices=False)[2][:2] @ offset_m.T
     candidates = (
         np.arange(len(centres_m)),
         np.argsort(first, kind="stable"),
         np.argsort(np.arctan2(second, first), kind="stable"),
     )
-    best = None
+    best, along_m = candidates[0], np.full(1, np.inf)
     for order in candidates:
-        steps = np.linalg.norm(np.diff(centres_m[order], axis=0), axis=1)
-        if best is None or steps.sum() < 0.999 * best[1][-1]:
-            best = order, np.concatenate([[0.0], np.cumsum(steps)])
-    return best
+        steps_m = np.linalg.norm(np.diff(centres_m[order], axis=0), axis=1)
+        if steps_m.sum() < 0.999 * along_m[-1]:
+            best, along_m = order, np.concatenate([[0.0], np.cumsum(steps_m)])
+    return best, along_m
 
 
 def _fit(along: NDArray[np.float64], position_m: NDArray[np.float64], intervals: int) -> BSpline:

@@ -1,10 +1,10 @@
-"""A grid's pixels as cells of a plane, and how far off it they lie."""
+"""The surface of a grid: its pixels in cells of a plane, and their relief off the plane."""
 
 from __future__ import annotations
 
 import functools
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import product
 
 import numpy as np
@@ -21,48 +21,48 @@ _CORNERS = {n: np.array(list(product((-0.5, 0.5), repeat=n))) for n in (2, 3)}  
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """Where a grid's pixels lie: in cells of a plane, and off it by their relief.
+    """Positions of a grid's pixels: their cells in a plane, and their offsets from it.
 
-    Subimages are rectangles of cells. What they hold lies in a box: its extents are rows, columns
-    and, unless the grid is a plane itself, metres of relief; its sides these times `steps_m`.
+    Subimages are rectangles of cells. The pixels of a subimage lie in a box. Its extents are rows,
+    columns and, unless the grid is a plane, metres of relief; its sides are these times `steps_m`.
 
     Attributes
     ----------
     grid : Grid
     plane : Grid
-        The cells, a plane: the grid itself; that which fits a height map best; or that through
+        The cells: the grid itself, the plane that fits a height map best, or a plane through
         points.
     steps_m : float64 [axes, 3]
-        From a row and from a column of cells to the next; and the unit vector along which pixels
-        lie off the plane.
-    cell : int64 [pixels] or None
-        The cell that holds each pixel, row by row. None on a plane, where they are the same.
-    off_m : float64 [pixels] or None
-        How far along the last of `steps_m` pixels lie off.
+        Steps to the next row and to the next column of cells, and the unit vector of offsets from
+        the plane.
+    cell : int64 [pixels]
+        Number of the cell that holds each pixel, in row order; empty on a plane.
+    off_m : float64 [pixels]
+        Offsets of the pixels along the last of `steps_m`; empty on a plane.
     """
 
     grid: Grid
     plane: Grid
     steps_m: NDArray[np.float64]
-    cell: NDArray[np.int64] | None = None
-    off_m: NDArray[np.float64] | None = None
+    cell: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
+    off_m: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
 
     @property
     def is_plane(self) -> bool:
-        """Whether cells and pixels are the same."""
-        return self.cell is None
+        """True if the grid is a plane: cells are pixels."""
+        return self.plane is self.grid
 
     def counts(self, side: tuple[int, int]) -> NDArray[np.int64]:
-        """Return how many pixels (of a plane, cells) subimages of a size hold, [down, across]."""
+        """Return the number of pixels in each subimage of a size, [down, across]."""
         return self._held(side)[0]
 
     def middles_m(self, side: tuple[int, int], corners: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the middles of subimages of a size that begin at some cells, [..., 3].
+        """Return the middles of subimages of a size whose first cells are `corners`, [..., 3].
 
-        Those of the boxes around their pixels; of cells where there are none.
+        A middle is that of the box around the pixels, or of the cells if there are no pixels.
         """
         middle = corners + (np.array(side) - 1) / 2
-        position_m = self.plane.origin_m + middle @ self.steps_m[:2]
+        position_m = self.plane.vectors_m[0] + middle @ self.steps_m[:2]
         if not self.is_plane:
             _, low_m, high_m = self._held(side)
             off_m = _at(low_m + high_m, side, corners) / 2
@@ -70,7 +70,7 @@ class Surface:
         return position_m
 
     def holds(self, side: tuple[int, int], corners: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Return whether subimages of a size that begin at some cells hold a pixel, [...]."""
+        """Return whether subimages of a size, whose first cells are `corners`, hold a pixel."""
         inside = np.all(corners < self.plane.shape, axis=-1)
         return inside if self.is_plane else inside & (_at(self.counts(side), side, corners) > 0)
 
@@ -79,7 +79,7 @@ class Surface:
     ) -> NDArray[np.float64]:
         """Return the relief of subimages of a size, metres, [down, across].
 
-        With a root: of those with most relief in every subimage of that larger size.
+        With a root size, return the largest relief within each root.
         """
         if self.is_plane:
             return np.zeros((1, 1))
@@ -88,13 +88,13 @@ class Surface:
         return relief_m if root is None else within_roots(np.maximum, relief_m, side, root)
 
     def extents(self, side: tuple[int, int], relief_m: float = 0.0) -> NDArray[np.float64]:
-        """Return the extents of subimages of a size and of some relief, [axes]."""
+        """Return the extents of subimages of a size with a relief, [axes]."""
         return np.array([*side, relief_m][: len(self.steps_m)], np.float64)
 
     def extents_in(
         self, side: tuple[int, int], root: tuple[int, int], corners: NDArray[np.int64]
     ) -> NDArray[np.float64]:
-        """Return extents that hold all subimages of a size in some roots, [roots, axes]."""
+        """Return the largest extents of subimages of a size within some roots, [roots, axes]."""
         extents = np.tile(self.extents(side), (len(corners), 1))
         if not self.is_plane:
             extents[:, 2] = _at(self.relief_m(side, root), root, corners)
@@ -168,58 +168,61 @@ class Surface:
 
 
 def surface_of(grid: Grid) -> Surface:
-    """Return a grid's pixels as cells of a plane, and their relief."""
+    """Return the surface of a grid."""
     if grid.points_m is not None:
         return _through_points(grid)
-    steps_m = np.stack([grid.row_step_m, grid.column_step_m])
+    origin_m, *in_plane_m = grid.vectors_m
+    steps_m = np.stack(in_plane_m)
     if grid.height_m is None:
         return Surface(grid, grid, steps_m)
-    # The plane that fits best: over regular rows and columns either slope is found by itself.
+    # Least-squares plane: over regular rows and columns, the two slopes are independent.
     up = np.array([0.0, 0.0, 1.0])
-    height_m = grid.height_m
+    height_m, (rows, columns) = grid.height_m, grid.shape
     middle_m, slopes = height_m.mean(), []
     plane_m = np.full(grid.shape, middle_m)
     for axis, n in enumerate(grid.shape):
-        place = np.arange(n) - (n - 1) / 2
-        slope = place @ height_m.mean(axis=1 - axis) / max(place @ place, 1.0)
+        offset = np.arange(n) - (n - 1) / 2
+        slope = offset @ height_m.mean(axis=1 - axis) / max(offset @ offset, 1.0)
         slopes.append(slope)
-        plane_m += np.expand_dims(slope * place, 1 - axis)
+        plane_m += np.expand_dims(slope * offset, 1 - axis)
     steps_m = steps_m + np.outer(slopes, up)
     corner_m = plane_m[0, 0]
-    plane = Grid.oriented(grid.origin_m + corner_m * up, *steps_m, grid.shape)
+    plane = Grid.oriented(origin_m + corner_m * up, steps_m[0], steps_m[1], (rows, columns))
     off_m = (height_m - plane_m).ravel()
     return Surface(grid, plane, np.concatenate([steps_m, [up]]), np.arange(grid.size), off_m)
 
 
 def _through_points(grid: Grid) -> Surface:
-    """Return points in cells of the plane that they lie off least, about one in each.
+    """Return the surface of points: the plane that fits them best, with about one point a cell.
 
-    Its columns run along x as far as that can be: along the track of most.
+    Columns run as nearly along x, the usual direction of the track, as the plane allows.
     """
-    points_m = grid.points_m.reshape(-1, 3)
+    points_m = grid.positions_m().reshape(-1, 3)
     middle_m = points_m.mean(axis=0)
-    away_m = points_m - middle_m
-    normal = np.linalg.eigh(away_m.T @ away_m)[1][:, 0]
+    offset_m = points_m - middle_m
+    normal = np.linalg.eigh(offset_m.T @ offset_m)[1][:, 0]
     across = np.eye(3)[0 if abs(normal[0]) < 0.9 else 1]
     across = across - (across @ normal) * normal
     across /= np.linalg.norm(across)
     axes = np.stack([np.cross(normal, across), across])
-    place_m = away_m @ axes.T
-    low_m, span_m = place_m.min(axis=0), np.ptp(place_m, axis=0)
+    in_plane_m = offset_m @ axes.T
+    low_m, span_m = in_plane_m.min(axis=0), np.ptp(in_plane_m, axis=0)
     step_m = max(math.sqrt(math.prod(span_m) / grid.size), span_m.max() / grid.size)
     step_m = max(1.000001 * step_m, _LEAST_CELL_M)
-    shape = tuple(int(n) for n in span_m // step_m + 1)
-    index = np.minimum(((place_m - low_m) // step_m).astype(np.int64), np.array(shape) - 1)
+    rows, columns = (int(n) for n in span_m // step_m + 1)
+    shape = rows, columns
+    index = np.minimum(((in_plane_m - low_m) // step_m).astype(np.int64), np.array(shape) - 1)
     steps_m = step_m * axes
-    plane = Grid.oriented(middle_m + (low_m + step_m / 2) @ axes, *steps_m, shape)
+    origin_m = middle_m + (low_m + step_m / 2) @ axes
+    plane = Grid.oriented(origin_m, steps_m[0], steps_m[1], shape)
     cell = index[:, 0] * shape[1] + index[:, 1]
-    return Surface(grid, plane, np.concatenate([steps_m, [normal]]), cell, away_m @ normal)
+    return Surface(grid, plane, np.concatenate([steps_m, [normal]]), cell, offset_m @ normal)
 
 
 def within_roots(
     ufunc: np.ufunc, values: NDArray, side: tuple[int, int], root: tuple[int, int]
 ) -> NDArray:
-    """Return what a ufunc makes of what there is of all subimages of a size in each larger one."""
+    """Reduce values of subimages of a size over each root with a ufunc."""
     for axis in range(2):
         starts = np.arange(0, values.shape[axis], root[axis] // side[axis])
         values = ufunc.reduceat(values, starts, axis=axis)
@@ -227,6 +230,6 @@ def within_roots(
 
 
 def _at(values: NDArray, side: tuple[int, int], corners: NDArray[np.int64]) -> NDArray:
-    """Return what there is of subimages that begin at some cells; beyond the last, its."""
+    """Return values of the subimages whose first cells are `corners`; the last one's beyond it."""
     row, column = np.moveaxis(corners // np.array(side), -1, 0)
     return values[np.minimum(row, len(values) - 1), np.minimum(column, values.shape[1] - 1)]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,7 +12,7 @@ from clsas.core.geometry import bistatic_range_m
 from clsas.core.grid import Grid
 from clsas.mosaics.survey import Survey
 from clsas.sonar.beam import BeamWindow
-from clsas.sonar.visibility import touches_boxes
+from clsas.sonar.visibility import BeamTrack, Boxes
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,10 +68,12 @@ class SurveyVisibility:
         found = self.survey.within(*self.ranges_m(grid))
         if self.beam is not None:
             centre_m, half_m = bounding_box(grid)
-            found &= touches_boxes(
-                self.beam.limits, centre_m[None], half_m, self.phase_centres_m, self.along
-            )[0]
+            found &= self._beam_track.touching(Boxes.equal(centre_m[None], half_m))[0]
         return found
+
+    @functools.cached_property
+    def _beam_track(self) -> BeamTrack:
+        return BeamTrack(self.beam.limits, self.phase_centres_m, self.along)
 
     def any_channel_from(self, first: int, grid: Grid) -> bool:
         """Return whether any channel from number `first` on may contribute to a grid."""

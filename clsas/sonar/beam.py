@@ -370,3 +370,8 @@ def _taylor(u: NDArray[np.float64]) -> NDArray[np.float64]:
     factors = np.array(found)
     total = 1 + np.cos(2 * np.pi * np.asarray(u)[..., None] * terms) @ factors
     return total / (1 + factors.sum())
+
+
+def normalising(sums: NDArray[np.floating], channels: int) -> NDArray[np.floating]:
+    """Return the factors by which a normalising beam multiplies pixels with these weight sums."""
+    return (channels / np.maximum(sums, LEAST_WEIGHT_SUM)).astype(sums.dtype)

@@ -12,7 +12,7 @@ from clsas.core.geometry import pairwise_range_m
 from clsas.core.grid import Grid
 from clsas.core.lines import RangeLines, some_channels
 from clsas.sonar.beam import BeamWindow
-from clsas.sonar.visibility import sines, touches_boxes
+from clsas.sonar.visibility import BeamTrack, Boxes, sines
 
 _SAMPLED_CHANNELS = 64  # a quick test that finds nearly every grid covered
 _SAMPLED_PIXELS = 16  # along either side of the grid, in the quick test
@@ -67,6 +67,9 @@ def _reached_in_boxes(
     `centres_m` and `half_m` hold the boxes' centres and half sides along x, y and z, [boxes, 3].
     """
     beyond_m = _TAPS * lines.range_step_m
+    track = None
+    if beam is not None and along is not None:
+        track = BeamTrack(beam.limits, lines.phase_centres_m, along)
     for centre_m, sides_m in zip(centres_m, half_m, strict=True):
         range_m = pairwise_range_m(
             centre_m[None], lines.tx_m, lines.rx_m, lines.rx_velocity_m_s, lines.sound_speed_m_s
@@ -74,11 +77,8 @@ def _reached_in_boxes(
         radius_m = np.linalg.norm(sides_m) * (1 + 2 * _SPEED_RATIO) + beyond_m
         reached = range_m + radius_m >= lines.first_range_m
         reached &= range_m - radius_m <= lines.last_range_m
-        if beam is not None and along is not None and reached.any():
-            track_m, direction = lines.phase_centres_m[reached], along[reached]
-            reached = touches_boxes(
-                beam.limits, centre_m[None], np.diag(sides_m), track_m, direction
-            )
+        if track is not None and reached.any():
+            reached &= track.touching(Boxes.equal(centre_m[None], np.diag(sides_m)))[0]
         if reached.any():
             return True
     return False

@@ -1,19 +1,19 @@
-"""Visibility: which channels see a point, a ball or a box through a beam."""
+"""Visibility: from which channels, or positions on a track, a beam touches points and boxes."""
 
 from __future__ import annotations
 
+import functools
+import math
 from dataclasses import dataclass
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
-from clsas.core.lines import RangeLines
-from clsas.sonar.beam import BeamWindow
-
-_ROUNDING = 1e-5  # more than the device's rounding error of a sine
-_RUN = 16  # channels tested together first
+_LEAST_DISTANCE_M = 1e-9
+_ANY_DIRECTION = 4.0  # exceeds any difference of two sines
+_PAIRS_AT_ONCE = 1 << 16  # of boxes and runs: with half as many the search takes a tenth longer
 
 
 def sines(
@@ -34,73 +34,36 @@ def sines(
     return _sines(points_m, phase_centres_m, along)[0].T
 
 
-def channel_ranges(
-    beam: BeamWindow,
-    lines: RangeLines,
-    along: NDArray[np.float64],
-    centres_m: NDArray[np.float64],
-    radius_m: float,
-) -> NDArray[np.int32]:
-    """Return the range of channels whose beam touches each of some balls, int32 [balls, 2].
+@dataclass(frozen=True, eq=False)
+class Boxes:
+    """Boxes whose sides have common directions.
 
-    A range is the first of these channels and the one after the last, or 0, 0 if there is none.
-    Runs of 16 channels are tested first, then the single channels of the runs at both ends.
-
-    Parameters
+    Attributes
     ----------
-    beam : BeamWindow
-    lines : RangeLines
-    along : float64 [channels, 3]
-        The track's unit directions.
-    centres_m : float64 [balls, 3]
-    radius_m : float
-        Radius of every ball.
+    centres_m : float64 [boxes, 3]
+    axes_m : float64 [axes, 3]
+        Directions of the sides.
+    half : float64 [boxes, axes] or [1, axes]
+        Half the sides, in lengths of the axes.
     """
-    phase_centres_m = lines.phase_centres_m
-    count, run = lines.channels, _RUN
-    starts = np.arange(0, count, run)
-    run_of = np.arange(count) // run
-    # One channel in the middle stands for a run. The margins are how far the others lie from it
-    # and how much their directions differ.
-    middle_m = np.add.reduceat(phase_centres_m, starts, axis=0) / np.bincount(run_of)[:, None]
-    reach_m = np.linalg.norm(phase_centres_m - middle_m[run_of], axis=1)
-    direction = along[starts]
-    spread = np.linalg.norm(along - direction[run_of], axis=1)
-    sine, distance_m = _sines(centres_m, middle_m, direction)
-    visible = _touches(
-        beam,
-        sine,
-        distance_m,
-        radius_m + np.maximum.reduceat(reach_m, starts),
-        np.maximum.reduceat(spread, starts),
-    )
-    some = np.flatnonzero(visible.any(axis=1))
-    ranges = np.zeros((len(centres_m), 2), np.int32)
-    if not some.size:
-        return ranges
-    visible = visible[some]
 
-    def touched(runs: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Channels of one run per ball that touch it, [balls, 16]; the last channel is repeated."""
-        index = np.minimum(runs[:, None] * run + np.arange(run), count - 1)
-        square, sine = np.zeros(index.shape), np.zeros(index.shape)
-        for axis in range(3):
-            offset_m = centres_m[some, axis, None] - phase_centres_m[index, axis]
-            sine += offset_m * along[index, axis]
-            square += offset_m * offset_m
-        distance_m = np.sqrt(square)
-        return _touches(beam, sine / np.maximum(distance_m, 1e-30), distance_m, radius_m)
+    centres_m: NDArray[np.float64]
+    axes_m: NDArray[np.float64]
+    half: NDArray[np.float64]
 
-    first = visible.argmax(axis=1)
-    last = len(starts) - 1 - visible[:, ::-1].argmax(axis=1)
-    inside = touched(first)
-    begin = run * first + np.where(inside.any(axis=1), inside.argmax(axis=1), run)
-    inside = touched(last)
-    end = run * (last + 1) - np.where(inside.any(axis=1), inside[:, ::-1].argmax(axis=1), run)
-    end = np.minimum(end, count)
-    ranges[some, 0] = np.where(begin < end, begin, 0)
-    ranges[some, 1] = np.where(begin < end, end, 0)
-    return ranges
+    @classmethod
+    def equal(cls, centres_m: NDArray[np.float64], half_m: NDArray[np.float64]) -> Boxes:
+        """Return boxes of one size; `half_m` holds half their sides as vectors, [axes, 3]."""
+        return cls(centres_m, half_m, np.ones((1, len(half_m))))
+
+    def __len__(self) -> int:
+        """Return the number of boxes."""
+        return len(self.centres_m)
+
+    def __getitem__(self, some: slice | NDArray[np.int64]) -> Boxes:
+        """Return some of the boxes."""
+        half = self.half if len(self.half) == 1 else self.half[some]
+        return Boxes(self.centres_m[some], self.axes_m, half)
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,7 +92,6 @@ class Visibility:
         axes_m: NDArray[np.float64],
         track_m: NDArray[np.float64],
         along: NDArray[np.float64],
-        index: NDArray[np.int64] | None = None,
     ) -> Visibility:
         """Return the visibility of points from positions on a track.
 
@@ -137,37 +99,53 @@ class Visibility:
         ----------
         points_m : float64 [points, 3]
         axes_m : float64 [axes, 3]
-        track_m, along : float64 [track positions, 3]
+        track_m, along : float64 [positions, 3]
             Positions on the track, and its unit direction there.
-        index : int64 [points, positions], optional
-            Track positions to evaluate for each point. All, unless given.
         """
-        changes = along @ axes_m.T  # [:, axes]
-        slopes: Any  # an array, or a list of them
-        changed: Any
-        if index is None:
-            sine, distance_m = _sines(points_m, track_m, along)
-            slopes = (axes_m @ points_m.T)[..., None] - (axes_m @ track_m.T)[:, None]
-            changed = changes.T
-        else:
-            sine, square = np.zeros(index.shape), np.zeros(index.shape)
-            for point_m, from_m, direction in zip(points_m.T, track_m.T, along.T, strict=True):
-                offset_m = point_m[:, None] - from_m[index]
-                sine += offset_m * direction[index]
-                square += offset_m * offset_m
-            distance_m = np.sqrt(square)
-            sine /= np.maximum(distance_m, 1e-9)
-            towards_m = axes_m @ points_m.T
-            slopes = [
-                each[:, None] - from_m[index]
-                for each, from_m in zip(towards_m, axes_m @ track_m.T, strict=True)
-            ]
-            changed = [each[index] for each in changes.T]
-        inverse_m = 1 / np.maximum(distance_m, 1e-9, out=distance_m)
-        for slope, change in zip(slopes, changed, strict=True):
+        sine, distance_m = _sines(points_m, track_m, along)
+        towards_m = (axes_m @ points_m.T)[..., None] - (axes_m @ track_m.T)[:, None]
+        return cls._of(sine, distance_m, axes_m, towards_m, (axes_m @ along.T)[:, None])
+
+    @classmethod
+    def of_each(
+        cls,
+        points_m: NDArray[np.float64],
+        axes_m: NDArray[np.float64],
+        track_m: NDArray[np.float64],
+        along: NDArray[np.float64],
+        index: NDArray[np.int64],
+    ) -> Visibility:
+        """Return the visibility of points, each from positions of its own.
+
+        Parameters are those of `of`, and `index`, int64 [points, positions]: the positions' numbers
+        for each point.
+        """
+        of_positions = (track_m.T, along.T, axes_m @ track_m.T, axes_m @ along.T)
+        gathered = np.take(np.concatenate(of_positions), index, axis=1)
+        position, direction, from_m, turning = np.split(gathered, [3, 6, 6 + len(axes_m)])
+        offset_m = np.subtract(points_m.T[..., None], position, out=position)
+        sine = np.einsum("ipn,ipn->pn", offset_m, direction)
+        distance_m = np.sqrt(np.einsum("ipn,ipn->pn", offset_m, offset_m))
+        sine /= np.maximum(distance_m, _LEAST_DISTANCE_M)
+        towards_m = np.subtract((axes_m @ points_m.T)[..., None], from_m, out=from_m)
+        return cls._of(sine, distance_m, axes_m, towards_m, turning)
+
+    @classmethod
+    def _of(
+        cls,
+        sine: NDArray[np.float64],
+        distance_m: NDArray[np.float64],
+        axes_m: NDArray[np.float64],
+        towards_m: NDArray[np.float64],
+        along_axes: NDArray[np.float64],
+    ) -> Visibility:
+        """Return it from the components of the lines of sight and of the track along the axes."""
+        inverse_m = 1 / np.maximum(distance_m, _LEAST_DISTANCE_M, out=distance_m)
+        slopes = towards_m
+        for slope, along in zip(slopes, along_axes, strict=True):
             slope *= inverse_m
             slope *= sine
-            np.subtract(change, slope, out=slope)
+            np.subtract(along, slope, out=slope)
             slope *= inverse_m
             np.abs(slope, out=slope)
         return cls(sine, inverse_m, axes_m, slopes)
@@ -188,55 +166,177 @@ class Visibility:
         ----------
         limits : (low, high)
             Sines of the aspect angle at which the beam begins and ends.
-        half : float64 [axes]
+        half : float64 [axes], [1, axes] or [points, axes]
             Half the boxes' sides, in lengths of the axes.
         around_m, spread : float or float64 [positions]
             A position stands for others within this distance, whose directions differ from its
             own by a vector of at most this length.
         """
-        radius_m = np.linalg.norm(np.abs(half[:, None] * self.axes_m).sum(axis=0))
-        reach = radius_m * self.inverse_m
-        reach *= reach
-        for each, slope in zip(half, self.slopes, strict=True):
-            reach += each * slope
         low, high = limits
+        half = np.atleast_2d(half)
+        radius_m = np.linalg.norm(np.abs(half) @ np.abs(self.axes_m), axis=1)
+        wide = radius_m[:, None] * self.inverse_m
+        reach = wide * wide
+        for each, slope in zip(half.T, self.slopes, strict=True):
+            reach += each[:, None] * slope
         if np.any(around_m) or np.any(spread):
             ratio = np.minimum(around_m * self.inverse_m, 0.5)
-            # Seen from closer, the box fills a larger angle. From half the distance it may lie
-            # in any direction.
-            reach = (reach + ratio + ratio**3) / (1 - ratio) + spread
-            reach[ratio == 0.5] = np.inf
+            # Seen from closer, the box fills a larger angle.
+            reach += ratio + ratio * ratio * ratio
+            reach /= 1 - ratio
+            reach += spread
+            # From half the distance it may lie in any direction.
+            wide += 2 * ratio
+        # So may its parts, seen from inside the ball around it.
+        np.copyto(reach, _ANY_DIRECTION, where=wide >= 1)
         # The depth past the nearer limit, which is the smaller of the two depths.
         reach -= np.abs(self.sine - (low + high) / 2)
         reach += (high - low) / 2
         return reach
 
 
-def touches_boxes(
-    limits: tuple[float, float],
-    centres_m: NDArray[np.float64],
-    half_m: NDArray[np.float64],
-    track_m: NDArray[np.float64],
-    along: NDArray[np.float64],
-    around_m: float | NDArray[np.float64] = 0.0,
-    spread: float | NDArray[np.float64] = 0.0,
-) -> NDArray[np.bool_]:
-    """Return which boxes a beam may touch from which positions, bool [boxes, positions].
+@dataclass(frozen=True, eq=False)
+class BeamTrack:
+    """Positions along a track with the beam that each carries.
 
-    Parameters
+    The type answers from which positions the beam touches boxes, coarse to fine: first for runs
+    of positions together, then for the single positions of the runs that matter. Its bounds are
+    safe: a position whose beam touches a box is never missed, and a few others may be found.
+
+    Attributes
     ----------
     limits : (low, high)
         Sines of the aspect angle at which the beam begins and ends.
-    centres_m : float64 [boxes, 3]
-    half_m : float64 [axes, 3]
-        Half the boxes' sides, as vectors.
-    track_m, along : float64 [positions, 3]
-        Positions on the track, and its unit direction there.
-    around_m, spread : float or float64 [positions]
-        What each position stands for; see `Visibility.overlap`.
+    position_m, along : float64 [positions, 3]
+        Positions in order along the track, and its unit direction at each.
     """
-    visibility = Visibility.of(centres_m, half_m, track_m, along)
-    return visibility.overlap(limits, np.ones(len(half_m)), around_m, spread) > 0
+
+    limits: tuple[float, float]
+    position_m: NDArray[np.float64]
+    along: NDArray[np.float64]
+
+    @property
+    def count(self) -> int:
+        """Number of positions."""
+        return len(self.position_m)
+
+    @functools.cached_property
+    def run(self) -> int:
+        """Number of positions in a run, a power of two.
+
+        Searching both ends of `count` positions costs count / run + 2 run tests, which is least
+        at this length.
+        """
+        return 2 ** max(round(math.log2(self.count / 2) / 2), 0)
+
+    def touching(self, boxes: Boxes) -> NDArray[np.bool_]:
+        """Return which boxes the beam touches from which positions, bool [boxes, positions]."""
+        found = np.zeros((len(boxes), self.count), np.bool_)
+        box, run = np.nonzero(self._runs_touching(boxes))
+        step = max(_PAIRS_AT_ONCE // self.run, 1)
+        for start in range(0, len(box), step):
+            some, index = box[start : start + step], self._members(run[start : start + step])
+            found[some[:, None], index] = self.depth(boxes[some], index) > 0
+        return found
+
+    def spans(self, boxes: Boxes) -> Spans:
+        """Return the first and the last position whose beam touches each box."""
+        step = max(_PAIRS_AT_ONCE * self.run // self.count, 1)
+        starts = range(0, max(len(boxes), 1), step)
+        found = [self._spans(boxes[start : start + step]) for start in starts]
+        return Spans(*np.concatenate(found, axis=1))
+
+    def depth(self, boxes: Boxes, index: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Return `Visibility.overlap` of each box at positions of its own, [boxes, positions].
+
+        It is above 0 where the beam may touch the box. `index` holds the positions' numbers,
+        int64 [boxes, positions].
+        """
+        centres_m = boxes.centres_m - self.position_m[0]
+        visibility = Visibility.of_each(centres_m, boxes.axes_m, self._local_m, self.along, index)
+        return visibility.overlap(self.limits, boxes.half)
+
+    @functools.cached_property
+    def _local_m(self) -> NDArray[np.float64]:
+        """Positions about the first one: far from the origin, coordinates would cancel."""
+        return self.position_m - self.position_m[0]
+
+    @functools.cached_property
+    def _runs(self) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
+        """For each run, the position that stands for it, and how far the others may differ.
+
+        That is their largest distance from it, and the largest change of direction.
+        """
+        starts = np.arange(0, self.count, self.run)
+        middle = np.minimum(starts + self.run // 2, self.count - 1)
+        run = np.arange(self.count) // self.run
+        around_m, spread = (
+            np.maximum.reduceat(np.linalg.norm(each - each[middle[run]], axis=1), starts)
+            for each in (self._local_m, self.along)
+        )
+        return middle, around_m, spread
+
+    def _runs_touching(self, boxes: Boxes) -> NDArray[np.bool_]:
+        """Return which boxes the beam may touch from anywhere in which runs, [boxes, runs]."""
+        middle, around_m, spread = self._runs
+        centres_m = boxes.centres_m - self.position_m[0]
+        visibility = Visibility.of(
+            centres_m, boxes.axes_m, self._local_m[middle], self.along[middle]
+        )
+        return visibility.overlap(self.limits, boxes.half, around_m, spread) > 0
+
+    def _members(self, run: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Return the numbers of the positions in runs, [runs, run]; the last one is repeated."""
+        return np.minimum(self.run * run[:, None] + np.arange(self.run), self.count - 1)
+
+    def _spans(self, boxes: Boxes) -> tuple[NDArray[np.int64], ...]:
+        """Return the fields of `spans` for a few boxes."""
+        touched = self._runs_touching(boxes)
+        ever = touched.any(axis=1)
+        first_run = touched.argmax(axis=1)
+        last_run = touched.shape[1] - 1 - touched[:, ::-1].argmax(axis=1)
+        first, last = np.full(len(boxes), self.count), np.full(len(boxes), -1)
+        for edge, start, stop, step in (
+            (first, first_run, last_run, 1),
+            (last, last_run, first_run, -1),
+        ):
+            some = np.flatnonzero(ever)
+            run = start[some]
+            while some.size:
+                index = self._members(run)[:, ::step]
+                inside = self.depth(boxes[some], index) > 0
+                found = inside.any(axis=1)
+                edge[some[found]] = index[found, inside[found].argmax(axis=1)]
+                # A run may touch a box that none of its positions does: go on to the next one.
+                further = ~found & (run != stop[some])
+                some, run = some[further], run[further] + step
+        earliest = np.where(ever, self.run * first_run, self.count)
+        latest = np.where(ever, np.minimum(self.run * (last_run + 1), self.count) - 1, -1)
+        return first, last, earliest, latest
+
+
+class Spans(NamedTuple):
+    """The outermost positions whose beam touches each box, all int64 [boxes].
+
+    Attributes
+    ----------
+    first, last : int64 [boxes]
+        First and last position; `first` is beyond `last` where no position touches the box.
+    earliest, latest : int64 [boxes]
+        First and last position of the runs that may touch the box anywhere between their
+        positions; `earliest` is beyond `latest` where none does.
+    """
+
+    first: NDArray[np.int64]
+    last: NDArray[np.int64]
+    earliest: NDArray[np.int64]
+    latest: NDArray[np.int64]
+
+    @property
+    def ranges(self) -> NDArray[np.int32]:
+        """First position and the one after the last, int32 [boxes, 2]; 0, 0 where none touches."""
+        found = self.first <= self.last
+        return np.where(found, [self.first, self.last + 1], 0).T.astype(np.int32)
 
 
 def _sines(
@@ -249,22 +349,3 @@ def _sines(
     sine -= np.einsum("ci,ci->c", centres_m - origin_m, along)
     sine /= np.where(distance_m > 0, distance_m, np.inf)
     return sine, distance_m
-
-
-def _touches(
-    beam: BeamWindow,
-    sine: NDArray[np.float64],
-    distance_m: NDArray[np.float64],
-    radius_m: float | NDArray[np.float64],
-    spread: float | NDArray[np.float64] = 0.0,
-) -> NDArray[np.bool_]:
-    """Return where a beam may touch a ball whose centre lies at a sine and a distance.
-
-    `spread` is the largest change of the track's unit direction, as the length of a vector.
-    """
-    low, high = beam.limits
-    ratio = radius_m / np.maximum(distance_m, 1e-30)
-    # The direction to a point of the ball differs from that to its centre by at most asin(ratio).
-    # The unit vectors then differ by the chord of that angle.
-    wider = ratio * (1 + 0.42 * ratio * ratio) + (spread + _ROUNDING)
-    return (ratio >= 1) | ((sine + wider > low) & (sine - wider < high))

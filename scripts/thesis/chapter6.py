@@ -21,7 +21,7 @@ import clsas
 from clsas.factorized import thesis as nearest
 from clsas.opencl.device import Device, open_device
 from clsas.simulation import seabeds
-from clsas.sonar.visibility import sines, touches_boxes
+from clsas.sonar.visibility import BeamTrack, Boxes, sines
 from clsas.trials import wreck
 
 PIXELS = 1024
@@ -123,9 +123,8 @@ class Scene:
         half_m = (np.array(grid.shape)[:, None] - 1) / 2 * [grid.row_step_m, grid.column_step_m]
         # What the patch was formed from.
         centre_m = grid.origin_m + half_m.sum(axis=0)
-        seen = touches_boxes(
-            BEAM.limits, centre_m[None], half_m, self.lines.phase_centres_m, along
-        )[0]
+        track = BeamTrack(BEAM.limits, self.lines.phase_centres_m, along)
+        seen = track.touching(Boxes.equal(centre_m[None], half_m))[0]
         lines, along = self.lines.select(seen), along[seen]
         plan = clsas.Plan.from_json(json.dumps(patch.record.plan))
         random = np.random.default_rng(1)

@@ -32,10 +32,11 @@ from clsas.core.image_error import relative_error_db
 from clsas.core.lines import RangeLines
 from clsas.core.validate import ClsasWarning
 from clsas.exact.backprojection import backproject, prepare
+from clsas.exact.groups import Groups
 from clsas.exact.lookup import lookup_options, lookup_room
 from clsas.exact.reference import same_interpolator
 from clsas.exact.run import execute
-from clsas.exact.tiles import BLOCKS, STACK, Groups, Tiles
+from clsas.exact.tiles import BLOCKS, STACK, Tiles
 from clsas.opencl.device import list_devices
 from clsas.simulation.scenes import PointTargets
 from clsas.simulation.simulator import simulate_lines

@@ -5,12 +5,18 @@ import pytest
 from cases import along_x, beside, patch
 
 from clsas.core.grid import Grid
-from clsas.exact.tiles import BLOCKS, GEOMETRY_ERROR, STACK, Groups, Tiles, allowed, lay_out
+from clsas.exact.groups import Groups
+from clsas.exact.layout import GEOMETRY_ERROR, Conditions, allowed, lay_out
+from clsas.exact.tiles import BLOCKS, STACK, Tiles
 from clsas.sonar.beam import BeamWindow
 
 CYCLES_PER_M = 2 * 1e6 / 1500
 TRACK = along_x(20, 0.2)
 WIDTHS = sorted(BLOCKS)
+
+
+def laid_out(grid, cycles_per_m, width, **options):
+    return lay_out(grid, Conditions(TRACK, cycles_per_m, width, **options))
 
 
 def positions_of(layout):
@@ -35,7 +41,7 @@ def scattered(points, size_m, seed=0):
 
 @pytest.mark.parametrize("width", WIDTHS)
 def test_a_far_plane_is_cut_into_tiles(width):
-    assert isinstance(lay_out(patch(0, 40), TRACK, CYCLES_PER_M, width), Tiles)
+    assert isinstance(laid_out(patch(0, 40), CYCLES_PER_M, width), Tiles)
 
 
 @pytest.mark.parametrize(
@@ -49,12 +55,12 @@ def test_a_far_plane_is_cut_into_tiles(width):
     ids=["near", "heights", "points", "coarse"],
 )
 def test_everything_else_is_grouped(grid):
-    assert isinstance(lay_out(grid, TRACK, CYCLES_PER_M, 16), Groups)
+    assert isinstance(laid_out(grid, CYCLES_PER_M, 16), Groups)
 
 
 def test_tiles_shrink_towards_the_antennas():
     fine = {"pitch": 0.5e-3}
-    sides = [lay_out(patch(0, y, **fine), TRACK, CYCLES_PER_M, 16).side for y in (40.0, 3.0, 1.0)]
+    sides = [laid_out(patch(0, y, **fine), CYCLES_PER_M, 16).side for y in (40.0, 3.0, 1.0)]
     assert sides[0] > sides[-1]
     assert sides == sorted(sides, reverse=True)
 
@@ -63,7 +69,7 @@ def test_tiles_shrink_where_a_beam_amplifies_errors_of_weights():
     """As in a normalised image next to the edge of what is seen."""
     grid, beam = patch(0, 4, pitch=2e-2), BeamWindow(18, "hamming")
     found = [
-        lay_out(grid, TRACK, 20.0, 8, error=allowed(-31), beam=beam, fullness=fullness)
+        laid_out(grid, 20.0, 8, error=allowed(-31), beam=beam, fullness=fullness)
         for fullness in (1.0, 0.1, 0.001)
     ]
     sides = [each.side if isinstance(each, Tiles) else 0 for each in found]
@@ -132,7 +138,7 @@ def grid(request):
 
 @pytest.mark.parametrize("width", WIDTHS)
 def test_groups_hold_every_pixel_where_it_lies(grid, width):
-    groups = lay_out(grid, TRACK, CYCLES_PER_M, width)
+    groups = laid_out(grid, CYCLES_PER_M, width)
     assert isinstance(groups, Groups)
     assert groups.index.shape == (groups.parts, STACK * width) == groups.offset_m.shape[:2]
     np.testing.assert_array_equal(np.unique(groups.index), np.arange(grid.size))
@@ -144,8 +150,9 @@ def test_groups_hold_every_pixel_where_it_lies(grid, width):
 @pytest.mark.parametrize("width", WIDTHS)
 @pytest.mark.parametrize("cycles_per_m", [1.0, CYCLES_PER_M, 1e6])
 def test_groups_stay_within_the_radius_that_float32_allows(grid, width, cycles_per_m):
-    groups = lay_out(grid.with_height(np.zeros(grid.shape)) if grid.is_planar else grid, TRACK,
-                     cycles_per_m, width)  # fmt: skip
+    groups = laid_out(
+        grid.with_height(np.zeros(grid.shape)) if grid.is_planar else grid, cycles_per_m, width
+    )
     assert isinstance(groups, Groups)
     assert groups.radius_m == pytest.approx(distances_of(groups).max(), rel=1e-6)
     # Half a unit in the last place of a phase of so many cycles.
@@ -158,29 +165,29 @@ def test_groups_stay_within_the_radius_that_float32_allows(grid, width, cycles_p
 def test_neighbours_share_a_group(name, width):
     """Groups are few: pixels that lie close together are not spread over many."""
     grid = GRIDS[name]
-    groups = lay_out(grid, TRACK, 1.0, width)
+    groups = laid_out(grid, 1.0, width)
     assert groups.parts <= 2 * -(-grid.size // (STACK * width)) + 8
 
 
 def test_groups_collect_every_pixel(grid):
-    groups = lay_out(grid, TRACK, CYCLES_PER_M, 4)
+    groups = laid_out(grid, CYCLES_PER_M, 4)
     image = groups.collect(groups.index.ravel().astype(np.complex64))
     np.testing.assert_array_equal(image, np.arange(grid.size).reshape(grid.shape))
 
 
 @pytest.mark.parametrize("width", WIDTHS)
 def test_blocks_are_no_larger_than_groups(grid, width):
-    groups = lay_out(grid, TRACK, CYCLES_PER_M, width)
+    groups = laid_out(grid, CYCLES_PER_M, width)
     assert groups.block_radius_m <= 2 * groups.radius_m * (1 + 1e-6)
     if width == 1:
         assert groups.block_radius_m == 0
 
 
 def test_a_plane_without_a_carrier_is_laid_out_too():
-    layout = lay_out(patch(0, 40), TRACK, 0.0, 16)
+    layout = laid_out(patch(0, 40), 0.0, 16)
     assert layout.parts >= 1
     heights = dataclasses.replace(patch(0, 40), height_m=np.zeros((33, 40)))
-    assert np.isfinite(lay_out(heights, TRACK, 0.0, 16).radius_m)
+    assert np.isfinite(laid_out(heights, 0.0, 16).radius_m)
 
 
 @pytest.mark.parametrize("width", WIDTHS)

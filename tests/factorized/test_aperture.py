@@ -8,12 +8,12 @@ from clsas.core.geometry import pairwise_range_m
 from clsas.core.grid import Grid
 from clsas.core.lines import RangeLines
 from clsas.factorized.aperture import (
+    cumulative_cycles,
     cycles_per_extent,
     drift,
     mean_track,
     own_drift,
     stretches,
-    turned,
 )
 from clsas.factorized.surface import surface_of
 
@@ -34,7 +34,7 @@ def circle(channels, degrees, radius_m=20.0):
 
 def distance_m(track, centres_m):
     """Of phase centres from their places on the track."""
-    return np.linalg.norm(track.positions_m(track.place) - centres_m, axis=1)
+    return np.linalg.norm(track.positions_m(track.coordinate) - centres_m, axis=1)
 
 
 def pings():
@@ -62,7 +62,7 @@ def test_the_track_follows_a_smooth_path(name):
 
 @pytest.mark.parametrize("name", TRACKS)
 def test_places_rise_along_a_path(name):
-    place = mean_track(lines_of(TRACKS[name])).place
+    place = mean_track(lines_of(TRACKS[name])).coordinate
     steps = np.diff(place)
     assert (steps > 0).all() or (steps < 0).all()
     assert np.ptp(place) == pytest.approx(1, abs=0.01)
@@ -74,7 +74,7 @@ def test_the_order_of_channels_does_not_matter(name):
     order = np.random.default_rng(2).permutation(len(centres_m))
     track = mean_track(lines_of(centres_m[order]))
     assert distance_m(track, centres_m[order]).max() < 0.05 * WAVELENGTH
-    steps = np.diff(track.place[np.argsort(order)])
+    steps = np.diff(track.coordinate[np.argsort(order)])
     if name == "circle":  # which may begin anywhere
         steps = np.delete(steps, np.abs(steps).argmax())
     assert (steps > 0).all() or (steps < 0).all()
@@ -86,7 +86,7 @@ def test_the_track_of_pings_of_many_receivers_is_straight():
     assert distance_m(track, lines.phase_centres_m).max() < 0.01 * WAVELENGTH
     x = lines.phase_centres_m[:, 0]
     order = np.argsort(x)
-    assert (np.diff(track.place[order]) >= -1e-9).all()
+    assert (np.diff(track.coordinate[order]) >= -1e-9).all()
 
 
 def test_the_track_does_not_follow_jitter():
@@ -129,7 +129,7 @@ def test_a_channel_off_the_track_is_seen_in_its_direction():
     centres_m = along_x(200, 0.03) + np.random.default_rng(4).normal(0, 0.05, (200, 3)) * [0, 1, 1]
     track = mean_track(lines_of(centres_m))
     points_m = np.array([[0.5, 40, -5], [30, 30, -5], [-20, 25, 3]])
-    places = track.places_seen_from(points_m, centres_m)
+    places = track.apparent_coordinates(points_m, centres_m)
     for point_m, place in zip(points_m, places, strict=True):
         ways = [position - point_m for position in (track.positions_m(place), centres_m)]
         virtual, real = (way / np.linalg.norm(way, axis=1, keepdims=True) for way in ways)
@@ -142,8 +142,8 @@ def test_a_channel_off_the_track_is_seen_in_its_direction():
 
 def test_on_a_straight_track_channels_are_seen_where_they_are():
     track = mean_track(lines_of(TRACKS["straight"]))
-    places = track.places_seen_from(np.array([[0.0, 10, 0], [5, 3, 1]]), TRACKS["straight"])
-    np.testing.assert_allclose(places, np.tile(track.place, (2, 1)), atol=1e-9)
+    places = track.apparent_coordinates(np.array([[0.0, 10, 0], [5, 3, 1]]), TRACKS["straight"])
+    np.testing.assert_allclose(places, np.tile(track.coordinate, (2, 1)), atol=1e-9)
 
 
 def test_drift_is_the_mean_speed_of_receivers():
@@ -163,7 +163,7 @@ def test_ranges_grow_as_those_of_places_do_once_stretched(speed):
     lines = lines_of(tx, rx, velocity=velocity)
     track = mean_track(lines)
     point_m = np.array([[3.0, 40.0, -8.0]])
-    place = track.places_seen_from(point_m, lines.phase_centres_m, own_drift(lines))
+    place = track.apparent_coordinates(point_m, lines.phase_centres_m, own_drift(lines))
     virtual_m = track.positions_m(place)
     plane = Grid.plane((0, 1, 2), (0, 1, 2))
     antennas = tx, rx, velocity, 1500.0
@@ -236,18 +236,18 @@ def test_rates_about_many_places_are_those_about_each():
 def test_turns_are_the_integral_of_rates():
     track = mean_track(lines_of(TRACKS["straight"]))
     place = track.samples
-    cycles = turned(track, np.full((1, len(place)), 7.0))[0]
+    cycles = cumulative_cycles(track, np.full((1, len(place)), 7.0))[0]
     np.testing.assert_allclose(np.diff(cycles), 7 * np.diff(place), rtol=1e-9)
     rate = 3 * np.clip(place, 0, 1)[None]
     inside = np.searchsorted(place, [0, 1])
-    rising = turned(track, rate)[0, inside]
+    rising = cumulative_cycles(track, rate)[0, inside]
     assert rising[1] - rising[0] == pytest.approx(1.5, rel=1e-4)
 
 
 def test_turns_are_the_integral_of_their_rate():
     track = mean_track(lines_of(TRACKS["straight"]))
     rate = np.stack([np.ones_like(track.samples), np.abs(track.samples - 0.5)])
-    cycles = turned(track, rate)[:, np.abs(track.samples - 0.5) <= 0.5]
+    cycles = cumulative_cycles(track, rate)[:, np.abs(track.samples - 0.5) <= 0.5]
     assert np.ptp(cycles, axis=1) == pytest.approx([1.0, 0.25], rel=1e-3)
 
 
@@ -255,4 +255,4 @@ def test_bistatic_channels_are_where_their_middles_are():
     tx = TRACKS["straight"]
     track = mean_track(lines_of(tx, beside(tx, 0.4, 0.1, -0.1)))
     middle_m = beside(tx, 0.2, 0.05, -0.05)
-    assert np.linalg.norm(track.positions_m(track.place) - middle_m, axis=1).max() < 1e-6
+    assert np.linalg.norm(track.positions_m(track.coordinate) - middle_m, axis=1).max() < 1e-6

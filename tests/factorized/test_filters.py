@@ -39,5 +39,5 @@ def test_the_spectrum_of_steering_functions(of_highest):
     spectrum = steering_spectrum(of_highest)
     assert spectrum.power.sum() == pytest.approx(1)
     assert (spectrum.power >= 0).all()
-    beyond = spectrum.frequency > (np.max(of_highest) + 1 / filters._FINENESS) / 2
+    beyond = spectrum.frequency > (np.max(of_highest) + 1 / filters._BINS) / 2
     assert not spectrum.power[beyond].any()

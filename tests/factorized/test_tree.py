@@ -8,16 +8,16 @@ from factorizing import BEAMS, EXACT_IS_SLOW, arc, around, made, near, over, str
 from clsas.core.grid import Grid
 from clsas.core.image_error import relative_error_db
 from clsas.exact.backprojection import backproject
-from clsas.factorized import tree
+from clsas.factorized import tree, visibility
 from clsas.factorized.aperture import cycles_per_extent, mean_track
 from clsas.factorized.surface import surface_of
-from clsas.factorized.tree import Division, interpolated_nodes, nearest_nodes
+from clsas.factorized.tree import Division, interpolated_channels, nearest_nodes
 from clsas.planning.factorize import factorize
 from clsas.planning.planner import plan
 from clsas.signal import interpolation
 from clsas.signal.spectrum import Spectrum
 from clsas.sonar.beam import BeamWindow
-from clsas.sonar.visibility import touches_boxes
+from clsas.sonar.visibility import Visibility
 
 FLAT = Spectrum(0.0, (np.arange(64) + 0.5) / 128, np.full(64, 1 / 64))
 
@@ -62,7 +62,7 @@ def test_a_centre_is_the_mean_of_pixels():
         assert np.linalg.norm(pixels_m - centre_m, axis=1).max() <= surface.radius_m(SIDES[1])
 
 
-# Nodes
+# Virtual channels
 
 
 def interpolation_error_db(case, side, aperture, root=(128, 128)):
@@ -76,11 +76,11 @@ def interpolation_error_db(case, side, aperture, root=(128, 128)):
     wrong = total = 0.0
     for corner in division.roots[:2]:
         middle_m = division.centres_m(0, corner[None])
-        place = track.places_seen_from(middle_m, centres_m)
+        place = track.apparent_coordinates(middle_m, centres_m)
         extents, nearest_m = surface.extents(root), surface.radius_m(side)
         rates = cycles_per_extent(track, surface, middle_m, extents, cycles_per_m, nearest_m)
         rate = side[0] * rates[0] + side[1] * rates[1]
-        nodes = interpolated_nodes(track, rate, place, aperture)
+        nodes = interpolated_channels(track, rate, place, aperture)
         between = nodes.base[0][:, None] + np.arange(nodes.taps)
         of_channels = track.positions_m(nodes.ordered(place)[0])
         leaves_m = division.centres_m(1, division.corners(1, corner[None]))[0]
@@ -122,18 +122,18 @@ def any_nodes(shuffled=False):
     middle_m = surface.middles_m(side, np.array([[0, 0], [64, 64]]))
     extents, cycles_per_m = surface.extents(side), lines.carrier_cycles_per_m
     rates = cycles_per_extent(track, surface, middle_m, extents, cycles_per_m, 0.1)
-    place = track.places_seen_from(middle_m, lines.phase_centres_m)
+    place = track.apparent_coordinates(middle_m, lines.phase_centres_m)
     aperture = interpolation.design(6, 2.0, FLAT)
-    return place, interpolated_nodes(track, 64 * rates.sum(axis=0), place, aperture)
+    return place, interpolated_channels(track, 64 * rates.sum(axis=0), place, aperture)
 
 
 def test_every_channel_lies_between_its_middle_nodes():
     place, nodes = any_nodes()
     place = nodes.ordered(place)
     rows = np.arange(2)[:, None]
-    assert (np.diff(nodes.place, axis=1) > 0).all()
-    assert (nodes.place[rows, nodes.base + 2] <= place + 1e-9).all()
-    assert (place <= nodes.place[rows, nodes.base + 3] + 1e-9).all()
+    assert (np.diff(nodes.coordinate, axis=1) > 0).all()
+    assert (nodes.coordinate[rows, nodes.base + 2] <= place + 1e-9).all()
+    assert (place <= nodes.coordinate[rows, nodes.base + 3] + 1e-9).all()
 
 
 @pytest.mark.parametrize("shuffled", [False, True])
@@ -142,7 +142,7 @@ def test_channels_come_in_the_order_of_their_nodes(shuffled):
     assert (nodes.order is None) == (not shuffled)
     assert (np.diff(nodes.base, axis=1) >= 0).all()
     assert (nodes.base >= 0).all()
-    assert (nodes.base + nodes.taps <= nodes.place.shape[1]).all()
+    assert (nodes.base + nodes.taps <= nodes.coordinate.shape[1]).all()
     assert (np.diff(nodes.ordered(place), axis=1) >= 0).all()
     np.testing.assert_array_equal(np.sort(nodes.ordered(place), axis=1), np.sort(place, axis=1))
 
@@ -157,10 +157,10 @@ def test_nearest_nodes_are_means_of_neighbours(channels, factor):
     place = np.random.default_rng(0).permutation(channels)[None] / channels
     position_m = place[..., None] * [3.0, 1, 0]
     nodes = nearest_nodes(place, position_m, factor)
-    assert nodes.place.shape == (1, -(-channels // factor))
-    for node in range(nodes.place.shape[1]):
+    assert nodes.coordinate.shape == (1, -(-channels // factor))
+    for node in range(nodes.coordinate.shape[1]):
         mine = nodes.order[0, nodes.base[0] == node]
-        assert nodes.place[0, node] == pytest.approx(place[0, mine].mean())
+        assert nodes.coordinate[0, node] == pytest.approx(place[0, mine].mean())
         np.testing.assert_allclose(nodes.position_m[0, node], position_m[0, mine].mean(axis=0))
     assert (nodes.weights == 1).all()
 
@@ -176,8 +176,10 @@ def everything(monkeypatch):
         everywhere = np.full_like(seen[0], -np.inf), np.full_like(seen[1], np.inf)
         return ranges(division, nodes, place, everywhere, np.ones_like(inside))
 
-    ranges = tree.ranges
-    monkeypatch.setattr(importlib.import_module("clsas.factorized.sector").tree, "ranges", widened)
+    ranges = tree.channel_ranges
+    monkeypatch.setattr(
+        importlib.import_module("clsas.factorized.sector").tree, "channel_ranges", widened
+    )
 
 
 @pytest.mark.slow
@@ -211,14 +213,16 @@ def test_subimages_beyond_the_grid_are_not_missed(shape, everything, monkeypatch
 def test_places_from_where_leaves_are_seen_hold_all_that_weigh():
     lines, grid = made(near)
     beam, track = BEAMS[0], mean_track(lines)
-    along = tree.beam_directions(beam.directions(lines), track, track.samples)
+    along = visibility.beam_directions(beam.directions(lines), track, track.samples)
     division = Division(surface_of(grid), ((16, 16),))
     corners = division.roots[:, None]
     half_m = 8 * np.stack([grid.row_step_m, grid.column_step_m])
-    begin, end = tree.seen_from(beam.limits, track, along, division.centres_m(0, corners), half_m)
+    begin, end = visibility.visible_stretches(
+        beam.limits, track, along, division.centres_m(0, corners), half_m
+    )
     place = np.linspace(0, 1, 2001)
     position_m = track.positions_m(place)
-    direction = tree.beam_directions(beam.directions(lines), track, place)
+    direction = visibility.beam_directions(beam.directions(lines), track, place)
     for (corner,), (first,), (last,) in zip(corners, begin, end, strict=True):
         for pixel in corner + np.array([[0, 0], [0, 15], [15, 0], [15, 15], [7, 8]]):
             pixel_m = grid.origin_m + pixel @ np.stack([grid.row_step_m, grid.column_step_m])
@@ -236,19 +240,15 @@ def test_boxes_are_seen_from_where_they_are_and_from_hardly_more(beam, range_m):
     track_m = np.stack([80 * place - 40, 0.3 * np.sin(9 * place), 0 * place], axis=1)
     lines = thesis_lines(Grid.plane((-1, 1, 4), (29, 30, 4)), track_m)
     track = mean_track(lines)
-    along = tree.beam_directions(beam.directions(lines), track, track.samples)
+    along = visibility.beam_directions(beam.directions(lines), track, track.samples)
     random = np.random.default_rng(1)
     centres_m = random.uniform((-70, 0.7 * range_m, -1), (70, 1.3 * range_m, 1), (300, 3))
     half_m = range_m * np.array([[0.02, 0, 0], [0, 0.01, 0]])
-    begin, end = tree.seen_from(beam.limits, track, along, centres_m, half_m)
+    begin, end = visibility.visible_stretches(beam.limits, track, along, centres_m, half_m)
     place, spacing = np.linspace(0, 1, 4001), 2 / 256  # of those that are looked at
-    seen = touches_boxes(
-        beam.limits,
-        centres_m,
-        half_m,
-        track.positions_m(place),
-        tree.interpolated_directions(track.samples, along, place),
-    )
+    direction = visibility.interpolated_directions(track.samples, along, place)
+    boxes = Visibility.of(centres_m, half_m, track.positions_m(place), direction)
+    seen = boxes.overlap(beam.limits, np.ones(2)) > 0
     ever = seen.any(axis=1)
     assert 50 < np.count_nonzero(ever) < 300
     first = place[seen.argmax(axis=1)][ever]
@@ -265,5 +265,5 @@ def test_boxes_are_seen_from_where_they_are_and_from_hardly_more(beam, range_m):
 def test_directions_between_channels_are_of_length_one():
     lines, _ = made(arc)
     track = mean_track(lines)
-    along = tree.beam_directions(BEAMS[0].directions(lines), track, np.linspace(-1, 2, 50))
+    along = visibility.beam_directions(BEAMS[0].directions(lines), track, np.linspace(-1, 2, 50))
     np.testing.assert_allclose(np.linalg.norm(along, axis=1), 1)

@@ -39,7 +39,7 @@ REFUSED = [
     (("backproject", "factorize", "wavenumber"), "lines", HUGE, ValueError,
      r"samples must be at most .* got 3e\+37"),
     (("wavenumber",), "lines", LINES.select([7]), ValueError,
-     "lines must have phase centres at two places or more"),
+     "lines must have phase centres at two positions or more"),
     # Grid
     (EVERY, "grid", (5, 5), TypeError, "grid must be .*Grid.*tuple"),
     (IN_PARTS, "grid", Grid.plane((-1, 1, 10**6), (30, 31, 10**6)), ValueError,

@@ -25,14 +25,15 @@ from clsas.core.image_error import relative_error_db
 from clsas.core.lines import RangeLines
 from clsas.core.validate import ClsasWarning
 from clsas.exact.backprojection import backproject, form_exactly, prepare
+from clsas.exact.groups import Groups
 from clsas.exact.reference import ideal, same_interpolator
 from clsas.exact.run import execute
-from clsas.exact.tiles import Groups, Tiles
+from clsas.exact.tiles import Tiles
 from clsas.simulation.scenes import PointTargets
 from clsas.simulation.simulator import simulate_lines
 from clsas.sonar.beam import INTERVALS, SHAPES, BeamWindow
 from clsas.sonar.system import element_pattern
-from clsas.sonar.visibility import channel_ranges, sines
+from clsas.sonar.visibility import BeamTrack, sines
 
 FINE = {"taps": 8, "upsampling": 4}
 X = (1.0, 0, 0)
@@ -338,9 +339,8 @@ def test_a_narrow_beam_costs_little(platform):
     beam = BeamWindow(2, "hann")
     preparation = prepare(lines, grid, device=platform, beam=beam, **FINE)
     layout = preparation.layout
-    ranges = channel_ranges(
-        beam, lines, preparation.along, layout.centres_m(slice(None)), layout.radius_m
-    )
+    track = BeamTrack(beam.limits, lines.phase_centres_m, preparation.along)
+    ranges = track.spans(layout.boxes(slice(None))).ranges
     assert (ranges[:, 1] - ranges[:, 0]).mean() < 0.1 * 1500
     some = grid.positions_m()[::9, ::9]
     image = execute(preparation)

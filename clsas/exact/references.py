@@ -1,0 +1,151 @@
+"""References: ranges and phases of the parts' centres, in float64, and the antennas' geometry.
+
+A reference is a whole sample, a fraction of a sample and a phase in cycles, reduced to
+[-0.5, 0.5]. The device only computes differences from it.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+from numpy.typing import NDArray
+
+from clsas.core.geometry import bistatic_range_m, pairwise_range_m
+from clsas.core.lines import RangeLines
+from clsas.exact.blocks import Blocks
+from clsas.opencl.buffers import VECTOR_ROOM, channel_pitch, float_pairs
+from clsas.signal.interpolation import Resampling
+
+
+def is_bistatic(lines: RangeLines) -> bool:
+    """Return whether paths out and back differ."""
+    return lines.rx_velocity_m_s is not None or not np.array_equal(lines.tx_m, lines.rx_m)
+
+
+def geometry_rows(
+    lines: RangeLines,
+    origin_m: NDArray[np.float64],
+    *,
+    bistatic: bool,
+    directions: NDArray[np.float64] | None,
+) -> NDArray[np.float32]:
+    """Return the antennas' geometry as kernels take it (cl/antennas.h), float32 [rows, pitch].
+
+    The rows hold positions about the origin, receivers' velocities over the speed of sound, and the
+    directions. They are so much longer than the channels that a vector may begin at the last one.
+
+    Parameters
+    ----------
+    lines : RangeLines
+    origin_m : float64 [3]
+    bistatic : bool
+        Whether kernels take receivers' positions.
+    directions : float64 [channels, 3] or None
+        For a beam, the track's directions times `BeamTable.per_sine`.
+    """
+    rows = [float_pairs(lines.tx_m - origin_m)]
+    if bistatic:
+        rows.append(float_pairs(lines.rx_m - origin_m))
+    if lines.rx_velocity_m_s is not None:
+        rows.append((lines.rx_velocity_m_s / lines.sound_speed_m_s).astype(np.float32))
+    if directions is not None:
+        rows.append(directions.astype(np.float32))
+    pitch = channel_pitch(lines.channels) + VECTOR_ROOM
+    geometry = np.concatenate(rows, axis=1).T
+    return np.pad(geometry, ((0, 0), (0, pitch - lines.channels)), mode="edge")
+
+
+def references_of(
+    centres_m: NDArray[np.float64],
+    lines: RangeLines,
+    ranges: NDArray[np.int32],
+    resampling: Resampling,
+    blocks: Blocks,
+) -> dict[str, NDArray]:
+    """Return the sample, its fraction and the phase of each centre's echo in each line.
+
+    Parameters
+    ----------
+    centres_m : float64 [parts, 3]
+    lines : RangeLines
+    ranges : int32 [parts, 2]
+        First channel that a part needs, and the one after the last.
+    resampling : Resampling
+    blocks : Blocks
+
+    Returns
+    -------
+    dict of str to int32 or float32 [parts, channels]
+        "sample", "fraction" and "phase", from the first channel of each part's range on.
+    """
+    visible = ranges[:, 1] > ranges[:, 0]
+    count = int((ranges[:, 1] - ranges[:, 0]).max())
+    if count == lines.channels and not ranges[:, 0].any():
+        visible[:] = True
+        range_m = pairwise_range_m(
+            centres_m, lines.tx_m, lines.rx_m, lines.rx_velocity_m_s, lines.sound_speed_m_s
+        )
+        first_range_m = lines.first_range_m
+    else:
+        range_m, first_range_m = _windowed_ranges(
+            centres_m[visible], lines, ranges[visible, 0], count
+        )
+    position = (range_m - first_range_m) / lines.range_step_m + resampling.lead
+    range_m *= lines.carrier_cycles_per_m
+    cycles = range_m + position * resampling.centre_cycles_per_sample
+    cycles -= np.rint(cycles)
+    position *= resampling.ratio
+    position += blocks.margin - resampling.first
+    nearest = np.rint(position)
+    position -= nearest
+    # A part that lies outside a line altogether is moved to where it reads zeros only.
+    nearest = np.clip(
+        nearest,
+        blocks.margin - blocks.reach,
+        blocks.margin + resampling.length + blocks.reach,
+    )
+    shape = (len(centres_m), channel_pitch(count))
+    references: dict[str, NDArray] = {
+        "sample": np.zeros(shape, np.int32),
+        "fraction": np.zeros(shape, np.float32),
+        "phase": np.zeros(shape, np.float32),
+    }
+    for array, values in zip(references.values(), (nearest, position, cycles), strict=True):
+        array[visible, :count] = values
+    return references
+
+
+def _windowed_ranges(
+    centres_m: NDArray[np.float64], lines: RangeLines, first: NDArray[np.int32], count: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the ranges of centres to `count` channels from each one's first, [centres, count].
+
+    The second result holds the ranges of the lines' first samples. The last channel is repeated.
+    """
+
+    def window(values: NDArray[np.float64]) -> NDArray[np.float64]:
+        return sliding_window_view(np.pad(values, (0, count - 1), mode="edge"), count)[first]
+
+    def distance_m(antennas_m: NDArray[np.float64]) -> NDArray[np.float64]:
+        square = np.zeros((len(first), count))
+        for axis in range(3):
+            offset_m = window(antennas_m[:, axis])
+            offset_m -= centres_m[:, axis, None]
+            offset_m *= offset_m
+            square += offset_m
+        return np.sqrt(square, out=square)
+
+    if lines.rx_velocity_m_s is not None:
+        antennas = (lines.tx_m, lines.rx_m, lines.rx_velocity_m_s)
+        tx_m, rx_m, velocity_m_s = (
+            np.stack([window(axis) for axis in each.T], axis=-1) for each in antennas
+        )
+        range_m = bistatic_range_m(
+            centres_m[:, None], tx_m, rx_m, velocity_m_s, lines.sound_speed_m_s
+        )
+    else:
+        range_m = distance_m(lines.tx_m)
+        if not np.array_equal(lines.tx_m, lines.rx_m):
+            range_m += distance_m(lines.rx_m)
+            range_m *= 0.5
+    return range_m, window(lines.first_range_m)
