@@ -280,10 +280,10 @@ def _pixels_m(grid: Grid) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     places = [np.unique(np.linspace(0, n - 1, _PIXELS).round().astype(int)) for n in grid.shape]
     index = np.ravel_multi_index(np.ix_(*places), grid.shape).ravel()
     surface = surface_of(grid)
-    relief_m = surface.off_m
-    if relief_m is None:
+    if surface.is_plane:
         points_m = grid.at(index)
         return points_m, points_m
+    relief_m = surface.off_m
     index = np.append(index, [relief_m.argmin(), relief_m.argmax()])
     points_m = grid.at(index)
     return points_m, points_m - relief_m[index, None] * surface.steps_m[2]
