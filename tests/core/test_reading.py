@@ -1,4 +1,5 @@
 import os
+import sys
 
 import pytest
 
@@ -30,7 +31,17 @@ def test_a_text_too_large_to_be_parsed_is_refused_unread(tmp_path, monkeypatch):
         reading.read_bytes(path)
 
 
+@pytest.fixture
+def usual_recursion_limit():
+    """Python's own limit: Hypothesis raises it in a process that ran its tests."""
+    limit = sys.getrecursionlimit()
+    sys.setrecursionlimit(1000)
+    yield
+    sys.setrecursionlimit(limit)
+
+
 @pytest.mark.parametrize("depth", [1500, DEEP])
+@pytest.mark.usefixtures("usual_recursion_limit")
 def test_nesting_is_no_recursion_error(depth):
     for text in (b"a=" + b"[" * depth + b"]" * depth, b"a=" + b"{a=" * depth):
         with pytest.raises(ValueError, match=r"nested too deep"):
