@@ -1,0 +1,1 @@
+"""Where the sonar really was: micronavigation and autofocus."""

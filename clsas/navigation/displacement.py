@@ -1,0 +1,359 @@
+"""Displacement of an array from a ping to the next, from channels that share phase centres.
+
+Both channels of a pair receive the same speckle. Each is read along one ray from their phase
+centre, at the ranges that its own transmitter and receiver have to the points of the ray: range
+migration, separate transmitters and motion during flight are then gone. What is left is the change
+in range by an array that does not lie where its navigation says (Bellettini and Pinto 2002).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import scipy.fft
+from numpy.typing import NDArray
+
+from clsas.core.geometry import bistatic_range_m
+from clsas.core.lines import RangeLines
+from clsas.navigation.overlap import Array, Overlap
+from clsas.signal.readout import Readout
+from clsas.signal.spectrum import cycles_per_m_at, measure_spectrum
+from clsas.sonar.system import element_pattern
+
+_ANGLES = 65  # of the beam, over which the expected phase is averaged
+_WIDEST = math.radians(75)  # half of the beam that is averaged
+_SLOPES = np.linspace(-0.2, 0.2, 81)  # yaw between pings that is tried first, rad
+_FINE = 16  # points per sample at which the envelope's peak is looked for
+_SPECKLE_LAGS = 64  # samples over which speckle may be correlated in range
+
+
+@dataclass(frozen=True, eq=False)
+class Swath:
+    """What is seen of the seabed, and by which windows of range it is measured.
+
+    Attributes
+    ----------
+    edges_m : float64 [windows + 1]
+        Ranges between windows.
+    side : int
+        1 where the seabed lies to port, -1 to starboard.
+    seabed_z_m : float or None
+        Height of the seabed; None takes every ray as horizontal.
+    element_length_m : (transmitter, receiver) or None
+        Lengths of the elements, whose beam weighs directions; None takes the beam as narrow.
+    """
+
+    edges_m: NDArray[np.float64]
+    side: int = 1
+    seabed_z_m: float | None = None
+    element_length_m: tuple[float, float] | None = None
+
+    @property
+    def windows(self) -> int:
+        """Number of windows."""
+        return len(self.edges_m) - 1
+
+    @property
+    def middles_m(self) -> NDArray[np.float64]:
+        """Ranges in the middle of the windows, [windows]."""
+        return (self.edges_m[1:] + self.edges_m[:-1]) / 2
+
+    def slopes(
+        self, height_m: NDArray[np.float64], range_m: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the horizontal and vertical parts of unit rays that end on the seabed.
+
+        `height_m` is that of where rays begin. Rays shorter than their height point straight down.
+        """
+        if self.seabed_z_m is None:
+            return np.ones_like(range_m), np.zeros_like(range_m)
+        down = np.clip((height_m - self.seabed_z_m) / range_m, -1.0, 1.0)
+        return np.sqrt(1 - down**2), -down
+
+
+@dataclass(frozen=True, eq=False)
+class Correlation:
+    """Correlation of channel pairs at lags of range.
+
+    Attributes
+    ----------
+    values : complex128 [pairs, windows, lags]
+        Cross-correlation, without the phase that is expected of arrays where they are said to lie.
+    coherence : float64 [pairs, windows, lags]
+        Its magnitude over the geometric mean of both energies.
+    lags_m : float64 [lags]
+    cycles_per_m : float
+        Phase per metre of range.
+    sensitivity : float64 [pairs, windows]
+        Decrease in range per metre of sway.
+    along_m : float64 [pairs]
+        See `Overlap`.
+    independent : float64 [windows]
+        Number of independent samples of speckle in a window.
+    """
+
+    values: NDArray[np.complex128]
+    coherence: NDArray[np.float64]
+    lags_m: NDArray[np.float64]
+    cycles_per_m: float
+    sensitivity: NDArray[np.float64]
+    along_m: NDArray[np.float64]
+    independent: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Displacement:
+    """Displacement of an array between two pings, beside what its navigation says.
+
+    Attributes
+    ----------
+    sway_m, yaw_rad : float
+        At the middle of the overlap, to port; and turn from forward to port.
+    covariance : float64 [2, 2]
+        Of both.
+    coherence : float64 [windows]
+        Mean over the pairs.
+    misfit : float
+        Mean square of the residual phases over what their coherence explains; 1 is expected.
+    """
+
+    sway_m: float
+    yaw_rad: float
+    covariance: NDArray[np.float64]
+    coherence: NDArray[np.float64]
+    misfit: float
+
+
+class Correlator:
+    """Lines, read along rays and correlated pair by pair."""
+
+    def __init__(self, lines: RangeLines, swath: Swath) -> None:
+        self.readout, self.swath = Readout.of(lines), swath
+        spectrum = measure_spectrum(lines)
+        self.cycles_per_m = float(cycles_per_m_at(lines, spectrum.centre))
+        self.step_m = lines.range_step_m
+        counts = np.maximum(np.diff(swath.edges_m) / self.step_m, 1.0)
+        self.samples = counts.astype(np.int64)
+        self.spectrum = spectrum
+
+    @cached_property
+    def independent(self) -> NDArray[np.float64]:
+        """Independent samples of speckle per window: N^2 over the sum of squared correlations."""
+        lags = np.arange(-_SPECKLE_LAGS, _SPECKLE_LAGS + 1)
+        turns = np.cos(2 * np.pi * np.outer(lags, self.spectrum.frequency))
+        correlated = (turns @ self.spectrum.share) ** 2
+        return np.array(
+            [
+                n / float(np.sum(correlated * np.maximum(1 - np.abs(lags) / n, 0.0)))
+                for n in self.samples
+            ]
+        )
+
+    def correlate(
+        self, lines: RangeLines, array: Array, pairs: Overlap, most_m: float
+    ) -> Correlation:
+        """Return the correlation of some pairs at lags of up to `most_m`.
+
+        `lines` has the samples that the correlator was made for, and the positions to test.
+        """
+        swath, most = self.swath, max(math.ceil(most_m / self.step_m), 1)
+        centre_m = (lines.phase_centres_m[pairs.first] + lines.phase_centres_m[pairs.second]) / 2
+        ping = int(np.searchsorted(array.starts, pairs.first[0], "right")) - 1
+        forward = array.forward[ping] + array.forward[ping + 1]
+        forward /= np.linalg.norm(forward)
+        outward = swath.side * np.array([-forward[1], forward[0], 0.0])
+        range_m = np.concatenate(
+            [
+                low + self.step_m * np.arange(n)
+                for low, n in zip(swath.edges_m[:-1], self.samples, strict=True)
+            ]
+        )
+        first, second = (
+            self._along_rays(lines, each, centre_m, outward, range_m)
+            for each in (pairs.first, pairs.second)
+        )
+        values, coherence, start = [], [], 0
+        for n in self.samples:
+            part = slice(start, start + n)
+            one, other = first[:, part], second[:, part]
+            length = scipy.fft.next_fast_len(int(n) + most)
+            spectra = (scipy.fft.fft(each, length, axis=1) for each in (one, other))
+            of_one, of_other = spectra
+            lagged = scipy.fft.ifft(of_one.conj() * of_other, axis=1).conj()
+            lagged = np.concatenate([lagged[:, length - most :], lagged[:, : most + 1]], axis=1)
+            energy = np.sqrt(
+                np.sum(np.abs(one) ** 2, axis=1) * np.sum(np.abs(other) ** 2, axis=1)
+            )[:, None]
+            values.append(lagged)
+            coherence.append(np.abs(lagged) / np.maximum(energy, 1e-300))
+            start += n
+        expected, sensitivity = self._expected(lines, array, pairs, centre_m, forward, outward)
+        return Correlation(
+            np.stack(values, axis=1) * np.exp(-1j * expected)[..., None],
+            np.stack(coherence, axis=1),
+            self.step_m * np.arange(-most, most + 1),
+            self.cycles_per_m,
+            sensitivity,
+            pairs.along_m,
+            self.independent,
+        )
+
+    def _along_rays(
+        self,
+        lines: RangeLines,
+        channels: NDArray[np.int64],
+        centre_m: NDArray[np.float64],
+        outward: NDArray[np.float64],
+        range_m: NDArray[np.float64],
+    ) -> NDArray[np.complex128]:
+        """Return channels at the points of rays from their phase centres, [channels, ranges].
+
+        The phase of an echo is that of its distance along the ray.
+        """
+        across, up = self.swath.slopes(centre_m[:, 2:], range_m)
+        points_m = centre_m[:, None] + (range_m * across)[..., None] * outward
+        points_m[..., 2] += range_m * up
+        path_m = self._range_m(lines, channels, points_m)
+        turns = lines.carrier_cycles_per_m * path_m - self.cycles_per_m * range_m
+        values = self.readout.read(channels, path_m).astype(np.complex128)
+        return values * np.exp(2j * np.pi * (turns - np.rint(turns)))
+
+    def _range_m(
+        self, lines: RangeLines, channels: NDArray[np.int64], points_m: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Return ranges of points [channels, n, 3] in channels, [channels, n]."""
+        velocity = lines.rx_velocity_m_s
+        return bistatic_range_m(
+            points_m,
+            lines.tx_m[channels, None],
+            lines.rx_m[channels, None],
+            None if velocity is None else velocity[channels, None],
+            lines.sound_speed_m_s,
+        )
+
+    def _expected(
+        self,
+        lines: RangeLines,
+        array: Array,
+        pairs: Overlap,
+        centre_m: NDArray[np.float64],
+        forward: NDArray[np.float64],
+        outward: NDArray[np.float64],
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the phase of a pair's correlation, and its sensitivity, over the whole beam.
+
+        Pairs are aligned for the ray in the middle of the beam. Echoes from other directions come
+        with slightly other differences in range, whose mean phase is the expected one.
+        """
+        swath = self.swath
+        angle = np.zeros(1)
+        if swath.element_length_m is not None:
+            wavelength_m = 2 / abs(self.cycles_per_m)
+            shortest = wavelength_m / max(swath.element_length_m)
+            half = min(math.asin(min(shortest, 1.0)), _WIDEST)
+            angle = np.linspace(-half, half, _ANGLES)
+        across, up = swath.slopes(centre_m[:, 2:], swath.middles_m)
+        shape = pairs.pairs, swath.windows
+        ray = np.broadcast_to(across, shape)[..., None] * outward
+        ray[..., 2] += up
+        # [pairs, windows, angles, 3]
+        rays = np.cos(angle)[:, None] * ray[..., None, :] + np.sin(angle)[:, None] * forward
+        weights = self._beam(rays, array, pairs)
+        points_m = swath.middles_m[:, None, None] * rays + centre_m[:, None, None]
+        middle_m = swath.middles_m[:, None] * ray + centre_m[:, None]
+        apart_m = 0.0
+        for channels, sign in ((pairs.first, -1), (pairs.second, 1)):
+            flat_m = points_m.reshape(len(channels), -1, 3)
+            path_m = self._range_m(lines, channels, flat_m).reshape(weights.shape)
+            path_m -= self._range_m(lines, channels, middle_m)[..., None]
+            apart_m = apart_m + sign * path_m
+        # Channels of unlike separation migrate by different amounts: that is not delay.
+        total = np.sum(weights * np.exp(2j * np.pi * self.cycles_per_m * apart_m), axis=-1)
+        port = swath.side * outward
+        sensitivity = np.sum(weights * (rays @ port), axis=-1) / np.sum(weights, axis=-1)
+        return np.angle(total), sensitivity
+
+    def _beam(
+        self, rays: NDArray[np.float64], array: Array, pairs: Overlap
+    ) -> NDArray[np.float64]:
+        """Return the product of both channels' two-way amplitudes in directions."""
+        weights = np.ones(rays.shape[:-1])
+        if self.swath.element_length_m is None:
+            return weights
+        wavelength_m = 2 / abs(self.cycles_per_m)
+        for channel in (pairs.first[0], pairs.second[0]):
+            ping = int(np.searchsorted(array.starts, channel, "right")) - 1
+            sine = rays @ array.forward[ping]
+            for length_m in self.swath.element_length_m:
+                weights = weights * element_pattern(length_m, sine, 1.0, wavelength_m)
+        return weights
+
+
+def displacement(found: Correlation, *, first: bool, yaw: bool = True) -> Displacement:
+    """Return the displacement that explains a correlation best.
+
+    The envelope's peak over lags decides between whole wavelengths; phases, fitted by a straight
+    line along the array, do the rest. `first` also tries yaw of up to 0.2 rad. Without `yaw` the
+    array does not turn: the line is level.
+    """
+    turns = 2 * np.pi * found.cycles_per_m * found.sensitivity
+    slope = 0.0
+    steer = turns * found.along_m[:, None]
+    if first and yaw:
+        power = [
+            np.sum(np.abs(np.einsum("kwm,kw->wm", found.values, np.exp(1j * steer * each))) ** 2)
+            for each in _SLOPES
+        ]
+        slope = float(_SLOPES[int(np.argmax(power))])
+    summed = np.einsum("kwm,kw->wm", found.values, np.exp(1j * steer * slope))
+    sway_m = -_peak_m(summed, found.lags_m) / float(np.mean(found.sensitivity))
+    lag = int(np.argmin(np.abs(found.lags_m + sway_m * np.mean(found.sensitivity))))
+    model = -turns * (sway_m + slope * found.along_m[:, None])
+    phase = np.angle(found.values[:, :, lag] * np.exp(-1j * model))
+    # The mean is taken on the circle first: single phases may be anywhere.
+    mean = np.angle(np.sum(found.values[:, :, lag] * np.exp(-1j * model)))
+    phase = np.angle(np.exp(1j * (phase - mean))) + mean
+    coherence = np.sqrt(np.mean(found.coherence[:, :, lag] ** 2, axis=0))
+    variance = phase_variance(coherence, found.independent)
+    design = np.stack([-turns, -steer] if yaw else [-turns], axis=-1)
+    weights = np.broadcast_to(1 / variance, phase.shape)
+    normal = np.einsum("kw,kwa,kwb->ab", weights, design, design)
+    unknowns = len(normal)
+    covariance, solution = np.zeros((2, 2)), np.zeros(2)
+    covariance[:unknowns, :unknowns] = np.linalg.inv(normal)
+    right = np.einsum("kw,kwa,kw->a", weights, design, phase)
+    solution[:unknowns] = covariance[:unknowns, :unknowns] @ right
+    residual = phase - design @ solution[:unknowns]
+    misfit = float(np.sum(weights * residual**2) / max(phase.size - unknowns, 1))
+    return Displacement(
+        sway_m + float(solution[0]), slope + float(solution[1]), covariance, coherence, misfit
+    )
+
+
+def phase_variance(
+    coherence: NDArray[np.float64], independent: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return the variance of a correlation's phase, rad^2.
+
+    (1 - g^2)/(2 L g^2) for a coherence g over L independent samples; `coherence` is a sample's,
+    which noise alone makes 1/sqrt(L).
+    """
+    square = np.clip((independent * coherence**2 - 1) / (independent - 1), 1e-6, 1 - 1e-9)
+    return (1 - square) / (2 * independent * square)
+
+
+def _peak_m(summed: NDArray[np.complex128], lags_m: NDArray[np.float64]) -> float:
+    """Return the lag of the envelope's peak, interpolated between samples."""
+    step_m = lags_m[1] - lags_m[0]
+    peak = int(np.argmax(np.sum(np.abs(summed) ** 2, axis=0)))
+    fine_m = lags_m[peak] + step_m * np.linspace(-1, 1, 2 * _FINE + 1)
+    between = np.sinc((fine_m[:, None] - lags_m) / step_m)
+    power = np.sum(np.abs(summed @ between.T) ** 2, axis=0)
+    best = int(np.clip(np.argmax(power), 1, len(power) - 2))
+    before, at, after = power[best - 1 : best + 2]
+    bend = before - 2 * at + after
+    shift = 0.5 * (before - after) / bend if bend < 0 else 0.0
+    return float(fine_m[best] + np.clip(shift, -1, 1) * step_m / _FINE)
