@@ -1,0 +1,291 @@
+"""Autofocus in the time domain: the track that brings an image's brightest responses into focus.
+
+An image is formed, and its brightest local maxima are taken as responses. Every ping's contribution
+to each is read from the lines along the present track. From these come errors of the track, from
+coarse to fine: the drift of responses between subapertures (`clsas.navigation.drift`), their phase
+steps from ping to ping, and the sharpness over each single ping (`clsas.navigation.gradient`). Each
+is solved as a *position* of the sonar, so that the beam may be wide and the grid and track of any
+kind. Each is kept only where the image gets sharper.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsas.core import reprs, validate
+from clsas.core.grid import Grid
+from clsas.core.image import Image
+from clsas.core.lines import RangeLines
+from clsas.navigation.drift import drift_m
+from clsas.navigation.gradient import phase_gradient_m, sharpest_m
+from clsas.navigation.responses import Contributions, Passage, brightest, contributions
+from clsas.opencl.device import Device, open_device
+from clsas.planning.factorize import factorize
+from clsas.signal.spectrum import measure_spectrum
+from clsas.sonar.beam import BeamWindow
+
+UNKNOWNS = ("sway", "heave", "surge")
+
+IMAGE_TOLERANCE_DB = -30.0
+"""Tolerance of the images in between: errors far below responses."""
+LEAST_SHARPNESS = 3.0
+"""Sharpness below which a scene has no responses; fully developed speckle has 2."""
+
+_DRIFTS = 3  # times that drift is measured at most
+_NEIGHBOURHOODS_M = (1.2, 0.8, 0.5, 0.3)  # around responses, along the track
+_SWEEPS = 2  # times that single pings are moved
+_RESPONSES, _RESPONSES_FOR_DRIFT = 200, 80
+_OFFSETS = np.arange(-5, 6)  # samples in range, of which drift sees images
+_APART = 4.0  # range resolution cells between responses
+_GAIN = 1.02  # of sharpness, for which a step is repeated
+
+
+@dataclass(frozen=True, eq=False)
+class Autofocus:
+    """What autofocus found.
+
+    Attributes
+    ----------
+    lines : RangeLines
+        The lines given, with corrected positions.
+    correction_m : float64 [channels, 3]
+        By how much transmitters and receivers were moved.
+    correction_sd_m : float64 [channels]
+        Standard deviation of the correction's change from ping to ping. A shift and a linear trend
+        of the track are not observable and stay as they were.
+    sharpness_before, sharpness_after : float
+        Mean squared intensity over the squared mean: 2 for speckle, the more the sharper.
+    sharpness : tuple of (step, float)
+        Sharpness after each step that was tried.
+    focused : bool
+        False where the scene has no responses to focus on. The lines are then as they were.
+    """
+
+    lines: RangeLines
+    correction_m: NDArray[np.float64]
+    correction_sd_m: NDArray[np.float64]
+    sharpness_before: float
+    sharpness_after: float
+    sharpness: tuple[tuple[str, float], ...]
+    focused: bool
+
+    def __repr__(self) -> str:
+        """Return the size of the correction and both sharpnesses."""
+        rms_m = float(np.sqrt(np.mean(np.sum(self.correction_m**2, axis=1))))
+        return reprs.summary(
+            self,
+            f"correction {reprs.quantity(rms_m, 'm')} rms",
+            f"sharpness {self.sharpness_before:.3g} to {self.sharpness_after:.3g}",
+            None if self.focused else "no responses to focus on",
+        )
+
+
+def autofocus(
+    lines: RangeLines,
+    grid: Grid,
+    *,
+    beam: BeamWindow | None = None,
+    unknowns: Sequence[str] = ("sway",),
+    device: Device | str | int | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> Autofocus:
+    """Correct a track by the bright responses of an image.
+
+    Parameters
+    ----------
+    lines : RangeLines
+        At least ten pings, monostatic, bistatic or of an array.
+    grid : Grid
+        Where responses are looked for: some hundred of the scene are enough.
+    beam : BeamWindow, optional
+        Weights of the channels.
+    unknowns : sequence of {"sway", "heave", "surge"}
+        Displacements to solve for, across the track, up and along it. Responses must see the sonar
+        from different directions to tell several apart.
+    device : Device, str or int, optional
+        See `clsas.opencl.device.choose`.
+    progress : callable, optional
+        Called as progress(steps done, steps).
+
+    Returns
+    -------
+    Autofocus
+
+    Raises
+    ------
+    TypeError, ValueError
+        If an argument is of the wrong kind, there are too few pings, or the geometry does not tell
+        the unknowns apart.
+    DeviceError
+        If there is no such device.
+
+    Warns
+    -----
+    ClsasWarning
+        If the scene has no responses. The lines are then returned as they are.
+    """
+    validate.instance("lines", lines, RangeLines)
+    validate.instance("grid", grid, Grid)
+    if beam is not None:
+        validate.instance("beam", beam, BeamWindow)
+    validate.progress(progress)
+    names = _checked_unknowns(unknowns)
+    pings = len(lines.ping_starts)
+    if pings < 10:
+        raise ValueError(f"lines must hold at least 10 pings for autofocus, got {pings}")
+    focus = _Focus(lines, grid, Passage.of(lines, names), beam, open_device(device), progress)
+    focus.check_geometry(names)
+    return focus.result()
+
+
+def _checked_unknowns(unknowns: Sequence[str]) -> tuple[str, ...]:
+    names = (unknowns,) if isinstance(unknowns, str) else tuple(unknowns)
+    for name in names:
+        validate.one_of("every entry of unknowns", name, UNKNOWNS)
+    if not names or len(set(names)) < len(names):
+        raise ValueError(f"unknowns must be one or several of {UNKNOWNS}, got {names}")
+    return names
+
+
+class _Focus:
+    """Lines on their way into focus."""
+
+    def __init__(
+        self,
+        lines: RangeLines,
+        grid: Grid,
+        passage: Passage,
+        beam: BeamWindow | None,
+        device: Device,
+        progress: Callable[[int, int], None] | None,
+    ) -> None:
+        self.given, self.grid, self.passage, self.beam = lines, grid, passage, beam
+        self.device, self.progress = device, progress
+        self.moved_m = np.zeros((len(passage.axes), passage.pings))
+        self.deviation_m = np.full(passage.pings, np.inf)
+        spectrum = measure_spectrum(lines)
+        self.cell_m = lines.range_step_m * min(max(spectrum.oversampling, 1.0), 64.0)
+        self.steps: list[tuple[str, float]] = []
+        self.image = self._form(self.moved_m)
+        self.sharpness = self.before = sharpness(self.image)
+
+    def check_geometry(self, names: tuple[str, ...]) -> None:
+        """Refuse unknowns that the responses do not tell apart."""
+        if len(names) == 1:
+            return
+        found = self._contributions(_RESPONSES)
+        weights = np.abs(found.values[..., 0]) ** 2
+        normal = np.einsum("ucp,vcp,cp->uv", found.gradient, found.gradient, weights)
+        scale = np.sqrt(np.diag(normal))
+        likeness = normal / np.maximum(np.outer(scale, scale), 1e-300)
+        condition = float(np.linalg.cond(likeness))
+        if not condition < 1e3:
+            raise ValueError(
+                f"unknowns {', '.join(names)} cannot be told apart: all responses see them from "
+                f"nearly one direction (condition number {condition:.3g}, at most 1000)"
+            )
+
+    def result(self) -> Autofocus:
+        """Focus, and return what was found."""
+        stages, dropped = list(self._stages()), ""
+        for number, (name, find) in enumerate(stages, start=1):
+            # What gained nothing once gains nothing from the same image again.
+            if name != dropped and not self._try(name, find):
+                dropped = name
+            if self.progress is not None:
+                self.progress(number, len(stages))
+        focused = self.sharpness >= LEAST_SHARPNESS
+        if not focused:
+            validate.warn(
+                f"the scene has no bright responses to focus on (sharpness {self.sharpness:.2f}, "
+                f"speckle has 2): the lines are left as they were"
+            )
+            self.moved_m[:] = 0
+        vectors_m = self.passage.vectors_m(self.moved_m)
+        return Autofocus(
+            lines=self._lines(self.moved_m),
+            correction_m=vectors_m,
+            correction_sd_m=self.deviation_m[self.passage.ping],
+            sharpness_before=self.before,
+            sharpness_after=self.sharpness if focused else self.before,
+            sharpness=tuple(self.steps),
+            focused=focused,
+        )
+
+    def _stages(self) -> Iterator[tuple[str, Callable[[], NDArray[np.float64] | None]]]:
+        """Yield what is tried, from coarse to fine."""
+        for _ in range(_DRIFTS):
+            yield "drift between subapertures", self._drift
+        for each_m in _NEIGHBOURHOODS_M:
+            yield f"phase gradient within {each_m:g} m", lambda m=each_m: self._gradient(m)
+        for _ in range(_SWEEPS):
+            yield "sharpness of single pings", self._pings
+
+    def _drift(self) -> NDArray[np.float64] | None:
+        offsets_m = self.given.range_step_m * _OFFSETS
+        found = self._contributions(_RESPONSES_FOR_DRIFT, offsets_m)
+        drift = drift_m(self.passage, found)
+        if drift is None:
+            return None
+        return np.concatenate([drift[None], np.zeros_like(self.moved_m[1:])])
+
+    def _gradient(self, neighbourhood_m: float) -> NDArray[np.float64]:
+        return phase_gradient_m(self.passage, self._contributions(_RESPONSES), neighbourhood_m)
+
+    def _pings(self) -> NDArray[np.float64]:
+        found_m, self.deviation_m = sharpest_m(self.passage, self._contributions(_RESPONSES))
+        return np.concatenate([found_m[None], np.zeros_like(self.moved_m[1:])])
+
+    def _contributions(
+        self, count: int, offsets_m: NDArray[np.float64] | None = None
+    ) -> Contributions:
+        points_m = brightest(self.image, count, _APART * self.cell_m)
+        if not len(points_m):
+            points_m = self.grid.positions_m().reshape(-1, 3)[:1]
+        lines = self._lines(self.moved_m)
+        return contributions(self.passage, lines, points_m, self.beam, offsets_m)
+
+    def _try(self, name: str, find: Callable[[], NDArray[np.float64] | None]) -> bool:
+        """Keep a correction if it makes the image sharper; return whether it does so by much."""
+        found_m = find()
+        if found_m is None:
+            return False
+        moved_m = _detrended(self.moved_m + found_m, self.passage.along_m)
+        image = self._form(moved_m)
+        reached = sharpness(image)
+        self.steps.append((name, reached))
+        before = self.sharpness
+        if reached > before:
+            self.moved_m, self.image, self.sharpness = moved_m, image, reached
+        return reached > _GAIN * before
+
+    def _form(self, moved_m: NDArray[np.float64]) -> Image:
+        lines = self._lines(moved_m)
+        return factorize(
+            lines, self.grid, IMAGE_TOLERANCE_DB, beam=self.beam, device=self.device
+        )
+
+    def _lines(self, moved_m: NDArray[np.float64]) -> RangeLines:
+        vectors_m = self.passage.vectors_m(moved_m)
+        given = self.given
+        return replace(given, tx_m=given.tx_m + vectors_m, rx_m=given.rx_m + vectors_m)
+
+
+def sharpness(image: Image) -> float:
+    """Return the mean squared intensity of an image over its squared mean intensity."""
+    intensity = np.abs(image.pixels.astype(np.complex128)) ** 2
+    mean = float(intensity.mean())
+    return float((intensity**2).mean()) / mean**2 if mean else 0.0
+
+
+def _detrended(
+    moved_m: NDArray[np.float64], along_m: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return displacements without a shift and a linear trend along the track."""
+    design = np.stack([np.ones_like(along_m), along_m - along_m.mean()], axis=1)
+    fitted = np.linalg.lstsq(design, moved_m.T, rcond=None)[0]
+    return moved_m - (design @ fitted).T

@@ -1,0 +1,155 @@
+"""Bright responses of an image, and what every ping contributes to them."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import maximum_filter
+
+from clsas.core.geometry import pairwise_range_m
+from clsas.core.image import Image
+from clsas.core.lines import RangeLines, wavelength_m
+from clsas.signal.readout import Readout
+from clsas.sonar.beam import BeamWindow
+from clsas.sonar.directions import track_directions
+from clsas.sonar.visibility import sines
+
+READ_DB = -40.0
+"""Accuracy of what is read of the lines."""
+_READ_AT_ONCE = 1 << 21  # samples: bounds the memory
+
+
+@dataclass(frozen=True, eq=False)
+class Passage:
+    """The sonar's passage: its pings, and the directions in which each may be moved.
+
+    Attributes
+    ----------
+    lines : RangeLines
+    ping : int64 [channels]
+        Number of every channel's ping.
+    along_m : float64 [pings]
+        Distance travelled.
+    axes : float64 [unknowns, pings, 3]
+        Unit vectors of the displacements that are solved for.
+    """
+
+    lines: RangeLines
+    ping: NDArray[np.int64]
+    along_m: NDArray[np.float64]
+    axes: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, lines: RangeLines, unknowns: tuple[str, ...]) -> Passage:
+        """Return the passage of lines; `unknowns` are some of "sway", "heave" and "surge"."""
+        starts = lines.ping_starts
+        counts = np.diff(np.append(starts, lines.channels))
+        centres_m = np.add.reduceat(lines.phase_centres_m, starts) / counts[:, None]
+        along = track_directions(lines)[starts]
+        up = np.array([0.0, 0.0, 1.0])
+        sway = np.cross(up, along)
+        sway /= np.maximum(np.linalg.norm(sway, axis=1, keepdims=True), 1e-9)
+        vectors = {"sway": sway, "heave": np.cross(along, sway), "surge": along}
+        steps_m = np.linalg.norm(np.diff(centres_m, axis=0), axis=1)
+        travelled_m = np.concatenate([[0.0], np.cumsum(steps_m)])
+        axes = np.stack([vectors[name] for name in unknowns])
+        return cls(lines, np.repeat(np.arange(len(starts)), counts), travelled_m, axes)
+
+    @property
+    def pings(self) -> int:
+        """Number of pings."""
+        return len(self.along_m)
+
+    def by_ping(self, values: NDArray) -> NDArray:
+        """Return sums over the channels of every ping, [pings, ...], of values [channels, ...]."""
+        return np.add.reduceat(values, self.lines.ping_starts, axis=0)
+
+    def vectors_m(self, moved_m: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return displacements of the channels, [channels, 3], from those of pings.
+
+        `moved_m` is [unknowns, pings].
+        """
+        return np.einsum("up,upi->pi", moved_m, self.axes)[self.ping]
+
+
+def brightest(image: Image, count: int, apart_m: float) -> NDArray[np.float64]:
+    """Return positions of the largest local maxima of an image, [n, 3], at most `count`.
+
+    Each is the largest within `apart_m` along rows and columns.
+    """
+    amplitude = np.abs(image.pixels)
+    positions_m = image.grid.positions_m()
+    size = []
+    for axis in range(2):
+        steps = np.diff(positions_m, axis=axis)
+        step_m = float(np.median(np.linalg.norm(steps, axis=-1))) if steps.size else math.inf
+        size.append(2 * math.ceil(apart_m / step_m) + 1)
+    largest = amplitude == maximum_filter(amplitude, size=tuple(size), mode="constant")
+    found = np.flatnonzero((largest & (amplitude > 0)).ravel())
+    found = found[np.argsort(-amplitude.ravel()[found], kind="stable")[:count]]
+    return positions_m.reshape(-1, 3)[found]
+
+
+@dataclass(frozen=True, eq=False)
+class Contributions:
+    """What every channel contributes to some points.
+
+    Attributes
+    ----------
+    values : complex128 [channels, points, offsets]
+        In phase with the point displaced by every offset in range.
+    gradient : float64 [unknowns, channels, points]
+        Change in range per metre of displacement.
+    range_m : float64 [channels, points]
+    """
+
+    values: NDArray[np.complex128]
+    gradient: NDArray[np.float64]
+    range_m: NDArray[np.float64]
+
+
+def contributions(
+    passage: Passage,
+    lines: RangeLines,
+    points_m: NDArray[np.float64],
+    beam: BeamWindow | None,
+    offsets_m: NDArray[np.float64] | None = None,
+) -> Contributions:
+    """Return what channels contribute to points and, with offsets, to others beside them in range.
+
+    `lines` are those of the passage, moved as far as is known.
+    """
+    offsets_m = np.zeros(1) if offsets_m is None else offsets_m
+    readout, shape = Readout.of(lines, READ_DB), (lines.channels, len(points_m))
+    values = np.empty((*shape, len(offsets_m)), np.complex128)
+    gradient, range_m = np.empty((len(passage.axes), *shape)), np.empty(shape)
+    along = None if beam is None else beam.directions(lines)
+    step = max(_READ_AT_ONCE // max(len(points_m) * len(offsets_m), lines.length), 1)
+    for first in range(0, lines.channels, step):
+        some = np.arange(first, min(first + step, lines.channels))
+        legs_m = [points_m - each[some, None] for each in (lines.tx_m, lines.rx_m)]
+        lengths_m = [np.linalg.norm(each, axis=-1) for each in legs_m]
+        outward, back = (
+            leg / np.maximum(length_m, 1e-9)[..., None]
+            for leg, length_m in zip(legs_m, lengths_m, strict=True)
+        )
+        rays = (outward + back) / 2
+        axes = passage.axes[:, passage.ping[some]]
+        gradient[:, some] = -np.einsum("ucj,cpj->ucp", axes, rays)
+        part = lines.select(slice(int(some[0]), int(some[-1]) + 1))
+        path_m = pairwise_range_m(
+            points_m, part.tx_m, part.rx_m, part.rx_velocity_m_s, part.sound_speed_m_s
+        ).T
+        range_m[some] = path_m
+        at_m = (path_m[..., None] + offsets_m).reshape(len(some), -1)
+        turns = lines.carrier_cycles_per_m * at_m
+        read = readout.read(some, at_m) * np.exp(2j * np.pi * (turns - np.rint(turns)))
+        values[some] = read.reshape(len(some), len(points_m), -1)
+        if beam is not None:
+            sine = sines(points_m, part.phase_centres_m, along[some])
+            values[some] *= beam.weights(sine, wavelength_m(lines))[..., None]
+    return Contributions(values, gradient, range_m)
+
