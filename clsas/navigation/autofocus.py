@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from clsas.core import reprs, validate
 from clsas.core.grid import Grid
 from clsas.core.image import Image
-from clsas.core.lines import RangeLines
+from clsas.core.lines import RangeLines, wavelength_m
 from clsas.navigation.drift import drift_m
 from clsas.navigation.gradient import phase_gradient_m, sharpest_m
 from clsas.navigation.responses import Contributions, Passage, brightest, contributions
@@ -32,14 +32,15 @@ UNKNOWNS = ("sway", "heave", "surge")
 
 IMAGE_TOLERANCE_DB = -30.0
 """Tolerance of the images in between: errors far below responses."""
-LEAST_SHARPNESS = 3.0
-"""Sharpness below which a scene has no responses; fully developed speckle has 2."""
+MOST_DISAGREEMENT = 1 / 32
+"""Wavelengths that halves of the responses may disagree about single pings, rms. Responses of
+speckle disagree by 0.06 and more, bright ones by 0.01."""
 
 _DRIFTS = 3  # times that drift is measured at most
 _NEIGHBOURHOODS_M = (1.2, 0.8, 0.5, 0.3)  # around responses, along the track
 _SWEEPS = 2  # times that single pings are moved
-_RESPONSES, _RESPONSES_FOR_DRIFT = 200, 80
-_OFFSETS = np.arange(-5, 6)  # samples in range, of which drift sees images
+_RESPONSES, _RESPONSES_FOR_DRIFT = 200, 60
+_OFFSETS = np.arange(-4, 5)  # samples in range, of which drift sees images
 _APART = 4.0  # range resolution cells between responses
 _GAIN = 1.02  # of sharpness, for which a step is repeated
 
@@ -198,13 +199,17 @@ class _Focus:
                 dropped = name
             if self.progress is not None:
                 self.progress(number, len(stages))
-        focused = self.sharpness >= LEAST_SHARPNESS
+        wave_m = wavelength_m(self.given)
+        apart_m = self._disagreement_m()
+        focused = apart_m <= MOST_DISAGREEMENT * wave_m
         if not focused:
             validate.warn(
-                f"the scene has no bright responses to focus on (sharpness {self.sharpness:.2f}, "
-                f"speckle has 2): the lines are left as they were"
+                f"the scene has no bright responses to focus on: one half of them and the other "
+                f"want the pings moved by displacements that differ by {apart_m / wave_m:.2g} "
+                f"wavelengths rms (at most {MOST_DISAGREEMENT:g}); the lines are left as they were"
             )
             self.moved_m[:] = 0
+            self.deviation_m[:] = np.inf
         vectors_m = self.passage.vectors_m(self.moved_m)
         return Autofocus(
             lines=self._lines(self.moved_m),
@@ -215,6 +220,21 @@ class _Focus:
             sharpness=tuple(self.steps),
             focused=focused,
         )
+
+    def _disagreement_m(self) -> float:
+        """Return how far apart two halves of the responses want single pings, rms.
+
+        Responses of a scene agree, as they all see the one track. Brightest pixels of speckle can
+        be made brighter, but every one in its own way.
+        """
+        found = self._contributions(_RESPONSES)
+        if found.points < 2:
+            return 0.0
+        halves = [
+            sharpest_m(self.passage, found.of(some))[0]
+            for some in (slice(0, None, 2), slice(1, None, 2))
+        ]
+        return float(np.std(halves[0] - halves[1])) / 2
 
     def _stages(self) -> Iterator[tuple[str, Callable[[], NDArray[np.float64] | None]]]:
         """Yield what is tried, from coarse to fine."""

@@ -15,6 +15,7 @@ from functools import cached_property
 import numpy as np
 import scipy.fft
 from numpy.typing import NDArray
+from scipy.ndimage import uniform_filter1d
 
 from clsas.core.geometry import bistatic_range_m
 from clsas.core.lines import RangeLines
@@ -27,6 +28,9 @@ _ANGLES = 65  # of the beam, over which the expected phase is averaged
 _WIDEST = math.radians(75)  # half of the beam that is averaged
 _SLOPES = np.linspace(-0.2, 0.2, 81)  # yaw between pings that is tried first, rad
 _FINE = 16  # points per sample at which the envelope's peak is looked for
+_FREQUENCIES = 9  # of the band, over which the expected phase is averaged
+_HIGHLIGHT = 4.0  # times the median power, from which on echoes are weakened
+_SMOOTHED = 9  # samples over which that power is a mean
 _SPECKLE_LAGS = 64  # samples over which speckle may be correlated in range
 
 
@@ -179,6 +183,8 @@ class Correlator:
         for n in self.samples:
             part = slice(start, start + n)
             one, other = first[:, part], second[:, part]
+            if swath.element_length_m is not None:
+                one, other = _without_highlights(one, other)
             length = scipy.fft.next_fast_len(int(n) + most)
             spectra = (scipy.fft.fft(each, length, axis=1) for each in (one, other))
             of_one, of_other = spectra
@@ -261,29 +267,42 @@ class Correlator:
         ray[..., 2] += up
         # [pairs, windows, angles, 3]
         rays = np.cos(angle)[:, None] * ray[..., None, :] + np.sin(angle)[:, None] * forward
-        weights = self._beam(rays, array, pairs)
         points_m = swath.middles_m[:, None, None] * rays + centre_m[:, None, None]
         middle_m = swath.middles_m[:, None] * ray + centre_m[:, None]
         apart_m = 0.0
         for channels, sign in ((pairs.first, -1), (pairs.second, 1)):
             flat_m = points_m.reshape(len(channels), -1, 3)
-            path_m = self._range_m(lines, channels, flat_m).reshape(weights.shape)
+            path_m = self._range_m(lines, channels, flat_m).reshape(rays.shape[:-1])
             path_m -= self._range_m(lines, channels, middle_m)[..., None]
             apart_m = apart_m + sign * path_m
         # Channels of unlike separation migrate by different amounts: that is not delay.
-        total = np.sum(weights * np.exp(2j * np.pi * self.cycles_per_m * apart_m), axis=-1)
+        total, seen = 0.0, 0.0
+        for cycles_per_m in self._band():
+            weights = self._beam(rays, array, pairs, cycles_per_m)
+            seen = seen + weights
+            turned = np.exp(2j * np.pi * cycles_per_m * apart_m)
+            total = total + np.sum(weights * turned, axis=-1)
         port = swath.side * outward
-        sensitivity = np.sum(weights * (rays @ port), axis=-1) / np.sum(weights, axis=-1)
+        sensitivity = np.sum(seen * (rays @ port), axis=-1) / np.sum(seen, axis=-1)
         return np.angle(total), sensitivity
 
+    def _band(self) -> NDArray[np.float64]:
+        """Return phases per metre at frequencies that stand for equal shares of the power."""
+        if self.swath.element_length_m is None:
+            return np.array([self.cycles_per_m])
+        at = (np.arange(_FREQUENCIES) + 0.5) / _FREQUENCIES
+        share = np.cumsum(self.spectrum.share)
+        away = np.interp(at, share / share[-1], self.spectrum.frequency) / self.step_m
+        return np.concatenate([self.cycles_per_m - away, self.cycles_per_m + away])
+
     def _beam(
-        self, rays: NDArray[np.float64], array: Array, pairs: Overlap
+        self, rays: NDArray[np.float64], array: Array, pairs: Overlap, cycles_per_m: float
     ) -> NDArray[np.float64]:
         """Return the product of both channels' two-way amplitudes in directions."""
         weights = np.ones(rays.shape[:-1])
         if self.swath.element_length_m is None:
             return weights
-        wavelength_m = 2 / abs(self.cycles_per_m)
+        wavelength_m = 2 / abs(cycles_per_m)
         for channel in (pairs.first[0], pairs.second[0]):
             ping = int(np.searchsorted(array.starts, channel, "right")) - 1
             sine = rays @ array.forward[ping]
@@ -331,6 +350,21 @@ def displacement(found: Correlation, *, first: bool, yaw: bool = True) -> Displa
     return Displacement(
         sway_m + float(solution[0]), slope + float(solution[1]), covariance, coherence, misfit
     )
+
+
+def _without_highlights(
+    one: NDArray[np.complex128], other: NDArray[np.complex128]
+) -> tuple[NDArray[np.complex128], NDArray[np.complex128]]:
+    """Return samples of both channels of all pairs, with strong echoes weakened.
+
+    The stronger an echo, the less is left of it: it then weighs less than what is usual. A strong echo comes from one direction only. It would decide the mean phase, which is expected
+    of echoes from all over the beam.
+    """
+    power = np.mean(np.abs(one) ** 2 + np.abs(other) ** 2, axis=0)
+    power = uniform_filter1d(power, _SMOOTHED, mode="nearest")
+    usual = _HIGHLIGHT * float(np.median(power))
+    amplitude = np.minimum(1.0, usual / np.maximum(power, 1e-300))
+    return amplitude * one, amplitude * other
 
 
 def phase_variance(

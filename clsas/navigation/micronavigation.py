@@ -23,6 +23,7 @@ LEAST_PAIRS = 3
 
 _LEAST_COHERENCE = 3.0
 """Coherence of noise alone, 1/sqrt(independent samples), times which a window must have."""
+_LEAST_SHARE = 0.25  # of the pairs of pings, that must be coherent
 _PASSES, _SETTLED = 6, 0.1  # at most; changes of the last pass over their standard deviations
 _LATER_LAGS = 4  # samples to either side that later passes look at
 _LEAST_WINDOW = 16  # samples
@@ -251,7 +252,7 @@ def _result(
 ) -> Micronavigation:
     """Fuse displacements with the navigation."""
     coherent, count = found.coherent, len(overlaps)
-    if coherent.sum() <= count // 2:
+    if coherent.sum() < max(1, _LEAST_SHARE * count):
         best = max(float(step.coherence.max()) for step in found.steps)
         raise ValueError(
             f"lines must be coherent from ping to ping; {count - int(coherent.sum())} of {count} "

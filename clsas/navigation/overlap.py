@@ -73,7 +73,10 @@ class Array:
             )
         forward /= length_m[:, None]
         port = np.stack([-forward[:, 1], forward[:, 0], np.zeros(len(forward))], axis=1)
-        spacing_m = float(np.median(length_m / (counts - 1)))
+        at_m = np.einsum("ci,ci->c", centres_m, np.repeat(forward, counts, axis=0))
+        neighbours = np.ones(len(at_m) - 1, bool)
+        neighbours[starts[1:-1] - 1] = False  # from a ping to the next
+        spacing_m = float(np.median(np.abs(np.diff(at_m)[neighbours])))
         return cls(starts, reference_m, forward, port, spacing_m)
 
     @property

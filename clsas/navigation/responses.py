@@ -110,6 +110,17 @@ class Contributions:
     gradient: NDArray[np.float64]
     range_m: NDArray[np.float64]
 
+    @property
+    def points(self) -> int:
+        """Number of points."""
+        return self.values.shape[1]
+
+    def of(self, points: slice) -> Contributions:
+        """Return the contributions to some of the points."""
+        return Contributions(
+            self.values[:, points], self.gradient[:, :, points], self.range_m[:, points]
+        )
+
 
 def contributions(
     passage: Passage,
