@@ -285,9 +285,7 @@ class _Focus:
 
     def _form(self, moved_m: NDArray[np.float64]) -> Image:
         lines = self._lines(moved_m)
-        return factorize(
-            lines, self.grid, IMAGE_TOLERANCE_DB, beam=self.beam, device=self.device
-        )
+        return factorize(lines, self.grid, IMAGE_TOLERANCE_DB, beam=self.beam, device=self.device)
 
     def _lines(self, moved_m: NDArray[np.float64]) -> RangeLines:
         vectors_m = self.passage.vectors_m(moved_m)
@@ -302,9 +300,7 @@ def sharpness(image: Image) -> float:
     return float((intensity**2).mean()) / mean**2 if mean else 0.0
 
 
-def _detrended(
-    moved_m: NDArray[np.float64], along_m: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _detrended(moved_m: NDArray[np.float64], along_m: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return displacements without a shift and a linear trend along the track."""
     design = np.stack([np.ones_like(along_m), along_m - along_m.mean()], axis=1)
     fitted = np.linalg.lstsq(design, moved_m.T, rcond=None)[0]

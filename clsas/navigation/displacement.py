@@ -29,7 +29,8 @@ _WIDEST = math.radians(75)  # half of the beam that is averaged
 _SLOPES = np.linspace(-0.2, 0.2, 81)  # yaw between pings that is tried first, rad
 _FINE = 16  # points per sample at which the envelope's peak is looked for
 _FREQUENCIES = 9  # of the band, over which the expected phase is averaged
-_HIGHLIGHT = 4.0  # times the median power, from which on echoes are weakened
+_HIGHLIGHT = 2.0  # times the median power, from which on echoes are weakened
+_LEAST_SQUARE = 1e-4  # of a coherence whose logarithm is taken
 _SMOOTHED = 9  # samples over which that power is a mean
 _SPECKLE_LAGS = 64  # samples over which speckle may be correlated in range
 
@@ -84,6 +85,8 @@ class Correlation:
 
     Attributes
     ----------
+    apart_m : float
+        Mean distance forward from the phase centre of a pair's first channel to the second one's.
     values : complex128 [pairs, windows, lags]
         Cross-correlation, without the phase that is expected of arrays where they are said to lie.
     coherence : float64 [pairs, windows, lags]
@@ -99,6 +102,7 @@ class Correlation:
         Number of independent samples of speckle in a window.
     """
 
+    apart_m: float
     values: NDArray[np.complex128]
     coherence: NDArray[np.float64]
     lags_m: NDArray[np.float64]
@@ -190,14 +194,16 @@ class Correlator:
             of_one, of_other = spectra
             lagged = scipy.fft.ifft(of_one.conj() * of_other, axis=1).conj()
             lagged = np.concatenate([lagged[:, length - most :], lagged[:, : most + 1]], axis=1)
-            energy = np.sqrt(
-                np.sum(np.abs(one) ** 2, axis=1) * np.sum(np.abs(other) ** 2, axis=1)
-            )[:, None]
+            energy = np.sqrt(np.sum(np.abs(one) ** 2, axis=1) * np.sum(np.abs(other) ** 2, axis=1))[
+                :, None
+            ]
             values.append(lagged)
             coherence.append(np.abs(lagged) / np.maximum(energy, 1e-300))
             start += n
         expected, sensitivity = self._expected(lines, array, pairs, centre_m, forward, outward)
+        between_m = lines.phase_centres_m[pairs.second] - lines.phase_centres_m[pairs.first]
         return Correlation(
+            float(np.mean(between_m @ forward)),
             np.stack(values, axis=1) * np.exp(-1j * expected)[..., None],
             np.stack(coherence, axis=1),
             self.step_m * np.arange(-most, most + 1),
@@ -311,7 +317,7 @@ class Correlator:
         return weights
 
 
-def displacement(found: Correlation, *, first: bool, yaw: bool = True) -> Displacement:
+def displacement(found: Correlation, *, first: bool, yaw: bool) -> Displacement:
     """Return the displacement that explains a correlation best.
 
     The envelope's peak over lags decides between whole wavelengths; phases, fitted by a straight
@@ -352,13 +358,40 @@ def displacement(found: Correlation, *, first: bool, yaw: bool = True) -> Displa
     )
 
 
+def surge(
+    at: Correlation, behind: Correlation, ahead: Correlation, spacing_m: float
+) -> tuple[float, float]:
+    """Return how far an array advanced beyond what its navigation says, and its deviation, metres.
+
+    `at` correlates pairs that share a phase centre, `behind` and `ahead` pairs whose second channel
+    lies one spacing off. A parabola through the logarithms of their coherence has its peak where
+    the second channel really is: near the peak the coherence of a beam is much like a Gaussian.
+    """
+    logs, deviations = [], []
+    for found in (behind, at, ahead):
+        samples = found.independent
+        square = np.mean(found.coherence.max(axis=-1) ** 2, axis=0) - 1 / samples
+        mean = float(np.clip(np.average(square, weights=samples), _LEAST_SQUARE, 1.0))
+        logs.append(0.5 * math.log(mean))
+        count = float(np.sum(samples)) * len(found.along_m)
+        deviations.append((1 - mean) / math.sqrt(2 * count * mean))
+    before, here, after = logs
+    bend = before - 2 * here + after
+    if bend >= 0 or here < max(before, after):
+        return math.copysign(spacing_m, before - after) - at.apart_m, spacing_m
+    shift = 0.5 * (before - after) / bend
+    deviation = spacing_m * 0.5 * math.hypot(deviations[0], deviations[2]) / -bend
+    return -spacing_m * shift - at.apart_m, deviation
+
+
 def _without_highlights(
     one: NDArray[np.complex128], other: NDArray[np.complex128]
 ) -> tuple[NDArray[np.complex128], NDArray[np.complex128]]:
     """Return samples of both channels of all pairs, with strong echoes weakened.
 
-    The stronger an echo, the less is left of it: it then weighs less than what is usual. A strong echo comes from one direction only. It would decide the mean phase, which is expected
-    of echoes from all over the beam.
+    The stronger an echo, the less is left of it: it then weighs less than what is usual. A strong
+    echo comes from one direction only. It would decide the mean phase, which is expected of echoes
+    from all over the beam.
     """
     power = np.mean(np.abs(one) ** 2 + np.abs(other) ** 2, axis=0)
     power = uniform_filter1d(power, _SMOOTHED, mode="nearest")

@@ -3,29 +3,26 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from clsas.core import reprs, validate
 from clsas.core.lines import RangeLines
-from clsas.navigation.displacement import Correlator, Displacement, Swath, displacement
-from clsas.navigation.overlap import Array, Overlap, moved, overlap
-from clsas.navigation.smoother import Step, integrated, smooth
+from clsas.navigation.displacement import Correlator, Swath
+from clsas.navigation.overlap import Array, moved
+from clsas.navigation.passes import Displacements, measured
+from clsas.navigation.smoother import Step, smooth
 from clsas.signal.compression import compress
 from clsas.signal.echoes import Echoes
+from clsas.signal.spectrum import measure_spectrum
 from clsas.sonar.track import Track
 
-LEAST_PAIRS = 3
-"""Fewest pairs of channels that tell yaw from sway."""
+UNKNOWNS = ("sway", "yaw", "surge")
 
-_LEAST_COHERENCE = 3.0
-"""Coherence of noise alone, 1/sqrt(independent samples), times which a window must have."""
 _LEAST_SHARE = 0.25  # of the pairs of pings, that must be coherent
-_PASSES, _SETTLED = 6, 0.1  # at most; changes of the last pass over their standard deviations
-_LATER_LAGS = 4  # samples to either side that later passes look at
 _LEAST_WINDOW = 16  # samples
 _WINDOW_CELLS = 150.0  # range resolution cells of a window, unless given
 
@@ -40,9 +37,10 @@ class Micronavigation:
         The lines given, with corrected positions.
     track : Track
         The array's mean phase centre and heading, ping by ping. `time_s` counts pings.
-    sway_m, yaw_rad : float64 [pings]
-        Displacement of the array to port of its navigation, and turn from forward to port.
-    sway_sd_m, yaw_sd_rad : float64 [pings]
+    sway_m, yaw_rad, surge_m : float64 [pings]
+        Displacement of the array to port of its navigation, turn from forward to port, and
+        displacement forward.
+    sway_sd_m, yaw_sd_rad, surge_sd_m : float64 [pings]
         Their standard deviations. A common shift and turn of the whole track stem from the
         navigation and have its accuracy.
     sway_steps_m, yaw_steps_rad : float64 [pings - 1]
@@ -61,8 +59,10 @@ class Micronavigation:
     track: Track
     sway_m: NDArray[np.float64]
     yaw_rad: NDArray[np.float64]
+    surge_m: NDArray[np.float64]
     sway_sd_m: NDArray[np.float64]
     yaw_sd_rad: NDArray[np.float64]
+    surge_sd_m: NDArray[np.float64]
     sway_steps_m: NDArray[np.float64]
     yaw_steps_rad: NDArray[np.float64]
     sway_steps_sd_m: NDArray[np.float64]
@@ -91,9 +91,10 @@ def micronavigate(
     seabed_z_m: float | None = None,
     element_length_m: float | tuple[float, float] | None = None,
     sway_sd_m: ArrayLike = 0.1,
-    yaw_sd_rad: ArrayLike = math.radians(1.0),
+    yaw_sd_rad: ArrayLike = 0.02,
+    surge_sd_m: ArrayLike = 0.1,
     correlation_pings: float | None = None,
-    yaw: bool = True,
+    unknowns: Sequence[str] = UNKNOWNS,
     most_step_m: float = 0.1,
     progress: Callable[[int, int], None] | None = None,
 ) -> Micronavigation:
@@ -117,14 +118,14 @@ def micronavigate(
         Lengths of the elements. Give them where the beam is wide: echoes far from broadside change
         their range less, and the expected phase of separate transmitters and receivers is a mean
         over the beam.
-    sway_sd_m, yaw_sd_rad : float or array_like [pings]
-        Standard deviation of the navigation's sway and yaw.
+    sway_sd_m, yaw_sd_rad, surge_sd_m : float or array_like [pings]
+        Standard deviation of the navigation's sway, yaw and surge.
     correlation_pings : float, optional
         Number of pings over which errors of the navigation persist. Unless given the whole
         recording, so that the navigation decides little but a common shift and turn.
-    yaw : bool
-        False where the array does not turn from ping to ping, such as one at rest whose timing
-        jitters: only sway is found.
+    unknowns : sequence of {"sway", "yaw", "surge"}
+        What to find; sway always. Leave out yaw and surge of an array at rest whose timing jitters.
+        Surge, the advance, is told by where the coherence along the array is largest.
     most_step_m : float
         Largest displacement in range that is looked for between two pings, beside the
         navigation's.
@@ -163,154 +164,89 @@ def micronavigate(
         lines = compress(lines)
     validate.instance("lines", lines, RangeLines)
     validate.progress(progress)
+    names = _checked_unknowns(unknowns)
     array = Array.of(lines)
     swath = _swath(lines, range_m, window_m, side, seabed_z_m, element_length_m)
-    fixes = _fixes(array.pings, sway_sd_m, yaw_sd_rad, correlation_pings)
+    fixes = _fixes(
+        array.pings,
+        {"sway_sd_m": sway_sd_m, "yaw_sd_rad": yaw_sd_rad, "surge_sd_m": surge_sd_m},
+        correlation_pings,
+    )
     most_step_m = validate.positive("most_step_m", most_step_m, "m")
     correlator = Correlator(lines, swath)
-    overlaps = [overlap(lines, array, ping) for ping in range(array.pings - 1)]
-    fewest = int(np.argmin([each.pairs for each in overlaps]))
-    if overlaps[fewest].pairs < LEAST_PAIRS:
-        raise ValueError(
-            f"at least {LEAST_PAIRS} phase centres must overlap from ping to ping, got "
-            f"{overlaps[fewest].pairs} between pings {fewest} and {fewest + 1}: they advance by "
-            f"{_advance_m(array, fewest):.3g} m, the phase centres extend over "
-            f"{_extent_m(lines, array, fewest):.3g} m; without overlap use clsas.autofocus"
-        )
-    found = _measured(correlator, lines, array, overlaps, most_step_m, yaw, progress)
-    return _result(lines, array, swath, overlaps, found, fixes)
+    found = measured(lines, array, correlator, names, most_step_m, progress)
+    return _result(lines, array, swath, found, fixes)
 
 
-@dataclass(frozen=True)
-class _Measured:
-    """Displacements between pings, and which of them are coherent."""
-
-    steps: list[Displacement]
-    coherent: NDArray[np.bool_]
-
-
-def _measured(
-    correlator: Correlator,
-    lines: RangeLines,
-    array: Array,
-    overlaps: list[Overlap],
-    most_step_m: float,
-    yaw: bool,
-    progress: Callable[[int, int], None] | None,
-) -> _Measured:
-    """Measure all displacements, pass by pass until they settle.
-
-    Every pass aligns the channels by all that was found before it: what is left is small, and
-    linear in the displacement.
-    """
-    count = len(overlaps)
-    total = np.zeros((count, 2))
-    steps: list[Displacement] = []
-    for number in range(_PASSES):
-        states = integrated([
-            Step(moved_by, np.zeros((2, 2)), _levers_m(array, each, ping))
-            for ping, (moved_by, each) in enumerate(zip(total, overlaps, strict=True))
-        ])  # fmt: skip
-        corrected = moved(lines, array, *states.T)
-        here = Array.of(corrected)
-        most_m = most_step_m if number == 0 else _LATER_LAGS * lines.range_step_m
-        steps, changes = [], np.zeros((count, 2))
-        for ping, each in enumerate(overlaps):
-            correlation = correlator.correlate(corrected, here, each, most_m)
-            step = displacement(correlation, first=number == 0, yaw=yaw)
-            steps.append(step)
-            changes[ping] = step.sway_m, step.yaw_rad
-            if progress is not None and number == 0:
-                progress(ping + 1, count)
-        coherent = np.array([_is_coherent(step, correlator) for step in steps])
-        changes[~coherent] = 0.0
-        total[~coherent] = 0.0
-        total += changes
-        deviations = np.stack([np.sqrt(np.diag(step.covariance)) for step in steps])
-        if np.all(np.abs(changes) <= _SETTLED * deviations):
-            break
-    steps = [
-        replace(step, sway_m=float(sway), yaw_rad=float(yaw))
-        for step, (sway, yaw) in zip(steps, total, strict=True)
-    ]
-    return _Measured(steps, coherent)
-
-
-def _is_coherent(step: Displacement, correlator: Correlator) -> bool:
-    """Return whether any window is more coherent than noise would be."""
-    noise = 1 / np.sqrt(correlator.independent)
-    return bool(np.any(step.coherence > _LEAST_COHERENCE * noise))
+def _checked_unknowns(unknowns: Sequence[str]) -> tuple[str, ...]:
+    names = (unknowns,) if isinstance(unknowns, str) else tuple(unknowns)
+    for name in names:
+        validate.one_of("every entry of unknowns", name, UNKNOWNS)
+    if "sway" not in names:
+        raise ValueError(f"unknowns must hold 'sway', got {names}")
+    return names
 
 
 def _result(
     lines: RangeLines,
     array: Array,
     swath: Swath,
-    overlaps: list[Overlap],
-    found: _Measured,
-    fixes: tuple[NDArray[np.float64], NDArray[np.float64]],
+    found: Displacements,
+    fixes: NDArray[np.float64],
 ) -> Micronavigation:
-    """Fuse displacements with the navigation."""
-    coherent, count = found.coherent, len(overlaps)
-    if coherent.sum() < max(1, _LEAST_SHARE * count):
-        best = max(float(step.coherence.max()) for step in found.steps)
-        raise ValueError(
-            f"lines must be coherent from ping to ping; {count - int(coherent.sum())} of {count} "
-            f"pairs of pings are not: their coherence is at most {best:.2f} in any window. Check "
-            f"side, range_m, and that the navigation's advance from ping to ping is right"
-        )
-    if not coherent.all():
-        validate.warn(
-            f"{int((~coherent).sum())} of {count} pairs of pings are not coherent (the first "
-            f"after ping {int(np.argmin(coherent))}): the navigation's accuracy bridges them"
-        )
-    misfit = max(float(np.mean([s.misfit for s, ok in zip(found.steps, coherent) if ok])), 1.0)
-    sway_sd, yaw_sd, fix = fixes[0], fixes[1], None
-    steps, deviations = [], np.full((count, 2), np.inf)
-    for ping, (step, each) in enumerate(zip(found.steps, overlaps, strict=True)):
-        covariance = misfit * step.covariance
-        if coherent[ping]:
-            deviations[ping] = np.sqrt(np.diag(covariance))
-        else:
-            covariance = 2 * np.diag([float(sway_sd[ping]), float(yaw_sd[ping])]) ** 2
-        moved_by = np.array([step.sway_m, step.yaw_rad])
-        steps.append(Step(moved_by, covariance, _levers_m(array, each, ping)))
-    del fix
-    states, covariances = smooth(steps, *fixes)
-    corrected = moved(lines, array, *states.T)
+    """Fuse displacements with the navigation; `fixes` are [pings, 3]: sway, yaw and surge."""
+    _check_coherence(found)
+    count = len(found.moved)
+    misfit = max(float(found.misfit[found.coherent].mean()), 1.0)
+    # Errors of a navigation between two pings are no larger than those of both.
+    bridged = 2 * fixes[:-1] ** 2
+    steps, along = [], []
+    for ping in range(count):
+        covariance, deviation_m = misfit * found.covariance[ping], found.surge_sd_m[ping]
+        if not found.coherent[ping]:
+            covariance, deviation_m = np.diag(bridged[ping, :2]), math.sqrt(bridged[ping, 2])
+        steps.append(Step.over(found.moved[ping], covariance, found.levers_m[ping]))
+        along.append(Step.along(found.surge_m[ping], deviation_m))
+    states, covariances = smooth(steps, fixes[:, :2])
+    surges, spreads = smooth(along, fixes[:, 2:])
+    corrected = moved(lines, array, *states.T, surges[:, 0])
     at = Array.of(corrected)
     heading = np.arctan2(at.forward[:, 1], at.forward[:, 0])
+    deviations = np.sqrt(misfit * np.stack([np.diag(each) for each in found.covariance]))
+    deviations[~found.coherent] = np.inf
     return Micronavigation(
         lines=corrected,
         track=Track(at.reference_m, np.arange(at.pings, dtype=np.float64), yaw_rad=heading),
         sway_m=states[:, 0],
         yaw_rad=states[:, 1],
+        surge_m=surges[:, 0],
         sway_sd_m=np.sqrt(covariances[:, 0, 0]),
         yaw_sd_rad=np.sqrt(covariances[:, 1, 1]),
-        sway_steps_m=np.array([step.sway_m for step in found.steps]),
-        yaw_steps_rad=np.array([step.yaw_rad for step in found.steps]),
+        surge_sd_m=np.sqrt(spreads[:, 0, 0]),
+        sway_steps_m=found.moved[:, 0],
+        yaw_steps_rad=found.moved[:, 1],
         sway_steps_sd_m=deviations[:, 0],
         yaw_steps_sd_rad=deviations[:, 1],
-        coherence=np.stack([step.coherence for step in found.steps]),
+        coherence=found.coherence,
         range_m=swath.middles_m,
-        overlap=np.array([each.pairs for each in overlaps]),
+        overlap=found.pairs,
     )
 
 
-def _levers_m(array: Array, pairs: Overlap, ping: int) -> tuple[float, float]:
-    """Return the distances forward from the middles of two arrays to that of their overlap."""
-    return tuple(
-        float((pairs.pivot_m - array.reference_m[each]) @ array.forward[each])
-        for each in (ping, ping + 1)
-    )  # type: ignore[return-value]
-
-
-def _advance_m(array: Array, ping: int) -> float:
-    return float(np.linalg.norm(array.reference_m[ping + 1] - array.reference_m[ping]))
-
-
-def _extent_m(lines: RangeLines, array: Array, ping: int) -> float:
-    return float(np.ptp(lines.phase_centres_m[array.channels(ping)] @ array.forward[ping]))
+def _check_coherence(found: Displacements) -> None:
+    """Refuse lines hardly any of which are coherent; warn of those that are not."""
+    without = int((~found.coherent).sum())
+    if len(found.coherent) - without < max(1, _LEAST_SHARE * len(found.coherent)):
+        raise ValueError(
+            f"lines must be coherent from ping to ping; {without} of {len(found.coherent)} pairs "
+            f"of pings are not: their coherence is at most {found.coherence.max():.2f} in any "
+            f"window. Check side, range_m, and the navigation's advance from ping to ping"
+        )
+    if without:
+        validate.warn(
+            f"{without} of {len(found.coherent)} pairs of pings are not coherent (the first after "
+            f"ping {int(np.argmin(found.coherent))}): the navigation's accuracy bridges them"
+        )
 
 
 def _swath(
@@ -336,12 +272,14 @@ def _swath(
             f"got ({near:.6g}, {far:.6g})"
         )
     if window_m is None:
-        from clsas.signal.spectrum import measure_spectrum
-
         cell_m = lines.range_step_m * max(measure_spectrum(lines).oversampling, 1.0)
         window_m = min(_WINDOW_CELLS * cell_m, far - near)
     window_m = validate.number(
-        "window_m", window_m, "m", least=_LEAST_WINDOW * lines.range_step_m, most=(far - near) * (1 + 1e-9)
+        "window_m",
+        window_m,
+        "m",
+        least=_LEAST_WINDOW * lines.range_step_m,
+        most=(far - near) * (1 + 1e-9),
     )
     if seabed_z_m is not None:
         seabed_z_m = validate.number("seabed_z_m", seabed_z_m, "m")
@@ -361,9 +299,9 @@ def _swath(
 
 
 def _fixes(
-    pings: int, sway_sd_m: ArrayLike, yaw_sd_rad: ArrayLike, correlation_pings: float | None
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the navigation's standard deviations as one independent measurement per ping.
+    pings: int, deviations: dict[str, ArrayLike], correlation_pings: float | None
+) -> NDArray[np.float64]:
+    """Return the navigation's standard deviations as independent measurements, [pings, n].
 
     Errors that persist over n pings average out like white ones that are sqrt(2 n) times as large.
     """
@@ -371,9 +309,9 @@ def _fixes(
     if correlation_pings is not None:
         persist = validate.number("correlation_pings", correlation_pings, "pings", least=0.5)
     found = []
-    for name, value in (("sway_sd_m", sway_sd_m), ("yaw_sd_rad", yaw_sd_rad)):
+    for name, value in deviations.items():
         checked = validate.array(name, value, np.float64, (pings,), broadcast=True)
         if checked.min() <= 0:
             raise ValueError(f"{name} must be above 0, got {checked.min():g}")
         found.append(checked * math.sqrt(2 * persist))
-    return found[0], found[1]
+    return np.stack(found, axis=1)

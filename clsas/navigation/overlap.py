@@ -151,14 +151,15 @@ def moved(
     array: Array,
     sway_m: NDArray[np.float64],
     yaw_rad: NDArray[np.float64],
+    surge_m: NDArray[np.float64],
 ) -> RangeLines:
-    """Return lines whose array lies further to port and is turned about z, ping by ping.
+    """Return lines whose array lies further to port and forward and is turned about z, by ping.
 
     The array turns about its mean phase centre, positive yaw from forward to port.
     """
     ping = np.repeat(np.arange(array.pings), np.diff(array.starts))
     turn = Rotation.from_rotvec(np.outer(yaw_rad, [0.0, 0.0, 1.0]))
-    shift_m = (sway_m[:, None] * array.port)[ping]
+    shift_m = (sway_m[:, None] * array.port + surge_m[:, None] * array.forward)[ping]
     reference_m = array.reference_m[ping]
     tx_m, rx_m = (
         turn[ping].apply(each - reference_m) + reference_m + shift_m

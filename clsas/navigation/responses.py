@@ -163,4 +163,3 @@ def contributions(
             sine = sines(points_m, part.phase_centres_m, along[some])
             values[some] *= beam.weights(sine, wavelength_m(lines))[..., None]
     return Contributions(values, gradient, range_m)
-

@@ -24,74 +24,78 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """A displacement between two pings.
+    """What is known of the next ping's state from that of a ping: x' = F x + u, give or take.
 
     Attributes
     ----------
-    moved : float64 [2]
-        Sway in metres and yaw in radians, at the middle of the overlap.
-    covariance : float64 [2, 2]
-        Of both.
-    levers_m : (here, there)
-        From the middles of both arrays forward to the middle of the overlap.
+    transition : float64 [n, n]
+        F.
+    drift : float64 [n]
+        u.
+    spread : float64 [n, n]
+        Covariance of u.
     """
 
-    moved: NDArray[np.float64]
-    covariance: NDArray[np.float64]
-    levers_m: tuple[float, float]
+    transition: NDArray[np.float64]
+    drift: NDArray[np.float64]
+    spread: NDArray[np.float64]
 
-    @property
-    def _inverse(self) -> NDArray[np.float64]:
-        """What the middle of the overlap makes of the next array's state, undone."""
-        return np.array([[1.0, -self.levers_m[1]], [0.0, 1.0]])
+    @classmethod
+    def over(
+        cls,
+        moved: NDArray[np.float64],
+        covariance: NDArray[np.float64],
+        levers_m: tuple[float, float],
+    ) -> Step:
+        """Return the step of sway and yaw from a displacement at the middle of an overlap.
 
-    @property
-    def transition(self) -> NDArray[np.float64]:
-        """State of the next ping over that of this one."""
-        return self._inverse @ np.array([[1.0, self.levers_m[0]], [0.0, 1.0]])
+        Parameters
+        ----------
+        moved : float64 [2]
+            Sway in metres and yaw in radians.
+        covariance : float64 [2, 2]
+            Of both.
+        levers_m : (here, there)
+            From the middles of both arrays forward to the middle of the overlap.
+        """
+        here, there = (np.array([[1.0, lever], [0.0, 1.0]]) for lever in levers_m)
+        back = np.linalg.inv(there)
+        return cls(back @ here, back @ moved, back @ covariance @ back.T)
 
-    @property
-    def drift(self) -> NDArray[np.float64]:
-        """What the displacement adds to the next ping's state."""
-        return self._inverse @ self.moved
-
-    @property
-    def spread(self) -> NDArray[np.float64]:
-        """Covariance of `drift`."""
-        return self._inverse @ self.covariance @ self._inverse.T
+    @classmethod
+    def along(cls, moved: float, deviation: float) -> Step:
+        """Return the step of a single number that changes by `moved`."""
+        return cls(np.eye(1), np.array([moved]), np.array([[deviation**2]]))
 
 
 def integrated(steps: Sequence[Step]) -> NDArray[np.float64]:
-    """Return the states of all pings, [pings, 2], with (0, 0) at the first."""
-    states = np.zeros((len(steps) + 1, 2))
-    for ping, step in enumerate(steps):
-        states[ping + 1] = step.transition @ states[ping] + step.drift
-    return states
+    """Return the states of all pings, [pings, n], with zeros at the first."""
+    states = [np.zeros(len(steps[0].drift))]
+    for step in steps:
+        states.append(step.transition @ states[-1] + step.drift)
+    return np.stack(states)
 
 
 def smooth(
-    steps: Sequence[Step], sway_sd_m: NDArray[np.float64], yaw_sd_rad: NDArray[np.float64]
+    steps: Sequence[Step], fixes: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the states of all pings, [pings, 2], and their covariances, [pings, 2, 2].
+    """Return the states of all pings, [pings, n], and their covariances, [pings, n, n].
 
-    `sway_sd_m` and `yaw_sd_rad` are the standard deviations of the navigation as a measurement of
-    every ping, [pings].
+    `fixes` are the standard deviations of the navigation as a measurement of every ping,
+    [pings, n].
     """
-    pings = len(steps) + 1
-    fix = np.stack([sway_sd_m, yaw_sd_rad], axis=1) ** 2
-    states, covariances = np.zeros((pings, 2)), np.zeros((pings, 2, 2))
-    ahead, spread = np.zeros((pings, 2)), np.zeros((pings, 2, 2))  # before the ping's own fix
-    state, covariance = np.zeros(2), np.diag(fix[0])
-    states[0], covariances[0] = state, covariance
+    pings, size = fixes.shape
+    variances = [np.diag(each**2) for each in fixes]
+    states, ahead = np.zeros((pings, size)), np.zeros((pings, size))
+    covariances, spread = np.zeros((pings, size, size)), np.zeros((pings, size, size))
+    covariances[0] = variances[0]
     for ping, step in enumerate(steps, start=1):
-        state = ahead[ping] = step.transition @ state + step.drift
-        covariance = step.transition @ covariance @ step.transition.T + step.spread
-        spread[ping] = covariance
-        gain = np.linalg.solve(covariance + np.diag(fix[ping]), covariance).T
-        state = state - gain @ state
-        covariance = (np.eye(2) - gain) @ covariance
-        states[ping], covariances[ping] = state, (covariance + covariance.T) / 2
-        covariance = covariances[ping]
+        ahead[ping] = step.transition @ states[ping - 1] + step.drift
+        spread[ping] = step.transition @ covariances[ping - 1] @ step.transition.T + step.spread
+        gain = np.linalg.solve(spread[ping] + variances[ping], spread[ping]).T
+        states[ping] = ahead[ping] - gain @ ahead[ping]
+        covariance = (np.eye(size) - gain) @ spread[ping]
+        covariances[ping] = (covariance + covariance.T) / 2
     for ping in range(pings - 2, -1, -1):
         carried = steps[ping].transition @ covariances[ping]
         gain = np.linalg.solve(spread[ping + 1], carried).T

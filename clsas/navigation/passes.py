@@ -1,0 +1,205 @@
+"""Displacements of an array between all pings, measured pass by pass until they settle."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsas.core.lines import RangeLines
+from clsas.navigation.displacement import Correlator, Displacement, displacement, surge
+from clsas.navigation.overlap import Array, Overlap, moved, overlap
+from clsas.navigation.smoother import Step, integrated
+
+LEAST_PAIRS = 3
+"""Fewest pairs of channels that tell yaw from sway."""
+
+_LEAST_COHERENCE = 3.0  # of a window, times that of noise alone, 1/sqrt(independent samples)
+_PASSES = 6  # at most, and again after a surge
+_SETTLED = 0.1  # changes of the last pass, over their standard deviations
+_LATER_LAGS = 4  # samples to either side that later passes look at
+_SURGES = 3  # times that the advance is corrected and channels are paired anew
+_LEAST_SURGE = 0.02  # spacings of the array, for which that is worth it
+
+
+@dataclass(frozen=True, eq=False)
+class Displacements:
+    """Displacements between pings, beside what the navigation says.
+
+    Attributes
+    ----------
+    moved : float64 [pings - 1, 2]
+        Sway in metres at the middle of the overlap, and yaw in radians.
+    covariance : float64 [pings - 1, 2, 2]
+        Of both, from the coherence.
+    surge_m, surge_sd_m : float64 [pings - 1]
+        Advance along the array, and its standard deviation.
+    levers_m : list of (here, there)
+        See `Step.over`.
+    coherence : float64 [pings - 1, windows]
+    misfit : float64 [pings - 1]
+        See `Displacement`.
+    pairs : int64 [pings - 1]
+        Pairs of channels that share a phase centre.
+    coherent : bool [pings - 1]
+        False where no window is more coherent than noise would be.
+    """
+
+    moved: NDArray[np.float64]
+    covariance: NDArray[np.float64]
+    surge_m: NDArray[np.float64]
+    surge_sd_m: NDArray[np.float64]
+    levers_m: list[tuple[float, float]]
+    coherence: NDArray[np.float64]
+    misfit: NDArray[np.float64]
+    pairs: NDArray[np.int64]
+    coherent: NDArray[np.bool_]
+
+
+def measured(
+    lines: RangeLines,
+    array: Array,
+    correlator: Correlator,
+    unknowns: tuple[str, ...],
+    most_step_m: float,
+    progress: Callable[[int, int], None] | None,
+) -> Displacements:
+    """Return the displacements between all pings.
+
+    Every pass aligns the channels by all that was found before it: what is left is small, and
+    linear in the displacement. Where the advance differs from the navigation's, channels are then
+    paired anew.
+    """
+    passes = _Passes(lines, array, correlator, unknowns, progress)
+    passes.settle(most_step_m)
+    deviation_m = np.zeros(array.pings - 1)
+    if "surge" in unknowns:
+        for _ in range(_SURGES):
+            found_m, deviation_m = passes.surges_m()
+            passes.surge_m = passes.surge_m + found_m
+            passes.settle(_LATER_LAGS * lines.range_step_m)
+            if np.abs(found_m).max() <= _LEAST_SURGE * array.spacing_m:
+                break
+    return passes.result(deviation_m)
+
+
+class _Passes:
+    """What is known so far, and what comes of it."""
+
+    def __init__(
+        self,
+        lines: RangeLines,
+        array: Array,
+        correlator: Correlator,
+        unknowns: tuple[str, ...],
+        progress: Callable[[int, int], None] | None,
+    ) -> None:
+        self.lines, self.array, self.correlator = lines, array, correlator
+        self.yaw, self.progress = "yaw" in unknowns, progress
+        count = array.pings - 1
+        self.moved, self.surge_m = np.zeros((count, 2)), np.zeros(count)
+        self.coherent = np.ones(count, bool)
+        self.steps: list[Displacement] = []
+        self.overlaps = self._paired(lines, array)
+
+    def settle(self, most_m: float) -> None:
+        """Measure sway and yaw until they change no more; look for steps of up to `most_m`."""
+        first = not self.steps
+        for _ in range(_PASSES):
+            corrected, here = self._corrected()
+            self.steps, changes = [], np.zeros_like(self.moved)
+            for ping, each in enumerate(self.overlaps):
+                correlation = self.correlator.correlate(corrected, here, each, most_m)
+                step = displacement(correlation, first=first, yaw=self.yaw)
+                self.steps.append(step)
+                changes[ping] = step.sway_m, step.yaw_rad
+                if self.progress is not None and first:
+                    self.progress(ping + 1, len(self.overlaps))
+            self.coherent = np.array([self._is_coherent(step) for step in self.steps])
+            changes[~self.coherent] = self.moved[~self.coherent] = 0.0
+            self.moved = self.moved + changes
+            deviations = np.stack([np.sqrt(np.diag(step.covariance)) for step in self.steps])
+            first, most_m = False, _LATER_LAGS * self.lines.range_step_m
+            if np.all(np.abs(changes) <= _SETTLED * deviations):
+                return
+
+    def surges_m(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return what is left of every advance, and its standard deviation; 0 without coherence."""
+        corrected, here = self._corrected()
+        found = np.zeros((len(self.overlaps), 2))
+        for ping in np.flatnonzero(self.coherent):
+            at, behind, ahead = (
+                self.correlator.correlate(
+                    corrected,
+                    here,
+                    overlap(corrected, here, ping, lag),
+                    self.lines.range_step_m,
+                )
+                for lag in (0, -1, 1)
+            )
+            found[ping] = surge(at, behind, ahead, here.spacing_m)
+        return found[:, 0], found[:, 1]
+
+    def result(self, surge_sd_m: NDArray[np.float64]) -> Displacements:
+        """Return what was found."""
+        _, here = self._corrected()
+        return Displacements(
+            moved=self.moved,
+            covariance=np.stack([step.covariance for step in self.steps]),
+            surge_m=np.where(self.coherent, self.surge_m, 0.0),
+            surge_sd_m=surge_sd_m,
+            levers_m=self._levers_m(here),
+            coherence=np.stack([step.coherence for step in self.steps]),
+            misfit=np.array([step.misfit for step in self.steps]),
+            pairs=np.array([each.pairs for each in self.overlaps]),
+            coherent=self.coherent,
+        )
+
+    def _corrected(self) -> tuple[RangeLines, Array]:
+        """Return the lines moved by all that is known, and their array; pair their channels."""
+        surge_m = np.concatenate([[0.0], np.cumsum(self.surge_m)])
+        none = np.zeros(self.array.pings)
+        advanced = moved(self.lines, self.array, none, none, surge_m)
+        there = Array.of(advanced)
+        self.overlaps = self._paired(advanced, there)
+        states = integrated(
+            [
+                Step.over(each, np.zeros((2, 2)), levers_m)
+                for each, levers_m in zip(self.moved, self._levers_m(there), strict=True)
+            ]
+        )
+        corrected = moved(advanced, there, *states.T, none)
+        return corrected, Array.of(corrected)
+
+    def _paired(self, lines: RangeLines, array: Array) -> list[Overlap]:
+        """Return the overlaps of all pings; refuse those of too few channels."""
+        found = [overlap(lines, array, ping) for ping in range(array.pings - 1)]
+        fewest = int(np.argmin([each.pairs for each in found]))
+        if found[fewest].pairs < LEAST_PAIRS:
+            advance_m = np.linalg.norm(np.diff(array.reference_m[fewest : fewest + 2], axis=0))
+            along_m = lines.phase_centres_m[array.channels(fewest)] @ array.forward[fewest]
+            raise ValueError(
+                f"at least {LEAST_PAIRS} phase centres must overlap from ping to ping, got "
+                f"{found[fewest].pairs} between pings {fewest} and {fewest + 1}: they advance by "
+                f"{advance_m:.3g} m, the phase centres extend over {np.ptp(along_m):.3g} m; "
+                f"without overlap use clsas.autofocus"
+            )
+        return found
+
+    def _levers_m(self, array: Array) -> list[tuple[float, float]]:
+        """Return distances forward from the middles of two arrays to that of their overlap."""
+        levers_m = []
+        for ping, each in enumerate(self.overlaps):
+            here, there = (
+                float((each.pivot_m - array.reference_m[n]) @ array.forward[n])
+                for n in (ping, ping + 1)
+            )
+            levers_m.append((here, there))
+        return levers_m
+
+    def _is_coherent(self, step: Displacement) -> bool:
+        """Return whether any window is more coherent than noise would be."""
+        noise = 1 / np.sqrt(self.correlator.independent)
+        return bool(np.any(step.coherence > _LEAST_COHERENCE * noise))
