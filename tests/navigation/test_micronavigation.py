@@ -59,7 +59,7 @@ def with_noise(lines, coherence, rng):
 def straight():
     sonar, advance_m = array(96, 24)  # the overlap of Sonar.sensotek
     track = clsas.Track.straight((0, 0, 0), (advance_m, 0, 0), 13, 1.0)
-    return recorded(sonar, track, track, speckle(track, 60, 66, 8000), 60, 66)
+    return recorded(sonar, track, track, speckle(track, 60, 66, 25000), 60, 66)
 
 
 COHERENCES = (0.95, 0.7, 0.5)
