@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     from clsas.files.xarrays import to_xarray
     from clsas.mosaics.mosaic import Mosaic, Patch, mosaic
     from clsas.mosaics.store import Store
+    from clsas.navigation.autofocus import Autofocus, autofocus
+    from clsas.navigation.micronavigation import Micronavigation, micronavigate
     from clsas.opencl.device import DeviceError, list_devices
     from clsas.planning.factorize import factorize
     from clsas.planning.planner import plan
@@ -40,6 +42,7 @@ from clsas.core.version import __version__ as __version__
 
 __all__ = [
     "Assessment",
+    "Autofocus",
     "BeamWindow",
     "ClsasWarning",
     "DeviceError",
@@ -48,6 +51,7 @@ __all__ = [
     "FileFormatError",
     "Grid",
     "Image",
+    "Micronavigation",
     "Mosaic",
     "Patch",
     "Plan",
@@ -61,6 +65,7 @@ __all__ = [
     "Track",
     "Tradeoff",
     "assess",
+    "autofocus",
     "backproject",
     "channels",
     "check_sampling",
@@ -71,6 +76,7 @@ __all__ = [
     "list_devices",
     "load",
     "measure_point",
+    "micronavigate",
     "mosaic",
     "plan",
     "plot",
@@ -97,6 +103,8 @@ _MODULES = {
     "files.xarrays": "to_xarray",
     "mosaics.mosaic": "Mosaic Patch mosaic",
     "mosaics.store": "Store",
+    "navigation.autofocus": "Autofocus autofocus",
+    "navigation.micronavigation": "Micronavigation micronavigate",
     "opencl.device": "DeviceError list_devices",
     "planning.factorize": "factorize",
     "planning.planner": "plan",

@@ -30,6 +30,8 @@ _COMMANDS = {
         "assess",
         "Show which effects an image needs, the error of leaving each out, and its cost.",
     ),
+    "navigate": ("navigation", "Correct an array's track by displaced phase centres."),
+    "focus": ("navigation", "Correct a track by the bright responses of an image (autofocus)."),
     "mosaic": ("mosaics", "Form an image of any size patch by patch, into a Zarr store."),
     "quality": (
         "measures",

@@ -86,6 +86,13 @@ def _percentiles(text: str) -> tuple[float, float]:
     return low, high
 
 
+def _range(text: str) -> tuple[float, float]:
+    near, far = map(float, text.split(":"))
+    if not 0 <= near < far < float("inf"):
+        raise ValueError
+    return near, far
+
+
 AXIS = Parsed("START:STOP:N", _axis, "START:STOP:N, two positions in metres and a number of pixels")
 POSITION = Parsed("X,Y", _position, "X,Y or X,Y,Z in metres, without a space, such as 0,42.5")
 RATIO = Parsed("NUMBER", _ratio, "a number or a fraction such as 1/30")
@@ -93,6 +100,7 @@ STAGES = Parsed("stages", _stages, "QRxQI for every stage, such as 2x2,2x2")
 PERCENTILES = Parsed(
     "LOW,HIGH", _percentiles, "LOW,HIGH from 0 to 100, without a space, such as 1,99.5"
 )
+RANGE = Parsed("NEAR:FAR", _range, "NEAR:FAR, two ascending ranges in metres, such as 30:60")
 COUNTS = Parsed("ROWSxCOLUMNS", _counts, "ROWSxCOLUMNS, at least 1x1, such as 8x8")
 
 

@@ -1,12 +1,15 @@
 """Autofocus against tracks that it is not told."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 from scipy.ndimage import gaussian_filter1d
 
 import clsas
+from clsas.cli import main
 from clsas.core.validate import ClsasWarning
 from clsas.navigation.autofocus import autofocus
 
@@ -154,3 +157,18 @@ def test_bad_arguments():
         autofocus(told.samples, GRID)
     with pytest.raises(TypeError, match="grid"):
         autofocus(told, None)
+
+
+def test_the_command(tmp_path):
+    true, told = recorded(points(), smooth_m(0.3 * WAVELENGTH_M))
+    clsas.save(tmp_path / "lines.h5", told)
+    result = CliRunner().invoke(
+        main,
+        ["focus", str(tmp_path / "lines.h5"), "-o", str(tmp_path / "focused.h5"), "--json"]
+        + ["--x", "1.5:6.5:320", "--y", "18:21:220"],
+    )
+    assert result.exit_code == 0, result.output
+    results = json.loads(result.stdout)
+    assert results["focused"]
+    assert results["sharpness_after"] > 2 * results["sharpness_before"]
+    assert abs(peak_db(clsas.load(tmp_path / "focused.h5"), true)) <= 0.3

@@ -1,12 +1,15 @@
 """Micronavigation against tracks that it is not told, and against the bound of its errors."""
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 
 import clsas
+from clsas.cli import main
 from clsas.core.validate import ClsasWarning
 from clsas.navigation.micronavigation import micronavigate
 from clsas.navigation.overlap import Array, overlap
@@ -275,3 +278,19 @@ def test_an_advance_that_differs_is_found():
     found = micronavigate(lines, range_m=(12, 20), element_length_m=WAVELENGTH_M, surge_sd_m=0.05)
     advanced_m = np.diff(found.track.positions_m[:, 0])
     assert np.abs(advanced_m - advance_m).max() <= 0.05 * SPACING_M
+
+
+def test_the_command(straight, tmp_path):
+    clsas.save(tmp_path / "lines.h5", straight)
+    arguments = ["navigate", str(tmp_path / "lines.h5"), "-o", str(tmp_path / "corrected.h5")]
+    options = ["--range-m", "60:66", "--element-length-m", "0.015", "--json"]
+    result = CliRunner().invoke(main, arguments + options)
+    assert result.exit_code == 0, result.output
+    results = json.loads(result.stdout)
+    assert results["overlap"] == 24
+    assert results["coherence"] > 0.99
+    corrected = clsas.load(tmp_path / "corrected.h5")
+    assert np.abs(corrected.rx_m - straight.rx_m).max() < 0.05
+    refused = CliRunner().invoke(main, [*arguments, "--range-m", "66:60"])
+    assert refused.exit_code == 2
+    assert "NEAR:FAR" in refused.output

@@ -1,0 +1,186 @@
+"""Commands that correct a track by the echoes themselves: navigate, focus."""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import click
+import numpy as np
+
+import clsas
+from clsas.cli import options
+from clsas.cli.inputs import load, read_beam, read_grid
+from clsas.cli.outputs import progress_bar, report
+from clsas.cli.parameters import INPUT, RANGE
+from clsas.core import validate
+from clsas.navigation.autofocus import UNKNOWNS as FOCUSED
+from clsas.navigation.micronavigation import UNKNOWNS as NAVIGATED
+
+
+def _positive(name: str, unit: str) -> Any:
+    return options.checked(partial(validate.positive, name, unit=unit))
+
+
+@click.command()
+@click.argument("lines_file", metavar="LINES.H5", type=INPUT)
+@options.output("Corrected range lines")
+@click.option("--range-m", type=RANGE, help="Nearest and farthest range to use, NEAR:FAR (m).")
+@click.option(
+    "--window-m",
+    type=float,
+    callback=_positive("window_m", "m"),
+    help="Length of a window of range (m). [default: about 150 resolution cells]",
+)
+@click.option(
+    "--side",
+    type=click.Choice(("port", "starboard")),
+    default="port",
+    show_default=True,
+    help="Side of the array on which the seabed lies.",
+)
+@click.option("--seabed-z-m", type=float, help="Height of the seabed, for rays that slope (m).")
+@click.option(
+    "--element-length-m",
+    type=float,
+    callback=_positive("element_length_m", "m"),
+    help="Length of the elements: needed where the beam is wide (m).",
+)
+@click.option(
+    "--sway-sd-m",
+    type=float,
+    default=0.1,
+    show_default=True,
+    callback=_positive("sway_sd_m", "m"),
+    help="Accuracy of the navigation's sway (m).",
+)
+@click.option(
+    "--yaw-sd-deg",
+    type=float,
+    default=1.0,
+    show_default=True,
+    callback=_positive("yaw_sd_deg", "degrees"),
+    help="Accuracy of its yaw (degrees).",
+)
+@click.option(
+    "--surge-sd-m",
+    type=float,
+    default=0.1,
+    show_default=True,
+    callback=_positive("surge_sd_m", "m"),
+    help="Accuracy of its surge (m).",
+)
+@click.option(
+    "--unknown",
+    "unknowns",
+    multiple=True,
+    type=click.Choice(NAVIGATED),
+    help="What to find; repeat the option. [default: sway, yaw and surge]",
+)
+@options.as_json
+def navigate(
+    lines_file: Path,
+    output: Path,
+    yaw_sd_deg: float,
+    unknowns: tuple[str, ...],
+    as_json: bool,
+    **given: Any,
+) -> None:
+    """Correct an array's track by displaced phase centres.
+
+    Phase centres of the array must overlap from ping to ping. Sway, yaw and surge between pings
+    are measured from the echoes that both have in common, and fused with the navigation.
+
+    \b
+    Example:  clsas navigate lines.h5 --range-m 30:60 --element-length-m 0.015 -o corrected.h5
+    """
+    lines = load(lines_file, clsas.RangeLines)
+    with progress_bar("navigating") as progress:
+        found = clsas.micronavigate(
+            lines, **given, yaw_sd_rad=np.radians(yaw_sd_deg), unknowns=unknowns or NAVIGATED,
+            progress=progress,
+        )  # fmt: skip
+    clsas.save(output, found.lines)
+    measured = np.isfinite(found.sway_steps_sd_m)
+    results = {
+        "pings": len(found.sway_m),
+        "overlap": int(found.overlap.min()),
+        "coherence": float(np.median(found.coherence)),
+        "sway_rms_m": float(np.std(found.sway_m)),
+        "yaw_rms_rad": float(np.std(found.yaw_rad)),
+        "surge_rms_m": float(np.std(found.surge_m)),
+        "sway_step_sd_m": float(np.median(found.sway_steps_sd_m[measured])),
+        "yaw_step_sd_rad": float(np.median(found.yaw_steps_sd_rad[measured])),
+    }
+    report(
+        as_json,
+        f"{output}: {results['pings']} pings, {results['overlap']} overlapping phase centres or "
+        f"more, median coherence {results['coherence']:.2f}\n"
+        f"  corrected by {1e3 * results['sway_rms_m']:.3g} mm of sway, "
+        f"{np.degrees(results['yaw_rms_rad']):.3g} degrees of yaw and "
+        f"{1e3 * results['surge_rms_m']:.3g} mm of surge, rms\n"
+        f"  standard deviation per ping {1e6 * results['sway_step_sd_m']:.3g} um of sway, "
+        f"{1e6 * results['yaw_step_sd_rad']:.3g} urad of yaw",
+        file=output,
+        **results,
+    )
+
+
+@click.command()
+@click.argument("lines_file", metavar="LINES.H5", type=INPUT)
+@options.output("Corrected range lines")
+@options.grid
+@click.option(
+    "--unknown",
+    "unknowns",
+    multiple=True,
+    type=click.Choice(FOCUSED),
+    help="Displacement to solve for; repeat the option. [default: sway]",
+)
+@options.beam
+@options.device
+@options.as_json
+def focus(
+    lines_file: Path,
+    output: Path,
+    scene: Path | None,
+    unknowns: tuple[str, ...],
+    device: str | None,
+    as_json: bool,
+    **given: Any,
+) -> None:
+    """Correct a track by the bright responses of an image (autofocus).
+
+    The grid, of --scene or given by --x, --y and --z, should hold some dozen bright responses. A
+    shift and a linear trend of the track are not observable and stay as they are.
+
+    \b
+    Example:  clsas focus lines.h5 --x 2:10:512 --y 28:32:320 -o focused.h5
+    """
+    described, grid = read_grid(scene, given)
+    beam = read_beam(described, given)
+    lines = load(lines_file, clsas.RangeLines)
+    with progress_bar("focusing") as progress:
+        found = clsas.autofocus(
+            lines, grid, beam=beam, unknowns=unknowns or FOCUSED[:1], device=device,
+            progress=progress,
+        )  # fmt: skip
+    clsas.save(output, found.lines)
+    rms_m = float(np.sqrt(np.mean(np.sum(found.correction_m**2, axis=1))))
+    results = {
+        "focused": found.focused,
+        "correction_rms_m": rms_m,
+        "correction_sd_m": float(np.median(found.correction_sd_m)) if found.focused else None,
+        "sharpness_before": found.sharpness_before,
+        "sharpness_after": found.sharpness_after,
+    }
+    how = f"corrected by {1e3 * rms_m:.3g} mm rms" if found.focused else "left as they were"
+    steps = "".join(f"\n  {name}: {value:.4g}" for name, value in found.sharpness)
+    report(
+        as_json,
+        f"{output}: {lines.channels} lines, {how}; sharpness {found.sharpness_before:.4g} to "
+        f"{found.sharpness_after:.4g}{steps}",
+        file=output,
+        **results,
+    )  # fmt: skip
