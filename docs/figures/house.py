@@ -23,6 +23,7 @@ FLOORS = (
     ),
     (
         (
+            ("navigation", "where was the sonar?\nmicronavigation, autofocus"),
             ("files", "in and out\nHDF5, scene files"),
             ("mosaics", "larger than memory\nsurvey, patches, store"),
             ("products", "what does it show?\nquality, tradeoff, pictures"),
