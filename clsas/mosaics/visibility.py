@@ -12,6 +12,7 @@ from clsas.core.geometry import bistatic_range_m
 from clsas.core.grid import Grid
 from clsas.mosaics.survey import Survey
 from clsas.sonar.beam import BeamWindow
+from clsas.sonar.directions import MOST_TRACK_PINGS
 from clsas.sonar.visibility import BeamTrack, Boxes
 
 
@@ -48,7 +49,7 @@ class SurveyVisibility:
         if self.beam.along is not None:
             return self.survey.channels
         pings = self.survey.geometry.ping_starts
-        later = self.beam.track_pings // 2 + 1
+        later = (self.beam.track_pings or MOST_TRACK_PINGS) // 2 + 1
         return int(pings[-later]) if len(pings) > 2 * later else 0
 
     def ranges_m(self, grid: Grid) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -66,13 +67,15 @@ class SurveyVisibility:
     def channels(self, grid: Grid) -> NDArray[np.bool_]:
         """Return which channels may contribute to a grid, [channels]."""
         found = self.survey.within(*self.ranges_m(grid))
-        if self.beam is not None:
+        if self._beam_track is not None:
             centre_m, half_m = bounding_box(grid)
             found &= self._beam_track.touching(Boxes.equal(centre_m[None], half_m))[0]
         return found
 
     @functools.cached_property
-    def _beam_track(self) -> BeamTrack:
+    def _beam_track(self) -> BeamTrack | None:
+        if self.beam is None or self.along is None:
+            return None
         return BeamTrack(self.beam.limits, self.phase_centres_m, self.along)
 
     def any_channel_from(self, first: int, grid: Grid) -> bool:
@@ -81,14 +84,14 @@ class SurveyVisibility:
 
     def has_passed(self, grid: Grid, settled: int) -> bool:
         """Return whether the beam of the latest settled channels is ahead of a grid."""
-        if self.any_channel_from(settled, grid):
+        if self.beam is None or self.along is None or self.any_channel_from(settled, grid):
             return False
         centre_m, half_m = bounding_box(grid)
         offset_m = centre_m - self.phase_centres_m[settled - 1]
         direction = self.along[settled - 1]
         extent_m = np.abs(half_m @ direction).sum()
-        low, away_m = max(self.beam.limits[0], -1.0), np.linalg.norm(offset_m)
-        radius_m = np.linalg.norm(np.abs(half_m).sum(axis=0))
+        low, away_m = max(self.beam.limits[0], -1.0), float(np.linalg.norm(offset_m))
+        radius_m = float(np.linalg.norm(np.abs(half_m).sum(axis=0)))
         # The beam leaves the farthest point of the box last, or the nearest if it looks ahead.
         distance_m = away_m + radius_m if low < 0 else max(away_m - radius_m, 0.0)
         return bool(direction @ offset_m + extent_m < low * distance_m)
@@ -100,8 +103,9 @@ def bounding_box(grid: Grid) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         low, high = (edge(grid.points_m, axis=(0, 1)) for edge in (np.min, np.max))
         return (low + high) / 2, np.diag((high - low) / 2)
     rows, columns = grid.shape
-    half_m = np.array([grid.row_step_m * (rows - 1), grid.column_step_m * (columns - 1)]) / 2
-    centre_m = grid.origin_m + half_m.sum(axis=0)
+    origin_m, row_step_m, column_step_m = grid.vectors_m
+    half_m = np.array([row_step_m * (rows - 1), column_step_m * (columns - 1)]) / 2
+    centre_m = origin_m + half_m.sum(axis=0)
     if grid.height_m is None:
         return centre_m, half_m
     low, high = grid.height_m.min(), grid.height_m.max()

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,7 +41,7 @@ _DRIFTS = 3  # times that drift is measured at most
 _NEIGHBOURHOODS_M = (1.2, 0.8, 0.5, 0.3)  # around responses, along the track
 _SWEEPS = 2  # times that single pings are moved
 _RESPONSES, _RESPONSES_FOR_DRIFT = 200, 60
-_OFFSETS = np.arange(-4, 5)  # samples in range, of which drift sees images
+_OFFSETS = np.arange(-4.0, 5.0)  # samples in range, of which drift sees images
 _APART = 4.0  # range resolution cells between responses
 _GAIN = 1.02  # of sharpness, for which a step is repeated
 
@@ -241,7 +242,7 @@ class _Focus:
         for _ in range(_DRIFTS):
             yield "drift between subapertures", self._drift
         for each_m in _NEIGHBOURHOODS_M:
-            yield f"phase gradient within {each_m:g} m", lambda m=each_m: self._gradient(m)
+            yield f"phase gradient within {each_m:g} m", partial(self._gradient, each_m)
         for _ in range(_SWEEPS):
             yield "sharpness of single pings", self._pings
 

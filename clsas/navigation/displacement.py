@@ -206,7 +206,7 @@ class Correlator:
             float(np.mean(between_m @ forward)),
             np.stack(values, axis=1) * np.exp(-1j * expected)[..., None],
             np.stack(coherence, axis=1),
-            self.step_m * np.arange(-most, most + 1),
+            self.step_m * np.arange(-most, most + 1, dtype=np.float64),
             self.cycles_per_m,
             sensitivity,
             pairs.along_m,
@@ -275,14 +275,15 @@ class Correlator:
         rays = np.cos(angle)[:, None] * ray[..., None, :] + np.sin(angle)[:, None] * forward
         points_m = swath.middles_m[:, None, None] * rays + centre_m[:, None, None]
         middle_m = swath.middles_m[:, None] * ray + centre_m[:, None]
-        apart_m = 0.0
+        apart_m = np.zeros(rays.shape[:-1])
         for channels, sign in ((pairs.first, -1), (pairs.second, 1)):
             flat_m = points_m.reshape(len(channels), -1, 3)
             path_m = self._range_m(lines, channels, flat_m).reshape(rays.shape[:-1])
             path_m -= self._range_m(lines, channels, middle_m)[..., None]
             apart_m = apart_m + sign * path_m
         # Channels of unlike separation migrate by different amounts: that is not delay.
-        total, seen = 0.0, 0.0
+        total = np.zeros(rays.shape[:-2], np.complex128)
+        seen = np.zeros(rays.shape[:-1])
         for cycles_per_m in self._band():
             weights = self._beam(rays, array, pairs, cycles_per_m)
             seen = seen + weights

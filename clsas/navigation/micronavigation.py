@@ -209,7 +209,7 @@ def _result(
         along.append(Step.along(found.surge_m[ping], deviation_m))
     states, covariances = smooth(steps, fixes[:, :2])
     surges, spreads = smooth(along, fixes[:, 2:])
-    corrected = moved(lines, array, *states.T, surges[:, 0])
+    corrected = moved(lines, array, states[:, 0], states[:, 1], surges[:, 0])
     at = Array.of(corrected)
     heading = np.arctan2(at.forward[:, 1], at.forward[:, 0])
     deviations = np.sqrt(misfit * np.stack([np.diag(each) for each in found.covariance]))

@@ -129,7 +129,7 @@ class _Passes:
         """Return what is left of every advance, and its standard deviation; 0 without coherence."""
         corrected, here = self._corrected()
         found = np.zeros((len(self.overlaps), 2))
-        for ping in np.flatnonzero(self.coherent):
+        for ping in np.flatnonzero(self.coherent).tolist():
             at, behind, ahead = (
                 self.correlator.correlate(
                     corrected,
@@ -170,7 +170,7 @@ class _Passes:
                 for each, levers_m in zip(self.moved, self._levers_m(there), strict=True)
             ]
         )
-        corrected = moved(advanced, there, *states.T, none)
+        corrected = moved(advanced, there, states[:, 0], states[:, 1], none)
         return corrected, Array.of(corrected)
 
     def _paired(self, lines: RangeLines, array: Array) -> list[Overlap]:

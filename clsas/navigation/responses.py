@@ -159,7 +159,7 @@ def contributions(
         turns = lines.carrier_cycles_per_m * at_m
         read = readout.read(some, at_m) * np.exp(2j * np.pi * (turns - np.rint(turns)))
         values[some] = read.reshape(len(some), len(points_m), -1)
-        if beam is not None:
+        if beam is not None and along is not None:
             sine = sines(points_m, part.phase_centres_m, along[some])
             values[some] *= beam.weights(sine, wavelength_m(lines))[..., None]
     return Contributions(values, gradient, range_m)

@@ -249,15 +249,18 @@ def _fitted(images: list[_Image], usual: Costs) -> Costs:
         [image.in_pixels for image in tiled],
     )
     of_points = [
-        (1e9 * image.in_pixels - leaves["leaf_channel_ns"] * image.expected.work.leaf_channel)
+        (
+            1e9 * image.in_pixels
+            - leaves["leaf_channel_ns"] * float(image.expected.work.leaf_channel)
+        )
         / image.pixel_work
         for image in plans
         if not image.tiled
     ]
-    pixel_ns = per_pixel([i for i in exact if i.tiled and not i.expected.weighted])
-    weighted = [i for i in exact if i.expected.weighted]
+    pixel_ns = per_pixel([image for image in exact if image.tiled and not _is_weighted(image)])
+    weighted = [image for image in exact if _is_weighted(image)]
     of_beam = [1e9 * image.in_pixels - pixel_ns * image.pixel_work for image in weighted]
-    pairs = [image.expected.work.beam for image in weighted]
+    pairs = [float(image.expected.work.beam) for image in weighted]
     return Costs(
         **least_squares(_HOST, [image.work(_HOST) for image in images], of_host),
         **least_squares(
@@ -271,6 +274,11 @@ def _fitted(images: list[_Image], usual: Costs) -> Costs:
         point_ns=per_pixel([i for i in exact if not i.tiled]),
         beam_ns=max(float(np.median(np.divide(of_beam, pairs))), 0.0),
     )
+
+
+def _is_weighted(image: _Image) -> bool:
+    """Return whether a beam weighs an exact image."""
+    return isinstance(image.expected, Exact) and image.expected.weighted
 
 
 def _least_squares(
