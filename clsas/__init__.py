@@ -14,7 +14,13 @@ if TYPE_CHECKING:
     from clsas.exact.backprojection import backproject
     from clsas.exact.wavenumber import wavenumber
     from clsas.factorized.plan import Plan
-    from clsas.files.hdf5 import FileFormatError, load, save
+    from clsas.files.airsas import read_airsas
+    from clsas.files.cphd import read_cphd
+    from clsas.files.cphd_writing import write_cphd
+    from clsas.files.formats import load, save
+    from clsas.files.full_matrix import read_full_matrix
+    from clsas.files.hdf5 import FileFormatError
+    from clsas.files.phase_histories import read_phase_history
     from clsas.files.xarrays import to_xarray
     from clsas.mosaics.mosaic import Mosaic, Patch, mosaic
     from clsas.mosaics.store import Store
@@ -31,6 +37,9 @@ if TYPE_CHECKING:
     from clsas.products.tradeoff_result import Tradeoff
     from clsas.signal.compression import compress
     from clsas.signal.echoes import Echoes
+    from clsas.signal.full_matrix import from_full_matrix
+    from clsas.signal.phase_history import from_phase_history
+    from clsas.signal.replica import Replica
     from clsas.simulation.scenes import PointTargets, Seabed
     from clsas.simulation.simulator import simulate, simulate_lines
     from clsas.sonar.beam import BeamWindow
@@ -59,6 +68,7 @@ __all__ = [
     "Pointing",
     "Pulse",
     "RangeLines",
+    "Replica",
     "Seabed",
     "Sonar",
     "Store",
@@ -73,6 +83,8 @@ __all__ = [
     "contrast",
     "entropy",
     "factorize",
+    "from_full_matrix",
+    "from_phase_history",
     "list_devices",
     "load",
     "measure_point",
@@ -80,6 +92,10 @@ __all__ = [
     "mosaic",
     "plan",
     "plot",
+    "read_airsas",
+    "read_cphd",
+    "read_full_matrix",
+    "read_phase_history",
     "relative_error_db",
     "save",
     "simulate",
@@ -88,6 +104,7 @@ __all__ = [
     "to_xarray",
     "tradeoff",
     "wavenumber",
+    "write_cphd",
 ]
 
 _MODULES = {
@@ -99,7 +116,13 @@ _MODULES = {
     "exact.backprojection": "backproject",
     "exact.wavenumber": "wavenumber",
     "factorized.plan": "Plan",
-    "files.hdf5": "FileFormatError load save",
+    "files.airsas": "read_airsas",
+    "files.cphd": "read_cphd",
+    "files.cphd_writing": "write_cphd",
+    "files.formats": "load save",
+    "files.full_matrix": "read_full_matrix",
+    "files.hdf5": "FileFormatError",
+    "files.phase_histories": "read_phase_history",
     "files.xarrays": "to_xarray",
     "mosaics.mosaic": "Mosaic Patch mosaic",
     "mosaics.store": "Store",
@@ -115,6 +138,9 @@ _MODULES = {
     "products.tradeoff_result": "Tradeoff",
     "signal.compression": "compress",
     "signal.echoes": "Echoes",
+    "signal.full_matrix": "from_full_matrix",
+    "signal.phase_history": "from_phase_history",
+    "signal.replica": "Replica",
     "simulation.scenes": "PointTargets Seabed",
     "simulation.simulator": "simulate simulate_lines",
     "sonar.beam": "BeamWindow",

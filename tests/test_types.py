@@ -12,6 +12,7 @@ from clsas.core.grid import Grid
 from clsas.core.image import Image
 from clsas.core.lines import RangeLines
 from clsas.signal.echoes import Echoes
+from clsas.signal.replica import Replica
 from clsas.simulation.scenes import PointTargets, Seabed
 from clsas.sonar.beam import BeamWindow
 from clsas.sonar.system import Sonar
@@ -40,7 +41,8 @@ def test_the_readme_passes_mypy(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    "kind", [BeamWindow, Echoes, Grid, Image, PointTargets, RangeLines, Seabed, Sonar, Track]
+    "kind",
+    [BeamWindow, Echoes, Grid, Image, PointTargets, RangeLines, Replica, Seabed, Sonar, Track],
 )
 def test_constructors_are_as_type_checkers_see_them(kind):
     (described,) = (

@@ -21,6 +21,10 @@ _COMMANDS = {
     "devices": ("machine", "List OpenCL devices, and show which one is used and why."),
     "simulate": ("lines", "Simulate the echoes of a scene file."),
     "compress": ("lines", "Compress echoes into range lines."),
+    "convert": (
+        "lines",
+        "Convert a file: recordings to range lines in HDF5, range lines to CPHD and back.",
+    ),
     "image": ("images", "Form the image of range lines, fast to a tolerance or exactly."),
     "plan": (
         "images",

@@ -1,4 +1,4 @@
-"""Commands that make range lines: simulate, compress."""
+"""Commands that make range lines: simulate, compress, convert."""
 
 from __future__ import annotations
 
@@ -12,7 +12,8 @@ import clsas
 from clsas.cli import options
 from clsas.cli.inputs import load, read_levels, read_scene, warn_of_sampling
 from clsas.cli.outputs import progress_bar, report
-from clsas.cli.parameters import HDF5, INPUT
+from clsas.cli.parameters import HDF5, INPUT, Output
+from clsas.files.formats import SUFFIXES
 from clsas.signal.compression import check_options
 from clsas.simulation.simulator import check_size
 
@@ -101,6 +102,33 @@ def compress(
         f"{1e3 * lines.range_step_m:.4g} mm apart, in {seconds:.2f} s",
         file=output, picture=picture, channels=lines.channels, length=lines.length,
         range_step_m=lines.range_step_m, seconds=seconds,
+    )  # fmt: skip
+
+
+@click.command()
+@click.argument("recording", metavar="FILE", type=INPUT)
+@click.option(
+    "-o", "--output", type=Output(*SUFFIXES), required=True,
+    help="File to write: HDF5, or CPHD if its name ends in .cphd.",
+)  # fmt: skip
+@options.as_json
+def convert(recording: Path, output: Path, as_json: bool) -> None:
+    """Convert a file: recordings to range lines in HDF5, range lines to CPHD and back.
+
+    Reads what `clsas image` reads: HDF5 of clsas, CPHD, AirSAS, and MATLAB files with a radar's
+    phase history or a full matrix capture.
+
+    \b
+    Example:  clsas convert lines.h5 -o lines.cphd
+    """
+    start = time.perf_counter()
+    obj = clsas.load(recording)
+    clsas.save(output, obj)
+    seconds = time.perf_counter() - start
+    report(
+        as_json,
+        f"{output}: {obj!r} in {seconds:.2f} s",
+        file=output, kind=type(obj).__name__, seconds=seconds,
     )  # fmt: skip
 
 

@@ -8,6 +8,7 @@ PACKAGES = {
     "pocl": ("pyopencl[pocl]>=2024.1",),
     "plot": ("matplotlib>=3.8",),
     "mosaic": ("zarr>=3.1.3", "distributed>=2024.1", "cryptography>=42.0", "xarray>=2024.1"),
+    "radar": ("sarkit>=1.8",),
 }
 """Requirements of every extra, as `pyproject.toml` has them."""
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from clsas.core import reprs, validate
+from clsas.core import conditioning, reprs, validate
 
 _GOLDEN = (np.sqrt(5) - 1) / 2
 
@@ -180,6 +180,84 @@ class RangeLines:
             rx_m=self.rx_m[index],
             rx_velocity_m_s=None if velocity is None else velocity[index],
         )
+
+    def high_passed(self, cutoff_hz: float) -> RangeLines:
+        """Return the lines without frequencies below a cutoff.
+
+        Recorders add a constant and slow drifts. On the carrier these lie at 0 Hz, where they add
+        up coherently over a whole image.
+
+        Parameters
+        ----------
+        cutoff_hz : float
+            Frequency in the recorded signal, before `carrier_hz` was mixed out. Frequencies from
+            the cutoff upwards pass unchanged. The filter falls to zero at half the cutoff, or at
+            the lowest frequency that the samples can hold if that is higher. It shifts nothing.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If the cutoff is not a number, is outside the band that the samples hold, carrier_hz
+            plus or minus half the sample rate, or is below one cycle per line.
+        """
+        return conditioning.high_passed(self, cutoff_hz)
+
+    def tapered_ends(self, length_m: float) -> RangeLines:
+        """Return the lines with both ends faded to zero.
+
+        Lines that end sharply in strong echoes cannot be interpolated well, even far from the ends.
+
+        Parameters
+        ----------
+        length_m : float
+            Range over which a raised cosine falls from 1 to 0, at each end. At most half a line.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If the length is not a number or outside its limits.
+        """
+        return conditioning.tapered_ends(self, length_m)
+
+    def without_background(
+        self, statistic: str = "mean", *, receivers: int | None = None
+    ) -> RangeLines:
+        """Return the lines without what all pings have in common.
+
+        Direct arrivals, ringing and interference of the electronics lie at the same delay in every
+        ping. Echoes of points move through the lines and mostly remain. A reflector at constant
+        range, such as a flat seabed seen vertically, is removed too.
+
+        Parameters
+        ----------
+        statistic : {"mean", "median"}
+            Over the pings, per receiver and sample. The median (of real and imaginary parts) is
+            less affected by strong echoes.
+        receivers : int, optional
+            Channels per ping; by default consecutive channels with one tx position are a ping.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If there are fewer than 2 pings, pings have different numbers of channels, or a
+            receiver's lines do not begin at the same range in all pings.
+        """
+        return conditioning.without_background(self, statistic, receivers)
+
+    def weighted(self, weights: ArrayLike) -> RangeLines:
+        """Return the lines, each multiplied by its weight.
+
+        Parameters
+        ----------
+        weights : array_like of float or complex, shape [channels]
+            Gains, apodization or phase corrections; 0 silences a channel.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If the weights are not finite numbers, one per channel.
+        """
+        return conditioning.weighted(self, weights)
 
     def without_samples(self) -> RangeLines:
         """Return these lines with a single sample per channel, which is zero."""

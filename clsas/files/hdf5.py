@@ -153,6 +153,17 @@ def read_samples(path: str | os.PathLike, rows: slice, columns: slice) -> np.nda
 @contextmanager
 def _opened(path: str | os.PathLike) -> Iterator[h5py.File]:
     """Open a clsas file for reading; every defect raises FileFormatError."""
+    with opened(path) as file:
+        _check_header(file)
+        yield file
+
+
+@contextmanager
+def opened(path: str | os.PathLike) -> Iterator[h5py.File]:
+    """Open any HDF5 file for reading; every defect raises FileFormatError.
+
+    FileFormatErrors and others of the reading code gain the file's name.
+    """
     path = Path(path)
     try:
         reading.check_ordinary(path)
@@ -164,7 +175,6 @@ def _opened(path: str | os.PathLike) -> Iterator[h5py.File]:
         raise FileFormatError(f"{path} is not an HDF5 file")
     try:
         with h5py.File(path, "r") as file:
-            _check_header(file)
             yield file
     except FileFormatError as error:
         raise FileFormatError(f"{path} {error}") from None
@@ -192,7 +202,7 @@ def _samples_of(file: h5py.File) -> h5py.Dataset:
     kind = _attribute(file, "kind")
     if kind != "range_lines":
         raise FileFormatError(f"must hold range lines, got {validate.shown(kind)}")
-    samples = _item(file, "samples")
+    samples = find_item(file, "samples")
     if not isinstance(samples, h5py.Dataset):
         raise FileFormatError("lacks samples of the range_lines at /")
     if samples.dtype.kind != "c" or len(samples.shape or ()) != 2 or not samples.size:
@@ -216,12 +226,12 @@ def _read(group: h5py.Group, **instead: Any) -> Any:
             values[field.name] = instead[field.name]
         elif field.name in group.attrs:
             values[field.name] = _attribute(group, field.name)
-        elif (item := _item(group, field.name)) is not None:
+        elif (item := find_item(group, field.name)) is not None:
             is_group = isinstance(item, h5py.Group)
             # A group may contain a link to itself.
             if is_group and _kind_of_field(field.type) != _attribute(item, "kind"):
                 raise FileFormatError(f"holds another object as {field.name} of the {name}")
-            values[field.name] = _read(item) if is_group else _values(item)
+            values[field.name] = _read(item) if is_group else read_values(item)
         elif "None" in str(field.type):
             values[field.name] = None
         else:
@@ -235,7 +245,7 @@ def _kind_of_field(annotation: object) -> str | None:
     return next((name for name, kind in _KINDS.items() if kind.__name__ in classes), None)
 
 
-def _item(group: h5py.Group, name: str) -> h5py.Group | h5py.Dataset | None:
+def find_item(group: h5py.Group, name: str) -> h5py.Group | h5py.Dataset | None:
     """Return a group or dataset of this file, or None if there is none of that name.
 
     Links are refused: a file must not decide which other files are read.
@@ -256,7 +266,8 @@ def _item(group: h5py.Group, name: str) -> h5py.Group | h5py.Dataset | None:
     return item
 
 
-def _values(dataset: h5py.Dataset) -> np.ndarray:
+def read_values(dataset: h5py.Dataset) -> np.ndarray:
+    """Return a whole dataset that fits into memory; one with missing parts is refused."""
     # HDF5 returns zeros for chunks that were never written.
     if dataset.chunks is None:
         whole = dataset.id.get_storage_size() >= dataset.nbytes

@@ -18,6 +18,7 @@ from clsas.core import validate
 from clsas.core.fourier import EDGE_PRODUCT, fourier_integral, smooth_edge
 from clsas.core.lines import RangeLines
 from clsas.signal.echoes import Echoes
+from clsas.signal.replica import Replica
 from clsas.sonar.system import Pulse
 
 Window = str | float | tuple
@@ -32,6 +33,7 @@ def compress(
     window: Window = "none",
     oversampling: float = 2.0,
     bandwidth_hz: float | None = None,
+    replica: Replica | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> RangeLines:
     """Compress echoes into range lines.
@@ -49,7 +51,9 @@ def compress(
         approximates it to 1e-6; `range_step_m` of the result is exact.
     bandwidth_hz : float, optional
         Width of the band that is kept, centred on the carrier; by default the pulse's. Required
-        without a pulse.
+        without a pulse. Within the sampled band of a replica.
+    replica : Replica, optional
+        Measured pulse, which the matched filter uses instead of the nominal one of `echoes`.
     progress : callable, optional
         Called as progress(channels done, channels).
 
@@ -73,15 +77,17 @@ def compress(
 
         h(t) = integral over the band of W(f) P*(f) exp(j 2 pi f t) df / integral of W |P|^2
 
-    [17], [37]. Without a pulse P is flat. The sharp ends of the band make h infinitely long. The
+    [17], [37]. Without a pulse P is flat; P of a replica is the spectrum of its samples. The sharp ends of the band make h infinitely long. The
     part of h that is as long as the recording is unchanged, and the rest fades smoothly in the
     padding. The result is therefore exactly the linear convolution, without wrap-around.
     """
     validate.instance("echoes", echoes, Echoes)
     validate.progress(progress)
     check_options(window=window, oversampling=oversampling)
-    pulse, rate = echoes.pulse, echoes.sample_rate_hz
-    band = _band(echoes, bandwidth_hz)
+    if replica is not None:
+        validate.instance("replica", replica, Replica)
+    pulse, rate = replica or echoes.pulse, echoes.sample_rate_hz
+    band = _band(echoes, bandwidth_hz, replica)
     weights = band_window(window, band)
     duration = 0.0 if pulse is None else pulse.duration_s
     whole = echoes.length - 1 - duration * rate
@@ -175,7 +181,7 @@ def band_window(
     return CubicSpline(np.linspace(-half, half, count), values)
 
 
-def _band(echoes: Echoes, bandwidth_hz: float | None) -> float:
+def _band(echoes: Echoes, bandwidth_hz: float | None, replica: Replica | None) -> float:
     if bandwidth_hz is None:
         if echoes.pulse is None:
             raise ValueError("bandwidth_hz must be given for echoes without a pulse")
@@ -188,6 +194,8 @@ def _band(echoes: Echoes, bandwidth_hz: float | None) -> float:
                 f"carrier_hz of real echoes must be between 0 and half the sample rate, "
                 f"{echoes.sample_rate_hz / 2:g} Hz, got {echoes.carrier_hz:g} Hz"
             )
+    if replica is not None:
+        limit = min(limit, replica.sample_rate_hz)
     return validate.number("bandwidth_hz", bandwidth_hz, "Hz", above=0.0, most=limit)
 
 
@@ -199,7 +207,7 @@ def _fraction(ratio: float) -> Fraction:
 
 
 def _filter_response(
-    pulse: Pulse | None,
+    pulse: Pulse | Replica | None,
     band: float,
     weights: Callable[[NDArray], NDArray],
     bins: NDArray[np.int_],
@@ -223,7 +231,10 @@ def _filter_response(
     points = fft.next_fast_len(math.ceil(1.25 * band * period_s))
     lag = fft.fftfreq(points) * period_s
     impulse = fourier_integral(matched, edges, lag, sign=1, rate=rate)
-    impulse /= fourier_integral(energy, edges, 0.0, sign=1, rate=rate).real
+    total = fourier_integral(energy, edges, 0.0, sign=1, rate=rate).real
+    if not total > 0:
+        raise ValueError("replica must have energy within bandwidth_hz, got none")
+    impulse /= total
     impulse *= smooth_edge((np.abs(lag) - reach_s) / (period_s / 2 - reach_s))
     return fft.fft(impulse)[bins % points] * (period_s / points)
 

@@ -1,0 +1,104 @@
+"""Conditioning of range lines: filter, taper, background, weights. `RangeLines` has the methods."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy import fft
+
+from clsas.core import validate
+
+if TYPE_CHECKING:
+    from clsas.core.lines import RangeLines
+
+_BLOCK = 1 << 22  # complex128 samples of the channels that are filtered together
+_EQUAL_RANGE = 1e-3  # steps by which first ranges of pings may differ: an error of -50 dB
+STATISTICS = ("mean", "median")
+
+
+def high_passed(lines: RangeLines, cutoff_hz: float) -> RangeLines:
+    """Remove frequencies below a cutoff; see `RangeLines.high_passed`."""
+    from clsas.core.fourier import EDGE_PRODUCT, smooth_edge  # imports finufft, which is slow
+
+    rate = lines.sound_speed_m_s / (2 * lines.range_step_m)
+    lowest = max(0.0, lines.carrier_hz - rate / 2)
+    cutoff = validate.number("cutoff_hz", cutoff_hz, "Hz", above=lowest, below=lowest + rate)
+    if cutoff * lines.length < rate:
+        raise ValueError(
+            f"cutoff_hz must be at least one cycle per line, {rate / lines.length:g} Hz, "
+            f"got {cutoff:g} Hz"
+        )
+    # The edge lies between half the cutoff and the cutoff, and above the band's lowest frequency.
+    width = min(cutoff / 2, cutoff - lowest)
+    padded = fft.next_fast_len(lines.length + int(np.ceil(EDGE_PRODUCT * rate / width)))
+    validate.memory("the padding for cutoff_hz", 16 * padded)
+    frequency = np.abs(lines.carrier_hz + fft.fftfreq(padded, 1 / rate))
+    response = smooth_edge((cutoff - frequency) / width)
+    samples = np.empty_like(lines.samples)
+    rows = max(1, _BLOCK // padded)
+    for first in range(0, lines.channels, rows):
+        block = slice(first, first + rows)
+        spectrum = fft.fft(lines.samples[block].astype(np.complex128), padded, workers=-1)
+        filtered = fft.ifft(spectrum * response, workers=-1, overwrite_x=True)
+        samples[block] = filtered[:, : lines.length]
+    return replace(lines, samples=samples)
+
+
+def tapered_ends(lines: RangeLines, length_m: float) -> RangeLines:
+    """Fade both ends of every line to zero; see `RangeLines.tapered_ends`."""
+    half = (lines.length - 1) * lines.range_step_m / 2
+    length = validate.number("length_m", length_m, "m", above=0.0, most=half)
+    from_end = np.arange(lines.length) * lines.range_step_m
+    from_end = np.minimum(from_end, from_end[::-1])
+    taper = np.sin(np.pi / 2 * np.minimum(from_end / length, 1)) ** 2
+    return replace(lines, samples=lines.samples * taper.astype(np.float32))
+
+
+def without_background(lines: RangeLines, statistic: str, receivers: int | None) -> RangeLines:
+    """Subtract what all pings have in common; see `RangeLines.without_background`."""
+    validate.one_of("statistic", statistic, STATISTICS)
+    count = _receivers(lines) if receivers is None else validate.count("receivers", receivers)
+    pings, rest = divmod(lines.channels, count)
+    if rest or pings < 2:
+        raise ValueError(
+            "receivers must divide the channels into at least 2 pings, "
+            f"got {count} receivers and {lines.channels} channels"
+        )
+    first_m = lines.first_range_m.reshape(pings, count)
+    spread_m = float(np.ptp(first_m, axis=0).max())
+    if spread_m > _EQUAL_RANGE * lines.range_step_m:
+        raise ValueError(
+            "first_range_m of a receiver must be the same in all pings, since a background lies "
+            f"at one delay; they differ by up to {spread_m:g} m"
+        )
+    samples = np.array(lines.samples).reshape(pings, count, lines.length)
+    for receiver in range(count):
+        own = samples[:, receiver]
+        if statistic == "mean":
+            background = own.mean(axis=0, dtype=np.complex128)
+        else:
+            background = np.median(own.real, axis=0) + 1j * np.median(own.imag, axis=0)
+        own -= background.astype(np.complex64)
+    return replace(lines, samples=samples.reshape(lines.samples.shape))
+
+
+def weighted(lines: RangeLines, weights: ArrayLike) -> RangeLines:
+    """Multiply every channel by its weight; see `RangeLines.weighted`."""
+    dtype = np.complex128 if np.iscomplexobj(weights) else np.float64
+    factors: NDArray = validate.array("weights", weights, dtype, (lines.channels,))
+    narrow = np.complex64 if dtype is np.complex128 else np.float32
+    return replace(lines, samples=lines.samples * factors.astype(narrow)[:, None])
+
+
+def _receivers(lines: RangeLines) -> int:
+    """Return the channels per ping, which must be the same for all pings."""
+    counts = np.diff(np.append(lines.ping_starts, lines.channels))
+    if np.ptp(counts):
+        raise ValueError(
+            "receivers must be given, since pings seem to have from "
+            f"{counts.min()} to {counts.max()} channels: consecutive channels with one tx position"
+        )
+    return int(counts[0])

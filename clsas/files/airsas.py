@@ -1,0 +1,270 @@
+"""Recordings of AirSAS, an in-air sonar on a rail, in HDF5 and CSV files.
+
+The schema is that of the public data set (https://doi.org/10.6084/m9.figshare.26961892): a scene's
+samples lie in `scenes/NAME.h5`, what all scenes share in `characterization data/*.csv` beside it.
+"""
+
+from __future__ import annotations
+
+import csv
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft
+
+from clsas.core import reading, validate
+from clsas.core.lines import RangeLines
+from clsas.files import hdf5
+from clsas.files.hdf5 import FileFormatError
+from clsas.signal.compression import Window, compress
+from clsas.signal.echoes import Echoes
+from clsas.sonar.system import Pulse
+
+SHARED = "characterization data"
+ACQUISITION, SENSORS = "acquistionParams.csv", "sensorCoordinates.csv"  # spelt so
+# Rows of the acquisition parameters, from 0; each has a name, a number, and more.
+_RATE, _GROUP_DELAY, _START_HZ, _STOP_HZ, _DURATION, _TAPER = 0, 1, 7, 8, 9, 12
+
+
+def is_airsas(file: h5py.File) -> bool:
+    """Return whether an HDF5 file has the parts of an AirSAS scene."""
+    return "na" in file and any(name.startswith("ch") for name in file)
+
+
+def read_airsas(
+    path: str | os.PathLike,
+    *,
+    channels: Sequence[int] | None = None,
+    shared: str | os.PathLike | None = None,
+    window: Window = "none",
+    oversampling: float = 2.0,
+) -> RangeLines:
+    """Read and compress the microphones' samples of an AirSAS scene.
+
+    The constant and the group delay of the recorder are removed, the transmission is blanked, and
+    samples are compressed with the chirp that the acquisition parameters describe.
+
+    Parameters
+    ----------
+    path : path-like
+        The scene, an HDF5 file with `/chN/ts` [pings, time] per microphone, and the position on
+        the rail (m) and temperature (degrees Celsius) of every ping in `/na`.
+    channels : sequence of int, optional
+        Microphones, from 1; by default all in the file.
+    shared : path-like, optional
+        Folder of the CSV files; by default `characterization data` beside the scene's folder.
+    window, oversampling
+        As in `compress`.
+
+    Returns
+    -------
+    RangeLines
+        One line per ping and microphone, in the rail's coordinates. The speed of sound is 331.6 +
+        0.61 T m/s, T in degrees Celsius. Lines of pings with another speed than the mean are
+        resampled to the mean speed.
+
+    Raises
+    ------
+    FileFormatError
+        If a file is damaged, lacks a part, or parts disagree.
+    TypeError, ValueError
+        If an option is outside its limits, or a microphone does not exist.
+    OSError
+        If a file does not exist or cannot be read.
+    """
+    path = validate.path("path", path)
+    folder = path.absolute().parent.parent / SHARED if shared is None else Path(shared)
+    parameters = _Parameters.read(folder / ACQUISITION)
+    sensors_m = _sensors_m(folder / SENSORS)
+    with hdf5.opened(path) as file:
+        there = [n for n in range(1, len(sensors_m)) if f"ch{n}" in file]
+    numbers = _microphones(path, there, channels)
+    with hdf5.opened(path) as file:
+        rail_m = _dataset(file, "na", "position").ravel()
+        pings = len(rail_m)
+        samples = [_dataset(file, f"ch{number}", "ts") for number in numbers]
+        for number, each in zip(numbers, samples, strict=True):
+            if each.shape != (pings, samples[0].shape[-1]):
+                raise FileFormatError(
+                    f"must hold /ch{number}/ts of shape [pings, time], {pings} by "
+                    f"{samples[0].shape[-1]}, got {each.shape}"
+                )
+        speed_m_s = _speeds_m_s(_dataset(file, "na", "temperature"), pings)
+    position_m = np.zeros((pings, 1, 3))
+    position_m[..., 0] = rail_m[:, None]
+    tx_m, rx_m = (
+        np.broadcast_to(position_m + sensors_m[rows], (pings, len(numbers), 3)).reshape(-1, 3)
+        for rows in ([0], numbers)
+    )
+    time_s = (np.arange(samples[0].shape[1]) - parameters.group_delay) / parameters.sample_rate_hz
+    pulse = parameters.pulse
+    echoes = Echoes(
+        _conditioned(samples, time_s, pulse.duration_s),
+        start_time_s=time_s[0],
+        sample_rate_hz=parameters.sample_rate_hz,
+        carrier_hz=pulse.carrier_hz,
+        tx_m=tx_m,
+        rx_m=rx_m,
+        sound_speed_m_s=float(speed_m_s.mean()),
+        pulse=pulse,
+    )
+    lines = compress(echoes, window=window, oversampling=oversampling)
+    return at_one_speed(lines, np.repeat(speed_m_s, len(numbers)))
+
+
+def at_one_speed(lines: RangeLines, speed_m_s: NDArray[np.float64]) -> RangeLines:
+    """Return lines whose channels had speeds of sound of their own at the speed of `lines`.
+
+    Parameters
+    ----------
+    lines : RangeLines
+        Lines as if all channels had their one speed c: sample times are 2 r/c.
+    speed_m_s : float64 array, [channels]
+        Speed of sound of every channel.
+
+    Notes
+    -----
+    Channel i has sample times t = 2 r/c_i in truth. Its line is interpolated at 2 r/c_i, by a
+    Fourier series, and turned by the phase 4 pi fc r (1/c_i - 1/c): a point at rho then has the
+    phase exp(-j 4 pi fc rho/c).
+    """
+    import finufft  # slow to import
+
+    speed = lines.sound_speed_m_s
+    samples = np.array(lines.samples)
+    padded = fft.next_fast_len(lines.length + lines.length // 4)
+    for channel in np.flatnonzero(speed_m_s != speed):
+        range_m = lines.first_range_m[channel] + np.arange(lines.length) * lines.range_step_m
+        at = (range_m * speed / speed_m_s[channel] - range_m[0]) / lines.range_step_m
+        series = fft.fftshift(fft.fft(samples[channel].astype(np.complex128), padded)) / padded
+        line = finufft.nufft1d2(2 * np.pi * at / padded, series, isign=1, eps=1e-9)
+        line[(at < 0) | (at > lines.length - 1)] = 0
+        cycles = 2 * lines.carrier_hz * range_m * (1 / speed_m_s[channel] - 1 / speed)
+        samples[channel] = line * np.exp(2j * np.pi * cycles)
+    return replace(lines, samples=samples)
+
+
+@dataclass(frozen=True)
+class _Parameters:
+    """Acquisition parameters: sample rate, group delay in samples, and the pulse."""
+
+    sample_rate_hz: float
+    group_delay: float
+    pulse: Pulse
+
+    @classmethod
+    def read(cls, path: Path) -> _Parameters:
+        rows = _rows(path, 1, 1)
+        if len(rows) <= _TAPER:
+            raise FileFormatError(f"{path} must have {_TAPER + 1} parameters, got {len(rows)}")
+
+        def value(row: int) -> float:
+            return _number(path, rows[row], 1)
+
+        start_hz, stop_hz = value(_START_HZ), value(_STOP_HZ)
+        try:
+            pulse = Pulse(
+                carrier_hz=(start_hz + stop_hz) / 2,
+                bandwidth_hz=abs(stop_hz - start_hz),
+                duration_s=value(_DURATION),
+                code="up" if stop_hz > start_hz else "down",
+                taper=value(_TAPER),
+            )
+            rate_hz = validate.positive("the sample rate", value(_RATE), "Hz")
+        except ValueError as error:
+            raise FileFormatError(f"{path}: {error}") from None
+        return cls(rate_hz, value(_GROUP_DELAY), pulse)
+
+
+def _rows(path: Path, first: int, last: int) -> list[list[str]]:
+    """Return the rows of a CSV file, without a header: a first row lacking numbers in columns."""
+    try:
+        text = reading.read_bytes(path).decode("utf-8-sig")
+        rows = [row for row in csv.reader(text.splitlines()) if row]
+    except (ValueError, csv.Error) as error:
+        raise FileFormatError(f"{path} is not a table: {error}") from None
+    is_header = rows and any(not _is_number(cell) for cell in rows[0][first : last + 1])
+    return rows[1:] if is_header else rows
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        return bool(np.isfinite(float(cell)))
+    except ValueError:
+        return False
+
+
+def _number(path: Path, row: list[str], column: int) -> float:
+    if len(row) <= column or not _is_number(row[column]):
+        raise FileFormatError(
+            f"{path} must have a number in column {column + 1}, got {validate.shown(row)}"
+        )
+    return float(row[column])
+
+
+def _sensors_m(path: Path) -> NDArray[np.float64]:
+    """Return positions of the loudspeaker and the microphones in its home position, [n, 3]."""
+    rows = _rows(path, 1, 3)
+    if len(rows) < 2:
+        raise FileFormatError(f"{path} must have a loudspeaker and microphones, got {len(rows)}")
+    return np.array([[_number(path, row, column) for column in (1, 2, 3)] for row in rows])
+
+
+def _microphones(path: Path, there: list[int], channels: Sequence[int] | None) -> list[int]:
+    if not there:
+        raise FileFormatError(f"{path} must hold microphones of {SENSORS} as /ch1, /ch2, got none")
+    if channels is None:
+        return there
+    numbers = [validate.count("channels", number) for number in channels]
+    if not numbers or not set(numbers) <= set(there):
+        raise ValueError(f"channels must be of {there}, got {validate.shown(channels)}")
+    return numbers
+
+
+def _dataset(file: h5py.File, group: str, name: str) -> NDArray[np.float64]:
+    item = hdf5.find_item(file, group)
+    item = hdf5.find_item(item, name) if isinstance(item, h5py.Group) else None
+    if not isinstance(item, h5py.Dataset) or item.dtype.kind not in "iuf" or not item.size:
+        raise FileFormatError(f"must hold numbers as /{group}/{name}")
+    values = hdf5.read_values(item).astype(np.float32 if name == "ts" else np.float64)
+    if not np.isfinite(values).all():
+        raise FileFormatError(f"must hold finite numbers as /{group}/{name}")
+    return values
+
+
+def _speeds_m_s(temperature: NDArray[np.float64], pings: int) -> NDArray[np.float64]:
+    """Speed of sound at every ping, from the mean of its thermometers."""
+    if temperature.ndim == 1:
+        temperature = temperature[None]
+    if temperature.ndim != 2 or temperature.shape[1] != pings:
+        raise FileFormatError(
+            f"must hold /na/temperature of {pings} pings, got shape {temperature.shape}"
+        )
+    speed = 331.6 + 0.61 * temperature.mean(axis=0)
+    if not (speed.min() > 200 and speed.max() < 600):
+        raise FileFormatError(
+            "must hold /na/temperature in degrees Celsius, got "
+            f"{temperature.min():g} to {temperature.max():g}"
+        )
+    return speed
+
+
+def _conditioned(
+    samples: list[NDArray[np.float32]], time_s: NDArray[np.float64], duration_s: float
+) -> NDArray[np.float32]:
+    """Remove constant and transmission from samples, and join them as [channels, time].
+
+    Until the pulse has been transmitted the microphones record it directly. They are silenced, and
+    faded in over another pulse length.
+    """
+    ramp = np.clip(time_s / duration_s - 1, 0, 1)
+    blanking = np.sin(np.pi / 2 * ramp).astype(np.float32) ** 2
+    together = np.stack(samples, axis=1)
+    together -= together.mean(axis=-1, keepdims=True, dtype=np.float64).astype(np.float32)
+    together *= blanking
+    return together.reshape(-1, together.shape[-1])

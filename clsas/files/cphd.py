@@ -1,0 +1,320 @@
+"""Compensated phase history data (CPHD, NGA.STND.0068) of radar, read by sarkit.
+
+A vector of a CPHD channel is one line. Its signal is relative to the stabilization reference point:
+a target whose delay exceeds that of the point by dt has the phase SGN f dt in cycles, at the
+frequency f in the FX domain, and at the middle of the band in the TOA domain.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.constants import speed_of_light
+
+from clsas.core import reading, validate
+from clsas.core.extras import install_command
+from clsas.core.lines import RangeLines
+from clsas.files.hdf5 import FileFormatError
+from clsas.signal.compression import Window
+from clsas.signal.phase_history import from_phase_history
+
+SPEED, ORIGIN = "clsas.sound_speed_m_s", "clsas.origin_m"
+"""Names of parameters of the collection that say what a CPHD file of a sonar stands for."""
+
+START = b"CPHD/"
+_LONGEST_XML = 64 << 20  # bytes; files with thousands of parameters have less than one MiB
+_BYTES = 24  # memory per sample while a signal becomes lines: as read, as complex64, and in work
+
+
+def sarkit_cphd() -> ModuleType:
+    """Import `sarkit.cphd`, or raise ImportError with the command that installs it."""
+    try:
+        import sarkit.cphd
+    except ImportError as error:
+        raise ImportError(f"CPHD files need sarkit: {install_command('radar')}") from error
+    return sarkit.cphd
+
+
+def read_cphd(
+    path: str | os.PathLike,
+    *,
+    channel: str | None = None,
+    window: Window = "none",
+    oversampling: float = 2.0,
+) -> RangeLines:
+    """Read a channel of a CPHD file of the FX or TOA domain, monostatic or bistatic.
+
+    Parameters
+    ----------
+    path : path-like
+        The file, of version 1.0.1 or 1.1.0.
+    channel : str, optional
+        Identifier of the channel; by default the file's reference channel.
+    window : str, float or tuple
+        Window over the frequencies of FX data, as in `from_phase_history`. TOA data are compressed
+        already and take none.
+    oversampling : float
+        Sample rate of FX data's lines over the bandwidth, at least 1.
+
+    Returns
+    -------
+    RangeLines
+        One line per vector with a signal. Positions are relative to the image area's reference
+        point (IARP): x and y along the image area's axes, z normal to them. Where the reference
+        surface is not a plane, x is east, y is north and z is up at the IARP.
+
+    Raises
+    ------
+    FileFormatError
+        If the file is damaged, incomplete or compressed, or claims more than it holds.
+    ValueError
+        If the file has no such channel, or an option is outside its limits.
+    ImportError
+        If sarkit is not installed (extra `radar`).
+    OSError
+        If the file cannot be read.
+
+    Notes
+    -----
+    Positions are those that the file gives for every vector, at the times of transmission and
+    reception, which is the standard's model. CPHD knows one speed of waves, that of light. A file
+    that clsas wrote of sonar lines says which speed it stands for, and frequencies are brought
+    back.
+    """
+    sarkit = sarkit_cphd()
+    path = validate.path("path", path)
+    with _defects(path):
+        reading.check_ordinary(path)
+    with path.open("rb") as file:
+        with _defects(path):
+            header = _header(file, path.stat().st_size)
+            file.seek(0)
+            reader = sarkit.Reader(file)
+            tree = sarkit.ElementWrapper(reader.metadata.xmltree.getroot())
+            there = [each["Identifier"] for each in tree["Data"].findall("Channel")]
+            reference = tree["Channel"]["RefChId"]
+        if channel is not None and channel not in there:
+            raise ValueError(f"channel must be one of {there}, got {validate.shown(channel)}")
+        with _defects(path):
+            name = reference if channel is None else channel
+            _check_sizes(tree, name, header, path.stat().st_size)
+            vectors = reader.read_pvps(name)
+            signal = reader.read_signal(name)
+            collection = _Collection(tree)
+            kept = _usable(vectors)
+            if not kept.any():
+                raise FileFormatError("must hold vectors with a signal, got none")
+            vectors, signal = vectors[kept], _complex(signal[kept])
+            if "AmpSF" in vectors.dtype.names:
+                signal *= vectors["AmpSF"].astype(np.float32)[:, None]
+            if collection.sign == 1:
+                np.conj(signal, out=signal)
+    if collection.domain == "FX":
+        return _lines_of_fx(signal, vectors, collection, window, oversampling)
+    with _defects(path):
+        return _lines_of_toa(signal, vectors, collection)
+
+
+@contextmanager
+def _defects(path: Path) -> Iterator[None]:
+    """Turn every exception of reading into FileFormatError with the file's name."""
+    try:
+        yield
+    except FileFormatError as error:
+        raise FileFormatError(f"{path} {error}") from None
+    except (MemoryError, OSError):
+        raise
+    # sarkit and lxml report damage by any exception.
+    except Exception as error:
+        text = validate.shown(str(error) or type(error).__name__)
+        raise FileFormatError(f"{path} is damaged: {text}") from error
+
+
+def _header(file: Any, size: int) -> dict[str, int]:
+    """Return offset and size of the file's blocks; all lie within the file."""
+    start = file.read(1 << 14)
+    if not start.startswith(START) or b"\f\n" not in start:
+        raise FileFormatError("is not a CPHD file")
+    rows = start[: start.index(b"\f\n")].decode().splitlines()[1:]
+    fields = dict(row.split(" := ", 1) for row in rows if " := " in row)
+    values = {}
+    for block in ("XML", "PVP", "SIGNAL"):
+        names = [f"{block}_BLOCK_{part}" for part in ("BYTE_OFFSET", "SIZE")]
+        if not all(
+            fields.get(name, "").isascii() and fields.get(name, "").isdigit() for name in names
+        ):
+            raise FileFormatError(f"lacks {' or '.join(names)}")
+        offset, length = (int(fields[name]) for name in names)
+        if offset + length > size:
+            raise FileFormatError(
+                f"is damaged: its {block} block ends at byte {offset + length} of {size}"
+            )
+        values |= {names[0]: offset, names[1]: length}
+    if values["XML_BLOCK_SIZE"] > _LONGEST_XML:
+        raise FileFormatError(f"must have at most {_LONGEST_XML} bytes of XML")
+    return values
+
+
+def _check_sizes(tree: Any, name: str, header: dict[str, int], size: int) -> None:
+    """Raise FileFormatError unless the arrays of a channel lie within the file and fit memory."""
+    data = tree["Data"]
+    if "SignalCompressionID" in data:
+        raise FileFormatError("must not have a compressed signal")
+    described = next((each for each in data.findall("Channel") if each["Identifier"] == name), None)
+    if described is None:
+        raise FileFormatError(f"lacks its channel {validate.shown(name)}")
+    vectors, length = described["NumVectors"], described["NumSamples"]
+    item = {"CI2": 2, "CI4": 4, "CF8": 8}.get(data["SignalArrayFormat"])
+    if item is None:
+        raise FileFormatError(f"has an unknown format {validate.shown(data['SignalArrayFormat'])}")
+    if vectors < 1 or length < 2:
+        raise FileFormatError(f"must hold lines, got {vectors} of {length} samples")
+    parts = {
+        "SIGNAL": described["SignalArrayByteOffset"] + vectors * length * item,
+        "PVP": described["PVPArrayByteOffset"] + vectors * data["NumBytesPVP"],
+    }
+    for block, end in parts.items():
+        if end > header[f"{block}_BLOCK_SIZE"]:
+            raise FileFormatError(
+                f"is damaged: {vectors} vectors of {length} samples exceed its {block} block"
+            )
+    try:
+        validate.memory("reading its signal", _BYTES * vectors * length)
+    except ValueError as error:
+        raise FileFormatError(f"is too large: {error}") from None
+
+
+class _Collection:
+    """What a file says of all its vectors: domain, sign, coordinates, and the speed of waves."""
+
+    def __init__(self, tree: Any) -> None:
+        self.domain: str = validate.one_of(
+            "its domain", tree["Global"]["DomainType"], ("FX", "TOA")
+        )
+        self.sign = int(tree["Global"]["SGN"])
+        if self.sign not in (-1, 1):
+            raise FileFormatError(f"must have the sign +1 or -1, got {self.sign}")
+        scene = tree["SceneCoordinates"]
+        self.centre_m = _vector(scene["IARP"]["ECF"])
+        surface = scene["ReferenceSurface"]
+        if "Planar" in surface:
+            x, y = _vector(surface["Planar"]["uIAX"]), _vector(surface["Planar"]["uIAY"])
+            z = np.cross(x, y)
+        else:
+            latitude, longitude = np.radians(_vector(scene["IARP"]["LLH"])[:2])
+            x = np.array([-np.sin(longitude), np.cos(longitude), 0])
+            z = np.array(
+                [
+                    np.cos(latitude) * np.cos(longitude),
+                    np.cos(latitude) * np.sin(longitude),
+                    np.sin(latitude),
+                ]
+            )
+            y = np.cross(z, x)
+        self.axes = np.stack([x, y, z])
+        if not np.allclose(self.axes @ self.axes.T, np.eye(3), atol=1e-5):
+            raise FileFormatError("must have orthogonal axes of length 1")
+        described = tree["CollectionID"].findall("Parameter")
+        own = {name: value for name, value in (each for each in described)}
+        self.speed_m_s = float(own.get(SPEED, speed_of_light))
+        self.origin_m = np.array(own.get(ORIGIN, "0 0 0").split(), dtype=np.float64)
+
+    @property
+    def frequency_scale(self) -> float:
+        """Frequencies of the waves that the file stands for, over those that it gives."""
+        return self.speed_m_s / speed_of_light
+
+    def local_m(self, position_m: NDArray) -> NDArray[np.float64]:
+        """Return positions in local coordinates."""
+        return (position_m.astype(np.float64) - self.centre_m) @ self.axes.T + self.origin_m
+
+
+def _vector(value: Any) -> NDArray[np.float64]:
+    vector = np.asarray(value, dtype=np.float64)
+    if vector.shape != (3,) or not np.isfinite(vector).all():
+        raise FileFormatError(f"must have positions of three numbers, got {validate.shown(value)}")
+    return vector
+
+
+def _usable(vectors: NDArray) -> NDArray[np.bool_]:
+    """Return which vectors hold a signal and are complete."""
+    usable = np.ones(len(vectors), bool)
+    if "SIGNAL" in vectors.dtype.names:
+        usable &= vectors["SIGNAL"] == 1
+    for name in ("TxPos", "RcvPos", "SRPPos"):
+        usable &= np.isfinite(vectors[name]).all(axis=1)
+    for name in ("SC0", "SCSS", "FX1", "FX2"):
+        usable &= np.isfinite(vectors[name])
+    return usable
+
+
+def _complex(signal: NDArray) -> NDArray[np.complex64]:
+    if signal.dtype.names:
+        return (signal["real"] + np.complex64(1j) * signal["imag"]).astype(np.complex64)
+    return signal.astype(np.complex64)
+
+
+def _geometry(vectors: NDArray, collection: _Collection) -> dict[str, Any]:
+    """Return positions, and the range to the reference point, of every vector."""
+    tx_m, rx_m, point_m = (
+        collection.local_m(vectors[name]) for name in ("TxPos", "RcvPos", "SRPPos")
+    )
+    range_m = [np.linalg.norm(each - point_m, axis=1) for each in (tx_m, rx_m)]
+    return {"tx_m": tx_m, "rx_m": rx_m, "reference_range_m": (range_m[0] + range_m[1]) / 2}
+
+
+def _lines_of_fx(
+    signal: NDArray[np.complex64],
+    vectors: NDArray,
+    collection: _Collection,
+    window: Window,
+    oversampling: float,
+) -> RangeLines:
+    scale = collection.frequency_scale
+    sampled_hz = signal.shape[1] * vectors["SCSS"]
+    occupied = float(np.max((vectors["FX2"] - vectors["FX1"]) / sampled_hz))
+    oversampling = validate.number("oversampling", oversampling, least=1.0)
+    return from_phase_history(
+        signal,
+        first_frequency_hz=scale * vectors["SC0"].astype(np.float64),
+        frequency_step_hz=scale * vectors["SCSS"].astype(np.float64),
+        **_geometry(vectors, collection),
+        sound_speed_m_s=collection.speed_m_s,
+        window=window,
+        oversampling=max(1.0, oversampling * min(1.0, occupied)),
+    )
+
+
+def _lines_of_toa(
+    signal: NDArray[np.complex64], vectors: NDArray, collection: _Collection
+) -> RangeLines:
+    """Bring signals, at the middle of each vector's band, to one carrier and absolute ranges."""
+    geometry = _geometry(vectors, collection)
+    reference_m = geometry.pop("reference_range_m")
+    step_s, start_s = (vectors[name].astype(np.float64) for name in ("SCSS", "SC0"))
+    if np.ptp(step_s) * signal.shape[1] > 1e-3 * step_s[0]:
+        raise FileFormatError("must have TOA samples at one step, got several (SCSS)")
+    middle_hz = (vectors["FX1"].astype(np.float64) + vectors["FX2"]) / 2
+    carrier_hz = math.fsum(middle_hz) / len(middle_hz)
+    samples = np.empty_like(signal)
+    number = np.arange(signal.shape[1])
+    for row, line in enumerate(signal):
+        cycles = (middle_hz[row] - carrier_hz) * (start_s[row] + number * step_s[0])
+        cycles -= 2 * carrier_hz / speed_of_light * reference_m[row]
+        samples[row] = line * np.exp(2j * np.pi * (cycles - np.rint(cycles)))
+    return RangeLines(
+        samples,
+        first_range_m=reference_m + speed_of_light / 2 * start_s,
+        range_step_m=float(speed_of_light / 2 * step_s[0]),
+        **geometry,
+        carrier_hz=carrier_hz * collection.frequency_scale,
+        sound_speed_m_s=collection.speed_m_s,
+    )

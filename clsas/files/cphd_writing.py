@@ -1,0 +1,275 @@
+"""Range lines written as compensated phase history data (CPHD) of the TOA domain."""
+
+from __future__ import annotations
+
+import datetime
+import os
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.constants import speed_of_light
+
+from clsas.core import validate
+from clsas.core.atomic import replacing
+from clsas.core.lines import RangeLines
+from clsas.files.cphd import ORIGIN, SPEED, sarkit_cphd
+
+SUFFIXES = (".cphd",)
+"""Suffix of CPHD files."""
+
+_NAMESPACE = "http://api.nsgreg.nga.mil/schema/cphd/1.1.0"
+_CHANNEL = "1"
+_EQUATOR_M = np.array([6378137.0, 0.0, 0.0])  # latitude and longitude 0: on the WGS 84 ellipsoid
+_AXES = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])  # east, north, up there
+_NEAR_M = 1e4  # positions closer to the origin stay where they are relative to it
+_NEAREST_M = 10.0  # of the reference point: angles at the Earth's centre must differ in float64
+_GRID = 1024  # lines and samples of the image grid that is proposed
+_DEPRESSION = np.radians(30)  # of the reference point as seen from the track
+_PULSE_INTERVAL_S = 1e-3
+_OVERSAMPLING = 1.25  # sample rate over the band that is declared; the standard asks for 1.1
+_POSITION = ("f8", (3,))
+_VECTOR = np.dtype(
+    [("TxTime", "f8"), ("TxPos", *_POSITION), ("TxVel", *_POSITION)]
+    + [("RcvTime", "f8"), ("RcvPos", *_POSITION), ("RcvVel", *_POSITION), ("SRPPos", *_POSITION)]
+    + [(name, "f8") for name in ("aFDOP", "aFRR1", "aFRR2", "FX1", "FX2", "TOA1", "TOA2")]
+    + [("TDTropoSRP", "f8"), ("SC0", "f8"), ("SCSS", "f8"), ("SIGNAL", "i8")]
+)
+"""Parameters of a vector, in the order of the file."""
+
+
+def write_cphd(path: str | os.PathLike, lines: RangeLines) -> None:
+    """Write range lines as a CPHD file, version 1.1.0, of the TOA domain.
+
+    `read_cphd` returns the lines in the same coordinates, with the samples' precision.
+
+    Parameters
+    ----------
+    path : path-like
+        The file; an existing one is replaced in one step. Its name ends in .cphd.
+    lines : RangeLines
+        Lines without receiver velocities: the standard's model has no motion during flight.
+
+    Raises
+    ------
+    TypeError
+        If `lines` are no range lines.
+    ValueError
+        If the lines have receiver velocities, or the file's name has another suffix.
+    ImportError
+        If sarkit is not installed (extra `radar`).
+    OSError
+        If the file cannot be written.
+
+    Notes
+    -----
+    CPHD knows one speed of waves, that of light. Lines of another speed c are written with the same
+    wavelengths and geometry: frequencies are multiplied by 299 792 458 m/s over c, so that any
+    processor of CPHD forms the same image. A parameter of the collection keeps c. The origin lies
+    at latitude and longitude 0, with x east, y north and z up. Times, velocities, polarization and
+    the date are not known to range lines: they are placeholders. Lines on their carrier
+    (`carrier_hz` 0) are written, and read back, on half of their sample rate.
+    """
+    sarkit = sarkit_cphd()
+    path = validate.path("path", path)
+    validate.suffix("path", path, *SUFFIXES)
+    validate.instance("lines", lines, RangeLines)
+    if lines.rx_velocity_m_s is not None:
+        raise ValueError(
+            "lines must not have rx_velocity_m_s: CPHD has no motion of receivers during flight"
+        )
+    origin_m = np.rint(lines.phase_centres_m.mean(axis=0))
+    origin_m *= np.abs(origin_m).max() > _NEAR_M
+    vectors, signal = _vectors(lines, origin_m)
+    tree = _document(sarkit, lines, vectors, origin_m, "TOA")
+    with replacing(path) as temporary, temporary.open("wb") as file:
+        write_vectors(sarkit, file, tree, vectors, signal)
+
+
+def write_vectors(sarkit: Any, file: Any, tree: Any, vectors: NDArray, signal: NDArray) -> None:
+    """Write a document with the vectors and the signal of its one channel."""
+    with sarkit.Writer(file, sarkit.Metadata(xmltree=tree)) as writer:
+        writer.write_pvp(_CHANNEL, vectors)
+        writer.write_signal(_CHANNEL, signal)
+
+
+def _vectors(lines: RangeLines, origin_m: NDArray) -> tuple[NDArray, NDArray[np.complex64]]:
+    """Return parameters per vector, and the signal relative to the reference point."""
+    scale = speed_of_light / lines.sound_speed_m_s
+    rate_hz = speed_of_light / (2 * lines.range_step_m)
+    carrier_hz = scale * lines.carrier_hz or rate_hz / 2
+    tx_m, rx_m = lines.tx_m - origin_m, lines.rx_m - origin_m
+    along, point_m = _reference(tx_m, rx_m, lines)
+    reference_m = sum(np.linalg.norm(each - point_m, axis=1) for each in (tx_m, rx_m)) / 2
+    vectors = np.zeros(lines.channels, _VECTOR)
+    delay_s = 2 * reference_m / speed_of_light
+    interval_s = max(_PULSE_INTERVAL_S, 1.1 * float(delay_s.max()))
+    vectors["TxTime"] = interval_s * np.arange(lines.channels)
+    vectors["RcvTime"] = vectors["TxTime"] + delay_s
+    extent_m = max(float(np.ptp((tx_m + rx_m) / 2 @ along)), 1.0)
+    velocity_m_s = along * extent_m / (interval_s * lines.channels) @ _AXES
+    for side, position_m in (("Tx", tx_m), ("Rcv", rx_m)):
+        vectors[f"{side}Pos"] = _EQUATOR_M + position_m @ _AXES
+        vectors[f"{side}Vel"] = velocity_m_s
+    vectors["SRPPos"] = _EQUATOR_M + point_m @ _AXES
+    half_band_hz = min(rate_hz / _OVERSAMPLING, 1.99 * carrier_hz) / 2
+    vectors["FX1"], vectors["FX2"] = carrier_hz - half_band_hz, carrier_hz + half_band_hz
+    vectors["SC0"] = 2 * (lines.first_range_m - reference_m) / speed_of_light
+    vectors["SCSS"] = 1 / rate_hz
+    vectors["TOA1"] = vectors["SC0"]
+    vectors["TOA2"] = vectors["SC0"] + (lines.length - 1) / rate_hz
+    vectors["SIGNAL"] = 1
+    # The phase of the reference range comes off, and that of a carrier that the lines still have.
+    moved_hz = carrier_hz - scale * lines.carrier_hz
+    signal = np.empty_like(lines.samples)
+    for row, line in enumerate(lines.samples):
+        range_m = lines.first_range_m[row] + np.arange(lines.length) * lines.range_step_m
+        cycles = 2 / speed_of_light * (carrier_hz * reference_m[row] - moved_hz * range_m)
+        signal[row] = line * np.exp(2j * np.pi * (cycles - np.rint(cycles)))
+    return vectors, signal
+
+
+def _reference(
+    tx_m: NDArray, rx_m: NDArray, lines: RangeLines
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the track's direction, and a reference point to its left in the middle of the lines.
+
+    Where the scene lies is not known. Any point serves: phases and ranges are relative to it.
+    """
+    centres_m = (tx_m + rx_m) / 2
+    middle_m = centres_m.mean(axis=0)
+    along = np.linalg.svd(centres_m - middle_m, full_matrices=False)[2][0]
+    along[2] = 0
+    length = float(np.linalg.norm(along))
+    along = along / length if length > 0.1 else np.array([1.0, 0.0, 0.0])
+    if along @ (centres_m[-1] - centres_m[0]) < 0:
+        along = -along
+    left = np.array([-along[1], along[0], 0.0])
+    range_m = abs(float((lines.first_range_m + lines.last_range_m).mean()) / 2)
+    look = np.cos(_DEPRESSION) * left - np.sin(_DEPRESSION) * np.array([0.0, 0.0, 1.0])
+    return along, middle_m + max(range_m, _NEAREST_M) * look
+
+
+def _document(
+    sarkit: Any, lines: RangeLines, vectors: NDArray, origin_m: NDArray, domain: str
+) -> Any:
+    """Return the XML document of one channel."""
+    import lxml.etree
+
+    tree = lxml.etree.ElementTree(
+        lxml.etree.Element(f"{{{_NAMESPACE}}}CPHD", nsmap={None: _NAMESPACE})
+    )
+    root = sarkit.ElementWrapper(tree.getroot())
+    monostatic = np.array_equal(lines.tx_m, lines.rx_m)
+    own = {
+        SPEED: repr(lines.sound_speed_m_s),
+        ORIGIN: " ".join(repr(float(each)) for each in origin_m),
+    }
+    root["CollectionID"] = {
+        "CollectorName": "clsas",
+        "CoreName": "lines",
+        "CollectType": "MONOSTATIC" if monostatic else "BISTATIC",
+        "RadarMode": {"ModeType": "DYNAMIC STRIPMAP"},
+        "Classification": "UNCLASSIFIED",
+        "ReleaseInfo": "UNRESTRICTED",
+        "Parameter": list(own.items()),
+    }
+    least = {name: float(vectors[name].min()) for name in ("FX1", "TOA1", "TxTime")}
+    most = {name: float(vectors[name].max()) for name in ("FX2", "TOA2", "TxTime")}
+    root["Global"] = {
+        "DomainType": domain,
+        "SGN": -1,
+        "Timeline": {
+            "CollectionStart": datetime.datetime(1970, 1, 1, tzinfo=datetime.UTC),
+            "TxTime1": least["TxTime"],
+            "TxTime2": most["TxTime"],
+        },
+        "FxBand": {"FxMin": least["FX1"], "FxMax": most["FX2"]},
+        "TOASwath": {"TOAMin": least["TOA1"], "TOAMax": most["TOA2"]},
+    }
+    root["SceneCoordinates"] = _scene(vectors)
+    root["Data"] = {
+        "SignalArrayFormat": "CF8",
+        "NumBytesPVP": _VECTOR.itemsize,
+        "NumCPHDChannels": 1,
+        "Channel": [
+            {
+                "Identifier": _CHANNEL,
+                "NumVectors": len(vectors),
+                "NumSamples": lines.length,
+                "SignalArrayByteOffset": 0,
+                "PVPArrayByteOffset": 0,
+            }
+        ],
+        "NumSupportArrays": 0,
+    }
+    fixed = {
+        "FX": not (np.ptp(vectors["FX1"]) or np.ptp(vectors["FX2"])),
+        "TOA": not (np.ptp(vectors["TOA1"]) or np.ptp(vectors["TOA2"])),
+        "SRP": bool(np.all(vectors["SRPPos"] == vectors["SRPPos"][0])),
+    }
+    root["Channel"] = {
+        "RefChId": _CHANNEL,
+        **{f"{name}FixedCPHD": value for name, value in fixed.items()},
+        "Parameters": [
+            {
+                "Identifier": _CHANNEL,
+                "RefVectorIndex": len(vectors) // 2,
+                **{f"{name}Fixed": value for name, value in fixed.items()},
+                "SignalNormal": True,
+                "Polarization": {"TxPol": "UNSPECIFIED", "RcvPol": "UNSPECIFIED"},
+                "FxC": (most["FX2"] + least["FX1"]) / 2,
+                "FxBW": most["FX2"] - least["FX1"],
+                "TOASaved": most["TOA2"] - least["TOA1"],
+                "DwellTimes": {"CODId": "1", "DwellId": "1"},
+            }
+        ],
+    }
+    root["PVP"] = _layout()
+    times = sarkit.compute_t_ref_from_pvps(vectors)
+    root["Dwell"] = {
+        "NumCODTimes": 1,
+        "CODTime": [{"Identifier": "1", "CODTimePoly": [[float(times[0] + times[-1]) / 2]]}],
+        "NumDwellTimes": 1,
+        "DwellTime": [{"Identifier": "1", "DwellTimePoly": [[float(times[-1] - times[0])]]}],
+    }
+    root["ReferenceGeometry"] = sarkit.compute_reference_geometry(tree, vectors)
+    return tree
+
+
+def _scene(vectors: NDArray) -> dict[str, Any]:
+    """Scene coordinates: the plane of the equator's tangent, and an area about the reference."""
+    import sarkit.wgs84
+
+    point_m = (vectors["SRPPos"][len(vectors) // 2] - _EQUATOR_M) @ _AXES.T
+    distance_m = np.linalg.norm(vectors["TxPos"] - vectors["SRPPos"], axis=1).max()
+    swath_m = speed_of_light / 2 * float((vectors["TOA2"] - vectors["TOA1"]).max())
+    half_m = float(max(distance_m, swath_m))
+    first, last = point_m[:2] - half_m, point_m[:2] + half_m
+    spacing_m = 2 * half_m / _GRID
+    corners_m = np.array(
+        [[first[0], last[1], 0], [last[0], last[1], 0], [last[0], first[1], 0], [*first, 0]]
+    )  # clockwise
+    corners = sarkit.wgs84.cartesian_to_geodetic(_EQUATOR_M + corners_m @ _AXES)
+    return {
+        "EarthModel": "WGS_84",
+        "IARP": {"ECF": _EQUATOR_M, "LLH": np.zeros(3)},
+        "ReferenceSurface": {"Planar": {"uIAX": _AXES[0], "uIAY": _AXES[1]}},
+        "ImageArea": {"X1Y1": first, "X2Y2": last},
+        "ImageAreaCornerPoints": corners[:, :2],
+        "ImageGrid": {
+            "Identifier": _CHANNEL,
+            "IARPLocation": -first / spacing_m - 0.5,
+            "IAXExtent": {"LineSpacing": spacing_m, "FirstLine": 0, "NumLines": _GRID},
+            "IAYExtent": {"SampleSpacing": spacing_m, "FirstSample": 0, "NumSamples": _GRID},
+        },
+    }
+
+
+def _layout() -> dict[str, dict[str, Any]]:
+    """Where every parameter lies in a vector."""
+    fields = _VECTOR.fields or {}
+    return {
+        name: {"Offset": offset // 8, "Size": dtype.itemsize // 8, "dtype": dtype}
+        for name, (dtype, offset, *_) in fields.items()
+    }

@@ -1,0 +1,104 @@
+"""Range lines of a full matrix capture: every element transmits, all receive."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from clsas.core import validate
+from clsas.core.lines import RangeLines
+from clsas.signal.compression import Window, compress
+from clsas.signal.echoes import Echoes
+
+
+def from_full_matrix(
+    samples: ArrayLike,
+    elements_m: ArrayLike,
+    *,
+    sample_rate_hz: float,
+    carrier_hz: float,
+    sound_speed_m_s: float,
+    start_time_s: float = 0.0,
+    pairs: tuple[ArrayLike, ArrayLike] | None = None,
+    bandwidth_hz: float | None = None,
+    window: Window = "hann",
+    oversampling: float = 2.0,
+) -> RangeLines:
+    """Return range lines of an array whose elements transmit in turn.
+
+    Parameters
+    ----------
+    samples : array_like of float, [tx, rx, time] or [pairs, time]
+        Real samples on their carrier.
+    elements_m : array_like of float, [elements, 3]
+        Positions of the elements.
+    sample_rate_hz : float
+        Samples per second.
+    carrier_hz : float
+        Centre frequency of the elements.
+    sound_speed_m_s : float
+        Speed of the waves in the material.
+    start_time_s : float
+        Time of the first sample after transmission began.
+    pairs : pair of array_like of int, [pairs], optional
+        Transmitting and receiving element of every line, from 0, for samples [pairs, time].
+    bandwidth_hz, window, oversampling
+        As in `compress`, without a pulse: pulses of an array are short. The band is twice the
+        carrier by default, and the window is zero at both of its ends. It removes constants.
+
+    Returns
+    -------
+    RangeLines
+        One line per pair, in the order of the samples. A pair of two elements whose reverse is not
+        among the pairs counts twice, since it stands for its reverse by reciprocity.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If an argument has the wrong type or shape or is outside its limits, or a pair names an
+        element that does not exist or is there twice.
+    """
+    elements_m = validate.array("elements_m", elements_m, np.float64, (None, 3))
+    count = len(elements_m)
+    if pairs is None:
+        samples = validate.array("samples", samples, np.float32, (count, count, None))
+        tx, rx = np.indices((count, count)).reshape(2, -1)
+        samples = samples.reshape(count * count, -1)
+    else:
+        samples = validate.array("samples", samples, np.float32, (None, None))
+        tx, rx = (_elements(each, len(samples), count) for each in pairs)
+    numbers = tx * count + rx
+    if len(np.unique(numbers)) < len(numbers):
+        raise ValueError(f"pairs must differ, got {len(np.unique(numbers))} of {len(numbers)}")
+    alone = (tx != rx) & ~np.isin(rx * count + tx, numbers)
+    lines = compress(
+        Echoes(
+            samples,
+            start_time_s=start_time_s,
+            sample_rate_hz=sample_rate_hz,
+            carrier_hz=carrier_hz,
+            tx_m=elements_m[tx],
+            rx_m=elements_m[rx],
+            sound_speed_m_s=sound_speed_m_s,
+        ),
+        window=window,
+        oversampling=oversampling,
+        bandwidth_hz=2 * carrier_hz if bandwidth_hz is None else bandwidth_hz,
+    )
+    return lines.weighted(np.where(alone, 2.0, 1.0)) if alone.any() else lines
+
+
+def _elements(given: ArrayLike, length: int, count: int) -> np.ndarray:
+    numbers = np.asarray(given)
+    if numbers.dtype.kind not in "iu" or numbers.shape != (length,):
+        raise ValueError(
+            f"pairs must be whole numbers, one per line ({length}), got {numbers.dtype} of shape "
+            f"{numbers.shape}"
+        )
+    numbers = numbers.astype(np.int64)
+    if numbers.min() < 0 or numbers.max() >= count:
+        raise ValueError(
+            f"pairs must name elements from 0 to {count - 1}, got {numbers.min()} to "
+            f"{numbers.max()}"
+        )
+    return numbers

@@ -1,0 +1,152 @@
+"""Range lines from samples over frequency: phase histories of stepped or dechirped pulses."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy import fft
+
+from clsas.core import validate
+from clsas.core.lines import RangeLines
+from clsas.signal.compression import Window, band_window
+
+_BLOCK = 1 << 22  # complex128 samples of the channels that are transformed together
+_EQUAL_STEPS = 1e-6  # cycles at a line's ends by which one common step may be wrong: -104 dB
+
+
+def from_phase_history(
+    samples: ArrayLike,
+    *,
+    first_frequency_hz: ArrayLike,
+    frequency_step_hz: ArrayLike,
+    reference_range_m: ArrayLike,
+    tx_m: ArrayLike,
+    rx_m: ArrayLike,
+    sound_speed_m_s: float,
+    window: Window = "none",
+    oversampling: float = 2.0,
+    sign: int = -1,
+) -> RangeLines:
+    """Return range lines of samples over frequency, such as those of motion-compensated radar.
+
+    A point of amplitude A at range rho gives A exp(sign j 4 pi f (rho - r0)/c) at the frequency f,
+    where r0 is the channel's reference range: range and phase are both relative to it.
+
+    Parameters
+    ----------
+    samples : array_like of complex, [channels, frequencies]
+        Frequency response of every channel. At least 2 frequencies.
+    first_frequency_hz, frequency_step_hz : float or array_like, [channels]
+        Frequency of the first sample, as transmitted, and the step between samples; one number
+        applies to all channels.
+    reference_range_m : float or array_like, [channels]
+        Range r0 (half the two-way path) that each channel is referenced to; 0 if phases are
+        absolute.
+    tx_m, rx_m : array_like, [channels, 3] or [3]
+        Transmitter and receiver positions.
+    sound_speed_m_s : float
+        Speed of the waves; 299 792 458 m/s for radar.
+    window : str, float or tuple
+        Window over the frequencies: "none", or a window of `scipy.signal.get_window`.
+    oversampling : float
+        Samples per line over samples per frequency response, at least 1; zeros pad the spectrum.
+    sign : {-1, +1}
+        Sign of the phase with growing range in `samples`.
+
+    Returns
+    -------
+    RangeLines
+        Lines of one period c/(2 step), centred on the reference range, at the mean frequency as
+        their carrier. Amplitudes are those of the samples. A conjugate is taken where sign is +1,
+        so that A becomes its conjugate.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If an argument has the wrong type or shape, is not finite or outside its limits, or the
+        lines do not fit into memory.
+
+    Notes
+    -----
+    With the centre frequency fc and weights w of sum 1,
+
+        s(r) = exp(-j 4 pi fc r0/c) sum_m w_m S_m exp(j 4 pi (f_m - fc)(r - r0)/c),
+
+    so that a point gives A p(r - rho) exp(-j 2 k rho), k = 2 pi fc/c. Phases of reference ranges
+    are computed in float64. A line is periodic: echoes from beyond one end appear at the other.
+    `RangeLines.tapered_ends` fades the ends, which interpolate poorly.
+    """
+    samples = validate.array("samples", samples, np.complex64, (None, None))
+    channels, count = samples.shape
+    if count < 2:
+        raise ValueError(f"samples must hold at least 2 frequencies, got {count}")
+    if sign not in (-1, 1):
+        raise ValueError(f"sign must be -1 or +1, got {validate.shown(sign)}")
+    oversampling = validate.number("oversampling", oversampling, least=1.0)
+    speed = validate.positive("sound_speed_m_s", sound_speed_m_s, "m/s")
+    first_hz = _per_channel("first_frequency_hz", first_frequency_hz, channels, above=0.0)
+    step_hz = _per_channel("frequency_step_hz", frequency_step_hz, channels, above=0.0)
+    reference_m = _per_channel("reference_range_m", reference_range_m, channels)
+    weights = band_window(window, 1.0)(np.linspace(-0.5, 0.5, count))
+    if not abs(weights.sum()) > 0:
+        raise ValueError(f"window must not have the sum 0, got {validate.shown(window)}")
+    weights = weights / weights.sum()
+
+    validate.memory("oversampling", 8 * channels * oversampling * count)
+    length = fft.next_fast_len(math.ceil(oversampling * count))
+    equal = np.ptp(step_hz) * count <= _EQUAL_STEPS * step_hz.min()
+    # The longest line that no channel's period is shorter than.
+    range_step_m = speed / (2 * length * step_hz.max())
+    offset_m = (np.arange(length) - length // 2) * range_step_m
+    carrier_hz = float(np.mean(first_hz + (count - 1) / 2 * step_hz))
+
+    lines = np.empty((channels, length), np.complex64)
+    rows = max(1, _BLOCK // length)
+    for first in range(0, channels, rows):
+        block = slice(first, first + rows)
+        spectrum = samples[block].astype(np.complex128)
+        spectrum = (spectrum if sign == -1 else spectrum.conj()) * weights
+        if equal:
+            part = fft.fftshift(length * fft.ifft(spectrum, length, workers=-1), axes=1)
+        else:
+            part = _at_own_steps(spectrum, step_hz[block] / step_hz.max(), length)
+        cycles = np.multiply.outer(2 * (first_hz[block] - carrier_hz) / speed, offset_m)
+        cycles -= (2 * carrier_hz / speed * reference_m[block])[:, None]
+        lines[block] = part * np.exp(2j * np.pi * (cycles - np.rint(cycles)))
+    return RangeLines(
+        lines,
+        first_range_m=reference_m + offset_m[0],
+        range_step_m=range_step_m,
+        tx_m=tx_m,
+        rx_m=rx_m,
+        carrier_hz=carrier_hz,
+        sound_speed_m_s=speed,
+    )
+
+
+def _per_channel(
+    name: str, value: ArrayLike, channels: int, *, above: float | None = None
+) -> NDArray[np.float64]:
+    """Return one number per channel, each greater than `above`."""
+    array = validate.array(name, value, np.float64, (channels,), broadcast=True)
+    if above is not None and not array.min() > above:
+        raise ValueError(f"{name} must be > {above:g}, got {array.min():g}")
+    return array
+
+
+def _at_own_steps(
+    spectrum: NDArray[np.complex128], ratio: NDArray[np.float64], length: int
+) -> NDArray[np.complex128]:
+    """Sum of S_m exp(j 2 pi m n ratio/length) over m, for n from -length/2, per channel."""
+    import finufft  # slow to import
+
+    number = np.arange(length) - length // 2
+    middle = spectrum.shape[1] // 2
+    result = np.empty((len(spectrum), length), np.complex128)
+    for row, (line, scale) in enumerate(zip(spectrum, ratio, strict=True)):
+        angle = 2 * np.pi * scale / length * number
+        result[row] = finufft.nufft1d2(angle, line, isign=1, eps=1e-9)
+        result[row] *= np.exp(1j * middle * angle)
+    return result
