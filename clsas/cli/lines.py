@@ -107,19 +107,16 @@ def compress(
 
 @click.command()
 @click.argument("recording", metavar="FILE", type=INPUT)
-@click.option(
-    "-o", "--output", type=Output(*SUFFIXES), required=True,
-    help="File to write: HDF5, or CPHD if its name ends in .cphd.",
-)  # fmt: skip
+@click.argument("output", metavar="OUTPUT", type=Output(*SUFFIXES))
 @options.as_json
 def convert(recording: Path, output: Path, as_json: bool) -> None:
     """Convert a file: recordings to range lines in HDF5, range lines to CPHD and back.
 
-    Reads what `clsas image` reads: HDF5 of clsas, CPHD, AirSAS, and MATLAB files with a radar's
-    phase history or a full matrix capture.
+    The name of OUTPUT says what it becomes: HDF5 (.h5) or CPHD (.cphd). FILE is HDF5 of clsas or
+    AirSAS, CPHD, or a MATLAB file with a radar's phase history or a full matrix capture.
 
     \b
-    Example:  clsas convert lines.h5 -o lines.cphd
+    Example:  clsas convert lines.h5 lines.cphd
     """
     start = time.perf_counter()
     obj = clsas.load(recording)

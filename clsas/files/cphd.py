@@ -11,6 +11,7 @@ import math
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -108,7 +109,7 @@ def read_cphd(
             _check_sizes(tree, name, header, path.stat().st_size)
             vectors = reader.read_pvps(name)
             signal = reader.read_signal(name)
-            collection = _Collection(tree)
+            collection = _Collection.read(tree)
             kept = _usable(vectors)
             if not kept.any():
                 raise FileFormatError("must hold vectors with a signal, got none")
@@ -148,11 +149,10 @@ def _header(file: Any, size: int) -> dict[str, int]:
     values = {}
     for block in ("XML", "PVP", "SIGNAL"):
         names = [f"{block}_BLOCK_{part}" for part in ("BYTE_OFFSET", "SIZE")]
-        if not all(
-            fields.get(name, "").isascii() and fields.get(name, "").isdigit() for name in names
-        ):
+        given = [fields.get(name, "") for name in names]
+        if not all(each.isascii() and each.isdigit() for each in given):
             raise FileFormatError(f"lacks {' or '.join(names)}")
-        offset, length = (int(fields[name]) for name in names)
+        offset, length = map(int, given)
         if offset + length > size:
             raise FileFormatError(
                 f"is damaged: its {block} block ends at byte {offset + length} of {size}"
@@ -192,40 +192,39 @@ def _check_sizes(tree: Any, name: str, header: dict[str, int], size: int) -> Non
         raise FileFormatError(f"is too large: {error}") from None
 
 
+@dataclass(frozen=True, eq=False)
 class _Collection:
-    """What a file says of all its vectors: domain, sign, coordinates, and the speed of waves."""
+    """What a file says of all its vectors.
 
-    def __init__(self, tree: Any) -> None:
-        self.domain: str = validate.one_of(
-            "its domain", tree["Global"]["DomainType"], ("FX", "TOA")
-        )
-        self.sign = int(tree["Global"]["SGN"])
-        if self.sign not in (-1, 1):
-            raise FileFormatError(f"must have the sign +1 or -1, got {self.sign}")
-        scene = tree["SceneCoordinates"]
-        self.centre_m = _vector(scene["IARP"]["ECF"])
-        surface = scene["ReferenceSurface"]
-        if "Planar" in surface:
-            x, y = _vector(surface["Planar"]["uIAX"]), _vector(surface["Planar"]["uIAY"])
-            z = np.cross(x, y)
-        else:
-            latitude, longitude = np.radians(_vector(scene["IARP"]["LLH"])[:2])
-            x = np.array([-np.sin(longitude), np.cos(longitude), 0])
-            z = np.array(
-                [
-                    np.cos(latitude) * np.cos(longitude),
-                    np.cos(latitude) * np.sin(longitude),
-                    np.sin(latitude),
-                ]
-            )
-            y = np.cross(z, x)
-        self.axes = np.stack([x, y, z])
-        if not np.allclose(self.axes @ self.axes.T, np.eye(3), atol=1e-5):
+    Positions in Earth-centred coordinates become local: relative to `centre_m`, along `axes`
+    (rows), plus `origin_m`.
+    """
+
+    domain: str
+    sign: int
+    centre_m: NDArray[np.float64]
+    axes: NDArray[np.float64]
+    origin_m: NDArray[np.float64]
+    speed_m_s: float
+
+    @classmethod
+    def read(cls, tree: Any) -> _Collection:
+        """Return it from the root of the XML."""
+        whole, scene = tree["Global"], tree["SceneCoordinates"]
+        if whole["SGN"] not in (-1, 1):
+            raise FileFormatError(f"must have the sign +1 or -1, got {whole['SGN']}")
+        own = dict(tree["CollectionID"].findall("Parameter"))
+        axes = _axes(scene)
+        if not np.allclose(axes @ axes.T, np.eye(3), atol=1e-5):
             raise FileFormatError("must have orthogonal axes of length 1")
-        described = tree["CollectionID"].findall("Parameter")
-        own = {name: value for name, value in (each for each in described)}
-        self.speed_m_s = float(own.get(SPEED, speed_of_light))
-        self.origin_m = np.array(own.get(ORIGIN, "0 0 0").split(), dtype=np.float64)
+        return cls(
+            domain=validate.one_of("its domain", whole["DomainType"], ("FX", "TOA")),
+            sign=whole["SGN"],
+            centre_m=_vector(scene["IARP"]["ECF"]),
+            axes=axes,
+            origin_m=_vector(own.get(ORIGIN, "0 0 0").split()),
+            speed_m_s=validate.positive("its speed", float(own.get(SPEED, speed_of_light)), "m/s"),
+        )
 
     @property
     def frequency_scale(self) -> float:
@@ -235,6 +234,19 @@ class _Collection:
     def local_m(self, position_m: NDArray) -> NDArray[np.float64]:
         """Return positions in local coordinates."""
         return (position_m.astype(np.float64) - self.centre_m) @ self.axes.T + self.origin_m
+
+
+def _axes(scene: Any) -> NDArray[np.float64]:
+    """Return unit vectors of local x, y and z: of a plane, else east, north and up."""
+    surface = scene["ReferenceSurface"]
+    if "Planar" in surface:
+        x, y = (_vector(surface["Planar"][name]) for name in ("uIAX", "uIAY"))
+        return np.stack([x, y, np.cross(x, y)])
+    latitude, longitude = np.radians(_vector(scene["IARP"]["LLH"])[:2])
+    east = np.array([-np.sin(longitude), np.cos(longitude), 0.0])
+    up = np.cos(latitude) * np.array([np.cos(longitude), np.sin(longitude), 0.0])
+    up[2] = np.sin(latitude)
+    return np.stack([east, np.cross(up, east), up])
 
 
 def _vector(value: Any) -> NDArray[np.float64]:

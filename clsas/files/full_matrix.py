@@ -84,7 +84,7 @@ def full_matrix_lines(
     if {len(other) for other in others} != {len(x_m)}:
         raise FileFormatError(f"{os.fspath(path)} must hold as many el_yc and el_zc as el_xc")
     tx, rx = (matlab.numbers(path, capture, name, 1) for name in ("tx", "rx"))
-    if tx.dtype.kind == "c" or rx.dtype.kind == "c" or np.any(tx % 1) or np.any(rx % 1):
+    if np.any(tx % 1) or np.any(rx % 1):
         raise FileFormatError(f"{os.fspath(path)} must hold tx and rx as whole numbers")
     samples = matlab.numbers(path, capture, "time_data", 2).T
     if samples.shape != (len(tx), len(time_s)) or len(rx) != len(tx):
@@ -92,19 +92,18 @@ def full_matrix_lines(
             f"{os.fspath(path)} must hold time_data of shape [time, pairs], "
             f"{len(time_s)} by {len(tx)}, got {samples.shape[::-1]}"
         )
+    carrier_hz = float(matlab.numbers(path, array, "centre_freq", 0))
     try:
         return from_full_matrix(
             samples,
             np.stack([x_m, *others], axis=-1),
             sample_rate_hz=float((len(time_s) - 1) / (time_s[-1] - time_s[0])),
-            carrier_hz=float(matlab.numbers(path, array, "centre_freq", 0)),
+            carrier_hz=carrier_hz,
             sound_speed_m_s=sound_speed_m_s,
             start_time_s=float(time_s[0]),
             pairs=(tx.astype(np.int64) - 1, rx.astype(np.int64) - 1),
             window=window,
             oversampling=oversampling,
         )
-    except FileFormatError:
-        raise
     except (TypeError, ValueError) as error:
         raise type(error)(f"{os.fspath(path)}: {error}") from None

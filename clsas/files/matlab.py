@@ -1,8 +1,8 @@
-"""MATLAB files of version 5 to 7, read by SciPy after a check of their sizes.
+"""MATLAB files of version 5 to 7: their numbers and structures.
 
-A file decides how much memory a reader allocates: by how far its parts unpack, and by the number of
-elements that cells and structures claim. Both are compared with the memory, and with what is there,
-before SciPy reads the file.
+Files are untrusted. SciPy's reader ends the process (a segmentation fault) on some damaged ones,
+and allocates what cells claim to hold. This reader takes the part of the format that recordings
+use. Every size is compared with what is there, or with the memory, before anything is allocated.
 """
 
 from __future__ import annotations
@@ -11,7 +11,6 @@ import math
 import os
 import struct
 import zlib
-from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -22,9 +21,22 @@ from clsas.files.hdf5 import FileFormatError
 
 _HEADER = 128  # bytes: text, and at their end version and byte order
 _MATRIX, _COMPRESSED = 14, 15  # types of elements
-_CELL, _STRUCT, _OBJECT = 1, 2, 3  # classes of matrices that hold further matrices
-_DEEPEST = 32  # matrices within matrices
-_READ_TIMES = 6  # memory that SciPy and a reader take per unpacked byte: 16-bit samples as complex
+_STRUCTURE, _COMPLEX = 2, 0x800  # class and flag of a matrix
+_DEEPEST = 32  # structures within structures
+# Types of numbers as stored, and by the class of a matrix; a double may be stored as a byte.
+_STORED = {
+    1: "i1",
+    2: "u1",
+    3: "i2",
+    4: "u2",
+    5: "i4",
+    6: "u4",
+    7: "f4",
+    9: "f8",
+    12: "i8",
+    13: "u8",
+}
+_CLASSES = dict(enumerate(("f8", "f4", "i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8"), start=6))
 
 
 def is_matlab(start: bytes) -> bool:
@@ -33,7 +45,9 @@ def is_matlab(start: bytes) -> bool:
 
 
 def read_matlab(path: str | os.PathLike) -> dict[str, Any]:
-    """Read the variables of a MATLAB file: structures as dicts, without axes of length 1.
+    """Read numbers and structures of a MATLAB file: arrays without axes of length 1, and dicts.
+
+    Variables of other kinds, and arrays of structures, become None.
 
     Raises
     ------
@@ -45,20 +59,20 @@ def read_matlab(path: str | os.PathLike) -> dict[str, Any]:
     """
     path = Path(path)
     try:
-        content = reading.read_bytes(path)
+        reading.check_ordinary(path)
+        validate.memory(str(path), path.stat().st_size)
+        content = path.read_bytes()
     except ValueError as error:
         raise FileFormatError(str(error)) from None
     if not is_matlab(content):
         raise FileFormatError(f"{path} is not a MATLAB file of version 5 to 7")
     try:
-        _check_sizes(content)
-        return _loaded(content)
+        return _variables(content)
     except FileFormatError as error:
         raise FileFormatError(f"{path} {error}") from None
     except MemoryError:
         raise
-    # SciPy reports damage by any exception.
-    except Exception as error:
+    except (ValueError, LookupError, struct.error, zlib.error) as error:
         raise FileFormatError(f"{path} is damaged: {error}") from error
 
 
@@ -92,61 +106,56 @@ def only(path: str | os.PathLike, found: list[dict[str, Any]], *names: str) -> d
     return found[0]
 
 
-def numbers(path: str | os.PathLike, group: dict[str, Any], name: str, ndim: int) -> np.ndarray:
-    """Return a field that holds numbers, with `ndim` axes; those of length 1 may be missing."""
+def numbers(
+    path: str | os.PathLike, group: dict[str, Any], name: str, ndim: int, kinds: str = "iuf"
+) -> np.ndarray:
+    """Return a field of real numbers, with `ndim` axes; those of length 1 may be missing."""
     value = np.asarray(group.get(name))
-    if value.dtype.kind not in "iufc" or value.ndim > ndim or not value.size:
+    if value.dtype.kind not in kinds or value.ndim > ndim or not value.size:
+        wanted = "complex" if kinds == "c" else "real"
         raise FileFormatError(
-            f"{os.fspath(path)} must hold {name} as numbers with {ndim} axes, got "
+            f"{os.fspath(path)} must hold {name} as {wanted} numbers with {ndim} axes, got "
             f"{value.dtype} of shape {value.shape}"
         )
     return value.reshape(value.shape + (1,) * (ndim - value.ndim))
 
 
-def _loaded(content: bytes) -> dict[str, Any]:
-    # Several variables of one name, and other oddities, are warnings of SciPy that say nothing here.
-    import warnings
-
-    from scipy.io import loadmat  # slow to import
-
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        return loadmat(BytesIO(content), simplify_cells=True, verify_compressed_data_integrity=True)
-
-
-def _check_sizes(content: bytes) -> None:
-    """Raise FileFormatError for parts that unpack beyond memory, or claim more than they hold."""
+def _variables(content: bytes) -> dict[str, Any]:
     order = "<" if content[126:128] == b"IM" else ">"
-    place, unpacked = _HEADER, 0
+    found: dict[str, Any] = {}
+    place = _HEADER
     while place + 8 <= len(content):
         kind, size = struct.unpack_from(f"{order}II", content, place)
         body = memoryview(content)[place + 8 : place + 8 + size]
         if len(body) < size:
             raise FileFormatError("is damaged: its last variable is cut off")
+        place += 8 + size
         if kind == _COMPRESSED:
-            body = memoryview(_unpacked(bytes(body), unpacked, order))
-            kind, size = struct.unpack_from(f"{order}II", body)
-            unpacked += len(body)
-            body = body[8:]
-            if len(body) < size:
-                raise FileFormatError("is damaged: a compressed variable is cut off")
-        if kind == _MATRIX:
-            _check_matrix(body, order, 0)
-        place += 8 + struct.unpack_from(f"{order}I", content, place + 4)[0]
+            kind, body = _unpacked(body, order)
+        if kind != _MATRIX:
+            raise FileFormatError(f"is damaged: it holds an element of type {kind}")
+        name, value = _matrix(body, order, 0)
+        found[name] = value
+    return found
 
 
-def _unpacked(packed: bytes, before: int, order: str) -> bytes:
-    """Unpack a variable, whose first 8 bytes tell its size, if that fits into memory."""
+def _unpacked(packed: memoryview, order: str) -> tuple[int, memoryview]:
+    """Unpack a variable, whose first 8 bytes tell its type and size, if that fits into memory."""
     unpacker = zlib.decompressobj()
-    tag = unpacker.decompress(packed, 8)
-    if len(tag) < 8:
-        raise FileFormatError("is damaged: a compressed variable is cut off")
-    size = struct.unpack(f"{order}I", tag[4:])[0]
+    kind, size = struct.unpack(f"{order}II", unpacker.decompress(packed, 8))
+    _check_memory("unpacking it", 2 * size)
+    content = unpacker.decompress(unpacker.unconsumed_tail, size) if size else b""
+    # The rest is the checksum.
+    if unpacker.decompress(unpacker.unconsumed_tail, 1) or not unpacker.eof or len(content) < size:
+        raise FileFormatError("is damaged: a variable does not unpack to its size")
+    return kind, memoryview(content)
+
+
+def _check_memory(what: str, size_bytes: int) -> None:
     try:
-        validate.memory("unpacking it", _READ_TIMES * (before + size))
+        validate.memory(what, size_bytes)
     except ValueError as error:
         raise FileFormatError(f"is too large: {error}") from None
-    return tag + unpacker.decompress(unpacker.unconsumed_tail, max(size, 1))
 
 
 def _elements(body: memoryview, order: str) -> list[tuple[int, memoryview]]:
@@ -154,34 +163,60 @@ def _elements(body: memoryview, order: str) -> list[tuple[int, memoryview]]:
     found, place = [], 0
     while place + 8 <= len(body):
         kind, size = struct.unpack_from(f"{order}II", body, place)
-        if kind >> 16:  # up to 4 bytes, within the tag
-            size, kind, start = kind >> 16, kind & 0xFFFF, place + 4
-            place += 8
-        else:
-            start = place + 8
-            place = start + size + -size % 8
-        if start + size > len(body):
+        start, place = place + 8, place + 8 + size + -size % 8
+        if kind >> 16:  # a size of up to 4 bytes, which follow within the tag
+            size, kind, start, place = kind >> 16, kind & 0xFFFF, start - 4, start
+        if start + size > min(len(body), place):
             raise FileFormatError("is damaged: a variable holds less than it claims")
         found.append((kind, body[start : start + size]))
     return found
 
 
-def _check_matrix(body: memoryview, order: str, depth: int) -> None:
+def _matrix(body: memoryview, order: str, depth: int) -> tuple[str, Any]:
+    """Return name and value of a matrix."""
     if depth > _DEEPEST:
-        raise FileFormatError(f"must hold at most {_DEEPEST} levels of structures")
+        raise FileFormatError(f"must hold at most {_DEEPEST} structures within each other")
     parts = _elements(body, order)
     if not parts:
-        return  # an empty matrix
-    if len(parts) < 2 or len(parts[0][1]) < 4:
-        raise FileFormatError("is damaged: a variable lacks its header")
+        return "", np.zeros(0)
     flags = struct.unpack_from(f"{order}I", parts[0][1])[0]
-    if flags & 0xFF not in (_CELL, _STRUCT, _OBJECT):
-        return  # numbers: SciPy compares them with their shape
-    count = math.prod(
-        struct.unpack(f"{order}{len(parts[1][1]) // 4}i", parts[1][1][: len(parts[1][1]) // 4 * 4])
-    )
-    held = [part for kind, part in parts if kind == _MATRIX]
-    if not 0 <= count <= max(len(held), 1):
-        raise FileFormatError("is damaged: a structure claims more elements than it holds")
-    for part in held:
-        _check_matrix(part, order, depth + 1)
+    kind = flags & 0xFF
+    name = bytes(parts[2][1]).decode("latin-1")
+    if kind not in _CLASSES and kind != _STRUCTURE:
+        return name, None
+    shape = [int(n) for n in np.frombuffer(parts[1][1], np.dtype("i4").newbyteorder(order))]
+    if len(shape) < 2 or min(shape) < 0:
+        raise FileFormatError(f"is damaged: a variable has the shape {validate.shown(shape)}")
+    if kind == _STRUCTURE:
+        return name, _structure(parts[3:], order, depth) if math.prod(shape) == 1 else None
+    value = _array(parts[3], shape, kind, order)
+    if flags & _COMPLEX:
+        imaginary = _array(parts[4], shape, kind, order)
+        _check_memory("reading complex numbers", 2 * value.nbytes)
+        value = value + np.result_type(value, np.complex64).type(1j) * imaginary
+    return name, value.squeeze()
+
+
+def _array(part: tuple[int, memoryview], shape: list[int], kind: int, order: str) -> np.ndarray:
+    stored = np.dtype(_STORED[part[0]]).newbyteorder(order)
+    count = math.prod(shape)
+    if count * stored.itemsize != len(part[1]):
+        raise FileFormatError(
+            f"is damaged: {len(part[1])} bytes are not a variable of shape {validate.shown(shape)}"
+        )
+    _check_memory("reading numbers", count * np.dtype(_CLASSES[kind]).itemsize)
+    # MATLAB's arrays are stored by columns.
+    return np.frombuffer(part[1], stored).astype(_CLASSES[kind]).reshape(shape, order="F")
+
+
+def _structure(parts: list[tuple[int, memoryview]], order: str, depth: int) -> dict[str, Any]:
+    length = struct.unpack_from(f"{order}i", parts[0][1])[0]
+    names = bytes(parts[1][1])
+    if length < 1 or len(names) // length != len(parts) - 2:
+        raise FileFormatError("is damaged: a structure lacks names or values of its fields")
+    fields = [
+        names[n : n + length].split(b"\0")[0].decode("latin-1")
+        for n in range(0, len(names) // length * length, length)
+    ]
+    values = [_matrix(part, order, depth + 1)[1] for _, part in parts[2:]]
+    return dict(zip(fields, values, strict=True))

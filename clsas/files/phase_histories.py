@@ -67,7 +67,7 @@ def phase_history_lines(
     oversampling: float = 2.0,
 ) -> RangeLines:
     """Return range lines of the fields that `read_phase_history` describes."""
-    samples = matlab.numbers(path, data, "fp", 2).T
+    samples = matlab.numbers(path, data, "fp", 2, kinds="c").T
     antenna = [matlab.numbers(path, data, axis, 1) for axis in "xyz"]
     frequency = matlab.numbers(path, data, "freq", 1)
     reference = matlab.numbers(path, data, "r0", 1)
@@ -78,8 +78,6 @@ def phase_history_lines(
             f"frequency, got {len(antenna[0])}, {len(antenna[1])}, {len(antenna[2])}, "
             f"{len(reference)} and {len(frequency)} for fp of {count} frequencies, {pulses} pulses"
         )
-    if samples.dtype.kind != "c":
-        raise FileFormatError(f"{os.fspath(path)} must hold fp as complex numbers")
     antenna_m = np.stack(antenna, axis=-1).astype(np.float64)
     try:
         first_hz, step_hz = _equal_steps(frequency)
@@ -94,8 +92,8 @@ def phase_history_lines(
             window=window,
             oversampling=oversampling,
         )
-    except FileFormatError as error:
-        raise FileFormatError(f"{os.fspath(path)} {error}") from None
+    except (TypeError, ValueError) as error:
+        raise type(error)(f"{os.fspath(path)}: {error}") from None
 
 
 def _equal_steps(frequency: NDArray) -> tuple[float, float]:

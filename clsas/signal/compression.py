@@ -77,9 +77,10 @@ def compress(
 
         h(t) = integral over the band of W(f) P*(f) exp(j 2 pi f t) df / integral of W |P|^2
 
-    [17], [37]. Without a pulse P is flat; P of a replica is the spectrum of its samples. The sharp ends of the band make h infinitely long. The
-    part of h that is as long as the recording is unchanged, and the rest fades smoothly in the
-    padding. The result is therefore exactly the linear convolution, without wrap-around.
+    [17], [37]. Without a pulse P is flat; of a replica it is the spectrum of its samples. The sharp
+    ends of the band make h infinitely long. The part of h that is as long as the recording is
+    unchanged, and the rest fades smoothly in the padding. The result is therefore exactly the
+    linear convolution, without wrap-around.
     """
     validate.instance("echoes", echoes, Echoes)
     validate.progress(progress)
