@@ -49,14 +49,14 @@ def survey(name: str, **simulate: Any) -> dict[str, Any]:
 
 def recorded_block() -> dict[str, Any]:
     """Return the ultrasonic recording."""
-    echoes = ultrasound.read_echoes(recordings.folder() / ultrasound.RECORDING)
-    return {"lines": ultrasound.range_lines(echoes), "grid": ultrasound.GRID}
+    path = recordings.folder() / ultrasound.RECORDING
+    return {"lines": ultrasound.range_lines(path), "grid": ultrasound.GRID}
 
 
 def recorded_car_park() -> dict[str, Any]:
     """Return the first degree of the radar recording."""
     path = recordings.folder() / radar.RECORDINGS[0]
-    return {"lines": radar.range_lines(radar.read_phase_history(path)), "grid": radar.GRID}
+    return {"lines": radar.range_lines(path), "grid": radar.GRID}
 
 
 def car_park_in_full() -> dict[str, Any]:

@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 from recordings import parse_arguments
-from scipy.io import loadmat
 
 import clsas
 from clsas import plot
@@ -23,35 +22,14 @@ SOUND_SPEED_M_S = 6320.0  # longitudinal waves in aluminium
 GRID = clsas.Grid.plane(x=(-20e-3, 20e-3, 401), y=(2e-3, 45e-3, 431))
 
 
-def read_echoes(path: Path) -> clsas.Echoes:
-    """Return a full-matrix capture as the arim project keeps it: one channel per pair tx <= rx.
-
-    By reciprocity a pair of two elements stands also for its reverse, so it counts twice.
-    """
-    capture = loadmat(path, simplify_cells=True)["exp_data"]
-    x_m = capture["array"]["el_xc"]
-    elements_m = np.stack([x_m, np.zeros_like(x_m), np.zeros_like(x_m)], axis=-1)
-    tx, rx = (capture[name].astype(int) - 1 for name in ("tx", "rx"))
-    time_s = capture["time"]
-    return clsas.Echoes(
-        capture["time_data"].T * np.where(tx == rx, 1.0, 2.0)[:, None],
-        start_time_s=time_s[0],
-        sample_rate_hz=(len(time_s) - 1) / (time_s[-1] - time_s[0]),
-        carrier_hz=capture["array"]["centre_freq"],
-        tx_m=elements_m[tx],
-        rx_m=elements_m[rx],
-        sound_speed_m_s=SOUND_SPEED_M_S,
-    )
-
-
-def range_lines(echoes: clsas.Echoes) -> clsas.RangeLines:
-    """Return the analytic signals, mixed down, as range lines.
+def range_lines(path: Path) -> clsas.RangeLines:
+    """Read a recording as range lines: its analytic signals, mixed down.
 
     The pulse is not known, and short enough to do without. The band from 0 to twice the array's
     frequency holds all of it. The window is zero at both ends: a constant offset of the samples
     leaves nothing, and neither transmission nor back wall rings through the image.
     """
-    return clsas.compress(echoes, window="hann", bandwidth_hz=2 * echoes.carrier_hz)
+    return clsas.read_full_matrix(path, sound_speed_m_s=SOUND_SPEED_M_S)
 
 
 def find_notch_tip(image: clsas.Image) -> PointResponse:
@@ -94,12 +72,9 @@ def draw(image: clsas.Image, tip: PointResponse, path: Path) -> None:
 def main() -> None:
     arguments = parse_arguments(__doc__, [RECORDING])
     for path in arguments.recording:
-        echoes = read_echoes(path)
-        print(
-            f"{path.name}: {echoes.channels} pairs of elements, {echoes.length} samples "
-            f"at {1e-6 * echoes.sample_rate_hz:g} MHz"
-        )
-        image = clsas.backproject(range_lines(echoes), GRID, device=arguments.device)
+        lines = range_lines(path)
+        print(f"{path.name}: {lines.channels} pairs of elements, {lines.length} samples each")
+        image = clsas.backproject(lines, GRID, device=arguments.device)
         tip, wall_m = find_notch_tip(image), back_wall_depth_m(image)
         level_db = 20 * np.log10(tip.amplitude / np.abs(image.pixels).max())
         print(

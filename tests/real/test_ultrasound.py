@@ -13,12 +13,26 @@ NOTCH_TIP_M = (6.75e-3, 19.6e-3)
 
 @pytest.fixture(scope="module")
 def echoes(recording):
-    return ultrasound.read_echoes(recording(ultrasound.RECORDING))
+    """The samples, read without clsas: a pair of two elements counts twice."""
+    capture = loadmat(recording(ultrasound.RECORDING), simplify_cells=True)["exp_data"]
+    x_m = capture["array"]["el_xc"]
+    elements_m = np.stack([x_m, np.zeros_like(x_m), np.zeros_like(x_m)], axis=-1)
+    tx, rx = (capture[name].astype(int) - 1 for name in ("tx", "rx"))
+    time_s = capture["time"]
+    return clsas.Echoes(
+        capture["time_data"].T * np.where(tx == rx, 1.0, 2.0)[:, None],
+        start_time_s=time_s[0],
+        sample_rate_hz=(len(time_s) - 1) / (time_s[-1] - time_s[0]),
+        carrier_hz=capture["array"]["centre_freq"],
+        tx_m=elements_m[tx],
+        rx_m=elements_m[rx],
+        sound_speed_m_s=ultrasound.SOUND_SPEED_M_S,
+    )
 
 
 @pytest.fixture(scope="module")
-def lines(echoes):
-    return ultrasound.range_lines(echoes)
+def lines(recording):
+    return ultrasound.range_lines(recording(ultrasound.RECORDING))
 
 
 @pytest.fixture(scope="module")
@@ -69,6 +83,14 @@ def test_recording_is_the_whole_matrix_with_pairs_of_two_counted_twice(recording
     np.testing.assert_array_equal(echoes.samples[same], raw["time_data"].T[same])
     np.testing.assert_array_equal(echoes.samples[~same], 2 * raw["time_data"].T[~same])
     assert np.ptp(echoes.tx_m[:, 0]) == pytest.approx(63 * 0.3e-3)
+
+
+def test_lines_are_the_compressed_samples_of_every_pair(echoes, lines):
+    compressed = clsas.compress(echoes, window="hann", bandwidth_hz=2 * echoes.carrier_hz)
+    np.testing.assert_allclose(lines.samples, compressed.samples, atol=1e-5)
+    np.testing.assert_array_equal(lines.tx_m, echoes.tx_m)
+    np.testing.assert_array_equal(lines.rx_m, echoes.rx_m)
+    np.testing.assert_array_equal(lines.first_range_m, compressed.first_range_m)
 
 
 def test_notch_tip_is_where_it_is(tip):
