@@ -119,7 +119,10 @@ def read_cphd(
             if collection.sign == 1:
                 np.conj(signal, out=signal)
     if collection.domain == "FX":
-        return _lines_of_fx(signal, vectors, collection, window, oversampling)
+        try:
+            return _lines_of_fx(signal, vectors, collection, window, oversampling)
+        except (TypeError, ValueError) as error:
+            raise type(error)(f"{path}: {error}") from None
     with _defects(path):
         return _lines_of_toa(signal, vectors, collection)
 

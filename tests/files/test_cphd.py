@@ -193,7 +193,7 @@ def test_channels_are_chosen_by_name(tmp_path):
     assert read_cphd(tmp_path / "pass.cphd", channel="1").channels == 47
     with pytest.raises(ValueError, match=r"channel must be one of \['1'\], got 'HH'"):
         read_cphd(tmp_path / "pass.cphd", channel="HH")
-    with pytest.raises(ValueError, match="window must be 'none' or"):
+    with pytest.raises(ValueError, match=r"pass\.cphd: window must be 'none' or"):
         read_cphd(tmp_path / "pass.cphd", window="nonsense")
 
 
@@ -288,7 +288,7 @@ def test_damaged_files_end_in_one_error_or_in_lines(tmp_path):
                 content[place] ^= 1 << random.integers(8)
         path.write_bytes(content)
         said = message_of(path)
-        assert said is None or "damaged.cphd" in said or " must " in said
+        assert said is None or "damaged.cphd" in said
         refused += said is not None
     assert refused > 50
 
