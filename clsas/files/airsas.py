@@ -226,7 +226,7 @@ def _microphones(path: Path, there: list[int], channels: Sequence[int] | None) -
     return numbers
 
 
-def _dataset(file: h5py.File, group: str, name: str) -> NDArray[np.float64]:
+def _dataset(file: h5py.File, group: str, name: str) -> NDArray:
     item = hdf5.find_item(file, group)
     item = hdf5.find_item(item, name) if isinstance(item, h5py.Group) else None
     if not isinstance(item, h5py.Dataset) or item.dtype.kind not in "iuf" or not item.size:
@@ -237,7 +237,7 @@ def _dataset(file: h5py.File, group: str, name: str) -> NDArray[np.float64]:
     return values
 
 
-def _speeds_m_s(temperature: NDArray[np.float64], pings: int) -> NDArray[np.float64]:
+def _speeds_m_s(temperature: NDArray, pings: int) -> NDArray[np.float64]:
     """Speed of sound at every ping, from the mean of its thermometers."""
     if temperature.ndim == 1:
         temperature = temperature[None]
@@ -245,7 +245,7 @@ def _speeds_m_s(temperature: NDArray[np.float64], pings: int) -> NDArray[np.floa
         raise FileFormatError(
             f"must hold /na/temperature of {pings} pings, got shape {temperature.shape}"
         )
-    speed = 331.6 + 0.61 * temperature.mean(axis=0)
+    speed: NDArray[np.float64] = 331.6 + 0.61 * temperature.mean(axis=0)
     if not (speed.min() > 200 and speed.max() < 600):
         raise FileFormatError(
             "must hold /na/temperature in degrees Celsius, got "
@@ -254,9 +254,7 @@ def _speeds_m_s(temperature: NDArray[np.float64], pings: int) -> NDArray[np.floa
     return speed
 
 
-def _conditioned(
-    samples: list[NDArray[np.float32]], time_s: NDArray[np.float64], duration_s: float
-) -> NDArray[np.float32]:
+def _conditioned(samples: list[NDArray], time_s: NDArray, duration_s: float) -> NDArray[np.float32]:
     """Remove constant and transmission from samples, and join them as [channels, time].
 
     Until the pulse has been transmitted the microphones record it directly. They are silenced, and

@@ -114,7 +114,7 @@ def read_cphd(
             if not kept.any():
                 raise FileFormatError("must hold vectors with a signal, got none")
             vectors, signal = vectors[kept], _complex(signal[kept])
-            if "AmpSF" in vectors.dtype.names:
+            if "AmpSF" in (vectors.dtype.names or ()):
                 signal *= vectors["AmpSF"].astype(np.float32)[:, None]
             if collection.sign == 1:
                 np.conj(signal, out=signal)
@@ -149,7 +149,7 @@ def _header(file: Any, size: int) -> dict[str, int]:
         raise FileFormatError("is not a CPHD file")
     rows = start[: start.index(b"\f\n")].decode().splitlines()[1:]
     fields = dict(row.split(" := ", 1) for row in rows if " := " in row)
-    values = {}
+    values: dict[str, int] = {}
     for block in ("XML", "PVP", "SIGNAL"):
         names = [f"{block}_BLOCK_{part}" for part in ("BYTE_OFFSET", "SIZE")]
         given = [fields.get(name, "") for name in names]
@@ -197,7 +197,7 @@ def _check_sizes(tree: Any, name: str, header: dict[str, int], size: int) -> Non
 
 @dataclass(frozen=True, eq=False)
 class _Collection:
-    """What a file says of all its vectors.
+    """Properties that all vectors of a file share.
 
     Positions in Earth-centred coordinates become local: relative to `centre_m`, along `axes`
     (rows), plus `origin_m`.
@@ -262,7 +262,7 @@ def _vector(value: Any) -> NDArray[np.float64]:
 def _usable(vectors: NDArray) -> NDArray[np.bool_]:
     """Return which vectors hold a signal and are complete."""
     usable = np.ones(len(vectors), bool)
-    if "SIGNAL" in vectors.dtype.names:
+    if "SIGNAL" in (vectors.dtype.names or ()):
         usable &= vectors["SIGNAL"] == 1
     for name in ("TxPos", "RcvPos", "SRPPos"):
         usable &= np.isfinite(vectors[name]).all(axis=1)

@@ -203,28 +203,7 @@ def _document(
         ],
         "NumSupportArrays": 0,
     }
-    fixed = {
-        "FX": not (np.ptp(vectors["FX1"]) or np.ptp(vectors["FX2"])),
-        "TOA": not (np.ptp(vectors["TOA1"]) or np.ptp(vectors["TOA2"])),
-        "SRP": bool(np.all(vectors["SRPPos"] == vectors["SRPPos"][0])),
-    }
-    root["Channel"] = {
-        "RefChId": _CHANNEL,
-        **{f"{name}FixedCPHD": value for name, value in fixed.items()},
-        "Parameters": [
-            {
-                "Identifier": _CHANNEL,
-                "RefVectorIndex": len(vectors) // 2,
-                **{f"{name}Fixed": value for name, value in fixed.items()},
-                "SignalNormal": True,
-                "Polarization": {"TxPol": "UNSPECIFIED", "RcvPol": "UNSPECIFIED"},
-                "FxC": (most["FX2"] + least["FX1"]) / 2,
-                "FxBW": most["FX2"] - least["FX1"],
-                "TOASaved": most["TOA2"] - least["TOA1"],
-                "DwellTimes": {"CODId": "1", "DwellId": "1"},
-            }
-        ],
-    }
+    root["Channel"] = _channel(vectors)
     root["PVP"] = _layout()
     times = sarkit.compute_t_ref_from_pvps(vectors)
     root["Dwell"] = {
@@ -237,8 +216,35 @@ def _document(
     return tree
 
 
+def _channel(vectors: NDArray) -> dict[str, Any]:
+    """Return the parameters of the one channel."""
+    fixed = {
+        "FX": not (np.ptp(vectors["FX1"]) or np.ptp(vectors["FX2"])),
+        "TOA": not (np.ptp(vectors["TOA1"]) or np.ptp(vectors["TOA2"])),
+        "SRP": bool(np.all(vectors["SRPPos"] == vectors["SRPPos"][0])),
+    }
+    least_hz, most_hz = float(vectors["FX1"].min()), float(vectors["FX2"].max())
+    return {
+        "RefChId": _CHANNEL,
+        **{f"{name}FixedCPHD": value for name, value in fixed.items()},
+        "Parameters": [
+            {
+                "Identifier": _CHANNEL,
+                "RefVectorIndex": len(vectors) // 2,
+                **{f"{name}Fixed": value for name, value in fixed.items()},
+                "SignalNormal": True,
+                "Polarization": {"TxPol": "UNSPECIFIED", "RcvPol": "UNSPECIFIED"},
+                "FxC": (most_hz + least_hz) / 2,
+                "FxBW": most_hz - least_hz,
+                "TOASaved": float(vectors["TOA2"].max() - vectors["TOA1"].min()),
+                "DwellTimes": {"CODId": "1", "DwellId": "1"},
+            }
+        ],
+    }
+
+
 def _scene(vectors: NDArray) -> dict[str, Any]:
-    """Scene coordinates: the plane of the equator's tangent, and an area about the reference."""
+    """Return scene coordinates: the tangent plane at the equator, an area about the reference."""
     import sarkit.wgs84
 
     point_m = (vectors["SRPPos"][len(vectors) // 2] - _EQUATOR_M) @ _AXES.T
@@ -267,8 +273,9 @@ def _scene(vectors: NDArray) -> dict[str, Any]:
 
 
 def _layout() -> dict[str, dict[str, Any]]:
-    """Where every parameter lies in a vector."""
-    fields = _VECTOR.fields or {}
+    """Return the position of every parameter in a vector, in 64-bit words."""
+    fields = _VECTOR.fields
+    assert fields is not None  # the type has names
     return {
         name: {"Offset": offset // 8, "Size": dtype.itemsize // 8, "dtype": dtype}
         for name, (dtype, offset, *_) in fields.items()

@@ -184,7 +184,7 @@ def _matrix(body: memoryview, order: str, depth: int) -> tuple[str, Any]:
     name = bytes(parts[2][1]).decode("latin-1")
     if kind not in _CLASSES and kind != _STRUCTURE:
         return name, None
-    shape = [int(n) for n in np.frombuffer(parts[1][1], np.dtype("i4").newbyteorder(order))]
+    shape = [int(n) for n in np.frombuffer(parts[1][1], np.dtype(f"{order}i4"))]
     if len(shape) < 2 or min(shape) < 0:
         raise FileFormatError(f"is damaged: a variable has the shape {validate.shown(shape)}")
     if kind == _STRUCTURE:
@@ -198,7 +198,7 @@ def _matrix(body: memoryview, order: str, depth: int) -> tuple[str, Any]:
 
 
 def _array(part: tuple[int, memoryview], shape: list[int], kind: int, order: str) -> np.ndarray:
-    stored = np.dtype(_STORED[part[0]]).newbyteorder(order)
+    stored = np.dtype(order + _STORED[part[0]])
     count = math.prod(shape)
     if count * stored.itemsize != len(part[1]):
         raise FileFormatError(

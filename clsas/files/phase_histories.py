@@ -98,7 +98,7 @@ def phase_history_lines(
 
 def _equal_steps(frequency: NDArray) -> tuple[float, float]:
     """Return first frequency and step of frequencies that are equally spaced but for rounding."""
-    exact = np.linspace(*frequency[[0, -1]].astype(np.float64), len(frequency))
+    exact = np.linspace(float(frequency[0]), float(frequency[-1]), len(frequency))
     step = float(exact[-1] - exact[0]) / max(len(exact) - 1, 1)
     rounding = 2 * _rounding(frequency) + 1e-3 * abs(step)
     if not step > 0 or not np.abs(exact - frequency).max() <= rounding:
