@@ -142,7 +142,7 @@ def at_one_speed(lines: RangeLines, speed_m_s: NDArray[np.float64]) -> RangeLine
         range_m = lines.first_range_m[channel] + np.arange(lines.length) * lines.range_step_m
         at = (range_m * speed / speed_m_s[channel] - range_m[0]) / lines.range_step_m
         series = fft.fftshift(fft.fft(samples[channel].astype(np.complex128), padded)) / padded
-        line = finufft.nufft1d2(2 * np.pi * at / padded, series, isign=1, eps=1e-9)
+        line = finufft.nufft1d2(2 * np.pi * at / padded, series, isign=1, eps=1e-9, nthreads=1)
         line[(at < 0) | (at > lines.length - 1)] = 0
         cycles = 2 * lines.carrier_hz * range_m * (1 / speed_m_s[channel] - 1 / speed)
         samples[channel] = line * np.exp(2j * np.pi * cycles)

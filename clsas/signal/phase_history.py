@@ -147,6 +147,6 @@ def _at_own_steps(
     result = np.empty((len(spectrum), length), np.complex128)
     for row, (line, scale) in enumerate(zip(spectrum, ratio, strict=True)):
         angle = 2 * np.pi * scale / length * number
-        result[row] = finufft.nufft1d2(angle, line, isign=1, eps=1e-9)
+        result[row] = finufft.nufft1d2(angle, line, isign=1, eps=1e-9, nthreads=1)
         result[row] *= np.exp(1j * middle * angle)
     return result
