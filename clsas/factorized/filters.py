@@ -19,9 +19,15 @@ _FINAL_TAPS = (2, 4, 6, 8)
 UPSAMPLING_SHARE = 0.03
 """Share of an image's error power that filters for upsampling may add."""
 _MOST_GAIN = 3.0  # limits the gain at band edges, where lines have little power
-_CORNERS_SHARE = 0.5  # weight of pixels near the corners of a subimage:
-_CORNERS_FROM = 0.7  # those with at least this part of the highest phase rate
-_STEPS, _SLOPE_DB, _CLOSE_DB = 3, 12.0, 0.1  # of the iteration to the least oversampling
+# Weight of pixels near the corners of a subimage: those with `_CORNERS_FROM` of the highest phase
+# rate or more. Half: 1.5 % faster and 1 dB less error on average, but corners err more. Twice:
+# tight tolerances find no filters.
+_CORNERS_SHARE = 0.5
+_CORNERS_FROM = 0.7
+# Of the iteration to the least oversampling; once only: 1 % slower.
+_STEPS = 3
+_SLOPE_DB = 12.0  # per tap and factor e of oversampling; a quarter more: 0.15 dB
+_CLOSE_DB = 0.1  # of the aim
 _WORST_DB = -22.0  # aperture filters; with worse ones only pixels at the corners err
 _RATES = tuple(np.geomspace(1, 12, 16))  # at which errors of filters are evaluated
 _BINS = 64  # of the steering functions' spectrum

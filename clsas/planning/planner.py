@@ -52,10 +52,12 @@ TOLERANCE_DB = -50.0
 NEAREST_UPSAMPLING = 8.0
 """Upsampling of lines before the linear interpolation of given stages."""
 
+# `scripts/bench sensitivity` halves and doubles these; without a remark nothing changes.
 _WORTH = 0.95  # of the time of an exact image, at most: less gain is within predictions' scatter
 _SEARCH_S = 0.05  # that a search takes at least: 0.05 to 0.12 s on a core of 2.5 GHz
-_LEAST_COVERED = 0.25  # least sum of weights, relative to that at the best covered pixel
-_LEAST_SHARE_COVERED, _LEAST_PARTIAL = 0.1, 0.25  # shares of an image
+_LEAST_COVERED = 0.25  # of the best pixel's sum of weights: normalising amplifies by its inverse
+_LEAST_SHARE_COVERED = 0.1  # of an image: less gives little gain, and few samples of errors
+_LEAST_PARTIAL = 0.25  # of an image: a step of the beam that few pixels see costs these more
 
 
 def plan(

@@ -42,10 +42,10 @@ MARGIN_DB = 1.0
 """Margin of predicted errors for the scatter of measured ones."""
 OUTSIDE = 0.1
 """Share of the allowed error power that may come from outside the nominal band."""
-_ROUNDING_SHARE = 0.1  # of an image's error power, for half precision
-_MOST_CHUNKS = 16  # in a sum that is rounded to half precision
+_ROUNDING_SHARE = 0.1  # of an image's error power, for half precision; half or twice: the same
+_MOST_CHUNKS = 16  # in a sum rounded to half precision; more lose what is added
 _FEW_CHANNELS = 7.0, 30.0  # per pixel, that double the scatter of errors; the latter with steps
-_ROOM = 1.06  # spare room of buffers over the largest predicted number of virtual channels
+_ROOM = 1.06  # of buffers, over the predicted virtual channels; twice the spare room: 2 % slower
 
 
 @dataclass(frozen=True)
