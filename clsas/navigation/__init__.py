@@ -1,1 +1,1 @@
-"""Where the sonar really was: micronavigation and autofocus."""
+"""Corrections of the track by the echoes themselves: micronavigation and autofocus."""

@@ -48,7 +48,7 @@ _GAIN = 1.02  # of sharpness, for which a step is repeated
 
 @dataclass(frozen=True, eq=False)
 class Autofocus:
-    """What autofocus found.
+    """Result of autofocus.
 
     Attributes
     ----------

@@ -20,6 +20,7 @@ from scipy.ndimage import uniform_filter1d
 from clsas.core.geometry import bistatic_range_m
 from clsas.core.lines import RangeLines
 from clsas.navigation.overlap import Array, Overlap
+from clsas.navigation.swath import Swath
 from clsas.signal.readout import Readout
 from clsas.signal.spectrum import cycles_per_m_at, measure_spectrum
 from clsas.sonar.system import element_pattern
@@ -33,50 +34,6 @@ _HIGHLIGHT = 3.0  # times the median power, from which on echoes are weakened
 _LEAST_SQUARE = 1e-4  # of a coherence whose logarithm is taken
 _SMOOTHED = 9  # samples over which that power is a mean
 _SPECKLE_LAGS = 64  # samples over which speckle may be correlated in range
-
-
-@dataclass(frozen=True, eq=False)
-class Swath:
-    """What is seen of the seabed, and by which windows of range it is measured.
-
-    Attributes
-    ----------
-    edges_m : float64 [windows + 1]
-        Ranges between windows.
-    side : int
-        1 where the seabed lies to port, -1 to starboard.
-    seabed_z_m : float or None
-        Height of the seabed; None takes every ray as horizontal.
-    element_length_m : (transmitter, receiver) or None
-        Lengths of the elements, whose beam weighs directions; None takes the beam as narrow.
-    """
-
-    edges_m: NDArray[np.float64]
-    side: int = 1
-    seabed_z_m: float | None = None
-    element_length_m: tuple[float, float] | None = None
-
-    @property
-    def windows(self) -> int:
-        """Number of windows."""
-        return len(self.edges_m) - 1
-
-    @property
-    def middles_m(self) -> NDArray[np.float64]:
-        """Ranges in the middle of the windows, [windows]."""
-        return (self.edges_m[1:] + self.edges_m[:-1]) / 2
-
-    def slopes(
-        self, height_m: NDArray[np.float64], range_m: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the horizontal and vertical parts of unit rays that end on the seabed.
-
-        `height_m` is that of where rays begin. Rays shorter than their height point straight down.
-        """
-        if self.seabed_z_m is None:
-            return np.ones_like(range_m), np.zeros_like(range_m)
-        down = np.clip((height_m - self.seabed_z_m) / range_m, -1.0, 1.0)
-        return np.sqrt(1 - down**2), -down
 
 
 @dataclass(frozen=True, eq=False)

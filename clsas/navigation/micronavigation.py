@@ -11,10 +11,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from clsas.core import reprs, validate
 from clsas.core.lines import RangeLines
-from clsas.navigation.displacement import Correlator, Swath
+from clsas.navigation.displacement import Correlator
 from clsas.navigation.overlap import Array, moved
 from clsas.navigation.passes import Displacements, measured
 from clsas.navigation.smoother import Step, smooth
+from clsas.navigation.swath import Swath
 from clsas.signal.compression import compress
 from clsas.signal.echoes import Echoes
 from clsas.signal.spectrum import measure_spectrum
@@ -29,7 +30,7 @@ _WINDOW_CELLS = 150.0  # range resolution cells of a window, unless given
 
 @dataclass(frozen=True, eq=False)
 class Micronavigation:
-    """What micronavigation found.
+    """Result of micronavigation.
 
     Attributes
     ----------
@@ -234,7 +235,7 @@ def _result(
 
 
 def _check_coherence(found: Displacements) -> None:
-    """Refuse lines hardly any of which are coherent; warn of those that are not."""
+    """Refuse lines if hardly any pair of pings is coherent; warn of pairs that are not."""
     without = int((~found.coherent).sum())
     if len(found.coherent) - without < max(1, _LEAST_SHARE * len(found.coherent)):
         raise ValueError(

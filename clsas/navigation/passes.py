@@ -86,7 +86,7 @@ def measured(
 
 
 class _Passes:
-    """What is known so far, and what comes of it."""
+    """Displacements found so far, and the next measurement of what is left."""
 
     def __init__(
         self,
@@ -126,7 +126,7 @@ class _Passes:
                 return
 
     def surges_m(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return what is left of every advance, and its standard deviation; 0 without coherence."""
+        """Return the rest of every advance, and its standard deviation; 0 without coherence."""
         corrected, here = self._corrected()
         found = np.zeros((len(self.overlaps), 2))
         for ping in np.flatnonzero(self.coherent).tolist():

@@ -1,4 +1,4 @@
-"""Bright responses of an image, and what every ping contributes to them."""
+"""Bright responses of an image, and the contributions of every ping to them."""
 
 from __future__ import annotations
 
@@ -95,7 +95,7 @@ def brightest(image: Image, count: int, apart_m: float) -> NDArray[np.float64]:
 
 @dataclass(frozen=True, eq=False)
 class Contributions:
-    """What every channel contributes to some points.
+    """Contributions of every channel to some points.
 
     Attributes
     ----------
@@ -129,7 +129,7 @@ def contributions(
     beam: BeamWindow | None,
     offsets_m: NDArray[np.float64] | None = None,
 ) -> Contributions:
-    """Return what channels contribute to points and, with offsets, to others beside them in range.
+    """Return the contributions to points and, with offsets, to others beside them in range.
 
     `lines` are those of the passage, moved as far as is known.
     """

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """What is known of the next ping's state from that of a ping: x' = F x + u, give or take.
+    """Relation between the states of a ping and of the next: x' = F x + u, with an uncertain u.
 
     Attributes
     ----------
