@@ -13,11 +13,11 @@ from clsas.core.lines import RangeLines
 
 def lines_digest(lines: RangeLines) -> str:
     """Return a digest of everything about lines but their samples."""
-    velocity = lines.rx_velocity_m_s
-    numbers = [lines.range_step_m, lines.carrier_hz, lines.sound_speed_m_s]
-    arrays = [lines.tx_m, lines.rx_m, lines.first_range_m, np.array(numbers)]
-    arrays += [] if velocity is None else [velocity]
-    return _digest(np.array(lines.samples.shape), *arrays)
+    numbers = np.array([lines.range_step_m, lines.carrier_hz, lines.sound_speed_m_s])
+    others = lines.per_channel
+    # This order keeps digests in stores and plans valid.
+    arrays = [others.pop(name) for name in ("tx_m", "rx_m", "first_range_m")]
+    return _digest(np.array(lines.samples.shape), *arrays, numbers, *others.values())
 
 
 def grid_digest(grid: Grid) -> str:

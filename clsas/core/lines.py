@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from clsas.core import conditioning, reprs, validate
 
+_PER_CHANNEL = ("first_range_m", "tx_m", "rx_m", "rx_velocity_m_s")
 _GOLDEN = (np.sqrt(5) - 1) / 2
 
 SAMPLED_CHANNELS = 128
@@ -110,6 +111,15 @@ class RangeLines:
         )
 
     @property
+    def per_channel(self) -> dict[str, NDArray[np.float64]]:
+        """Fields beside the samples with an entry per channel, by name; only those that are given.
+
+        Whoever selects, joins or compares lines takes the fields from here.
+        """
+        fields = {name: getattr(self, name) for name in _PER_CHANNEL}
+        return {name: values for name, values in fields.items() if values is not None}
+
+    @property
     def channels(self) -> int:
         """Number of channels."""
         return self.samples.shape[0]
@@ -171,15 +181,8 @@ class RangeLines:
             if index.dtype.kind not in "iub":
                 got = validate.shown(channels)
                 raise TypeError(f"channels must be a slice, whole numbers or bools, got {got}")
-        velocity = self.rx_velocity_m_s
-        return replace(
-            self,
-            samples=self.samples[index],
-            first_range_m=self.first_range_m[index],
-            tx_m=self.tx_m[index],
-            rx_m=self.rx_m[index],
-            rx_velocity_m_s=None if velocity is None else velocity[index],
-        )
+        of_channels = {name: values[index] for name, values in self.per_channel.items()}
+        return replace(self, samples=self.samples[index], **of_channels)
 
     def high_passed(self, cutoff_hz: float) -> RangeLines:
         """Return the lines without frequencies below a cutoff.

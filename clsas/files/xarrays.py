@@ -142,7 +142,7 @@ def _channels_to_xarray(xarray: ModuleType, obj: RangeLines | Echoes) -> xarray.
         if isinstance(value, np.ndarray):
             dims = ("channel", "sample" if name == "samples" else "axis")[: value.ndim]
             unit = next((unit for end, unit in _UNITS.items() if name.endswith(end)), "1")
-            known = {"long_name": _NAMES[name], "units": unit}
+            known = {"long_name": _NAMES.get(name, name), "units": unit}
             variables[name] = (dims, value, known)
         elif is_dataclass(value):
             attributes |= {

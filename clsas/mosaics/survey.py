@@ -157,16 +157,9 @@ class Survey:
         samples[missing] = 0
         silent[silent] = ~samples[silent].any(axis=1)
         missing |= silent
-        velocity = geometry.rx_velocity_m_s
-        lines = replace(
-            geometry,
-            samples=samples,
-            first_range_m=first_m,
-            tx_m=geometry.tx_m[index],
-            rx_m=geometry.rx_m[index],
-            rx_velocity_m_s=None if velocity is None else velocity[index],
-        )
-        return lines, missing
+        of_channels = {name: values[index] for name, values in geometry.per_channel.items()}
+        of_channels["first_range_m"] = first_m
+        return replace(geometry, samples=samples, **of_channels), missing
 
     def _blocks(
         self, visible: NDArray[np.bool_], near_m: NDArray[np.float64], far_m: NDArray[np.float64]
@@ -279,19 +272,13 @@ def open_files(paths: tuple[Path, ...], before: Survey | None = None) -> Survey:
                     f"{path}: {name} must be that of the survey's first file, {theirs:g}, got "
                     f"{ours:g}"
                 )
-        if (geometry.rx_velocity_m_s is None) != (found[0].rx_velocity_m_s is None):
-            raise ValueError(
-                f"{path}: rx_velocity_m_s must be in every file of the survey or in none"
-            )
-    velocities = [each.rx_velocity_m_s for each in found if each.rx_velocity_m_s is not None]
-    geometry = replace(
-        found[0],
-        samples=np.zeros((begins[-1], 1), np.complex64),
-        first_range_m=np.concatenate([each.first_range_m for each in found]),
-        tx_m=np.concatenate([each.tx_m for each in found]),
-        rx_m=np.concatenate([each.rx_m for each in found]),
-        rx_velocity_m_s=np.concatenate(velocities) if velocities else None,
-    )
+        for name in geometry.per_channel.keys() ^ found[0].per_channel.keys():
+            raise ValueError(f"{path}: {name} must be in every file of the survey or in none")
+    of_channels = {
+        name: np.concatenate([each.per_channel[name] for each in found])
+        for name in found[0].per_channel
+    }
+    geometry = replace(found[0], samples=np.zeros((begins[-1], 1), np.complex64), **of_channels)
     return Survey(geometry, tuple(paths), tuple(begins), tuple(lengths), tuple(stamps))
 
 

@@ -8,6 +8,7 @@ import pytest
 
 import clsas
 from clsas.core import reprs
+from clsas.products.effects import KEYS
 
 PULSE = clsas.Pulse(1e6, 1e5, 1e-3)
 SONAR = clsas.Sonar.thesis_wide_beam()
@@ -139,7 +140,7 @@ def test_everything_that_comes_with_a_result_is_short():
     point = clsas.measure_point(image, (0, 42.5))
     plan = clsas.plan(lines, grid, tolerance_db=-20)
     for obj, words in (
-        (assessment, "tolerance -50 dB, 8 effects, needed and not modelled: none"),
+        (assessment, f"tolerance -50 dB, {len(KEYS)} effects, needed and not modelled: none"),
         (assessment.effects[0], "name 'motion during flight'"),
         (tradeoff, "3 images of 101 x 101 pixels from 640 channels"),
         (patch, "row 0, column 0, 101 x 101 pixels, x -0.1 to 0.1 m"),
