@@ -111,8 +111,8 @@ class RangeLines:
         )
 
     @property
-    def per_channel(self) -> dict[str, NDArray[np.float64]]:
-        """Fields beside the samples with an entry per channel, by name; only those that are given.
+    def per_channel(self) -> dict[str, Any]:
+        """Float64 fields with an entry per channel, by name; only those that are given.
 
         Whoever selects, joins or compares lines takes the fields from here.
         """

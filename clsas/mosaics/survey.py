@@ -11,6 +11,7 @@ import os
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -274,7 +275,7 @@ def open_files(paths: tuple[Path, ...], before: Survey | None = None) -> Survey:
                 )
         for name in geometry.per_channel.keys() ^ found[0].per_channel.keys():
             raise ValueError(f"{path}: {name} must be in every file of the survey or in none")
-    of_channels = {
+    of_channels: dict[str, Any] = {
         name: np.concatenate([each.per_channel[name] for each in found])
         for name in found[0].per_channel
     }
