@@ -123,6 +123,15 @@ def one_of(name: str, value: _T, allowed: Sequence[_T]) -> _T:
     return value
 
 
+def named(name: str, values: object, allowed: Sequence[str]) -> tuple[str, ...]:
+    """Return one or several of the allowed names as a tuple; a single one may stand alone."""
+    if isinstance(values, str):
+        values = (values,)
+    if not isinstance(values, Sequence):
+        raise TypeError(f"{name} must be one or several of {tuple(allowed)}, got {shown(values)}")
+    return tuple(one_of(f"every entry of {name}", each, allowed) for each in values)
+
+
 def instance(name: str, value: object, *kinds: type) -> None:
     """Raise TypeError unless `value` is an instance of one of the classes `kinds`."""
     if not isinstance(value, kinds):

@@ -230,8 +230,16 @@ class Plan:
         """Return this plan with other values of some fields of its `image`, for study.
 
         The prediction stays as it was.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If there is no such field, or its value is not allowed.
         """
-        return replace(self, image=replace(self.image, **fields))
+        try:
+            return replace(self, image=replace(self.image, **fields))
+        except ValidationError as error:
+            raise ValueError(explained(error, fields)) from None
 
     def to_json(self, *, filters: bool = True) -> str:
         """Return this plan as text that `from_json` reads.

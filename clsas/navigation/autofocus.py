@@ -10,6 +10,7 @@ kind. Each is kept only where the image gets sharper.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -42,6 +43,8 @@ _NEIGHBOURHOODS_M = (1.2, 0.8, 0.5, 0.3)  # around responses, along the track
 _SWEEPS = 2  # times that single pings are moved
 _RESPONSES, _RESPONSES_FOR_DRIFT = 200, 60
 _OFFSETS = np.arange(-4.0, 5.0)  # samples in range, of which drift sees images
+_LEAST_RESPONSES = 8  # halves of which can agree
+_LEAST_GRADIENT = 0.05  # of range per displacement, rms
 _APART = 4.0  # range resolution cells between responses
 _GAIN = 1.02  # of sharpness, for which a step is repeated
 
@@ -102,12 +105,13 @@ def autofocus(
     lines : RangeLines
         At least ten pings, monostatic, bistatic or of an array.
     grid : Grid
-        Where responses are looked for: some hundred of the scene are enough.
+        Where responses are looked for: a part of the scene with some dozen bright ones is enough.
     beam : BeamWindow, optional
         Weights of the channels.
     unknowns : sequence of {"sway", "heave", "surge"}
         Displacements to solve for, across the track, up and along it. Responses must see the sonar
-        from different directions to tell several apart.
+        from different directions to tell several apart. Drift, and the sharpness of single pings,
+        are given to the first one.
     device : Device, str or int, optional
         See `clsas.opencl.device.choose`.
     progress : callable, optional
@@ -145,9 +149,7 @@ def autofocus(
 
 
 def _checked_unknowns(unknowns: Sequence[str]) -> tuple[str, ...]:
-    names = (unknowns,) if isinstance(unknowns, str) else tuple(unknowns)
-    for name in names:
-        validate.one_of("every entry of unknowns", name, UNKNOWNS)
+    names = validate.named("unknowns", unknowns, UNKNOWNS)
     if not names or len(set(names)) < len(names):
         raise ValueError(f"unknowns must be one or several of {UNKNOWNS}, got {names}")
     return names
@@ -177,10 +179,18 @@ class _Focus:
 
     def check_geometry(self, names: tuple[str, ...]) -> None:
         """Refuse unknowns that the responses do not tell apart."""
-        if len(names) == 1:
-            return
         found = self._contributions(_RESPONSES)
         weights = np.abs(found.values[..., 0]) ** 2
+        total = max(float(weights.sum()), 1e-300)
+        for name, gradient in zip(names, found.gradient, strict=True):
+            seen = math.sqrt(float(np.sum(weights * gradient**2)) / total)
+            if weights.any() and seen < _LEAST_GRADIENT:
+                raise ValueError(
+                    f"unknowns must change the range to the responses; {name} of 1 m changes it "
+                    f"by {seen:.2g} m rms, at least {_LEAST_GRADIENT:g} m is needed"
+                )
+        if len(names) == 1:
+            return
         normal = np.einsum("ucp,vcp,cp->uv", found.gradient, found.gradient, weights)
         scale = np.sqrt(np.diag(normal))
         likeness = normal / np.maximum(np.outer(scale, scale), 1e-300)
@@ -193,6 +203,11 @@ class _Focus:
 
     def result(self) -> Autofocus:
         """Focus, and return what was found."""
+        responses = self._contributions(_RESPONSES).points if self.before else 0
+        if responses < _LEAST_RESPONSES:
+            return self._unfocused(
+                f"the grid shows {responses} responses, at least {_LEAST_RESPONSES} are needed"
+            )
         stages, dropped = list(self._stages()), ""
         for number, (name, find) in enumerate(stages, start=1):
             # What gained nothing once gains nothing from the same image again.
@@ -202,15 +217,25 @@ class _Focus:
                 self.progress(number, len(stages))
         wave_m = wavelength_m(self.given)
         apart_m = self._disagreement_m()
-        focused = apart_m <= MOST_DISAGREEMENT * wave_m
-        if not focused:
-            validate.warn(
-                f"the scene has no bright responses to focus on: one half of them and the other "
-                f"want the pings moved by displacements that differ by {apart_m / wave_m:.2g} "
-                f"wavelengths rms (at most {MOST_DISAGREEMENT:g}); the lines are left as they were"
+        if apart_m > MOST_DISAGREEMENT * wave_m:
+            return self._unfocused(
+                f"one half of the responses and the other want the pings moved by displacements "
+                f"that differ by {apart_m / wave_m:.2g} wavelengths rms, at most "
+                f"{MOST_DISAGREEMENT:g}"
             )
-            self.moved_m[:] = 0
-            self.deviation_m[:] = np.inf
+        return self._outcome(focused=True)
+
+    def _unfocused(self, why: str) -> Autofocus:
+        """Warn that the scene has no responses to focus on, and return the lines as they were."""
+        validate.warn(
+            f"the scene has no bright responses to focus on: {why}; the lines are left as they were"
+        )
+        self.moved_m = np.zeros_like(self.moved_m)
+        self.deviation_m = np.full_like(self.deviation_m, np.inf)
+        return self._outcome(focused=False)
+
+    def _outcome(self, *, focused: bool) -> Autofocus:
+        """Return the lines as far as they were moved."""
         vectors_m = self.passage.vectors_m(self.moved_m)
         return Autofocus(
             lines=self._lines(self.moved_m),
@@ -229,8 +254,6 @@ class _Focus:
         be made brighter, but every one in its own way.
         """
         found = self._contributions(_RESPONSES)
-        if found.points < 2:
-            return 0.0
         halves = [
             sharpest_m(self.passage, found.of(some))[0]
             for some in (slice(0, None, 2), slice(1, None, 2))

@@ -19,8 +19,9 @@ from clsas.core.lines import wavelength_m
 from clsas.navigation.responses import Contributions, Passage
 
 _LENGTH = 1.5
-"""Length of a subaperture in lengths of sqrt(wavelength range/2). The longer, the finer is the
-image and the more an error bends within it; half and twice find no errors of 2 wavelengths rms."""
+"""Length of a subaperture in lengths of sqrt(wavelength range/2). A longer one makes a finer image,
+but errors bend more within it. With half or twice the length, errors of 2 wavelengths rms are not
+found."""
 _LEAST_PINGS = 4  # of a subaperture
 _CELLS = 12  # azimuth cells to either side of a response
 _PER_CELL = 4
@@ -38,16 +39,20 @@ def drift_m(passage: Passage, found: Contributions) -> NDArray[np.float64] | Non
     Returns
     -------
     float64 [pings] or None
-        None where the track is too short for three subapertures.
+        None where the track is too short for three subapertures. Those in gaps of the track are
+        left out.
     """
     wave_m = wavelength_m(passage.lines)
     along_m = passage.along_m
     length_m = _LENGTH * math.sqrt(wave_m * float(np.median(found.range_m)) / 2)
     length_m = max(length_m, _LEAST_PINGS * float(np.median(np.diff(along_m))))
     starts_m = np.arange(along_m[0], along_m[-1] - length_m, length_m / 2)
+    channel_m = np.sort(along_channels := _along_channels_m(passage))
+    held = np.searchsorted(channel_m, [starts_m, starts_m + length_m])
+    starts_m = starts_m[held[1] - held[0] >= _LEAST_PINGS]
     if len(starts_m) < 3:
         return None
-    channel_m = _along_channels_m(passage)
+    channel_m = along_channels
     frequency = np.arange(-_CELLS * _PER_CELL, _CELLS * _PER_CELL + 1) / (_PER_CELL * length_m)
     images, per_slope = [], []
     for start_m in starts_m:
@@ -59,25 +64,32 @@ def drift_m(passage: Passage, found: Contributions) -> NDArray[np.float64] | Non
         image = np.tensordot(turn.astype(np.complex64), values.astype(np.complex64), 1)
         images.append(np.abs(image) ** 2)
         per_slope.append(-2 / wave_m * float(found.gradient[0, some].mean()))
-    return _integrated(passage, starts_m + length_m / 2, _slopes(images, frequency, per_slope))
+    number = np.rint((starts_m - starts_m[0]) / (length_m / 2)).astype(np.int64)
+    slopes = _slopes(images, number, frequency, per_slope)
+    return _integrated(passage, starts_m + length_m / 2, slopes)
 
 
 def _slopes(
     images: list[NDArray[np.float32]],
+    number: NDArray[np.int64],
     frequency: NDArray[np.float64],
     per_slope: list[float],
 ) -> NDArray[np.float64]:
     """Return the slope of the track's error in every subaperture, the least-squares solution.
 
-    Images are [frequencies, points, offsets]; `per_slope` is the frequency of a slope of 1.
+    Images are [frequencies, points, offsets], of subapertures of some numbers along the track;
+    `per_slope` is the frequency of a slope of 1.
     """
     count, step = len(images), frequency[1] - frequency[0]
     size = [scipy.fft.next_fast_len(2 * images[0].shape[axis]) for axis in (0, 2)]
     spectra = [scipy.fft.fftn(each, s=size, axes=(0, 2)) for each in images]
     rows, right = [], []
-    for lag in _LAGS:
-        for first in range(count - lag):
-            both = np.sum(spectra[first].conj() * spectra[first + lag], axis=1)
+    for first in range(count):
+        for second in range(first + 1, min(first + max(_LAGS) + 1, count)):
+            lag = int(number[second] - number[first])
+            if lag not in _LAGS:
+                continue
+            both = np.sum(spectra[first].conj() * spectra[second], axis=1)
             power = scipy.fft.ifftn(both).real
             row, column = np.unravel_index(int(np.argmax(power)), power.shape)
             before, at, after = (power[(row + n) % size[0], column] for n in (-1, 0, 1))
@@ -85,10 +97,12 @@ def _slopes(
             shift = (row + size[0] // 2) % size[0] - size[0] // 2
             shift += 0.5 * (before - after) / bend if bend < 0 else 0.0
             each = np.zeros(count)
-            each[first + lag], each[first] = 1 / lag, -1 / lag
+            each[second], each[first] = 1 / lag, -1 / lag
             rows.append(each)
-            mean = (per_slope[first] + per_slope[first + lag]) / 2
+            mean = (per_slope[first] + per_slope[second]) / 2
             right.append(shift * step / mean / lag)
+    if not rows:
+        return np.zeros(count)
     return np.linalg.lstsq(np.array(rows), np.array(right), rcond=None)[0]
 
 

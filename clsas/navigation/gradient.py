@@ -32,7 +32,7 @@ def phase_gradient_m(
     gradient = np.stack([passage.by_ping(each) / counts for each in found.gradient])
     spacing_m = float(np.median(np.diff(passage.along_m)))
     smoothed_m = wave_m * float(np.median(found.range_m)) / (2 * neighbourhood_m)
-    width = smoothed_m / spacing_m / 2
+    width = min(smoothed_m / max(spacing_m, 1e-12) / 2, passage.pings)
     smooth = gaussian_filter1d(values.real, width, axis=0, mode="constant") + 1j * (
         gaussian_filter1d(values.imag, width, axis=0, mode="constant")
     )
@@ -42,6 +42,7 @@ def phase_gradient_m(
     slope = np.angle(product.sum(axis=0))
     steps_m = np.zeros((len(turns), len(product)))
     normal = np.einsum("sp,usp,vsp->suv", weights, turns, turns)
+    # Keeps the matrix regular where unknowns are much alike, or where nothing is received at all.
     normal += 1e-12 * np.trace(normal, axis1=1, axis2=2)[:, None, None] * np.eye(len(turns))
     normal += 1e-300 * np.eye(len(turns))
     total = np.maximum(weights.sum(axis=0), 1e-300)

@@ -1,4 +1,4 @@
-"""Micronavigation by displaced phase centres (DPCA): sway and yaw from the echoes themselves."""
+"""Micronavigation by displaced phase centres (DPCA): sway, yaw and surge from echoes."""
 
 from __future__ import annotations
 
@@ -22,8 +22,11 @@ from clsas.signal.spectrum import measure_spectrum
 from clsas.sonar.track import Track
 
 UNKNOWNS = ("sway", "yaw", "surge")
+YAW_SD_RAD = math.radians(1.0)
+"""Standard deviation of a navigation's yaw, unless given."""
 
 _LEAST_SHARE = 0.25  # of the pairs of pings, that must be coherent
+_LEAST_DEVIATION, _MOST_DEVIATION = 1e-9, 1e6  # of a navigation, metres and radians
 _LEAST_WINDOW = 16  # samples
 _WINDOW_CELLS = 150.0  # range resolution cells of a window, unless given
 
@@ -92,7 +95,7 @@ def micronavigate(
     seabed_z_m: float | None = None,
     element_length_m: float | tuple[float, float] | None = None,
     sway_sd_m: ArrayLike = 0.1,
-    yaw_sd_rad: ArrayLike = 0.02,
+    yaw_sd_rad: ArrayLike = YAW_SD_RAD,
     surge_sd_m: ArrayLike = 0.1,
     correlation_pings: float | None = None,
     unknowns: Sequence[str] = UNKNOWNS,
@@ -111,7 +114,8 @@ def micronavigate(
     window_m : float, optional
         Length of a window of range, metres. About 150 resolution cells unless given.
     side : {"port", "starboard"}
-        Where the seabed lies, seen forward along the array.
+        Where the seabed lies, seen in the direction in which the array advances. Echoes do not
+        tell: the wrong side gives sway of the wrong sign.
     seabed_z_m : float, optional
         Height of the seabed. Rays then slope down to it, and sway is horizontal; without it rays
         are taken as horizontal.
@@ -173,16 +177,15 @@ def micronavigate(
         {"sway_sd_m": sway_sd_m, "yaw_sd_rad": yaw_sd_rad, "surge_sd_m": surge_sd_m},
         correlation_pings,
     )
-    most_step_m = validate.positive("most_step_m", most_step_m, "m")
+    longest_m = float(np.diff(swath.edges_m).max())
+    most_step_m = validate.number("most_step_m", most_step_m, "m", above=0.0, most=longest_m)
     correlator = Correlator(lines, swath)
     found = measured(lines, array, correlator, names, most_step_m, progress)
     return _result(lines, array, swath, found, fixes)
 
 
 def _checked_unknowns(unknowns: Sequence[str]) -> tuple[str, ...]:
-    names = (unknowns,) if isinstance(unknowns, str) else tuple(unknowns)
-    for name in names:
-        validate.one_of("every entry of unknowns", name, UNKNOWNS)
+    names = validate.named("unknowns", unknowns, UNKNOWNS)
     if "sway" not in names:
         raise ValueError(f"unknowns must hold 'sway', got {names}")
     return names
@@ -241,7 +244,7 @@ def _check_coherence(found: Displacements) -> None:
         raise ValueError(
             f"lines must be coherent from ping to ping; {without} of {len(found.coherent)} pairs "
             f"of pings are not: their coherence is at most {found.coherence.max():.2f} in any "
-            f"window. Check side, range_m, and the navigation's advance from ping to ping"
+            f"window. Check range_m, and the navigation's advance from ping to ping"
         )
     if without:
         validate.warn(
@@ -284,6 +287,12 @@ def _swath(
     )
     if seabed_z_m is not None:
         seabed_z_m = validate.number("seabed_z_m", seabed_z_m, "m")
+        height_m = float(np.abs(lines.phase_centres_m[:, 2] - seabed_z_m).max())
+        if height_m >= near:
+            raise ValueError(
+                f"seabed_z_m must lie less than the nearest range of {near:.4g} m from the sonar's "
+                f"height, got {height_m:.4g} m: rays must reach the seabed beside it"
+            )
     lengths = None
     if element_length_m is not None:
         given = np.atleast_1d(validate.array(
@@ -312,7 +321,10 @@ def _fixes(
     found = []
     for name, value in deviations.items():
         checked = validate.array(name, value, np.float64, (pings,), broadcast=True)
-        if checked.min() <= 0:
-            raise ValueError(f"{name} must be above 0, got {checked.min():g}")
+        if checked.min() < _LEAST_DEVIATION or checked.max() > _MOST_DEVIATION:
+            wrong = checked.min() if checked.min() < _LEAST_DEVIATION else checked.max()
+            raise ValueError(
+                f"{name} must be from {_LEAST_DEVIATION:g} to {_MOST_DEVIATION:g}, got {wrong:g}"
+            )
         found.append(checked * math.sqrt(2 * persist))
     return np.stack(found, axis=1)

@@ -26,7 +26,8 @@ class Array:
     reference_m : float64 [pings, 3]
         Mean phase centre of every ping, about which the platform turns.
     forward : float64 [pings, 3]
-        Horizontal unit vector along the array.
+        Horizontal unit vector along the array, in the direction in which it advances. An array at
+        rest has the direction from its first receiver to its last.
     port : float64 [pings, 3]
         Horizontal unit vector to port.
     spacing_m : float
@@ -72,6 +73,9 @@ class Array:
                 f"{length_m.argmin()}"
             )
         forward /= length_m[:, None]
+        # Receivers may be numbered from either end: forward is where the array goes.
+        advance_m = np.gradient(reference_m, axis=0)
+        forward[np.einsum("pi,pi->p", forward, advance_m) < 0] *= -1
         port = np.stack([-forward[:, 1], forward[:, 0], np.zeros(len(forward))], axis=1)
         at_m = np.einsum("ci,ci->c", centres_m, np.repeat(forward, counts, axis=0))
         neighbours = np.ones(len(at_m) - 1, bool)
@@ -112,11 +116,6 @@ class Overlap:
     def pairs(self) -> int:
         """Number of pairs of channels."""
         return len(self.first)
-
-    @property
-    def aperture_m(self) -> float:
-        """Distance between the outermost phase centres."""
-        return float(np.ptp(self.along_m)) if self.pairs else 0.0
 
 
 def overlap(lines: RangeLines, array: Array, ping: int, lag: int = 0) -> Overlap:

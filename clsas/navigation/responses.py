@@ -85,8 +85,9 @@ def brightest(image: Image, count: int, apart_m: float) -> NDArray[np.float64]:
     size = []
     for axis in range(2):
         steps = np.diff(positions_m, axis=axis)
-        step_m = float(np.median(np.linalg.norm(steps, axis=-1))) if steps.size else math.inf
-        size.append(2 * math.ceil(apart_m / step_m) + 1)
+        step_m = float(np.median(np.linalg.norm(steps, axis=-1))) if steps.size else 0.0
+        most = amplitude.shape[axis]
+        size.append(2 * math.ceil(min(apart_m / step_m, most)) + 1 if step_m > 0 else 1)
     largest = amplitude == maximum_filter(amplitude, size=tuple(size), mode="constant")
     found = np.flatnonzero((largest & (amplitude > 0)).ravel())
     found = found[np.argsort(-amplitude.ravel()[found], kind="stable")[:count]]

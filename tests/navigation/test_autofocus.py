@@ -172,3 +172,38 @@ def test_the_command(tmp_path):
     assert results["focused"]
     assert results["sharpness_after"] > 2 * results["sharpness_before"]
     assert abs(peak_db(clsas.load(tmp_path / "focused.h5"), true)) <= 0.3
+
+
+def test_a_gap_of_the_track():
+    """Pings beyond a gap are focused with the others; no subaperture lies in the gap."""
+    kept = np.r_[0:190, 240:PINGS]
+    sway_m = smooth_m(0.3 * WAVELENGTH_M)
+    true, told = recorded(points(), sway_m)
+    found = autofocus(told.select(kept), GRID)
+    assert np.isfinite(found.lines.tx_m).all()
+    assert abs(peak_db(found.lines, true.select(kept))) <= 1.0
+
+
+@pytest.mark.filterwarnings("default::clsas.core.validate.ClsasWarning")
+@pytest.mark.parametrize("case", ["zeros", "beyond", "one pixel"])
+def test_nothing_to_focus_on(case):
+    _, told = recorded(points(), np.zeros(PINGS))
+    grid = GRID
+    if case == "zeros":
+        told = replace(told, samples=np.zeros_like(told.samples))
+    elif case == "beyond":
+        grid = clsas.Grid.plane(x=(0, 1, 20), y=(900, 901, 20))
+    else:
+        grid = clsas.Grid.plane(x=(3, 3, 1), y=(19, 19, 1))
+    with pytest.warns(ClsasWarning, match=r"no bright responses to focus on: the grid shows [01] "):
+        found = autofocus(told, grid)
+    assert not found.focused
+    np.testing.assert_array_equal(found.lines.tx_m, told.tx_m)
+
+
+def test_an_unknown_that_responses_do_not_see():
+    _, told = recorded(points(), np.zeros(PINGS))
+    with pytest.raises(ValueError, match="heave of 1 m changes it by"):
+        autofocus(told, GRID, unknowns="heave")
+    with pytest.raises(TypeError, match="unknowns must be one or several"):
+        autofocus(told, GRID, unknowns=3)

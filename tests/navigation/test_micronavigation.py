@@ -241,6 +241,10 @@ def test_what_cannot_be_navigated_is_refused(straight):
         ({"correlation_pings": 0.0}, "correlation_pings"),
         ({"seabed_z_m": np.nan}, "seabed_z_m"),
         ({"unknowns": ("roll",)}, "unknowns"),
+        ({"most_step_m": 1e3}, "most_step_m"),
+        ({"sway_sd_m": 1e-200}, "sway_sd_m must be from"),
+        ({"yaw_sd_rad": 1e200}, "yaw_sd_rad must be from"),
+        ({"seabed_z_m": -1000.0}, "seabed_z_m must lie less than the nearest range"),
         ({"unknowns": ("yaw",)}, "unknowns must hold 'sway'"),
     ],
 )
@@ -294,3 +298,16 @@ def test_the_command(straight, tmp_path):
     refused = CliRunner().invoke(main, [*arguments, "--range-m", "66:60"])
     assert refused.exit_code == 2
     assert "NEAR:FAR" in refused.output
+
+
+def test_the_order_of_receivers_does_not_matter(straight):
+    """An array whose receivers are numbered from the bow advances in the same direction."""
+    order = np.concatenate([np.arange(48)[::-1] + start for start in straight.ping_starts])
+    moved_m = 0.004 * np.sin(np.arange(21))
+    rx_m = straight.rx_m - np.repeat(moved_m, 48)[:, None] * [0.0, 1.0, 0.0]
+    tx_m = straight.tx_m - np.repeat(moved_m, 48)[:, None] * [0.0, 1.0, 0.0]
+    told = replace(straight, rx_m=rx_m, tx_m=tx_m)  # the navigation errs to starboard
+    options = {"range_m": (60, 66), "unknowns": ("sway",), "element_length_m": WAVELENGTH_M}
+    found, reversed_ = (micronavigate(each, **options) for each in (told, told.select(order)))
+    np.testing.assert_allclose(reversed_.sway_m, found.sway_m, atol=1e-6)
+    assert np.std(detrended(found.sway_m - moved_m)) <= WAVELENGTH_M / 100
