@@ -81,6 +81,7 @@ CASES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CASES)
 def test_smooth_sway_is_found(name):
     scene, sway_m = CASES[name]
@@ -94,6 +95,7 @@ def test_smooth_sway_is_found(name):
     assert found.sharpness_after > 2 * found.sharpness_before
 
 
+@pytest.mark.slow
 def test_smooth_sway_and_jitter():
     sway_m = smooth_m(2 * WAVELENGTH_M) + white_m(0.05 * WAVELENGTH_M)
     true, told = recorded(points(), sway_m)
@@ -109,6 +111,7 @@ def test_jitter_alone():
     assert abs(peak_db(autofocus(told, GRID).lines, true)) <= 1.0
 
 
+@pytest.mark.slow
 def test_an_image_in_focus_stays_so():
     true, _ = recorded(points(), np.zeros(PINGS))
     found = autofocus(true, GRID)
@@ -116,6 +119,7 @@ def test_an_image_in_focus_stays_so():
     assert np.abs(found.correction_m).max() <= WAVELENGTH_M / 16
 
 
+@pytest.mark.slow
 def test_speckle_is_reported_not_focused():
     _, told = recorded(speckle(0), smooth_m(0.5 * WAVELENGTH_M))
     with pytest.warns(ClsasWarning, match="no bright responses"):
@@ -124,6 +128,7 @@ def test_speckle_is_reported_not_focused():
     np.testing.assert_array_equal(found.lines.tx_m, told.tx_m)
 
 
+@pytest.mark.slow
 def test_sway_and_heave():
     """A track above the scene sees responses at different angles, which tell both apart."""
     course = (0, 0, 12.0), (STEP_M, 0, 0), PINGS, 1.0
@@ -157,6 +162,7 @@ def test_bad_arguments():
         autofocus(told, None)
 
 
+@pytest.mark.slow
 def test_the_command(tmp_path):
     true, told = recorded(points(), smooth_m(0.3 * WAVELENGTH_M))
     clsas.save(tmp_path / "lines.h5", told)
@@ -172,6 +178,7 @@ def test_the_command(tmp_path):
     assert abs(peak_db(clsas.load(tmp_path / "focused.h5"), true)) <= 0.3
 
 
+@pytest.mark.slow
 def test_a_gap_of_the_track():
     """Pings beyond a gap are focused with the others; no subaperture lies in the gap."""
     kept = np.r_[0:190, 240:PINGS]

@@ -88,6 +88,7 @@ def bounds(coherence):
     return {"sway_steps": ("m", sway), "yaw_steps": ("rad", yaw)}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("coherence", COHERENCES)
 def test_errors_reach_the_bound(noisy, coherence):
     for name, (unit, bound) in bounds(coherence).items():
@@ -98,6 +99,7 @@ def test_errors_reach_the_bound(noisy, coherence):
     assert mean == pytest.approx(coherence, abs=0.02)
 
 
+@pytest.mark.slow
 def test_intervals_hold_what_they_promise(noisy):
     inside = []
     for runs in noisy.values():
@@ -136,6 +138,7 @@ def detrended(values):
     return values - np.polyval(np.polyfit(at, values, 1), at)
 
 
+@pytest.mark.slow
 def test_motion_that_nobody_told_is_found(moving):
     _, _, found, motion = moving
     assert np.std(detrended(found.sway_m - motion["sway_m"])) <= WAVELENGTH_M / 16
@@ -145,6 +148,7 @@ def test_motion_that_nobody_told_is_found(moving):
     assert np.median(misses) < 3
 
 
+@pytest.mark.slow
 def test_an_image_is_focused(moving, platform):
     lines, right, found, _ = moving
     x = float(lines.phase_centres_m[:, 0].mean())
@@ -157,6 +161,7 @@ def test_an_image_is_focused(moving, platform):
     assert peaks["told"] < 0.5 * peaks["true"]
 
 
+@pytest.mark.slow
 def test_the_other_side_and_a_seabed_below():
     """Rays to starboard that slope down: sway is horizontal."""
     sonar, advance_m = array(48, 16)
@@ -172,6 +177,7 @@ def test_the_other_side_and_a_seabed_below():
     assert np.std(detrended(found.sway_m - sway_m)) <= WAVELENGTH_M / 16
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not RECORDED.exists(), reason=f"no recorded data at {RECORDED}")
 def test_jitter_of_a_recorded_array_is_followed():
     """Transmissions of a recorded full matrix get 20 ns rms of jitter, which is found to 5 ns."""
@@ -253,6 +259,7 @@ def test_arguments_outside_their_limits(straight, options, message):
         micronavigate(straight, **options)
 
 
+@pytest.mark.slow
 def test_pings_without_coherence_are_bridged(straight):
     samples = straight.samples.copy()
     rng = np.random.default_rng(0)
@@ -273,6 +280,7 @@ def test_phase_centres_pair_up(straight):
     assert np.ptp(pairs.along_m) == pytest.approx(23 * SPACING_M)
 
 
+@pytest.mark.slow
 def test_an_advance_that_differs_is_found():
     """The navigation says 2 % too little, by a part of the array's spacing and by more of it."""
     sonar, advance_m = array(56, 24)
@@ -284,6 +292,7 @@ def test_an_advance_that_differs_is_found():
     assert np.abs(advanced_m - advance_m).max() <= 0.05 * SPACING_M
 
 
+@pytest.mark.slow
 def test_the_command(straight, tmp_path):
     clsas.save(tmp_path / "lines.h5", straight)
     arguments = ["navigate", str(tmp_path / "lines.h5"), "-o", str(tmp_path / "corrected.h5")]
