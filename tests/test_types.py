@@ -21,6 +21,7 @@ from clsas.sonar.track import Track
 ROOT = Path(__file__).parents[1]
 
 
+@pytest.mark.slow
 def test_the_readme_passes_mypy(tmp_path, monkeypatch):
     api = pytest.importorskip("mypy.api")
     snippets = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)

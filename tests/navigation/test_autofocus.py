@@ -105,6 +105,7 @@ def test_smooth_sway_and_jitter():
     assert np.std(gaussian_filter1d(residual_m, 12)) <= WAVELENGTH_M / 100
 
 
+@pytest.mark.slow
 def test_jitter_alone():
     true, told = recorded(points(), white_m(0.1 * WAVELENGTH_M))
     assert peak_db(told, true) < -3

@@ -208,6 +208,7 @@ def test_jitter_of_a_recorded_array_is_followed():
     assert found.overlap.min() == 63
 
 
+@pytest.mark.slow
 def test_what_cannot_be_navigated_is_refused(straight):
     def one_ping():
         return straight.select(slice(0, 48))
@@ -233,6 +234,7 @@ def test_what_cannot_be_navigated_is_refused(straight):
             micronavigate(make(), range_m=(60, 66))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("options", "message"),
     [
@@ -271,6 +273,7 @@ def test_pings_without_coherence_are_bridged(straight):
     assert np.isfinite(found.sway_m).all()
 
 
+@pytest.mark.slow
 def test_phase_centres_pair_up(straight):
     pairs = overlap(straight, Array.of(straight), 0)
     assert pairs.pairs == 24
@@ -309,6 +312,7 @@ def test_the_command(straight, tmp_path):
     assert "NEAR:FAR" in refused.output
 
 
+@pytest.mark.slow
 def test_the_order_of_receivers_does_not_matter(straight):
     """An array whose receivers are numbered from the bow advances in the same direction."""
     order = np.concatenate([np.arange(48)[::-1] + start for start in straight.ping_starts])

@@ -190,6 +190,7 @@ def test_cars_stand_out_of_the_tarmac(total):
     assert 10 * np.log10(cars / lane) > 10
 
 
+@pytest.mark.slow
 def test_program_draws_every_image_and_says_what_is_in_it(recording, tmp_path):
     pytest.importorskip("matplotlib")
     path = recording(radar.RECORDINGS[0])
