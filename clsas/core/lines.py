@@ -140,6 +140,13 @@ class RangeLines:
         return np.flatnonzero(np.append(True, (np.diff(self.tx_m, axis=0) != 0).any(axis=1)))
 
     @property
+    def ping_centres_m(self) -> NDArray[np.float64]:
+        """Mean phase centre of every ping, metres, shape [pings, 3]."""
+        starts = self.ping_starts
+        counts = np.diff(np.append(starts, self.channels))
+        return np.add.reduceat(self.phase_centres_m, starts, axis=0) / counts[:, None]
+
+    @property
     def wavenumber_rad_m(self) -> float:
         """Wavenumber k of the carrier, radians per metre (one way)."""
         return 2 * np.pi * self.carrier_hz / self.sound_speed_m_s

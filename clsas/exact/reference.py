@@ -15,6 +15,7 @@ from clsas.core.image import Image
 from clsas.core.image_error import relative_error_db
 from clsas.core.lines import RangeLines, wavelength_m
 from clsas.exact.preparation import Preparation
+from clsas.signal.readout import interpolated
 from clsas.signal.spectrum import measure_spectrum
 from clsas.sonar.beam import BeamWindow, normalising
 from clsas.sonar.visibility import sines
@@ -59,19 +60,7 @@ def same_interpolator(
     def evaluate(
         samples: NDArray[np.complex128], position: NDArray[np.float64]
     ) -> NDArray[np.complex128]:
-        upsampled = resampling.apply(samples)
-        position = position + resampling.lead
-        upsampled_position = position * resampling.ratio - resampling.first
-        lower = np.floor(upsampled_position)
-        weights = interpolator.weights(upsampled_position - lower - 0.5)
-        first = lower.astype(np.int64) + 1 - interpolator.taps // 2
-        total = np.zeros(position.shape, np.complex128)
-        for tap in range(interpolator.taps):
-            inside = (first + tap >= 0) & (first + tap < resampling.length)
-            index = np.where(inside, first + tap, 0)
-            taken = np.take_along_axis(upsampled, index, axis=1)
-            total += inside * weights[..., tap] * taken
-        return total * np.exp(2j * np.pi * resampling.centre_cycles_per_sample * position)
+        return interpolated(samples, position, interpolator, resampling)
 
     return _sum_channels(preparation.lines, points_m, evaluate, progress, preparation.beam)
 

@@ -24,10 +24,16 @@ from clsas.core.image import Image
 from clsas.core.lines import RangeLines, wavelength_m
 from clsas.navigation.drift import drift_m
 from clsas.navigation.gradient import phase_gradient_m, sharpest_m
-from clsas.navigation.responses import Contributions, Passage, brightest, contributions
+from clsas.navigation.responses import (
+    READ_DB,
+    Contributions,
+    Passage,
+    brightest,
+    contributions,
+)
 from clsas.opencl.device import Device, open_device
 from clsas.planning.factorize import factorize
-from clsas.signal.spectrum import measure_spectrum
+from clsas.signal.readout import Readout
 from clsas.sonar.beam import BeamWindow
 
 UNKNOWNS = ("sway", "heave", "surge")
@@ -171,8 +177,9 @@ class _Focus:
         self.device, self.progress = device, progress
         self.moved_m = np.zeros((len(passage.axes), passage.pings))
         self.deviation_m = np.full(passage.pings, np.inf)
-        spectrum = measure_spectrum(lines)
-        self.cell_m = lines.range_step_m * min(max(spectrum.oversampling, 1.0), 64.0)
+        self.readout = Readout.of(lines, READ_DB)
+        oversampling = self.readout.spectrum.oversampling
+        self.cell_m = lines.range_step_m * min(max(oversampling, 1.0), 64.0)
         self.steps: list[tuple[str, float]] = []
         self.image = self._form(self.moved_m)
         self.sharpness = self.before = sharpness(self.image)
@@ -291,7 +298,7 @@ class _Focus:
         if not len(points_m):
             points_m = self.grid.positions_m().reshape(-1, 3)[:1]
         lines = self._lines(self.moved_m)
-        return contributions(self.passage, lines, points_m, self.beam, offsets_m)
+        return contributions(self.passage, self.readout, lines, points_m, self.beam, offsets_m)
 
     def _try(self, name: str, find: Callable[[], NDArray[np.float64] | None]) -> bool:
         """Keep a correction if it makes the image sharper; return whether it does so by much."""

@@ -22,7 +22,7 @@ from clsas.core.lines import RangeLines
 from clsas.navigation.overlap import Array, Overlap
 from clsas.navigation.swath import Swath
 from clsas.signal.readout import Readout
-from clsas.signal.spectrum import cycles_per_m_at, measure_spectrum
+from clsas.signal.spectrum import cycles_per_m_at
 from clsas.sonar.system import element_pattern
 
 _ANGLES = 65  # of the beam, over which the expected phase is averaged
@@ -97,12 +97,11 @@ class Correlator:
 
     def __init__(self, lines: RangeLines, swath: Swath) -> None:
         self.readout, self.swath = Readout.of(lines), swath
-        spectrum = measure_spectrum(lines)
+        self.spectrum = spectrum = self.readout.spectrum
         self.cycles_per_m = float(cycles_per_m_at(lines, spectrum.centre))
         self.step_m = lines.range_step_m
         counts = np.maximum(np.diff(swath.edges_m) / self.step_m, 1.0)
         self.samples = counts.astype(np.int64)
-        self.spectrum = spectrum
 
     @cached_property
     def independent(self) -> NDArray[np.float64]:

@@ -47,26 +47,27 @@ def drift_m(passage: Passage, found: Contributions) -> NDArray[np.float64] | Non
     length_m = _LENGTH * math.sqrt(wave_m * float(np.median(found.range_m)) / 2)
     length_m = max(length_m, _LEAST_PINGS * float(np.median(np.diff(along_m))))
     starts_m = np.arange(along_m[0], along_m[-1] - length_m, length_m / 2)
-    channel_m = np.sort(along_channels := _along_channels_m(passage))
-    held = np.searchsorted(channel_m, [starts_m, starts_m + length_m])
-    starts_m = starts_m[held[1] - held[0] >= _LEAST_PINGS]
-    if len(starts_m) < 3:
+    channel_m = _along_channels_m(passage)
+    channels = [
+        np.flatnonzero((channel_m >= start_m) & (channel_m <= start_m + length_m))
+        for start_m in starts_m
+    ]
+    number = np.flatnonzero([len(some) >= _LEAST_PINGS for some in channels])
+    if len(number) < 3:
         return None
-    channel_m = along_channels
     frequency = np.arange(-_CELLS * _PER_CELL, _CELLS * _PER_CELL + 1) / (_PER_CELL * length_m)
     images, per_slope = [], []
-    for start_m in starts_m:
-        some = np.flatnonzero((channel_m >= start_m) & (channel_m <= start_m + length_m))
-        at = (channel_m[some] - start_m) / length_m
-        taper = np.sin(np.pi * at) ** 2
-        turn = taper * np.exp(-2j * np.pi * frequency[:, None] * (channel_m[some] - start_m))
+    for each in number:
+        some = channels[each]
+        at_m = channel_m[some] - starts_m[each]
+        taper = np.sin(np.pi * at_m / length_m) ** 2
+        turn = taper * np.exp(-2j * np.pi * frequency[:, None] * at_m)
         values = found.values[some]
         image = np.tensordot(turn.astype(np.complex64), values.astype(np.complex64), 1)
         images.append(np.abs(image) ** 2)
         per_slope.append(-2 / wave_m * float(found.gradient[0, some].mean()))
-    number = np.rint((starts_m - starts_m[0]) / (length_m / 2)).astype(np.int64)
     slopes = _slopes(images, number, frequency, per_slope)
-    return _integrated(passage, starts_m + length_m / 2, slopes)
+    return _integrated(passage, starts_m[number] + length_m / 2, slopes)
 
 
 def _slopes(
@@ -120,8 +121,7 @@ def _along_channels_m(passage: Passage) -> NDArray[np.float64]:
     """Return how far along the track every channel's phase centre lies."""
     lines = passage.lines
     centres_m = lines.phase_centres_m
-    counts = np.bincount(passage.ping)
-    middles_m = passage.by_ping(centres_m) / counts[:, None]
+    middles_m = lines.ping_centres_m
     tangent = np.gradient(middles_m, axis=0)
     tangent /= np.maximum(np.linalg.norm(tangent, axis=1, keepdims=True), 1e-12)
     ahead_m = np.einsum("ci,ci->c", centres_m - middles_m[passage.ping], tangent[passage.ping])

@@ -63,7 +63,7 @@ class Array:
                 f"{counts.argmin()}: without overlapping phase centres use clsas.autofocus"
             )
         centres_m = lines.phase_centres_m
-        reference_m = np.add.reduceat(centres_m, starts[:-1]) / counts[:, None]
+        reference_m = lines.ping_centres_m
         forward = centres_m[starts[1:] - 1] - centres_m[starts[:-1]]
         forward[:, 2] = 0.0
         length_m = np.linalg.norm(forward, axis=1)

@@ -47,7 +47,7 @@ class Passage:
         """Return the passage of lines; `unknowns` are some of "sway", "heave" and "surge"."""
         starts = lines.ping_starts
         counts = np.diff(np.append(starts, lines.channels))
-        centres_m = np.add.reduceat(lines.phase_centres_m, starts) / counts[:, None]
+        centres_m = lines.ping_centres_m
         along = track_directions(lines)[starts]
         up = np.array([0.0, 0.0, 1.0])
         sway = np.cross(up, along)
@@ -125,6 +125,7 @@ class Contributions:
 
 def contributions(
     passage: Passage,
+    readout: Readout,
     lines: RangeLines,
     points_m: NDArray[np.float64],
     beam: BeamWindow | None,
@@ -132,10 +133,10 @@ def contributions(
 ) -> Contributions:
     """Return the contributions to points and, with offsets, to others beside them in range.
 
-    `lines` are those of the passage, moved as far as is known.
+    `readout` reads the passage's lines, and `lines` are these, moved as far as is known.
     """
     offsets_m = np.zeros(1) if offsets_m is None else offsets_m
-    readout, shape = Readout.of(lines, READ_DB), (lines.channels, len(points_m))
+    shape = lines.channels, len(points_m)
     values = np.empty((*shape, len(offsets_m)), np.complex128)
     gradient, range_m = np.empty((len(passage.axes), *shape)), np.empty(shape)
     along = None if beam is None else beam.directions(lines)

@@ -180,7 +180,7 @@ def track_errors_m(lines: RangeLines) -> NDArray[np.float64]:
     centres_m = lines.phase_centres_m
     starts = lines.ping_starts
     counts = np.diff(np.append(starts, lines.channels))
-    pings_m = np.add.reduceat(centres_m, starts, axis=0) / counts[:, None]
+    pings_m = lines.ping_centres_m
     middle_m = pings_m.mean(axis=0)
     direction = np.linalg.svd(pings_m - middle_m, full_matrices=False)[2][0]
     away_m = centres_m - middle_m

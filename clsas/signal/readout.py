@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from clsas.core.lines import RangeLines
 from clsas.signal.interpolation import Interpolator, Resampling, choose, resampling
-from clsas.signal.spectrum import measure_spectrum
+from clsas.signal.spectrum import Spectrum, measure_spectrum
+
+_Complex = TypeVar("_Complex", np.complex64, np.complex128)
 
 ACCURACY_DB = -70.0
 """Default relative rms error of what is read."""
@@ -22,11 +25,13 @@ class Readout:
     Attributes
     ----------
     lines : RangeLines
+    spectrum : Spectrum
     interpolator : Interpolator
     resampling : Resampling
     """
 
     lines: RangeLines
+    spectrum: Spectrum
     interpolator: Interpolator
     resampling: Resampling
 
@@ -35,7 +40,8 @@ class Readout:
         """Return lines with the fastest interpolator of an accuracy, dB."""
         spectrum = measure_spectrum(lines)
         interpolator = choose(spectrum, accuracy_db)
-        return cls(lines, interpolator, resampling(lines.length, interpolator, spectrum))
+        of_filter = resampling(lines.length, interpolator, spectrum)
+        return cls(lines, spectrum, interpolator, of_filter)
 
     def read(
         self, channels: NDArray[np.int64], range_m: NDArray[np.float64]
@@ -52,21 +58,39 @@ class Readout:
         complex64 [n, m]
             Values as the samples have them, without their carrier.
         """
-        lines, resampling = self.lines, self.resampling
-        upsampled = resampling.apply(lines.samples[channels])
+        lines = self.lines
         index = (range_m - lines.first_range_m[channels, None]) / lines.range_step_m
-        within = (index >= 0) & (index <= lines.length - 1)
-        index += resampling.lead
-        position = index * resampling.ratio - resampling.first
-        lower = np.floor(position)
-        taps = self.interpolator.taps
-        weights = self.interpolator.weights(position - lower - 0.5).astype(np.float32)
-        first = lower.astype(np.int64) + 1 - taps // 2
-        first = np.clip(first, 0, resampling.length - taps)
-        total = np.zeros(range_m.shape, np.complex64)
-        for tap in range(taps):
-            total += weights[..., tap] * np.take_along_axis(upsampled, first + tap, axis=1)
-        turns = resampling.centre_cycles_per_sample * index
-        total *= np.exp(2j * np.pi * (turns - np.rint(turns)))
-        total[~within] = 0
-        return total
+        values = interpolated(lines.samples[channels], index, self.interpolator, self.resampling)
+        values[(index < 0) | (index > lines.length - 1)] = 0
+        return values
+
+
+def interpolated(
+    samples: NDArray[_Complex],
+    index: NDArray[np.float64],
+    interpolator: Interpolator,
+    resampling: Resampling,
+) -> NDArray[_Complex]:
+    """Return lines between their samples, in the lines' own precision.
+
+    Parameters
+    ----------
+    samples : complex [n, length]
+    index : float64 [n, m]
+        Places in samples; beyond the ends lines fade out as their interpolation does.
+    interpolator, resampling : Interpolator, Resampling
+    """
+    upsampled = resampling.apply(samples)
+    index = index + resampling.lead
+    position = index * resampling.ratio - resampling.first
+    lower = np.floor(position)
+    weights = interpolator.weights(position - lower - 0.5).astype(samples.real.dtype)
+    first = lower.astype(np.int64) + 1 - interpolator.taps // 2
+    total = np.zeros(index.shape, samples.dtype)
+    for tap in range(interpolator.taps):
+        inside = (first + tap >= 0) & (first + tap < resampling.length)
+        taken = np.take_along_axis(upsampled, np.where(inside, first + tap, 0), axis=1)
+        total += inside * weights[..., tap] * taken
+    turns = resampling.centre_cycles_per_sample * index
+    total *= np.exp(2j * np.pi * (turns - np.rint(turns)))
+    return total

@@ -42,7 +42,7 @@ def track_directions(lines: RangeLines, pings: int | None = None) -> NDArray[np.
             f"no track"
         )
     receivers = np.diff(np.append(first, lines.channels))
-    centres_m = np.add.reduceat(channels_m, first, axis=0) / receivers[:, None]
+    centres_m = lines.ping_centres_m
     span = pings or min(max(count // _SMOOTHED_SHARE, 5), MOST_TRACK_PINGS)
     tangent = np.concatenate([_tangents(leg_m, span) for leg_m in _legs(centres_m)])
     speed = np.linalg.norm(tangent, axis=1)
