@@ -162,6 +162,12 @@ __kernel void backproject_points(__global const sample_t *lines, int line_pitch,
         for (int block = 0; block < STACK; block++) {
             __global const float *x = offsets + block * WIDTH;
             const Vector offset = {LOAD(x), LOAD(x + points), LOAD(x + 2 * (size_t)points)};
+            /* Weights first: 10 % faster than after the path, as fewer registers are spilled. */
+#if BEAM
+            const vfloat weight = point_weights(&antennas, &beam, offset);
+#else
+            const vfloat weight = 1.0f;
+#endif
             const vfloat path = path_change(&antennas, offset);
 #if ALIGNED
             const vfloat samples = (0.5f * path - scalar_product(uniform_vector(drift), offset)) * samples_per_m;
@@ -171,11 +177,6 @@ __kernel void backproject_points(__global const sample_t *lines, int line_pitch,
             const vfloat t = samples + start;
 #if WINDOWS > 1
             const Lookup lookup = lookup_about(line, line_pitch, reference.sample, LANE(t, MIDDLE));
-#endif
-#if BEAM
-            const vfloat weight = point_weights(&antennas, &beam, offset);
-#else
-            const vfloat weight = 1.0f;
 #endif
             add_echoes(&sums, block, &lookup, t, filter, samples * cycles_per_sample + reference.phase,
                        phase_polynomials, weight, channels);

@@ -17,11 +17,6 @@ from clsas.opencl.buffers import VECTOR_ROOM, channel_pitch, float_pairs
 from clsas.signal.interpolation import Resampling
 
 
-def is_bistatic(lines: RangeLines) -> bool:
-    """Return whether paths out and back differ."""
-    return lines.rx_velocity_m_s is not None or not np.array_equal(lines.tx_m, lines.rx_m)
-
-
 def geometry_rows(
     lines: RangeLines,
     origin_m: NDArray[np.float64],

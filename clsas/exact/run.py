@@ -15,20 +15,22 @@ from clsas.core import validate
 from clsas.core.image import Image, holds_any
 from clsas.core.lines import RangeLines
 from clsas.exact.blocks import band_parts, blocks_of
+from clsas.exact.buffers import block_buffers, is_bistatic, part_buffers
 from clsas.exact.lookup import lookup_options
 from clsas.exact.preparation import Preparation
-from clsas.exact.references import geometry_rows, is_bistatic, references_of
+from clsas.exact.references import geometry_rows, references_of
 from clsas.exact.tiles import STACK, Tiles
 from clsas.opencl.buffers import (
+    Slot,
     beam_table,
     expansion_kernel,
     filter_table,
     float_pairs,
     phase_polynomials,
+    pixel_buffers,
     slices,
     upsampled_lines,
 )
-from clsas.opencl.device import Slot
 from clsas.opencl.kernels import Kernel
 from clsas.sonar.beam import INTERVALS, normalising
 from clsas.sonar.coverage import warn_unseen
@@ -67,8 +69,8 @@ def execute(
         at_once = band_parts(device, layout.part_pixels, layout.across, normalise)
         for band in slices(slice(0, layout.parts), at_once):
             part = slice(band.start * layout.part_pixels, band.stop * layout.part_pixels)
-            names = ["pixels", "weight_sums"] if normalise else ["pixels"]
-            on_device = {name: device.zeros(pixels[part].nbytes) for name in names}
+            buffers = pixel_buffers(part.stop - part.start, p.beam)
+            on_device = {name: device.zeros(buffer.nbytes) for name, buffer in buffers.items()}
             for channels in slices(slice(0, p.lines.channels), run.blocks.channels_at_once):
                 run.add(channels, band, on_device)
             cl.enqueue_copy(device.queue, pixels[part], on_device["pixels"])
@@ -209,6 +211,7 @@ class _Run:
         lines = p.lines.select(channels)
         slot = next(self.line_slots)
         slot.wait()
+        slot.make(block_buffers(p.lines, lines.channels, blocks, p.beam))
         samples = upsampled_lines(
             lines.samples, p.resampling, p.device.info.width, blocks.margin, blocks.pitch
         )
@@ -230,7 +233,10 @@ class _Run:
         """Start copying the centres, ranges and references of some parts to the device."""
         slot = next(self.part_slots)
         slot.wait()
-        centres_m = self.p.layout.centres_m(parts)
+        layout = self.p.layout
+        count = int((ranges[:, 1] - ranges[:, 0]).max())
+        slot.make(part_buffers(len(ranges), layout.part_pixels, count, self.blocks))
+        centres_m = layout.centres_m(parts)
         slot.fill("centres", float_pairs(centres_m - self.origin_m))
         slot.fill("ranges", np.column_stack([ranges, ranges[:, 0]]))
         references = references_of(centres_m, lines, ranges, self.p.resampling, self.blocks)
@@ -289,7 +295,7 @@ class _Run:
         p, device = self.p, self.p.device
         count = job.parts.stop - job.parts.start
         pitch = job.ranges["channel_pitch"]
-        expansions = job.slot.buffer("expansions", 4 * self.blocks.terms * count * pitch)
+        expansions = job.slot["expansions"]
         device.run(
             self.expand,
             (pitch // device.info.width, count),

@@ -143,11 +143,3 @@ def tile_buffers(tiles: int, channels: int, beam: BeamWindow | None, *, aligned:
         buffers["sample"] = Buffer(row, np.int32)
         buffers |= {name: Buffer(row, np.float32) for name in ("fraction", "phase")}
     return buffers
-
-
-def pixel_buffers(pixels: int, beam: BeamWindow | None) -> Buffers:
-    """Return the pixels of a batch, and the sums of their weights for a normalising beam."""
-    buffers = {"pixels": Buffer((pixels,), np.complex64)}
-    if beam is not None and beam.normalise:
-        buffers["weight_sums"] = Buffer((pixels,), np.complex64)
-    return buffers

@@ -162,5 +162,10 @@ def explained(error: ValidationError, values: Any) -> str:
         return f"{where} is unknown"
     if mistake["type"] == "value_error":
         return f"{where}: {mistake['msg'].removeprefix('Value error, ')}"
-    allowed = mistake["msg"].removeprefix("Input should be ")
-    return f"{where} must be {allowed}, got {validate.shown(mistake['input'])}"
+    given, allowed = mistake["input"], mistake["msg"].removeprefix("Input should be ")
+    if mistake["type"].startswith("union_tag"):
+        where, given = f"{where}.method", dict(given).get("method")
+        allowed = mistake["ctx"].get("expected_tags", "given")
+    elif given != given:
+        allowed = "a number"
+    return f"{where} must be {allowed}, got {validate.shown(given)}"

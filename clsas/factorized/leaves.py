@@ -16,16 +16,17 @@ from clsas.exact.groups import Groups
 from clsas.exact.lookup import lookup_options
 from clsas.exact.tiles import Tiles
 from clsas.factorized import visibility
-from clsas.factorized.buffers import Level, leaf_tables, pixel_buffers
+from clsas.factorized.buffers import Level, leaf_tables
 from clsas.factorized.sector import Geometry, Sector
 from clsas.opencl.buffers import (
-    Buffers,
+    Slot,
     beam_table,
     filter_table,
     float_pairs,
     phase_polynomials,
+    pixel_buffers,
 )
-from clsas.opencl.device import Device, Slot
+from clsas.opencl.device import Device
 from clsas.sonar.beam import INTERVALS
 from clsas.sonar.visibility import sines
 
@@ -157,13 +158,9 @@ class Leaves:
         ]
         return np.stack(np.broadcast_arrays(*ranges), axis=-1).astype(np.int32)
 
-    def _allocated(self, buffers: Buffers) -> dict[str, cl.Buffer]:
-        """Return buffers of at least these sizes, by name."""
-        return {name: self.slot.buffer(name, each.nbytes) for name, each in buffers.items()}
-
     def _pixels(self, tables: Slot, count: int) -> dict[str, Any]:
         """Return the arguments of kernels that form some pixels."""
-        found = self._allocated(pixel_buffers(count, self.plan.beam))
+        found = self.slot.make(pixel_buffers(count, self.plan.beam))
         if self.normalise and self.aligned:
             found["represented"] = tables["represented"]
         return found

@@ -272,11 +272,9 @@ class Plan:
             values = parse_json(text)
             if not isinstance(values, dict):
                 raise ValueError(f"it must be an object, got {validate.shown(values)}")
-            digest = values.pop("digest", None)
-            if digest is not None and digest != _json_digest(values):
-                raise ValueError("its digest differs: it was changed or damaged")
             _check_version(values)
-            del values["version"]
+            _check_digest(values)
+            values = {name: values[name] for name in values if name not in ("version", "digest")}
             return _stored().validate_json(json.dumps(values))
         except ValidationError as error:
             problem = explained(error, values)
@@ -308,6 +306,15 @@ def _check_version(values: dict[str, Any]) -> None:
             f"it has version {validate.shown(version)}, made by {by}; this clsas reads version "
             f"{VERSION}: make it anew with clsas.plan"
         )
+
+
+def _check_digest(values: dict[str, Any]) -> None:
+    """Raise ValueError unless a text holds the digest of what it says."""
+    if "digest" not in values:
+        raise ValueError("it lacks 'digest', as a text that `to_json` wrote without filters does")
+    said = {name: value for name, value in values.items() if name != "digest"}
+    if values["digest"] != _json_digest(said):
+        raise ValueError("its digest differs: it was changed or damaged")
 
 
 @functools.cache

@@ -14,8 +14,7 @@ from clsas.factorized.buffers import tile_buffers
 from clsas.factorized.leaves import Finish, Leaves
 from clsas.factorized.sector import Sector
 from clsas.factorized.tree import Division
-from clsas.opencl.buffers import VECTOR_ROOM, channel_pitch, expansion_kernel, float_pairs
-from clsas.opencl.device import Slot
+from clsas.opencl.buffers import VECTOR_ROOM, Slot, channel_pitch, expansion_kernel, float_pairs
 from clsas.sonar.beam import normalising
 
 _EVERYTHING = slice(None), slice(None)
@@ -76,7 +75,7 @@ class PlaneLeaves(Leaves):
         references: dict[str, Any] = {"centre_sample": self.level.centre}
         if not aligned:  # the host fills references that the batch before may still read
             self.slot.wait()
-        buffers = self._allocated(tile_buffers(tiles, most, beam, aligned=aligned))
+        buffers = self.slot.make(tile_buffers(tiles, most, beam, aligned=aligned))
         if not aligned:
             references = {}
             for name, values in self._references(sector, batch, pitch).items():

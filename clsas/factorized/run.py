@@ -31,13 +31,14 @@ from clsas.opencl import phases
 from clsas.opencl.buffers import (
     GUARD,
     MARGIN,
+    Slot,
     filter_table,
     lines_buffer,
     padded_length,
     phase_polynomials,
     upsampled_lines,
 )
-from clsas.opencl.device import Device, Slot, aligned
+from clsas.opencl.device import Device, aligned
 from clsas.opencl.upsampling import upsample
 from clsas.sonar.coverage import warn_unseen
 

@@ -10,8 +10,7 @@ from clsas.exact.groups import groups_within
 from clsas.exact.tiles import BLOCKS
 from clsas.factorized.leaves import Finish, Leaves
 from clsas.factorized.sector import MOST_KEPT_BYTES, Sector
-from clsas.opencl.buffers import VECTOR_ROOM, float_pairs
-from clsas.opencl.device import Slot
+from clsas.opencl.buffers import VECTOR_ROOM, Slot, float_pairs
 from clsas.sonar.beam import normalising
 
 _ALL = slice(None)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -184,6 +184,24 @@ def lines_buffer(lines: int, pitch: int, half_precision: bool) -> Buffer:
     return Buffer((lines, pitch, 2), np.float16 if half_precision else np.float32)
 
 
+def beam_buffers(beam: BeamWindow | None) -> Buffers:
+    """Return the table of a beam's weights."""
+    return {} if beam is None else {"beam_table": Buffer((INTERVALS, 4), np.float32)}
+
+
+def total_bytes(buffers: Buffers) -> int:
+    """Return the size of all buffers."""
+    return sum(buffer.nbytes for buffer in buffers.values())
+
+
+def pixel_buffers(pixels: int, beam: BeamWindow | None) -> Buffers:
+    """Return the pixels formed together, and the sums of their weights for a normalising beam."""
+    buffers = {"pixels": Buffer((pixels,), np.complex64)}
+    if beam is not None and beam.normalise:
+        buffers["weight_sums"] = Buffer((pixels,), np.complex64)
+    return buffers
+
+
 def padded_length(resampling: Resampling) -> int:
     """Return the samples of an upsampled line on the device, with zeros around it.
 
@@ -191,3 +209,60 @@ def padded_length(resampling: Resampling) -> int:
     """
     length = -(-(resampling.length + 2 * MARGIN) // 16) * 16
     return length + 16 * (length % 256 == 0)
+
+
+class Slot:
+    """Named buffers of one job, filled anew once the job that used them last is done.
+
+    With two slots in turn the host fills one while the device works on the other. `busy` is to be
+    set to the last event that uses any of them.
+    """
+
+    def __init__(self, device: Device) -> None:
+        self.device = device
+        self.busy: cl.Event | None = None
+        self.filled: list[cl.Event] = []
+        self._buffers: dict[str, cl.Buffer] = {}
+
+    def __getitem__(self, name: str) -> cl.Buffer:
+        """Return a buffer that was filled or made before."""
+        return self._buffers[name]
+
+    def wait(self) -> None:
+        """Wait until the buffers are free; to be called before they are filled."""
+        self._wait_for_job()
+        self.filled.clear()
+
+    def buffer(self, name: str, bytes_: int) -> cl.Buffer:
+        """Return a buffer of at least so many bytes."""
+        return self._at_least(name, bytes_, self.device.buffer)
+
+    def make(self, buffers: Buffers) -> dict[str, cl.Buffer]:
+        """Return buffers of at least these sizes, by name."""
+        return {name: self.buffer(name, buffer.nbytes) for name, buffer in buffers.items()}
+
+    def zeros(self, name: str, bytes_: int) -> cl.Buffer:
+        """Return a buffer of at least so many bytes, that held zeros when it was made."""
+        return self._at_least(name, bytes_, self.device.zeros)
+
+    def _wait_for_job(self) -> None:
+        # A job of which nothing was seen has not waited for what was filled for it.
+        for event in [*self.filled, *([] if self.busy is None else [self.busy])]:
+            event.wait()
+
+    def _at_least(self, name: str, bytes_: int, make: Callable[[int], cl.Buffer]) -> cl.Buffer:
+        if name not in self._buffers:
+            self._buffers[name] = make(bytes_)
+        elif self._buffers[name].size < bytes_:
+            self._wait_for_job()
+            del self._buffers[name]
+            self._buffers[name] = make(bytes_)
+        return self._buffers[name]
+
+    def fill(self, name: str, array: np.ndarray) -> None:
+        """Start copying an array into a buffer; `filled` gains the event to wait for."""
+        array = np.ascontiguousarray(array)
+        buffer = self.buffer(name, array.nbytes)
+        event = cl.enqueue_copy(self.device.uploads, buffer, array, is_blocking=False)
+        self.filled.append(event)
+        self.device.uploads.flush()

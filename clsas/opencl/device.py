@@ -280,59 +280,6 @@ class Device:
         return buffer
 
 
-class Slot:
-    """Named buffers of one job, filled anew once the job that used them last is done.
-
-    With two slots in turn the host fills one while the device works on the other. `busy` is to be
-    set to the last event that uses any of them.
-    """
-
-    def __init__(self, device: Device) -> None:
-        self.device = device
-        self.busy: cl.Event | None = None
-        self.filled: list[cl.Event] = []
-        self._buffers: dict[str, cl.Buffer] = {}
-
-    def __getitem__(self, name: str) -> cl.Buffer:
-        """Return a buffer that was filled or made before."""
-        return self._buffers[name]
-
-    def wait(self) -> None:
-        """Wait until the buffers are free; to be called before they are filled."""
-        self._wait_for_job()
-        self.filled.clear()
-
-    def buffer(self, name: str, bytes_: int) -> cl.Buffer:
-        """Return a buffer of at least so many bytes."""
-        return self._at_least(name, bytes_, self.device.buffer)
-
-    def zeros(self, name: str, bytes_: int) -> cl.Buffer:
-        """Return a buffer of at least so many bytes, that held zeros when it was made."""
-        return self._at_least(name, bytes_, self.device.zeros)
-
-    def _wait_for_job(self) -> None:
-        # A job of which nothing was seen has not waited for what was filled for it.
-        for event in [*self.filled, *([] if self.busy is None else [self.busy])]:
-            event.wait()
-
-    def _at_least(self, name: str, bytes_: int, make: Callable[[int], cl.Buffer]) -> cl.Buffer:
-        if name not in self._buffers:
-            self._buffers[name] = make(bytes_)
-        elif self._buffers[name].size < bytes_:
-            self._wait_for_job()
-            del self._buffers[name]
-            self._buffers[name] = make(bytes_)
-        return self._buffers[name]
-
-    def fill(self, name: str, array: np.ndarray) -> None:
-        """Start copying an array into a buffer; `filled` gains the event to wait for."""
-        array = np.ascontiguousarray(array)
-        buffer = self.buffer(name, array.nbytes)
-        event = cl.enqueue_copy(self.device.uploads, buffer, array, is_blocking=False)
-        self.filled.append(event)
-        self.device.uploads.flush()
-
-
 def aligned(make: Callable[..., np.ndarray], shape: tuple[int, ...], kind: DTypeLike) -> np.ndarray:
     """Return np.empty or np.zeros of a shape that begins where vectors and pages do."""
     count = math.prod(shape) * np.dtype(kind).itemsize

@@ -5,17 +5,15 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-import numpy as np
-
 from clsas.exact.blocks import Blocks, band_parts, blocks_of
+from clsas.exact.buffers import block_buffers, part_buffers
 from clsas.exact.decision import decide
 from clsas.exact.groups import Groups, GroupsEstimate
 from clsas.exact.tiles import Tiles
 from clsas.factorized.estimates import Work, backprojecting, upsampling
-from clsas.opencl.buffers import VECTOR_ROOM, channel_pitch
+from clsas.opencl.buffers import beam_buffers, pixel_buffers, total_bytes
 from clsas.opencl.device import Device
 from clsas.planning.visibility_model import SMALL, VisibilityModel
-from clsas.sonar.beam import INTERVALS
 
 _LARGE = (64, 64)  # rows and columns of a subimage that holds any part of an exact image
 
@@ -130,19 +128,15 @@ def _memory_bytes(
     # Channels of the first set, and of the second one, which holds what is left.
     first = min(blocks.channels_at_once, lines.channels)
     rest = lines.channels - first if bands == 1 else first
-    sets = [first, min(first, rest)]
-
-    moving = lines.rx_velocity_m_s is not None
-    bistatic = moving or not np.array_equal(lines.tx_m, lines.rx_m)
-    rows = 6 + 6 * bistatic + 3 * moving + 3 * (beam is not None)
-    visible = [channel_pitch(min(n, math.ceil(most * lines.channels))) for n in sets]
+    sets = [n for n in (first, min(first, rest)) if n]
+    visible = [min(n, math.ceil(most * lines.channels)) for n in sets]
     if jobs_of_set > 1:
-        visible[1] = visible[0]
-    part_bytes = 36 + (0 if blocks.terms else 12 * part_pixels)
-    line_bytes = sum(
-        8 * n * blocks.pitch + 4 * rows * (channel_pitch(n) + VECTOR_ROOM) for n in sets if n
-    )
-    job_bytes = sum(of_job * (part_bytes + n * (12 + 4 * blocks.terms)) for n in visible if n)
-    band_bytes = 8 * (1 + normalise) * of_band * part_pixels
-    table_bytes = 0 if beam is None else 16 * INTERVALS
-    return int(min(bands, 2) * band_bytes + line_bytes + job_bytes + table_bytes)
+        visible = [visible[0]] * 2
+    bands_at_once = min(bands, 2) * [pixel_buffers(of_band * part_pixels, beam)]
+    lists = [
+        beam_buffers(beam),
+        *bands_at_once,
+        *(block_buffers(lines, n, blocks, beam) for n in sets),
+        *(part_buffers(of_job, part_pixels, n, blocks) for n in visible),
+    ]
+    return sum(total_bytes(buffers) for buffers in lists)

@@ -14,16 +14,21 @@ from clsas.exact.tiles import STACK
 from clsas.factorized.buffers import (
     LEAST_BATCH,
     leaf_tables,
-    pixel_buffers,
     stage_lines,
     stage_tables,
     tile_buffers,
 )
-from clsas.opencl.buffers import Buffer, Buffers, lines_buffer
+from clsas.opencl.buffers import (
+    Buffer,
+    Buffers,
+    beam_buffers,
+    lines_buffer,
+    pixel_buffers,
+    total_bytes,
+)
 from clsas.opencl.device import Device
 from clsas.opencl.upsampling import upsampling_buffers
 from clsas.planning.visibility_model import VisibilityModel
-from clsas.sonar.beam import INTERVALS
 
 _CACHED_BYTES = (
     16 << 20
@@ -76,9 +81,7 @@ class BufferSizes:
             buffers = upsampling_buffers(
                 lines.channels, lines.length, self.line_pitch, self.half_precision
             )
-        if self.view.beam is not None:
-            buffers["beam_table"] = Buffer((INTERVALS, 4), np.float32)
-        return buffers
+        return buffers | beam_buffers(self.view.beam)
 
     def tables(self, roots: int) -> Buffers:
         """Return the tables of some roots."""
@@ -149,8 +152,3 @@ def batches_within(sizes: BufferSizes, roots: int, device: Device, memory_bytes:
     tables = 2 * total_bytes(sizes.tables(min(prepared, roots)))
     needed = constant + total_bytes(sizes.work(at_once)) + tables
     return Batches(at_once, prepared, needed)
-
-
-def total_bytes(buffers: Buffers) -> int:
-    """Return the size of all buffers."""
-    return sum(buffer.nbytes for buffer in buffers.values())

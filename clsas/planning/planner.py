@@ -139,7 +139,7 @@ def plan(
     if sum(value is not None for value in given) != 1:
         raise ValueError(
             "exactly one of tolerance_db, tolerance_wavelengths and stages must be given, "
-            f"got {tolerance_db}, {tolerance_wavelengths}, {stages}"
+            f"got {tolerance_db}, {tolerance_wavelengths} and {stages}"
         )
     validate.memory("grid", 8 * grid.size)
     tolerance_db = tolerance_in_db(tolerance_db, tolerance_wavelengths)

@@ -20,7 +20,7 @@ from factorizing import (
 from clsas.core.digests import grid_digest, lines_digest
 from clsas.core.grid import Grid
 from clsas.exact.backprojection import backproject
-from clsas.factorized.plan import VERSION, Plan
+from clsas.factorized.plan import VERSION, Plan, _json_digest
 from clsas.opencl.device import open_device
 from clsas.planning import costs
 from clsas.planning.planner import plan
@@ -51,10 +51,15 @@ def any_plan(request):
 
 
 def changeable(plan):
-    """A plan's JSON as a dict that may be changed: without its digest."""
+    """A plan's JSON as a dict that may be changed and signed again."""
     values = json.loads(plan.to_json())
     del values["digest"]
     return values
+
+
+def signed(values):
+    """The text of a changed dict, with its own digest."""
+    return json.dumps(values | {"digest": _json_digest(values)})
 
 
 def replaced(plan, path, value):
@@ -65,7 +70,7 @@ def replaced(plan, path, value):
     for each in tables:
         table = table[each]
     table[name] = value
-    return json.dumps(values)
+    return signed(values)
 
 
 def test_text_gives_the_same_plan(any_plan):
@@ -191,6 +196,9 @@ def test_a_plan_with_a_wrong_value_is_refused(chosen, field, value):
         ("image.roots_at_once", 0, "image.roots_at_once must be greater than or equal to 1, got 0"),
         ("image.half_precision", 1, "image.half_precision must be a valid boolean, got 1"),
         ("image.colour", 1, "image.colour is unknown"),
+        ("image", {}, "image.method must be given, got None"),
+        ("image", {"method": "x"}, "image.method must be 'factorized', 'exact', got 'x'"),
+        ("tolerance_db", float("nan"), "tolerance_db must be a number, got nan"),
         (
             "image.half_lengths",
             [1],
@@ -222,10 +230,10 @@ def test_a_filter_that_is_none_is_refused(chosen, name, coefficients):
 def test_a_plan_with_a_field_too_many_or_too_few_is_refused(chosen):
     values = changeable(chosen)
     with pytest.raises(ValueError, match="unknown"):
-        Plan.from_json(json.dumps(values | {"unknown": 1}))
+        Plan.from_json(signed(values | {"unknown": 1}))
     del values["image"]["sides"]
     with pytest.raises(ValueError, match="image lacks 'sides'"):
-        Plan.from_json(json.dumps(values))
+        Plan.from_json(signed(values))
 
 
 # What it is
@@ -414,5 +422,5 @@ def test_json_may_leave_out_filters(chosen):
     values = json.loads(whole)
     del values["digest"]  # which is of whole plans
     assert json.loads(short) == without(values)
-    with pytest.raises(ValueError, match=r"a plan as of Plan\.to_json: image\.\S+ lacks 'coef"):
+    with pytest.raises(ValueError, match=r"lacks 'digest', as .* without filters"):
         Plan.from_json(short)

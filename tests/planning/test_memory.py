@@ -11,8 +11,9 @@ from factorizing import (
     straight,
 )
 
-from clsas.opencl.device import Slot
-from clsas.planning import memory, prediction
+from clsas.exact.backprojection import backproject
+from clsas.opencl.buffers import Slot
+from clsas.planning import exact_image, memory, prediction
 from clsas.planning.factorize import factorize
 from clsas.planning.planner import plan
 from clsas.sonar.beam import BeamWindow
@@ -52,15 +53,21 @@ def sizes_of(buffers):
     return {name: buffer.nbytes for name, buffer in buffers.items()}
 
 
-def test_a_run_allocates_what_was_predicted(case, monkeypatch):
-    lines, grid, chosen, sizes = case
-    allocated, at_least = {}, Slot._at_least
+@pytest.fixture
+def allocated(monkeypatch):
+    """Largest sizes of the buffers that a run allocates, by name."""
+    sizes, at_least = {}, Slot._at_least
 
     def recorded(self, name, bytes_, make):
-        allocated[name] = max(allocated.get(name, 0), bytes_)
+        sizes[name] = max(sizes.get(name, 0), bytes_)
         return at_least(self, name, bytes_, make)
 
     monkeypatch.setattr(Slot, "_at_least", recorded)
+    return sizes
+
+
+def test_a_run_allocates_what_was_predicted(case, allocated):
+    lines, grid, chosen, sizes = case
     factorize(lines, grid, chosen)
     image = chosen.factorization
     work = sizes_of(sizes.work(image.roots_at_once))
@@ -89,3 +96,28 @@ def test_memory_is_the_sum_of_all_buffers(case):
     roots = min(image.roots_prepared, chosen.stages[0].subimages)
     total += 2 * memory.total_bytes(sizes.tables(roots))
     assert chosen.memory_bytes == total
+
+
+@pytest.mark.parametrize("beam", [None, BEAMS[0], NORMALISING], ids=str)
+@pytest.mark.parametrize("make", [straight, hills, moving_array])
+def test_an_exact_run_allocates_what_was_predicted(make, beam, allocated, monkeypatch):
+    predicted = {}
+
+    def recorded(find):
+        def find_buffers(*sizes):
+            buffers = find(*sizes)
+            for name, bytes_ in sizes_of(buffers).items():
+                predicted[name] = max(predicted.get(name, 0), bytes_)
+            return buffers
+
+        return find_buffers
+
+    for find in (exact_image.block_buffers, exact_image.part_buffers):
+        monkeypatch.setattr(exact_image, find.__name__, recorded(find))
+    lines, grid = made(make)
+    plan(lines, grid, stages=[], beam=beam)
+    backproject(lines, grid, accuracy_db=-60, beam=beam)
+    assert allocated.keys() == predicted.keys()
+    most = 1.1 if make is hills else 1.0  # groups of points are estimated
+    for name, bytes_ in allocated.items():
+        assert 0.5 * predicted[name] <= bytes_ <= most * predicted[name], name
