@@ -1,25 +1,32 @@
-/* Arithmetic peak of a device: every work-item runs 16 independent chains of multiply-adds on vectors of WIDTH floats,
- * which is steps * 16 * WIDTH * 2 floating-point operations.
+/* Arithmetic peak of a device: every work-item runs CHAINS independent chains of multiply-adds on vectors of WIDTH floats,
+ * which is steps * CHAINS * WIDTH * 2 floating-point operations.
  *
  * result: float [items]; a sum that keeps the compiler from dropping the work.
+ *
+ * Build options
+ *   CHAINS  Too few do not hide the latency of a multiply-add; too many do not fit the registers.
  */
 
 #include "vectors.h"
 
+#ifndef CHAINS
+#define CHAINS 8
+#endif
+
 __kernel void peak(int steps, float factor, __global float *result)
 {
-    vfloat chain[16];
+    vfloat chain[CHAINS];
 #pragma unroll
-    for (int k = 0; k < 16; k++)
+    for (int k = 0; k < CHAINS; k++)
         chain[k] = (float)(k + get_global_id(0));
     for (int step = 0; step < steps; step++) {
 #pragma unroll
-        for (int k = 0; k < 16; k++)
+        for (int k = 0; k < CHAINS; k++)
             chain[k] = chain[k] * factor + 0.5f;
     }
     vfloat sum = 0.0f;
 #pragma unroll
-    for (int k = 0; k < 16; k++)
+    for (int k = 0; k < CHAINS; k++)
         sum += chain[k];
 #if WIDTH == 1
     result[get_global_id(0)] = sum;

@@ -28,6 +28,7 @@ OPTIONS = {
     "stage": [NUMBERS | options for options in STAGES],
     "upsample_lines": [NUMBERS | {"PHASES": 64, "FREQUENCY_SHIFT": shift} for shift in (0, 1)],
     "peak": [NUMBERS],
+    "stream": {},
 }
 """Options of kernels that make their parameters differ."""
 
