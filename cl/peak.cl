@@ -9,10 +9,6 @@
 
 #include "vectors.h"
 
-#ifndef CHAINS
-#define CHAINS 8
-#endif
-
 __kernel void peak(int steps, float factor, __global float *result)
 {
     vfloat chain[CHAINS];

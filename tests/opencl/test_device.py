@@ -266,15 +266,15 @@ def test_nothing_is_built_for_a_kernel_that_is_there(platform, monkeypatch):
 def test_only_the_kernels_used_last_are_kept(platform, monkeypatch):
     monkeypatch.setattr(module, "_MOST_KERNELS", 3)
     device = dataclasses.replace(platform, _kernels={})
-    first = device.kernel("peak", WIDTH=1)
+    first = device.kernel("peak", WIDTH=1, CHAINS=8)
     for unused in range(5):
-        assert device.kernel("peak", WIDTH=1) is first  # used again and again
-        device.kernel("peak", WIDTH=1, UNUSED=unused)
+        assert device.kernel("peak", WIDTH=1, CHAINS=8) is first  # used again and again
+        device.kernel("peak", WIDTH=1, CHAINS=8, UNUSED=unused)
     assert len(device._kernels) == 3
     for unused in range(3):
-        device.kernel("peak", WIDTH=1, UNUSED=unused)
+        device.kernel("peak", WIDTH=1, CHAINS=8, UNUSED=unused)
     assert len(device._kernels) == 3
-    again = device.kernel("peak", WIDTH=1)
+    again = device.kernel("peak", WIDTH=1, CHAINS=8)
     assert again is not first
     assert first.compiled.function_name == again.name  # what a run holds goes on living
 
@@ -298,7 +298,7 @@ def test_a_failed_build_shows_the_compilers_log(platform, monkeypatch):
 
 
 def test_a_profile_counts_and_times_what_runs_within(platform):
-    kernel = platform.kernel("peak", WIDTH=platform.info.width)
+    kernel = platform.kernel("peak", WIDTH=platform.info.width, CHAINS=8)
     result = platform.buffer(4 * 64)
     platform.run(kernel, (64,), steps=1, factor=0.5, result=result)
     with platform.profile() as times:

@@ -27,7 +27,7 @@ OPTIONS = {
     "expand_tiles": [NUMBERS | {"BEAM": beam} for beam in (0, 64)],
     "stage": [NUMBERS | options for options in STAGES],
     "upsample_lines": [NUMBERS | {"PHASES": 64, "FREQUENCY_SHIFT": shift} for shift in (0, 1)],
-    "peak": [NUMBERS],
+    "peak": [NUMBERS | {"CHAINS": 8}],
     "stream": {},
 }
 """Options of kernels that make their parameters differ."""
