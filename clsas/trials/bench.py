@@ -20,7 +20,6 @@ from clsas.exact.run import execute
 from clsas.mosaics.mosaic import mosaic
 from clsas.mosaics.store import Record
 from clsas.opencl.device import Device, open_device
-from clsas.opencl.speed import peak_flops
 from clsas.planning.factorize import factorize
 from clsas.planning.planner import plan
 from clsas.products.tradeoff import REFERENCE_DB
@@ -331,3 +330,22 @@ def flops_per_pair(taps: int, phase_terms: int) -> int:
     """
     pairs = taps // 2
     return 28 + 4 * (phase_terms - 1) + pairs * (4 * (pairs - 1) + 12)
+
+
+_CHAINS = (8, 12, 16)
+"""Chains of multiply-adds: 8 hide a latency of 4 cycles, 12 fit 16 registers, 16 fit 32."""
+
+
+def peak_flops(device: Device) -> float:
+    """Return a device's rate of independent multiply-adds, flop/s (cl/peak.cl)."""
+    width = device.info.width
+    items, steps = 1 << 14, 1 << 11
+    result = device.buffer(4 * items)
+    rates = []
+    for chains in _CHAINS:
+        kernel = device.kernel("peak", WIDTH=width, CHAINS=chains)
+        with device.profile() as times:
+            for _ in range(6):
+                device.run(kernel, (items,), steps=steps, factor=0.5, result=result)
+        rates.append(items * steps * chains * width * 2 / times["peak"].minimum_s)
+    return max(rates)
