@@ -28,7 +28,6 @@ OPTIONS = {
     "stage": [NUMBERS | options for options in STAGES],
     "upsample_lines": [NUMBERS | {"PHASES": 64, "FREQUENCY_SHIFT": shift} for shift in (0, 1)],
     "peak": [NUMBERS | {"CHAINS": 8}],
-    "stream": {},
 }
 """Options of kernels that make their parameters differ."""
 
