@@ -1,0 +1,82 @@
+"""Tuning: how sizes of batches and work-groups change the time of images on a device."""
+
+from __future__ import annotations
+
+import importlib
+import statistics
+import time
+from collections.abc import Callable, Iterator
+
+from clsas.core.image import Image
+from clsas.exact.backprojection import backproject
+from clsas.opencl.device import Device
+from clsas.planning.factorize import factorize
+from clsas.planning.planner import plan
+from clsas.trials.cases import FACTORIZED_CASES, Case
+from clsas.trials.sensitivity import Constant
+
+COLUMNS = ("constant", "set to", "exact, s", "over usual", "factorized, s", "over usual")
+FACTORS = (0.25, 0.5, 1.0, 2.0, 4.0)
+"""What each constant is set to, over its usual value."""
+
+_TOLERANCE_DB = -50.0
+_RUNS = 3  # of which the median counts
+
+
+def constants(device: Device) -> list[Constant]:
+    """Return the constants that matter on a device."""
+    batch = "_CACHED_BYTES" if device.info.kind == "cpu" else "_BATCH_BYTES"
+    names = [
+        ("exact.blocks", "_CHANNELS_AT_ONCE"),
+        ("exact.blocks", "_PART_BYTES"),
+        ("planning.memory", batch),
+        ("factorized.run", "_GROUPS_PER_UNIT"),
+    ]
+    if device.info.width == 1:
+        names += [("factorized.run", "_GROUP"), ("opencl.upsampling", "_GROUP")]
+    return [Constant(importlib.import_module(f"clsas.{room}"), name) for room, name in names]
+
+
+def changes(device: Device, case: Case = FACTORIZED_CASES["ffbp-2k"]) -> Iterator[list[str]]:
+    """Yield a row for every constant and value: the times of an exact and a factorized image.
+
+    The values of a constant take turns. The columns are `COLUMNS`.
+
+    Parameters
+    ----------
+    device : Device
+    case : Case
+    """
+    lines, grid, beam = case.lines(), case.grid, case.beam
+
+    def exact() -> Image:
+        return backproject(lines, grid, beam=beam, accuracy_db=_TOLERANCE_DB, device=device)
+
+    def factorized() -> Image:
+        chosen = plan(lines, grid, tolerance_db=_TOLERANCE_DB, beam=beam, device=device)
+        return factorize(lines, grid, chosen, device=device)
+
+    imagers = (exact, factorized)
+    for form in imagers:
+        form()  # builds the kernels
+    for constant in constants(device):
+        values = sorted({max(type(constant.value)(constant.value * f), 1) for f in FACTORS})
+        seconds = {(value, form): [0.0] * _RUNS for value in values for form in imagers}
+        for number in range(_RUNS):
+            for (value, form), times in seconds.items():
+                with constant.set_to(value):
+                    times[number] = _seconds(form)
+        medians = {key: statistics.median(times) for key, times in seconds.items()}
+        name = f"{constant.module.__name__.removeprefix('clsas.')}.{constant.name}"
+        for value in values:
+            cells = []
+            for form in imagers:
+                found, usual = medians[value, form], medians[constant.value, form]
+                cells += [f"{found:.4g}", f"{found / usual:.2f}"]
+            yield [name, f"{value:g}", *cells]
+
+
+def _seconds(form: Callable[[], Image]) -> float:
+    start = time.perf_counter()
+    form()
+    return time.perf_counter() - start

@@ -1,0 +1,93 @@
+"""Run clsas's tests, tuning and benchmarks on one device, and write a report in Markdown.
+
+`scripts/gpu` runs this in an environment that has what it needs.
+"""
+
+import argparse
+import os
+import platform
+import subprocess
+import sys
+import time
+from datetime import UTC, datetime
+from pathlib import Path
+
+from clsas.opencl.device import DeviceError, open_device
+
+ROOT = Path(__file__).parents[1]
+PYTHON = sys.executable
+LIMIT_S = 3600
+"""Of each part: what hangs is cut off, and the next part runs."""
+
+PARTS = {
+    "Devices": [PYTHON, "-m", "clsas", "devices"],
+    "Self test": [PYTHON, "-m", "clsas", "selftest", "--device", "{device}"],
+    "Tests": [PYTHON, "-m", "pytest", "-q", "--durations=10"],
+    "Calibration": [PYTHON, "-m", "clsas", "calibrate", "--device", "{device}"],
+    "Tuning": [PYTHON, "scripts/bench", "tuning", "--device", "{device}"],
+    "Exact imaging": [PYTHON, "scripts/bench", "speed", "--device", "{device}"],
+    "Factorized imaging": [PYTHON, "scripts/bench", "factorized", "--device", "{device}"],
+    "Scaling": [PYTHON, "scripts/bench", "scaling", "--largest", "8192", "--device", "{device}"],
+}
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--device", default="gpu", help="as `clsas devices` shows it")
+    parser.add_argument("--out", type=Path, default=Path("gpu-report.md"))
+    parser.add_argument("--only", default="", help="parts whose name contains this")
+    given = parser.parse_args()
+    try:
+        info = open_device(given.device).info
+    except DeviceError as error:
+        print(f"Error: {error}", file=sys.stderr)
+        return 1
+    now = datetime.now(UTC)
+    with given.out.open("w") as report:
+        report.write(
+            f"# clsas on {info.name}\n\n{now:%d %B %Y}, commit {commit()}. Driver {info.driver} of "
+            f"{info.platform}, {info.compute_units} compute units, "
+            f"{info.memory_bytes / 2**30:.1f} GiB; {platform.platform()}, {os.cpu_count()} cores.\n"
+        )
+        failed = [
+            name
+            for name, command in PARTS.items()
+            if given.only in name and not run(name, command, given.device, report)
+        ]
+        ended = f"failed: {', '.join(failed)}" if failed else "all parts ended well"
+        report.write(f"\n{ended[0].upper()}{ended[1:]}.\n")
+    print(f"wrote {given.out}; {ended}")
+    return int(bool(failed))
+
+
+def run(name, command, device, report):
+    """Run a part and write what it printed; return whether it ended well."""
+    command = [word.format(device=device) for word in command]
+    shown = " ".join(["python" if word == PYTHON else word for word in command])
+    print(f"== {name}: {shown}", flush=True)
+    start = time.monotonic()
+    try:
+        done = subprocess.run(
+            command, cwd=ROOT, env=os.environ | {"CLSAS_DEVICE": device}, text=True,
+            stdout=subprocess.PIPE, stderr=subprocess.STDOUT, timeout=LIMIT_S,
+        )  # fmt: skip
+        printed, ended = done.stdout, f"ended with {done.returncode}"
+    except subprocess.TimeoutExpired as error:
+        printed, ended = (error.stdout or b"").decode(errors="replace"), "was cut off"
+    seconds = time.monotonic() - start
+    text = printed if printed.startswith("|") else f"```\n{printed}```\n"
+    report.write(f"\n## {name}\n\n`{shown}`: {ended} after {seconds:.0f} s.\n\n{text}")
+    report.flush()
+    return ended == "ended with 0"
+
+
+def commit():
+    """Return the commit of this checkout, or that it is none."""
+    done = subprocess.run(
+        ["git", "-C", ROOT, "rev-parse", "--short", "HEAD"], text=True, capture_output=True
+    )
+    return done.stdout.strip() or "unknown (no git checkout)"
+
+
+if __name__ == "__main__":
+    sys.exit(main())

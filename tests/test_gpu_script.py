@@ -1,0 +1,39 @@
+"""The report of scripts/gpu, on whatever device there is."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+from clsas.opencl.device import open_device
+
+ROOT = Path(__file__).parents[1]
+
+
+def run(*arguments):
+    return subprocess.run(
+        [sys.executable, ROOT / "scripts" / "gpu_report.py", *arguments],
+        text=True, capture_output=True, env=os.environ | {"PYTHONPATH": str(ROOT)},
+    )  # fmt: skip
+
+
+def test_a_report_holds_what_a_part_printed(tmp_path):
+    report = tmp_path / "report.md"
+    info = open_device().info
+    done = run("--device", info.label, "--only", "Devices", "--out", report)
+    assert done.returncode == 0, done.stderr
+    text = report.read_text()
+    assert f"# clsas on {info.name}" in text
+    assert f"Driver {info.driver} of {info.platform}" in text
+    assert "`python -m clsas devices`: ended with 0 after" in text
+    assert info.label in text.split("## Devices")[1]
+    assert text.endswith("All parts ended well.\n")
+
+
+def test_a_device_that_is_missing_is_named_and_nothing_is_written(tmp_path):
+    report = tmp_path / "report.md"
+    done = run("--device", "abacus", "--out", report)
+    assert done.returncode == 1
+    assert "abacus" in done.stderr
+    assert "Traceback" not in done.stderr
+    assert not report.exists()

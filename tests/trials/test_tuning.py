@@ -1,0 +1,34 @@
+import pytest
+
+from clsas.factorized import run
+from clsas.opencl.device import open_device
+from clsas.trials import cases, tuning
+
+
+@pytest.mark.slow
+def test_every_constant_takes_turns_and_keeps_its_value(monkeypatch):
+    monkeypatch.setattr(tuning, "FACTORS", (1.0, 2.0))
+    monkeypatch.setattr(tuning, "_RUNS", 1)
+    device = open_device()
+    before = {str(each): each.value for each in tuning.constants(device)}
+    rows = list(tuning.changes(device, cases.scaled(256)))
+    assert {str(each): each.value for each in tuning.constants(device)} == before
+    assert len(rows) == 2 * len(before)
+    for row in rows:
+        assert len(row) == len(tuning.COLUMNS)
+        assert float(row[2]) > 0
+        assert float(row[4]) > 0
+    # The usual value is its own measure.
+    assert [row[3] for row in rows[::2]] == ["1.00"] * len(before)
+    assert [row[5] for row in rows[::2]] == ["1.00"] * len(before)
+
+
+def test_a_device_of_one_lane_has_work_groups_to_tune(monkeypatch):
+    import dataclasses
+
+    device = open_device()
+    info = dataclasses.replace(device.info, width=1, kind="gpu")
+    single = dataclasses.replace(device, info=info, _kernels={})
+    named = {(each.module.__name__, each.name) for each in tuning.constants(single)}
+    assert (run.__name__, "_GROUP") in named
+    assert ("clsas.planning.memory", "_BATCH_BYTES") in named
