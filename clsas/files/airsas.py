@@ -78,6 +78,12 @@ def read_airsas(
         If a file does not exist or cannot be read.
     """
     path = validate.path("path", path)
+    with hdf5.opened(path) as file:
+        if not is_airsas(file):
+            raise FileFormatError(
+                "is an HDF5 file, but no scene of AirSAS: it must hold /na and microphones as "
+                f"/ch1, /ch2, got {validate.shown(sorted(file))}"
+            )
     folder = path.absolute().parent.parent / SHARED if shared is None else Path(shared)
     parameters = _Parameters.read(folder / ACQUISITION)
     sensors_m = _sensors_m(folder / SENSORS)

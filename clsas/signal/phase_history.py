@@ -98,9 +98,12 @@ def from_phase_history(
     length = fft.next_fast_len(math.ceil(oversampling * count))
     equal = np.ptp(step_hz) * count <= _EQUAL_STEPS * step_hz.min()
     # The longest line that no channel's period is shorter than.
-    range_step_m = speed / (2 * length * step_hz.max())
+    range_step_m = float(speed / (2 * length * step_hz.max()))
     offset_m = (np.arange(length) - length // 2) * range_step_m
-    carrier_hz = float(np.mean(first_hz + (count - 1) / 2 * step_hz))
+    with np.errstate(over="ignore"):
+        carrier_hz = float(np.mean(first_hz + (count - 1) / 2 * step_hz))
+    farthest_m = float(np.abs(reference_m).max() - offset_m[0])
+    validate.phase(carrier_hz, speed, farthest_m)
 
     lines = np.empty((channels, length), np.complex64)
     rows = max(1, _BLOCK // length)
