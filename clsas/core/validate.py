@@ -29,6 +29,8 @@ _REPR.maxstring = _REPR.maxother = _REPR.maxlong = 2 * _LONGEST
 # Files with the memory limit of a process's control group, versions 2 and 1.
 _GROUP_LIMITS = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes")
 
+MOST_HZ, MOST_M_S = 1e15, 3e8
+"""Largest frequency and speed of waves that recordings may have: those of light."""
 _MOST_CYCLES = 1e10  # of phase: float64 holds them to 1e-6 of a cycle
 
 _T = TypeVar("_T")

@@ -67,8 +67,12 @@ def from_full_matrix(
     else:
         samples = validate.array("samples", samples, np.float32, (None, None))
         tx, rx = (_elements(each, len(samples), count) for each in pairs)
-    rate_hz = validate.positive("sample_rate_hz", sample_rate_hz, "Hz")
-    speed = validate.positive("sound_speed_m_s", sound_speed_m_s, "m/s")
+    rate_hz = validate.number(
+        "sample_rate_hz", sample_rate_hz, "Hz", above=0.0, most=validate.MOST_HZ
+    )
+    speed = validate.number(
+        "sound_speed_m_s", sound_speed_m_s, "m/s", above=0.0, most=validate.MOST_M_S
+    )
     start_s = validate.number("start_time_s", start_time_s, "s")
     carrier_hz = validate.number("carrier_hz", carrier_hz, "Hz", above=0.0, below=rate_hz / 2)
     if bandwidth_hz is None and carrier_hz > rate_hz / 4:

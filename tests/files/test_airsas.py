@@ -142,6 +142,17 @@ def test_scenes_that_disagree_are_refused(still, tmp_path, name, value, said):
         read_airsas(path, shared=still.parent.parent / "characterization data")
 
 
+def test_other_hdf5_files_are_refused_by_name(tmp_path):
+    lines = clsas.RangeLines(np.ones((2, 3), complex), 1.0, 0.1, [0] * 3, [0] * 3, 1e5, 1500.0)
+    clsas.save(tmp_path / "lines.h5", lines)
+    with h5py.File(tmp_path / "other.h5", "w") as file:
+        file["na/position"] = [1.0]
+    for name, got in (("lines.h5", "first_range_m"), ("other.h5", "na")):
+        said = rf"{name} is an HDF5 file, but no scene of AirSAS: .* got \['{got}'"
+        with pytest.raises(FileFormatError, match=said):
+            read_airsas(tmp_path / name)
+
+
 @pytest.mark.parametrize(
     ("file", "old", "new", "said"),
     [
