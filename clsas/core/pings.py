@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 
 STILL = 0.1
 """Share of the usual advance within which a platform counts as standing still."""
+_LOCAL = 11  # steps whose mean is the local course
 _USUAL_QUANTILE = 0.95  # of steps: leaves out up to 5 % of gaps, and holds with 95 % standing still
 
 
@@ -84,6 +85,20 @@ class Transmissions:
             if last_m is None or math.dist(place_m, last_m) >= least_m > 0:
                 kept[number], last_m = True, place_m
         return kept
+
+    @property
+    def turns(self) -> NDArray[np.int64]:
+        """Transmissions after which the track leads against its local course."""
+        from scipy.ndimage import uniform_filter1d  # slow to import
+
+        numbers = np.flatnonzero(self.advancing())
+        moves_m = np.diff(self.centres_m[numbers], axis=0)
+        if len(moves_m) < 2:
+            return np.zeros(0, np.int64)
+        # The mean direction of a few steps: a track may turn, but not from one ping to the next.
+        moves_m /= np.linalg.norm(moves_m, axis=1, keepdims=True)
+        course = uniform_filter1d(moves_m, min(_LOCAL, len(moves_m)), axis=0)
+        return numbers[np.flatnonzero(np.einsum("pi,pi->p", moves_m, course) < 0)]
 
     def channels(self, some: NDArray[np.bool_]) -> NDArray[np.int64]:
         """Return the channels of some transmissions, given as a mask."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import median_filter, uniform_filter1d
+from scipy.ndimage import median_filter
 
 from clsas.core.geometry import pairwise_range_m
 from clsas.core.grid import Grid
@@ -17,7 +17,6 @@ from clsas.sonar.sampling import Finding, check_sampling
 GAP = 1.75
 """Advance over that of the pings around it, above which pings are missing: one missing is 2."""
 _AROUND = 31  # steps whose median is the usual advance about a place
-_LOCAL = 11  # steps whose mean is the local course
 _UNSEEN = 0.01  # share of pixels beyond all lines, above which it is reported
 _POINTS = 16  # of the grid sampled along either side
 _FARTHEST = (
@@ -77,17 +76,17 @@ def check_track(pings: Transmissions, last_range_m: float) -> list[Finding]:
                 tuple(numbers[gaps].tolist()),
             )
         )
-    turns = _turns(np.diff(centres_m, axis=0))
+    turns = pings.turns
     if turns.size:
         found.append(
             Finding(
                 "order",
                 f"the track turns back {turns.size} time{'s' * (turns.size > 1)}, first after ping "
-                f"{numbers[turns[0]]}: pings are out of order, or positions are noisy",
+                f"{turns[0]}: pings are out of order, or positions are noisy",
                 float(turns.size),
                 0.0,
                 "sort the pings by time: lines.select(order); image passes to and fro one by one",
-                tuple(numbers[turns].tolist()),
+                tuple(turns.tolist()),
             )
         )
     if usual_m > last_range_m > 0:
@@ -111,13 +110,6 @@ def _gaps(
     steps_m = np.linalg.norm(np.diff(centres_m, axis=0), axis=1)
     around_m = median_filter(steps_m, size=min(_AROUND, len(steps_m)), mode="nearest")
     return np.flatnonzero(steps_m > GAP * around_m), steps_m, around_m
-
-
-def _turns(moves_m: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Return the steps that lead against the local course."""
-    length_m = np.linalg.norm(moves_m, axis=1, keepdims=True)
-    course = uniform_filter1d(moves_m / length_m, min(_LOCAL, len(moves_m)), axis=0)
-    return np.flatnonzero(np.einsum("pi,pi->p", moves_m, course) < 0)
 
 
 def check_spacing(

@@ -127,7 +127,7 @@ def test_weights_multiply_their_channels(weights):
 
 @pytest.mark.parametrize("weights", [[1e300, 1, 1], [1e300j, 1, 1], [3e38, 1, 1], [1e-300] * 3])
 def test_weights_that_overflow_are_refused(weights):
-    with pytest.raises(ValueError, match="weights must (have a largest value|keep the samples)"):
+    with pytest.raises(ValueError, match=r"weights must (have a largest value|keep the samples)"):
         lines_of(np.full((3, 2), 2 + 0j)).weighted(weights)
 
 

@@ -36,7 +36,7 @@ def test_a_carrier_above_a_quarter_of_the_rate_needs_a_band():
         ({"carrier_hz": 1e300}, "carrier_hz must be"),
         ({"sample_rate_hz": 1e301}, r"sample_rate_hz must be .* <= 1e\+15 Hz, got 1e\+301"),
         ({"sample_rate_hz": np.inf}, "sample_rate_hz must be finite"),
-        ({"sample_rate_hz": -1.0}, "sample_rate_hz must be finite and > 0 Hz, got -1"),
+        ({"sample_rate_hz": -1.0}, r"sample_rate_hz must be .* > 0 .* Hz, got -1"),
         ({"start_time_s": 1e300}, "makes .* cycles over"),
         ({"start_time_s": np.nan}, "start_time_s must be finite"),
         ({"sound_speed_m_s": 0.0}, "sound_speed_m_s must be"),
