@@ -1,4 +1,4 @@
-"""What a recording looks like, and what is wrong with it."""
+"""Inspection of a recording before it is imaged: its numbers, and what is wrong with it."""
 
 from __future__ import annotations
 

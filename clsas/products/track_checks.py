@@ -30,8 +30,6 @@ def check_track(pings: Transmissions, last_range_m: float) -> list[Finding]:
     if pings.count < 2:
         return []
     usual_m = pings.usual_step_m
-    kept = pings.advancing()
-    found = []
     if not usual_m:
         return [
             Finding(
@@ -42,53 +40,7 @@ def check_track(pings: Transmissions, last_range_m: float) -> list[Finding]:
                 "check the positions; they may be missing from the recording",
             )
         ]
-    if not kept.all():
-        still = np.flatnonzero(~kept)
-        found.append(
-            Finding(
-                "still_pings",
-                f"{still.size} of {pings.count} pings were taken standing still: they advance by "
-                f"less than {STILL:g} of the usual {usual_m:.4g} m. What they show alike adds up "
-                "and hides the scene",
-                float(still.size),
-                0.0,
-                "lines.without_still_pings(), or clsas convert --without-still-pings FILE OUTPUT",
-                tuple(still.tolist()),
-            )
-        )
-    centres_m = pings.centres_m[kept]
-    if len(centres_m) < 3:
-        return found
-    numbers = np.flatnonzero(kept)
-    gaps, steps_m, around_m = _gaps(centres_m)
-    if gaps.size:
-        widest = gaps[np.argmax(steps_m[gaps])]
-        found.append(
-            Finding(
-                "gaps",
-                f"{gaps.size} gap{'s' * (gaps.size > 1)} in the track, after "
-                f"ping{'s' * (gaps.size > 1)} {runs(numbers[gaps])}: the widest is "
-                f"{steps_m[widest]:.4g} m, where {around_m[widest]:.4g} m are usual",
-                float(steps_m[widest]),
-                float(GAP * around_m[widest]),
-                "targets beside a gap blur and get grating lobes: image the parts one by one, or "
-                "look for lost pings in the recorder",
-                tuple(numbers[gaps].tolist()),
-            )
-        )
-    turns = pings.turns
-    if turns.size:
-        found.append(
-            Finding(
-                "order",
-                f"the track turns back {turns.size} time{'s' * (turns.size > 1)}, first after ping "
-                f"{turns[0]}: pings are out of order, or positions are noisy",
-                float(turns.size),
-                0.0,
-                "sort the pings by time: lines.select(order); image passes to and fro one by one",
-                tuple(turns.tolist()),
-            )
-        )
+    found = _check_halts(pings) + _check_gaps(pings) + _check_order(pings)
     if usual_m > last_range_m > 0:
         found.append(
             Finding(
@@ -101,6 +53,63 @@ def check_track(pings: Transmissions, last_range_m: float) -> list[Finding]:
             )
         )
     return found
+
+
+def _check_halts(pings: Transmissions) -> list[Finding]:
+    still = np.flatnonzero(~pings.advancing())
+    if not still.size:
+        return []
+    return [
+        Finding(
+            "still_pings",
+            f"{still.size} of {pings.count} pings were taken standing still: they advance by "
+            f"less than {STILL:g} of the usual {pings.usual_step_m:.4g} m. What they show alike "
+            "adds up and hides the scene",
+            float(still.size),
+            0.0,
+            "lines.without_still_pings(), or clsas convert --without-still-pings FILE OUTPUT",
+            tuple(still.tolist()),
+        )
+    ]
+
+
+def _check_gaps(pings: Transmissions) -> list[Finding]:
+    numbers = np.flatnonzero(pings.advancing())
+    if len(numbers) < 3:
+        return []
+    gaps, steps_m, around_m = _gaps(pings.centres_m[numbers])
+    if not gaps.size:
+        return []
+    widest, several = gaps[np.argmax(steps_m[gaps])], "s" * (gaps.size > 1)
+    return [
+        Finding(
+            "gaps",
+            f"{gaps.size} gap{several} in the track, after ping{several} {runs(numbers[gaps])}: "
+            f"the widest is {steps_m[widest]:.4g} m, where {around_m[widest]:.4g} m are usual",
+            float(steps_m[widest]),
+            float(GAP * around_m[widest]),
+            "targets beside a gap blur and get grating lobes: image the parts one by one, or "
+            "look for lost pings in the recorder",
+            tuple(numbers[gaps].tolist()),
+        )
+    ]
+
+
+def _check_order(pings: Transmissions) -> list[Finding]:
+    turns = pings.turns
+    if not turns.size:
+        return []
+    return [
+        Finding(
+            "order",
+            f"the track turns back {turns.size} time{'s' * (turns.size > 1)}, first after ping "
+            f"{turns[0]}: pings are out of order, or positions are noisy",
+            float(turns.size),
+            0.0,
+            "sort the pings by time: lines.select(order); image passes to and fro one by one",
+            tuple(turns.tolist()),
+        )
+    ]
 
 
 def _gaps(

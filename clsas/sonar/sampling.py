@@ -92,44 +92,39 @@ def check_sampling(
         If an argument has the wrong type or is outside its limits, or lines without `carrier_hz`
         come without a wavelength.
     """
-    if beam is not None:
-        validate.instance("beam", beam, BeamWindow)
-    if element_length_m is not None:
-        element_length_m = validate.positive("element_length_m", element_length_m, "m")
-    if wavelength_m is not None:
-        wavelength_m = validate.positive("wavelength_m", wavelength_m, "m")
     if isinstance(sonar, RangeLines):
-        lines, grid = sonar, track if grid is None else grid  # type: ignore[assignment]
+        grid, track = track if grid is None else grid, None  # type: ignore[assignment]
         if grid is None and beam is None and element_length_m is None:
             raise ValueError("one of grid, beam and element_length_m must be given with lines")
-        if wavelength_m is None:
-            if not lines.carrier_hz:
-                raise ValueError("wavelength_m must be given for lines with carrier_hz 0")
-            wavelength_m = lines.sound_speed_m_s / lines.carrier_hz
-        tx, rx = lines.tx_m, lines.rx_m
     else:
         validate.instance("sonar", sonar, Sonar)
         validate.instance("track", track, Track)
         validate.instance("grid", grid, Grid)
-        tx, rx, _ = channels(sonar, track)  # type: ignore[arg-type]
-        wavelength_m = sonar.wavelength_m if wavelength_m is None else wavelength_m
-        if element_length_m is None:
-            element_length_m = sonar.element_length_m
-    corners = ranges = None
+    corners = None
     if grid is not None:
         validate.instance("grid", grid, Grid)
         corners = _corners_m(grid)
-        ranges = bistatic_range_m(corners[:, None], tx, rx)
-    limit = _spacing_limit(wavelength_m, element_length_m, beam)
+    tx, rx = _antennas_m(sonar, track)
+    limit = _spacing_limit(sonar, beam, element_length_m, wavelength_m)
+    ranges = None if corners is None else bistatic_range_m(corners[:, None], tx, rx)
     found = _check_spacing(limit, phase_centres_m(tx, rx), corners, ranges)
-    if isinstance(track, Track) and ranges is not None and isinstance(sonar, Sonar):
+    if isinstance(sonar, Sonar) and isinstance(track, Track) and ranges is not None:
         found += _check_ping_rate(sonar, track, ranges)
     return found
 
 
+def _antennas_m(survey: Sonar | RangeLines, track: Track | Grid | None) -> tuple[NDArray, NDArray]:
+    """Return positions of transmitters and receivers, [channels, 3]."""
+    if isinstance(survey, RangeLines):
+        return survey.tx_m, survey.rx_m
+    assert isinstance(track, Track)  # for type checkers
+    tx, rx, _ = channels(survey, track)
+    return tx, rx
+
+
 @dataclass(frozen=True)
 class _SpacingLimit:
-    """What limits the spacing of phase centres, apart from the grid."""
+    """Largest spacing of phase centres by elements or beam, and the wavelength."""
 
     wavelength_m: float
     spacing_m: float = np.inf
@@ -137,17 +132,33 @@ class _SpacingLimit:
 
 
 def _spacing_limit(
-    wavelength_m: float, element_length_m: float | None, beam: BeamWindow | None
+    survey: Sonar | RangeLines,
+    beam: BeamWindow | None,
+    element_length_m: float | None,
+    wavelength_m: float | None,
 ) -> _SpacingLimit:
     """Return the limit of elements or, where their length is not known, of the beam."""
+    if beam is not None:
+        validate.instance("beam", beam, BeamWindow)
+    if wavelength_m is not None:
+        wavelength = validate.positive("wavelength_m", wavelength_m, "m")
+    elif isinstance(survey, Sonar):
+        wavelength = survey.wavelength_m
+    elif survey.carrier_hz:
+        wavelength = survey.sound_speed_m_s / survey.carrier_hz
+    else:
+        raise ValueError("wavelength_m must be given for lines with carrier_hz 0")
+    if element_length_m is None and isinstance(survey, Sonar):
+        element_length_m = survey.element_length_m
     if element_length_m is not None:
-        meaning = f"half the element length of {element_length_m:.4g} m"
-        return _SpacingLimit(wavelength_m, element_length_m / 2, meaning)
+        length = validate.positive("element_length_m", element_length_m, "m")
+        meaning = f"half the element length of {length:.4g} m"
+        return _SpacingLimit(wavelength, length / 2, meaning)
     if beam is not None:
         low, high = np.sin(np.radians(beam.squint_deg + np.array([-0.5, 0.5]) * beam.width_deg))
         meaning = f"what keeps grating lobes out of the beam of {beam.width_deg:.4g} degrees"
-        return _SpacingLimit(wavelength_m, wavelength_m / (2 * float(high - low)), meaning)
-    return _SpacingLimit(wavelength_m)
+        return _SpacingLimit(wavelength, wavelength / (2 * float(high - low)), meaning)
+    return _SpacingLimit(wavelength)
 
 
 def _check_spacing(

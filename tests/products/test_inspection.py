@@ -184,6 +184,25 @@ def test_pings_taken_standing_still(lines):
     assert "still_pings" not in clsas.inspect(remedied)
 
 
+def test_a_long_halt_hides_what_the_moving_pings_show(lines, platform):
+    """The remedy of the finding brings the targets back."""
+
+    def peak_over_median_db(recording):
+        image = clsas.backproject(recording, GRID, device=platform, accuracy_db=-40)
+        return 20 * np.log10(np.abs(image.pixels).max() / np.median(np.abs(image.pixels)))
+
+    recording = lines.select(np.r_[0:100, np.full(355, 100), 101:PINGS])
+    found = clsas.inspect(recording, GRID, device=platform)
+    assert names(found) == ["still_pings"]
+    assert (
+        "355 of 554 pings" in found["still_pings"].message or len(found["still_pings"].where) == 354
+    )
+    clean_db = peak_over_median_db(lines)
+    assert peak_over_median_db(recording) < clean_db - 10
+    remedied_db = peak_over_median_db(recording.without_still_pings())
+    assert remedied_db == pytest.approx(clean_db, abs=0.1)
+
+
 def test_jitter_of_a_halt_is_no_motion(lines):
     def change(position_m):
         position_m = halting(position_m)
