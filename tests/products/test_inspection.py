@@ -194,9 +194,7 @@ def test_a_long_halt_hides_what_the_moving_pings_show(lines, platform):
     recording = lines.select(np.r_[0:100, np.full(355, 100), 101:PINGS])
     found = clsas.inspect(recording, GRID, device=platform)
     assert names(found) == ["still_pings"]
-    assert (
-        "355 of 554 pings" in found["still_pings"].message or len(found["still_pings"].where) == 354
-    )
+    assert "354 of 554 pings" in found["still_pings"].message
     clean_db = peak_over_median_db(lines)
     assert peak_over_median_db(recording) < clean_db - 10
     remedied_db = peak_over_median_db(recording.without_still_pings())
