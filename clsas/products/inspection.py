@@ -30,6 +30,8 @@ from clsas.signal.spectrum import Spectrum, cycles_per_m_at, measure_spectrum
 from clsas.sonar.beam import BeamWindow
 from clsas.sonar.sampling import Finding
 
+_FARTHEST_M = 1e12
+
 
 def inspect(
     lines: RangeLines | Echoes,
@@ -97,6 +99,7 @@ def inspect(
     is_echoes = isinstance(lines, Echoes)
     if isinstance(lines, Echoes):
         lines = compress(lines)
+    _check_distances(lines)
     pings = Transmissions.of(lines)
     alike = None if np.ptp(pings.receivers) else int(pings.receivers[0])
     found = check_levels(Levels.of(recorded, magnitudes=not is_echoes), alike)
@@ -115,6 +118,15 @@ def inspect(
     found += check_spacing(moving, grid, wavelength_m=band.wavelength_m, **limits)
     found += check_ranges(lines, grid) + check_sign(sign)
     return _inspection(lines, pings, band, sign, found)
+
+
+def _check_distances(lines: RangeLines) -> None:
+    """Raise ValueError for positions and ranges whose squares or differences float64 loses."""
+    for name in ("first_range_m", "tx_m", "rx_m"):
+        farthest_m = float(np.abs(getattr(lines, name)).max())
+        validate.number(f"the largest of {name}", farthest_m, "m", most=_FARTHEST_M)
+    extent_m = lines.length * lines.range_step_m
+    validate.number("the length of lines", extent_m, "m", most=_FARTHEST_M)
 
 
 @dataclass(frozen=True)

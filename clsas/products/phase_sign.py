@@ -63,11 +63,14 @@ def phase_sign(
         if made is None:
             continue
         part, patch = made
-        found = PhaseSign(
-            _sharpness(part, patch, device),
-            _sharpness(replace(part, samples=part.samples.conj()), patch, device),
-            tuple(float(each) for each in spot.place_m),  # type: ignore[arg-type]
-        )
+        try:
+            found = PhaseSign(
+                _sharpness(part, patch, device),
+                _sharpness(replace(part, samples=part.samples.conj()), patch, device),
+                tuple(float(each) for each in spot.place_m),  # type: ignore[arg-type]
+            )
+        except ValueError:  # numbers that no image can be formed of
+            continue
         if best is None or max(found.as_given, found.conjugate) > max(
             best.as_given, best.conjugate
         ):
@@ -157,6 +160,8 @@ def _patch(
     if len(near) < _LEAST_CHANNELS:
         return None
     part = lines.select(near[some_channels(len(near), _MOST_CHANNELS)])
+    # Sums of very large samples would overflow float32.
+    part = replace(part, samples=part.samples / (np.abs(part.samples).max() or np.float32(1)))
     along = _course(part.phase_centres_m)
     look = look / range_m
     across = look - along * (look @ along)

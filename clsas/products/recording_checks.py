@@ -61,6 +61,8 @@ class Levels:
         power, clipped = [], []
         for block in _blocks(samples):
             scaled = block / np.float32(scale)
+            if scaled.shape[1] == 1:  # has no variance
+                scaled = np.concatenate([scaled, -scaled], axis=1)
             power.append(scaled.var(axis=1, dtype=np.complex128 if scaled.dtype.kind == "c" else
                                     np.float64))  # fmt: skip
             parts = np.maximum(np.abs(scaled.real), np.abs(scaled.imag))

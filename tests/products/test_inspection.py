@@ -341,8 +341,11 @@ def test_lines_of_zeros_and_short_recordings(lines):
     assert silent.sign is None
     for some in ([3], [3, 4], [3, 4, 5]):
         assert clsas.inspect(lines.select(some), GRID).pings == len(some)
-    single = replace(lines, samples=lines.samples[:, :1])
+    single = replace(lines, samples=lines.samples[:, 200:201])
     assert clsas.inspect(single).length == 1
+    for carrier_hz in (0.0, 100e3):
+        scaled = replace(lines, samples=1e36 * lines.samples, carrier_hz=carrier_hz)
+        assert clsas.inspect(scaled).findings == ()
 
 
 def test_samples_that_are_not_finite_are_refused_with_their_place(lines, tmp_path):
@@ -377,6 +380,9 @@ def test_arguments_of_another_kind(lines):
         ({"lines": GRID}, "lines must be of type RangeLines or Echoes"),
         ({"grid": lines}, "grid must be of type Grid"),
         ({"beam": 3}, "beam must be of type BeamWindow"),
+        ({"lines": replace(lines, first_range_m=1e300)}, "the largest of first_range_m must be"),
+        ({"lines": replace(lines, tx_m=[1e200, 0, 0])}, r"the largest of tx_m .* got 1e\+200"),
+        ({"lines": replace(lines, range_step_m=1e300)}, "the length of lines must be"),
         ({"element_length_m": -1}, "element_length_m must be finite and > 0 m"),
     ):
         with pytest.raises((TypeError, ValueError), match=words):
