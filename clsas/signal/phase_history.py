@@ -93,11 +93,7 @@ def from_phase_history(
     reference_m = validate.array(
         "reference_range_m", reference_range_m, np.float64, (channels,), broadcast=True
     )
-    weights = band_window(window, 1.0)(np.linspace(-0.5, 0.5, count))
-    if not abs(weights.sum()) > 0:
-        raise ValueError(f"window must not have the sum 0, got {validate.shown(window)}")
-    weights = weights / weights.sum()
-
+    weights = _weights(window, count)
     validate.memory("oversampling", 8 * channels * oversampling * count)
     length = fft.next_fast_len(math.ceil(oversampling * count))
     equal = np.ptp(step_hz) * count <= _EQUAL_STEPS * step_hz.min()
@@ -130,6 +126,14 @@ def from_phase_history(
         carrier_hz=carrier_hz,
         sound_speed_m_s=speed,
     )
+
+
+def _weights(window: Window, count: int) -> NDArray[np.float64]:
+    """Return weights of the frequencies, of sum 1."""
+    weights = band_window(window, 1.0)(np.linspace(-0.5, 0.5, count))
+    if not abs(weights.sum()) > 0:
+        raise ValueError(f"window must not have the sum 0, got {validate.shown(window)}")
+    return weights / weights.sum()
 
 
 def _frequencies(name: str, value: ArrayLike, channels: int) -> NDArray[np.float64]:
