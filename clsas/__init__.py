@@ -32,6 +32,8 @@ if TYPE_CHECKING:
     from clsas.products import plot
     from clsas.products.assessment import assess, survey_lines
     from clsas.products.assessment_result import Assessment, Effect
+    from clsas.products.inspection import inspect
+    from clsas.products.inspection_result import Inspection, PhaseSign
     from clsas.products.quality import contrast, entropy, measure_point
     from clsas.products.tradeoff import tradeoff
     from clsas.products.tradeoff_result import Tradeoff
@@ -43,7 +45,7 @@ if TYPE_CHECKING:
     from clsas.simulation.scenes import PointTargets, Seabed
     from clsas.simulation.simulator import simulate, simulate_lines
     from clsas.sonar.beam import BeamWindow
-    from clsas.sonar.sampling import check_sampling
+    from clsas.sonar.sampling import Finding, check_sampling
     from clsas.sonar.system import Pulse, Sonar
     from clsas.sonar.track import Pointing, Track, channels
 
@@ -58,11 +60,14 @@ __all__ = [
     "Echoes",
     "Effect",
     "FileFormatError",
+    "Finding",
     "Grid",
     "Image",
+    "Inspection",
     "Micronavigation",
     "Mosaic",
     "Patch",
+    "PhaseSign",
     "Plan",
     "PointTargets",
     "Pointing",
@@ -85,6 +90,7 @@ __all__ = [
     "factorize",
     "from_full_matrix",
     "from_phase_history",
+    "inspect",
     "list_devices",
     "load",
     "measure_point",
@@ -133,6 +139,8 @@ _MODULES = {
     "planning.planner": "plan",
     "products.assessment": "assess survey_lines",
     "products.assessment_result": "Assessment Effect",
+    "products.inspection": "inspect",
+    "products.inspection_result": "Inspection PhaseSign",
     "products.quality": "contrast entropy measure_point",
     "products.tradeoff": "tradeoff",
     "products.tradeoff_result": "Tradeoff",
@@ -144,7 +152,7 @@ _MODULES = {
     "simulation.scenes": "PointTargets Seabed",
     "simulation.simulator": "simulate simulate_lines",
     "sonar.beam": "BeamWindow",
-    "sonar.sampling": "check_sampling",
+    "sonar.sampling": "Finding check_sampling",
     "sonar.system": "Pulse Sonar",
     "sonar.track": "Pointing Track channels",
 }

@@ -25,6 +25,10 @@ _COMMANDS = {
         "lines",
         "Convert a file: recordings to range lines in HDF5, range lines to CPHD and back.",
     ),
+    "inspect": (
+        "inspection",
+        "Show what a recording looks like, and what is wrong with it.",
+    ),
     "image": ("images", "Form the image of range lines, fast to a tolerance or exactly."),
     "plan": (
         "images",

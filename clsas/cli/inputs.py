@@ -20,19 +20,18 @@ from clsas.products.plot.colours import colour_map as check_colour_map
 DEFAULT_REQUEST = {"tolerance_db": TOLERANCE_DB}
 
 
-def load(path: Path, kind: type) -> Any:
-    """Return the object in a file; raise ValueError unless it is of type `kind`."""
+def load(path: Path, *kinds: type) -> Any:
+    """Return the object in a file; raise ValueError unless it is of one of the types `kinds`."""
     obj = clsas.load(path)
-    if isinstance(obj, kind):
+    if isinstance(obj, kinds):
         return obj
     hint = {
         clsas.Echoes: " (clsas simulate makes them)",
         clsas.RangeLines: " (clsas compress makes them)",
         clsas.Image: " (clsas image makes it)",
     }
-    raise ValueError(
-        f"{path} must hold {kind.__name__}{hint.get(kind, '')}, got {type(obj).__name__}"
-    )
+    wanted = " or ".join(f"{kind.__name__}{hint.get(kind, '')}" for kind in kinds)
+    raise ValueError(f"{path} must hold {wanted}, got {type(obj).__name__}")
 
 
 def read_scene(path: Path) -> SceneFile:

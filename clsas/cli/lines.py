@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +15,9 @@ from clsas.cli import options
 from clsas.cli.inputs import load, read_levels, read_scene, warn_of_sampling
 from clsas.cli.outputs import progress_bar, report
 from clsas.cli.parameters import HDF5, INPUT, Output
+from clsas.core import validate
+from clsas.core.conditioning import STATISTICS
+from clsas.files.cphd_writing import SUFFIXES as CPHD
 from clsas.files.formats import SUFFIXES
 from clsas.signal.compression import check_options
 from clsas.simulation.simulator import check_size
@@ -108,18 +113,63 @@ def compress(
 @click.command()
 @click.argument("recording", metavar="FILE", type=INPUT)
 @click.argument("output", metavar="OUTPUT", type=Output(*SUFFIXES))
+@click.option(
+    "--without-still-pings",
+    is_flag=True,
+    help="Drop pings taken standing still.",
+)
+@click.option(
+    "--without-background",
+    type=click.Choice(STATISTICS),
+    help="Subtract what all pings have in common.",
+)
+@click.option(
+    "--high-pass-hz",
+    type=float,
+    help="Remove frequencies of the recorded signal below this (Hz).",
+    callback=options.checked(partial(validate.positive, "high_pass_hz", unit="Hz")),
+)
+@click.option(
+    "--taper-m",
+    type=float,
+    help="Fade this range at either end of the lines (m).",
+    callback=options.checked(partial(validate.positive, "taper_m", unit="m")),
+)
 @options.as_json
-def convert(recording: Path, output: Path, as_json: bool) -> None:
+def convert(
+    recording: Path,
+    output: Path,
+    without_still_pings: bool,
+    without_background: str | None,
+    high_pass_hz: float | None,
+    taper_m: float | None,
+    as_json: bool,
+) -> None:
     """Convert a file: recordings to range lines in HDF5, range lines to CPHD and back.
 
     The name of OUTPUT says what it becomes: HDF5 (.h5) or CPHD (.cphd). FILE is HDF5 of clsas or
-    AirSAS, CPHD, or a MATLAB file with a radar's phase history or a full matrix capture.
+    AirSAS, CPHD, or a MATLAB file with a radar's phase history or a full matrix capture. The
+    options mend what `clsas inspect` finds, in the order in which they are listed.
 
     \b
     Example:  clsas convert lines.h5 lines.cphd
     """
     start = time.perf_counter()
-    obj = clsas.load(recording)
+    steps: list[Callable[[clsas.RangeLines], clsas.RangeLines]] = []
+    if without_still_pings:
+        steps.append(lambda lines: lines.without_still_pings())
+    if without_background is not None:
+        steps.append(lambda lines: lines.without_background(without_background))
+    if high_pass_hz is not None:
+        steps.append(lambda lines: lines.high_passed(high_pass_hz))
+    if taper_m is not None:
+        steps.append(lambda lines: lines.tapered_ends(taper_m))
+    if steps or output.suffix.lower() in CPHD:
+        obj = load(recording, clsas.RangeLines)
+    else:
+        obj = clsas.load(recording)
+    for step in steps:
+        obj = step(obj)
     clsas.save(output, obj)
     seconds = time.perf_counter() - start
     report(

@@ -87,10 +87,17 @@ def without_background(lines: RangeLines, statistic: str, receivers: int | None)
 
 def weighted(lines: RangeLines, weights: ArrayLike) -> RangeLines:
     """Multiply every channel by its weight; see `RangeLines.weighted`."""
-    dtype = np.complex128 if np.iscomplexobj(weights) else np.float64
+    dtype = np.complex64 if np.iscomplexobj(weights) else np.float32
     factors: NDArray = validate.array("weights", weights, dtype, (lines.channels,))
-    narrow = np.complex64 if dtype is np.complex128 else np.float32
-    return replace(lines, samples=lines.samples * factors.astype(narrow)[:, None])
+    with np.errstate(over="ignore", invalid="ignore"):
+        samples = lines.samples * factors[:, None]
+    if not np.isfinite(samples).all():
+        largest = float(np.abs(factors).max())
+        raise ValueError(
+            f"weights must keep the samples within float32, up to {np.finfo(np.float32).max:.2g}, "
+            f"got weights up to {largest:.3g}"
+        )
+    return replace(lines, samples=samples)
 
 
 def _receivers(lines: RangeLines) -> int:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from clsas.core import conditioning, reprs, validate
+from clsas.core import conditioning, pings, reprs, validate
 
 _PER_CHANNEL = ("first_range_m", "tx_m", "rx_m", "rx_velocity_m_s")
 _GOLDEN = (np.sqrt(5) - 1) / 2
@@ -253,6 +253,26 @@ class RangeLines:
             receiver's lines do not begin at the same range in all pings.
         """
         return conditioning.without_background(self, statistic, receivers)
+
+    def without_still_pings(self, least_advance_m: float | None = None) -> RangeLines:
+        """Return the lines without pings taken standing still.
+
+        A platform that stands still repeats one view of the scene. Hundreds of equal pings add up
+        to a bright circle about their place and hide what the moving ones show. Of the pings of
+        a halt the first stays.
+
+        Parameters
+        ----------
+        least_advance_m : float, optional
+            Distance from the last ping that stays, below which a ping is dropped, metres. By
+            default a tenth of the usual advance: the median over the pings that move.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If the distance is not a positive number.
+        """
+        return pings.without_still_pings(self, least_advance_m)
 
     def weighted(self, weights: ArrayLike) -> RangeLines:
         """Return the lines, each multiplied by its weight.

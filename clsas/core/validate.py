@@ -29,6 +29,9 @@ _REPR.maxstring = _REPR.maxother = _REPR.maxlong = 2 * _LONGEST
 # Files with the memory limit of a process's control group, versions 2 and 1.
 _GROUP_LIMITS = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes")
 
+MOST_HZ, MOST_M_S = 1e15, 3e8
+"""Largest frequency and speed of waves that recordings may have: those of light."""
+_MOST_CYCLES = 1e10  # of phase: float64 holds them to 1e-6 of a cycle
 
 _T = TypeVar("_T")
 
@@ -221,6 +224,20 @@ def _memory_bytes() -> float:
     return min(limits)
 
 
+def phase(carrier_hz: float, sound_speed_m_s: float, farthest_m: float) -> None:
+    """Raise ValueError if float64 cannot hold the phase of the farthest range.
+
+    `carrier_hz` and `farthest_m` may have overflown.
+    """
+    with np.errstate(over="ignore", invalid="ignore"):
+        cycles = np.float64(2) * carrier_hz / sound_speed_m_s * farthest_m
+    if not cycles <= _MOST_CYCLES:  # nor NaN
+        raise ValueError(
+            f"carrier_hz = {carrier_hz:g} Hz makes {cycles:.3g} cycles over {farthest_m:g} m "
+            f"at {sound_speed_m_s:g} m/s; float64 holds the phase of {_MOST_CYCLES:g}"
+        )
+
+
 def array(
     name: str,
     value: ArrayLike,
@@ -290,9 +307,11 @@ def array(
     with np.errstate(over="ignore", invalid="ignore"):
         finite = np.isfinite(np.add.reduce(result, axis=None))  # or the sum overflowed
     if not finite and not np.isfinite(result).all():
-        bad = int(np.size(result) - np.isfinite(result).sum())
+        wrong = ~np.isfinite(result)
+        first = [int(index) for index in np.unravel_index(int(wrong.argmax()), wrong.shape)]
         raise ValueError(
-            f"{name} must be finite, got {bad} NaN or infinite of {result.size} values"
+            f"{name} must be finite, got {int(wrong.sum())} NaN or infinite of {result.size} values"
+            + (f", the first at {first}" if first else "")
         )
     result = result.view()
     result.flags.writeable = False

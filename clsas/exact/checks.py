@@ -15,7 +15,6 @@ from clsas.sonar.beam import BeamWindow
 
 _LARGEST_DISTANCE_M = 1e9
 _SMALLEST_STEP_M = 1e-9
-_MOST_CYCLES = 1e10  # float64 holds them to 1e-6 of a cycle
 _LARGEST_SUM = 1e37
 _NUMBERS_AT_ONCE = 1 << 18  # stay in a core's cache between two passes over them
 _FASTEST = 0.05  # receiver, in sound speeds: for faster ones cl/antennas.h iterates too little
@@ -61,13 +60,7 @@ def check_numbers(lines: RangeLines, beam: BeamWindow | None) -> float:
         "range_step_m", lines.range_step_m, "m", least=_SMALLEST_STEP_M, most=_LARGEST_DISTANCE_M
     )
     farthest_m = np.abs([lines.first_range_m, lines.last_range_m]).max()
-    with np.errstate(over="ignore"):
-        cycles = np.float64(2) * lines.carrier_hz / lines.sound_speed_m_s * farthest_m
-    if not cycles <= _MOST_CYCLES:
-        raise ValueError(
-            f"carrier_hz = {lines.carrier_hz:g} Hz makes {cycles:.3g} cycles over {farthest_m:g} m "
-            f"at {lines.sound_speed_m_s:g} m/s; float64 holds the phase of {_MOST_CYCLES:g}"
-        )
+    validate.phase(lines.carrier_hz, lines.sound_speed_m_s, float(farthest_m))
     parts = lines.samples.reshape(-1).view(np.float32)  # contiguous, as every RangeLines
     spans = [parts[i : i + _NUMBERS_AT_ONCE] for i in range(0, parts.size, _NUMBERS_AT_ONCE)]
     largest = float(max(max(span.max(), -span.min()) for span in spans))

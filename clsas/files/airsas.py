@@ -21,6 +21,7 @@ from clsas.core import reading, validate
 from clsas.core.lines import RangeLines
 from clsas.files import hdf5
 from clsas.files.hdf5 import FileFormatError
+from clsas.files.positions import checked_positions
 from clsas.signal.compression import Window, compress
 from clsas.signal.echoes import Echoes
 from clsas.sonar.system import Pulse
@@ -76,8 +77,19 @@ def read_airsas(
         If an option is outside its limits, or a microphone does not exist.
     OSError
         If a file does not exist or cannot be read.
+
+    Warns
+    -----
+    ClsasWarning
+        If all pings have one position, or the track turns back, so that pings may be out of order.
     """
     path = validate.path("path", path)
+    with hdf5.opened(path) as file:
+        if not is_airsas(file):
+            raise FileFormatError(
+                "is an HDF5 file, but no scene of AirSAS: it must hold /na and microphones as "
+                f"/ch1, /ch2, got {validate.shown(sorted(file))}"
+            )
     folder = path.absolute().parent.parent / SHARED if shared is None else Path(shared)
     parameters = _Parameters.read(folder / ACQUISITION)
     sensors_m = _sensors_m(folder / SENSORS)
@@ -114,7 +126,7 @@ def read_airsas(
         pulse=pulse,
     )
     lines = compress(echoes, window=window, oversampling=oversampling)
-    return at_one_speed(lines, np.repeat(speed_m_s, len(numbers)))
+    return checked_positions(path, at_one_speed(lines, np.repeat(speed_m_s, len(numbers))))
 
 
 def at_one_speed(lines: RangeLines, speed_m_s: NDArray[np.float64]) -> RangeLines:

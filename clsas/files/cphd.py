@@ -24,6 +24,7 @@ from clsas.core import reading, validate
 from clsas.core.extras import install_command
 from clsas.core.lines import RangeLines
 from clsas.files.hdf5 import FileFormatError
+from clsas.files.positions import checked_positions
 from clsas.signal.compression import Window
 from clsas.signal.phase_history import from_phase_history
 
@@ -83,6 +84,12 @@ def read_cphd(
     OSError
         If the file cannot be read.
 
+    Warns
+    -----
+    ClsasWarning
+        If vectors lack positions, and are left out; if times of transmission do not ascend, the
+        track turns back, or all vectors have one position.
+
     Notes
     -----
     Positions are those that the file gives for every vector, at the times of transmission and
@@ -110,9 +117,11 @@ def read_cphd(
             vectors = reader.read_pvps(name)
             signal = reader.read_signal(name)
             collection = _Collection.read(tree)
-            kept = _usable(vectors)
+            kept = _usable(path, vectors)
             if not kept.any():
-                raise FileFormatError("must hold vectors with a signal, got none")
+                raise FileFormatError(
+                    "must hold vectors with a signal and complete positions, got none"
+                )
             vectors, signal = vectors[kept], _complex(signal[kept])
             if "AmpSF" in (vectors.dtype.names or ()):
                 signal *= vectors["AmpSF"].astype(np.float32)[:, None]
@@ -120,11 +129,13 @@ def read_cphd(
                 np.conj(signal, out=signal)
     if collection.domain == "FX":
         try:
-            return _lines_of_fx(signal, vectors, collection, window, oversampling)
+            lines = _lines_of_fx(signal, vectors, collection, window, oversampling)
         except (TypeError, ValueError) as error:
             raise type(error)(f"{path}: {error}") from None
-    with _defects(path):
-        return _lines_of_toa(signal, vectors, collection)
+    else:
+        with _defects(path):
+            lines = _lines_of_toa(signal, vectors, collection)
+    return checked_positions(path, lines)
 
 
 @contextmanager
@@ -134,7 +145,7 @@ def _defects(path: Path) -> Iterator[None]:
         yield
     except FileFormatError as error:
         raise FileFormatError(f"{path} {error}") from None
-    except (MemoryError, OSError):
+    except (MemoryError, OSError, validate.ClsasWarning):  # warnings may be made exceptions
         raise
     # sarkit and lxml report damage by any exception.
     except Exception as error:
@@ -259,15 +270,30 @@ def _vector(value: Any) -> NDArray[np.float64]:
     return vector
 
 
-def _usable(vectors: NDArray) -> NDArray[np.bool_]:
-    """Return which vectors hold a signal and are complete."""
-    usable = np.ones(len(vectors), bool)
+def _usable(path: Path, vectors: NDArray) -> NDArray[np.bool_]:
+    """Return which vectors hold a signal and are complete; warn of incomplete and repeated ones."""
+    normal = np.ones(len(vectors), bool)
     if "SIGNAL" in (vectors.dtype.names or ()):
-        usable &= vectors["SIGNAL"] == 1
+        normal = vectors["SIGNAL"] == 1
+    complete = np.ones(len(vectors), bool)
     for name in ("TxPos", "RcvPos", "SRPPos"):
-        usable &= np.isfinite(vectors[name]).all(axis=1)
+        complete &= np.isfinite(vectors[name]).all(axis=1)
     for name in ("SC0", "SCSS", "FX1", "FX2"):
-        usable &= np.isfinite(vectors[name])
+        complete &= np.isfinite(vectors[name])
+    usable = normal & complete
+    lost = np.flatnonzero(normal & ~complete)
+    if lost.size and usable.any():
+        validate.warn(
+            f"{path}: {lost.size} of {len(vectors)} vectors lack finite positions or frequencies "
+            f"(the first is vector {lost[0]}): they are left out"
+        )
+    late = np.flatnonzero(~(np.diff(vectors["TxTime"][usable]) > 0))
+    if late.size:
+        validate.warn(
+            f"{path}: TxTime does not ascend after {late.size} of {usable.sum()} vectors (first "
+            f"after vector {np.flatnonzero(usable)[late[0]]}): pulses are repeated or out of "
+            "order. They are read in the order of the file"
+        )
     return usable
 
 

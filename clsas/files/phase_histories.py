@@ -12,6 +12,7 @@ from scipy.constants import speed_of_light
 from clsas.core.lines import RangeLines
 from clsas.files import matlab
 from clsas.files.hdf5 import FileFormatError
+from clsas.files.positions import checked_positions
 from clsas.signal.compression import Window
 from clsas.signal.phase_history import from_phase_history
 
@@ -51,6 +52,11 @@ def read_phase_history(
     OSError
         If the file cannot be read.
 
+    Warns
+    -----
+    ClsasWarning
+        If all pings have one position, or the track turns back, so that pings may be out of order.
+
     Notes
     -----
     Reference ranges in float32 are rounded to about 1 mm, or 0.4 rad of phase at 10 GHz. Where they
@@ -81,7 +87,7 @@ def phase_history_lines(
     antenna_m = np.stack(antenna, axis=-1).astype(np.float64)
     try:
         first_hz, step_hz = _equal_steps(frequency)
-        return from_phase_history(
+        lines = from_phase_history(
             samples,
             first_frequency_hz=first_hz,
             frequency_step_hz=step_hz,
@@ -94,6 +100,7 @@ def phase_history_lines(
         )
     except (TypeError, ValueError) as error:
         raise type(error)(f"{os.fspath(path)}: {error}") from None
+    return checked_positions(path, lines)
 
 
 def _equal_steps(frequency: NDArray) -> tuple[float, float]:

@@ -29,8 +29,8 @@ def read_track(path: str | os.PathLike) -> Track:
     Raises
     ------
     ValueError
-        If a column is unknown, missing or repeated, a value is not a finite number, or time does
-        not ascend.
+        If a column is unknown, missing or repeated, there is no ping, a value is not a finite
+        number, or time does not ascend.
     OSError
         If the file cannot be read.
     """
@@ -51,6 +51,8 @@ def read_track(path: str | os.PathLike) -> Track:
     for name in (*_POSITION, *velocity, *names):
         if names.count(name) != 1:
             raise ValueError(f"{path}: column {name!r} must be there once")
+    if not rows:
+        raise ValueError(f"{path} must hold at least one ping under the names of columns")
     values = np.empty((len(rows), len(names)))
     for index, (line, row) in enumerate(rows):
         try:

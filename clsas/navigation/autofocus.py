@@ -22,6 +22,7 @@ from clsas.core import reprs, validate
 from clsas.core.grid import Grid
 from clsas.core.image import Image
 from clsas.core.lines import RangeLines, wavelength_m
+from clsas.navigation.checks import check_navigation
 from clsas.navigation.drift import drift_m
 from clsas.navigation.gradient import phase_gradient_m, sharpest_m
 from clsas.navigation.responses import (
@@ -138,7 +139,9 @@ def autofocus(
     Warns
     -----
     ClsasWarning
-        If the scene has no responses. The lines are then returned as they are.
+        If the scene has no responses: the lines are then returned as they are. If pings repeat a
+        position: they are corrected as one. If the track turns back, so that pings may be out of
+        order.
     """
     validate.instance("lines", lines, RangeLines)
     validate.instance("grid", grid, Grid)
@@ -146,9 +149,7 @@ def autofocus(
         validate.instance("beam", beam, BeamWindow)
     validate.progress(progress)
     names = _checked_unknowns(unknowns)
-    pings = len(lines.ping_starts)
-    if pings < 10:
-        raise ValueError(f"lines must hold at least 10 pings for autofocus, got {pings}")
+    check_navigation(lines, 10, "autofocus", may_stand=True)
     focus = _Focus(lines, grid, Passage.of(lines, names), beam, open_device(device), progress)
     focus.check_geometry(names)
     return focus.result()

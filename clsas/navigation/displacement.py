@@ -25,6 +25,7 @@ from clsas.signal.readout import Readout
 from clsas.signal.spectrum import cycles_per_m_at
 from clsas.sonar.system import element_pattern
 
+_CANCELLED = 1e-6  # length of the sum of two unit vectors, up to which they are opposite
 _ANGLES = 65  # of the beam, over which the expected phase is averaged
 _WIDEST = math.radians(75)  # half of the beam that is averaged
 _SLOPES = np.linspace(-0.2, 0.2, 81)  # yaw between pings that is tried first, rad
@@ -127,7 +128,9 @@ class Correlator:
         centre_m = (lines.phase_centres_m[pairs.first] + lines.phase_centres_m[pairs.second]) / 2
         ping = int(np.searchsorted(array.starts, pairs.first[0], "right")) - 1
         forward = array.forward[ping] + array.forward[ping + 1]
-        forward /= np.linalg.norm(forward)
+        both = float(np.linalg.norm(forward))
+        # They cancel where the track turns back from one ping to the next.
+        forward = forward / both if both > _CANCELLED else array.forward[ping]
         outward = swath.side * np.array([-forward[1], forward[0], 0.0])
         range_m = np.concatenate(
             [

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from clsas.core import reprs, validate
 from clsas.core.lines import RangeLines
+from clsas.navigation.checks import check_navigation
 from clsas.navigation.displacement import Correlator
 from clsas.navigation.overlap import Array, moved
 from clsas.navigation.passes import Displacements, measured
@@ -144,13 +145,15 @@ def micronavigate(
     Raises
     ------
     TypeError, ValueError
-        If an argument is of the wrong kind or outside its limits; if there is one ping, or fewer
-        than three phase centres overlap; or if hardly any two pings are coherent.
+        If an argument is of the wrong kind or outside its limits; if there is one ping, positions
+        are missing, or pings repeat a position; if fewer than three phase centres overlap; or if
+        hardly any two pings are coherent.
 
     Warns
     -----
     ClsasWarning
-        If some pairs of pings are not coherent. The navigation bridges them.
+        If some pairs of pings are not coherent: the navigation bridges them. If the track turns
+        back, so that pings may be out of order.
 
     Notes
     -----
@@ -170,6 +173,7 @@ def micronavigate(
     validate.instance("lines", lines, RangeLines)
     validate.progress(progress)
     names = _checked_unknowns(unknowns)
+    check_navigation(lines, 2, "micronavigation", may_stand=False)
     array = Array.of(lines)
     swath = _swath(lines, range_m, window_m, side, seabed_z_m, element_length_m)
     fixes = _fixes(

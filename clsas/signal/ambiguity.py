@@ -160,7 +160,7 @@ def ends_error(
         (square[:, ::-1], last - farthest, last - nearest),
     ):
         share = np.where((near < _NEAR_END) & (far > -_NEAR_END), _AT_END, 0.0)
-        ends_loudly = samples[:, 0] > _CUT * samples[:, :_FADING].mean(axis=1)
+        ends_loudly = _ends_loudly(samples)
         near = np.maximum(near, _NEAR_END)
         share += ends_loudly * inside * np.maximum(1 / near - 1 / np.maximum(far, near), 0.0)
         at_ends += share * samples[:, :_END].mean(axis=1)
@@ -168,3 +168,23 @@ def ends_error(
     within = (index >= first[:, None]) & (index < end[:, None])
     total = square.sum(where=within)
     return float(at_ends[imaged].sum() / total) if total else 0.0
+
+
+def end_powers(lines: RangeLines) -> tuple[float, float]:
+    """Power of the first and of the last samples over that of whole lines; 0 where lines fade."""
+    part = lines.select(some_channels(lines.channels, _CHANNELS))
+    square = part.samples.real.astype(np.float64) ** 2
+    square += part.samples.imag.astype(np.float64) ** 2
+    mean = float(square.mean())
+    if not mean:
+        return 0.0, 0.0
+    first, last = (
+        float((_ends_loudly(samples) * samples[:, :_END].mean(axis=1)).mean()) / mean
+        for samples in (square, square[:, ::-1])
+    )
+    return first, last
+
+
+def _ends_loudly(square: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return which lines do not fade towards their first sample; `square` is [channels, length]."""
+    return square[:, 0] > _CUT * square[:, :_FADING].mean(axis=1)

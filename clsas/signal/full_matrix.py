@@ -67,6 +67,22 @@ def from_full_matrix(
     else:
         samples = validate.array("samples", samples, np.float32, (None, None))
         tx, rx = (_elements(each, len(samples), count) for each in pairs)
+    rate_hz = validate.number(
+        "sample_rate_hz", sample_rate_hz, "Hz", above=0.0, most=validate.MOST_HZ
+    )
+    speed = validate.number(
+        "sound_speed_m_s", sound_speed_m_s, "m/s", above=0.0, most=validate.MOST_M_S
+    )
+    start_s = validate.number("start_time_s", start_time_s, "s")
+    carrier_hz = validate.number("carrier_hz", carrier_hz, "Hz", above=0.0, below=rate_hz / 2)
+    if bandwidth_hz is None and carrier_hz > rate_hz / 4:
+        raise ValueError(
+            f"carrier_hz must be at most a quarter of the sample rate, {rate_hz / 4:g} Hz, for a "
+            f"band of twice the carrier, got {carrier_hz:g} Hz: give bandwidth_hz, at most "
+            f"{rate_hz - 2 * carrier_hz:g} Hz"
+        )
+    last_s = abs(start_s) + samples.shape[-1] / rate_hz
+    validate.phase(carrier_hz, speed, speed / 2 * last_s)
     numbers = tx * count + rx
     if len(np.unique(numbers)) < len(numbers):
         raise ValueError(f"pairs must differ, got {len(np.unique(numbers))} of {len(numbers)}")

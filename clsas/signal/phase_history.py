@@ -85,22 +85,24 @@ def from_phase_history(
     if sign not in (-1, 1):
         raise ValueError(f"sign must be -1 or +1, got {validate.shown(sign)}")
     oversampling = validate.number("oversampling", oversampling, least=1.0)
-    speed = validate.positive("sound_speed_m_s", sound_speed_m_s, "m/s")
-    first_hz = _per_channel("first_frequency_hz", first_frequency_hz, channels, above=0.0)
-    step_hz = _per_channel("frequency_step_hz", frequency_step_hz, channels, above=0.0)
-    reference_m = _per_channel("reference_range_m", reference_range_m, channels)
-    weights = band_window(window, 1.0)(np.linspace(-0.5, 0.5, count))
-    if not abs(weights.sum()) > 0:
-        raise ValueError(f"window must not have the sum 0, got {validate.shown(window)}")
-    weights = weights / weights.sum()
-
+    speed = validate.number(
+        "sound_speed_m_s", sound_speed_m_s, "m/s", above=0.0, most=validate.MOST_M_S
+    )
+    first_hz = _frequencies("first_frequency_hz", first_frequency_hz, channels)
+    step_hz = _frequencies("frequency_step_hz", frequency_step_hz, channels)
+    reference_m = validate.array(
+        "reference_range_m", reference_range_m, np.float64, (channels,), broadcast=True
+    )
+    weights = _weights(window, count)
     validate.memory("oversampling", 8 * channels * oversampling * count)
     length = fft.next_fast_len(math.ceil(oversampling * count))
     equal = np.ptp(step_hz) * count <= _EQUAL_STEPS * step_hz.min()
     # The longest line that no channel's period is shorter than.
-    range_step_m = speed / (2 * length * step_hz.max())
+    range_step_m = float(speed / (2 * length * step_hz.max()))
     offset_m = (np.arange(length) - length // 2) * range_step_m
     carrier_hz = float(np.mean(first_hz + (count - 1) / 2 * step_hz))
+    farthest_m = float(np.abs(reference_m).max() - offset_m[0])
+    validate.phase(carrier_hz, speed, farthest_m)
 
     lines = np.empty((channels, length), np.complex64)
     rows = max(1, _BLOCK // length)
@@ -126,13 +128,21 @@ def from_phase_history(
     )
 
 
-def _per_channel(
-    name: str, value: ArrayLike, channels: int, *, above: float | None = None
-) -> NDArray[np.float64]:
-    """Return one number per channel, each greater than `above`."""
+def _weights(window: Window, count: int) -> NDArray[np.float64]:
+    """Return weights of the frequencies, of sum 1."""
+    weights = band_window(window, 1.0)(np.linspace(-0.5, 0.5, count))
+    if not abs(weights.sum()) > 0:
+        raise ValueError(f"window must not have the sum 0, got {validate.shown(window)}")
+    return weights / weights.sum()
+
+
+def _frequencies(name: str, value: ArrayLike, channels: int) -> NDArray[np.float64]:
+    """Return one frequency per channel, each greater than 0."""
     array = validate.array(name, value, np.float64, (channels,), broadcast=True)
-    if above is not None and not array.min() > above:
-        raise ValueError(f"{name} must be > {above:g}, got {array.min():g}")
+    if not array.min() > 0:
+        raise ValueError(f"{name} must be > 0, got {array.min():g}")
+    if not array.max() <= validate.MOST_HZ:
+        raise ValueError(f"{name} must be <= {validate.MOST_HZ:g} Hz, got {array.max():g}")
     return array
 
 

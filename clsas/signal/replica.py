@@ -41,6 +41,11 @@ class Replica:
 
     def __post_init__(self) -> None:
         """Check every field and convert it."""
+        if np.asarray(self.samples).dtype.kind in "iuf":
+            raise TypeError(
+                "samples must be complex numbers, relative to the carrier, got real ones: form the "
+                "analytic signal (scipy.signal.hilbert) and multiply it by exp(-2j pi carrier t)"
+            )
         samples = validate.array("samples", self.samples, np.complex128, (None,))
         if len(samples) < 2 or not samples.any():
             raise ValueError(

@@ -100,6 +100,16 @@ def measure_spectrum(lines: RangeLines, grid: Grid | None = None) -> Spectrum:
     )
 
 
+def power_spectrum(lines: RangeLines) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Ascending frequencies, cycles per sample in [-0.5, 0.5), and the share of power at each.
+
+    Lines are faded towards both ends, which keeps the leakage of cut lines out.
+    """
+    frequency, _, power = _mean_power(*_sampled_lines(lines, MEASURED_CHANNELS))
+    order = np.argsort(frequency)
+    return frequency[order], power[order]
+
+
 def _occupied_band(
     frequency: NDArray[np.float64], power: NDArray[np.float64]
 ) -> tuple[float, float, float]:

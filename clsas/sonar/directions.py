@@ -48,7 +48,11 @@ def track_directions(lines: RangeLines, pings: int | None = None) -> NDArray[np.
     speed = np.linalg.norm(tangent, axis=1)
     extent_m = np.linalg.norm(np.ptp(centres_m, axis=0))
     if not speed.min() > 1e-3 * extent_m / count:
-        raise ValueError("along must be given: the lines' phase centres stand still")
+        raise ValueError(
+            "along must be given: the lines' phase centres stand still about ping "
+            f"{speed.argmin()}; "
+            "lines.without_still_pings() drops such pings"
+        )
     tangent /= speed[:, None]
     # The front channels of a long array lie where the middles of later pings will be.
     ping = np.repeat(np.arange(count), receivers)

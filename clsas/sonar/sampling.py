@@ -13,6 +13,8 @@ from numpy.typing import ArrayLike, NDArray
 from clsas.core import validate
 from clsas.core.geometry import bistatic_range_m
 from clsas.core.grid import Grid
+from clsas.core.lines import RangeLines
+from clsas.sonar.beam import BeamWindow
 from clsas.sonar.system import Sonar
 from clsas.sonar.track import Track, channels
 
@@ -21,37 +23,63 @@ _SLACK = 0.01  # relative; a sway of centimetres changes the spacing a little
 
 @dataclass(frozen=True)
 class Finding:
-    """A sampling limit that a survey violates.
+    """Something that is wrong with a survey or a recording.
 
     Parameters
     ----------
     name : str
-        "along_track_spacing" or "ping_rate".
+        Which check found it, such as "along_track_spacing", "ping_rate" or "dead_channels".
     message : str
         Explanation with the numbers and their units.
     value, limit : float
-        The survey's value and the largest allowed one, in the unit of the message.
+        What was found and what is allowed, in the unit of the message.
+    remedy : str
+        What to do about it.
+    where : tuple of int
+        Pings or channels that it is about, from 0; the message says which of the two.
     """
 
     name: str
     message: str
     value: float
     limit: float
+    remedy: str = ""
+    where: tuple[int, ...] = ()
 
 
-def check_sampling(sonar: Sonar, track: Track, grid: Grid) -> list[Finding]:
+def check_sampling(
+    sonar: Sonar | RangeLines,
+    track: Track | Grid | None = None,
+    grid: Grid | None = None,
+    *,
+    beam: BeamWindow | None = None,
+    element_length_m: float | None = None,
+    wavelength_m: float | None = None,
+) -> list[Finding]:
     """Return the sampling limits that a survey of a grid violates.
 
+    Called as `check_sampling(sonar, track, grid)` before a survey, and as
+    `check_sampling(lines, grid)` for range lines, whose sonar and track need not be known.
+
     The spacing of the phase centres along the track may exceed half an element by at most 1 %
-    [27], [31]. For elements without a length the limit keeps the grating lobes of every target on
-    the grid off the grid. The ping rate must leave time for the last echo from the grid [24].
+    [27], [31]. For elements without a length the limit keeps the grating lobes of every target
+    off the grid and out of the beam, whichever is narrower. The ping rate must leave time for the
+    last echo from the grid [24]; range lines do not tell it.
 
     Parameters
     ----------
-    sonar : Sonar
+    sonar : Sonar or RangeLines
     track : Track
+        Left out with range lines.
     grid : Grid
-        Grid of the image.
+        Grid of the image. With range lines and a beam or an element length it may be left out.
+    beam : BeamWindow, optional
+        Beam of the image: echoes from outside it add nothing.
+    element_length_m : float, optional
+        Length of the elements, metres; by default that of the sonar.
+    wavelength_m : float, optional
+        Wavelength, metres; by default that of the carrier. Needed for lines that still have their
+        carrier.
 
     Returns
     -------
@@ -60,47 +88,114 @@ def check_sampling(sonar: Sonar, track: Track, grid: Grid) -> list[Finding]:
 
     Raises
     ------
-    TypeError
-        If an argument has the wrong type.
+    TypeError, ValueError
+        If an argument has the wrong type or is outside its limits, or lines without `carrier_hz`
+        come without a wavelength.
     """
-    validate.instance("grid", grid, Grid)
-    tx, rx, _ = channels(sonar, track)
-    corners = _corners_m(grid)
-    ranges = bistatic_range_m(corners[:, None], tx, rx)
-    centres = phase_centres_m(tx, rx)
-    return _check_spacing(sonar, centres, corners, ranges) + _check_ping_rate(sonar, track, ranges)
+    if isinstance(sonar, RangeLines):
+        grid, track = track if grid is None else grid, None  # type: ignore[assignment]
+        if grid is None and beam is None and element_length_m is None:
+            raise ValueError("one of grid, beam and element_length_m must be given with lines")
+    else:
+        validate.instance("sonar", sonar, Sonar)
+        validate.instance("track", track, Track)
+        validate.instance("grid", grid, Grid)
+    corners = None
+    if grid is not None:
+        validate.instance("grid", grid, Grid)
+        corners = _corners_m(grid)
+    tx, rx = _antennas_m(sonar, track)
+    limit = _spacing_limit(sonar, beam, element_length_m, wavelength_m)
+    ranges = None if corners is None else bistatic_range_m(corners[:, None], tx, rx)
+    found = _check_spacing(limit, phase_centres_m(tx, rx), corners, ranges)
+    if isinstance(sonar, Sonar) and isinstance(track, Track) and ranges is not None:
+        found += _check_ping_rate(sonar, track, ranges)
+    return found
+
+
+def _antennas_m(survey: Sonar | RangeLines, track: Track | Grid | None) -> tuple[NDArray, NDArray]:
+    """Return positions of transmitters and receivers, [channels, 3]."""
+    if isinstance(survey, RangeLines):
+        return survey.tx_m, survey.rx_m
+    assert isinstance(track, Track)  # for type checkers
+    tx, rx, _ = channels(survey, track)
+    return tx, rx
+
+
+@dataclass(frozen=True)
+class _SpacingLimit:
+    """Largest spacing of phase centres by elements or beam, and the wavelength."""
+
+    wavelength_m: float
+    spacing_m: float = np.inf
+    meaning: str = ""
+
+
+def _spacing_limit(
+    survey: Sonar | RangeLines,
+    beam: BeamWindow | None,
+    element_length_m: float | None,
+    wavelength_m: float | None,
+) -> _SpacingLimit:
+    """Return the limit of elements or, where their length is not known, of the beam."""
+    if beam is not None:
+        validate.instance("beam", beam, BeamWindow)
+    if wavelength_m is not None:
+        wavelength = validate.positive("wavelength_m", wavelength_m, "m")
+    elif isinstance(survey, Sonar):
+        wavelength = survey.wavelength_m
+    elif survey.carrier_hz:
+        wavelength = survey.sound_speed_m_s / survey.carrier_hz
+    else:
+        raise ValueError("wavelength_m must be given for lines with carrier_hz 0")
+    if element_length_m is None and isinstance(survey, Sonar):
+        element_length_m = survey.element_length_m
+    if element_length_m is not None:
+        length = validate.positive("element_length_m", element_length_m, "m")
+        meaning = f"half the element length of {length:.4g} m"
+        return _SpacingLimit(wavelength, length / 2, meaning)
+    if beam is not None:
+        low, high = np.sin(np.radians(beam.squint_deg + np.array([-0.5, 0.5]) * beam.width_deg))
+        meaning = f"what keeps grating lobes out of the beam of {beam.width_deg:.4g} degrees"
+        return _SpacingLimit(wavelength, wavelength / (2 * float(high - low)), meaning)
+    return _SpacingLimit(wavelength)
 
 
 def _check_spacing(
-    sonar: Sonar, centres: NDArray, corners: NDArray, ranges: NDArray
+    known: _SpacingLimit, centres: NDArray, corners: NDArray | None, ranges: NDArray | None
 ) -> list[Finding]:
     course = _course(centres)
     gaps = np.diff(np.sort(centres @ course))
     spacing = float(gaps.max(initial=0.0))
-    wavelength = sonar.wavelength_m
-    length = sonar.element_length_m
-    if length is not None:
-        limit, meaning = length / 2, f"half the element length of {length:.4g} m"
-    else:
+    limit, meaning = known.spacing_m, known.meaning
+    if corners is not None and not meaning.startswith("half"):
         way = corners[:, None] - centres
         distance = np.linalg.norm(way, axis=-1)
         sine = np.divide(way @ course, distance, out=np.zeros_like(distance), where=distance > 0)
         spread = float(np.ptp(sine, axis=0).max())
-        limit = wavelength / (2 * spread) if spread else np.inf
-        meaning = "what keeps grating lobes off the grid"
+        of_grid = known.wavelength_m / (2 * spread) if spread else np.inf
+        if of_grid > limit or not meaning:
+            limit, meaning = of_grid, "what keeps grating lobes off the grid"
     # With a sway of centimetres the principal direction deviates a little from the course.
     if spacing <= limit * (1 + _SLACK):
         return []
-    near, far = ranges.min(), ranges.max()
-    lobes = [grating_lobe_m(wavelength, spacing, distance) for distance in (near, far)]
+    where = ""
+    if ranges is not None:
+        near, far = ranges.min(), ranges.max()
+        lobes = [grating_lobe_m(known.wavelength_m, spacing, distance) for distance in (near, far)]
+        where = (
+            f": grating lobes {lobes[0]:.4g} m to {lobes[1]:.4g} m beside every "
+            f"target (at the ranges of the grid's corners, {near:.4g} m to {far:.4g} m)"
+        )
     return [
         Finding(
             "along_track_spacing",
             f"phase centres are up to {spacing:.4g} m apart along the track, more than {limit:.4g} "
-            f"m, {meaning}: grating lobes {lobes[0]:.4g} m to {lobes[1]:.4g} m beside every "
-            f"target (at the ranges of the grid's corners, {near:.4g} m to {far:.4g} m)",
+            f"m, {meaning}{where}",
             spacing,
             limit,
+            "survey more slowly, ping faster or use a narrower beam; of lines as they are, image "
+            "with a beam (beam=clsas.BeamWindow) that leaves grating lobes out",
         )
     ]
 
@@ -120,6 +215,7 @@ def _check_ping_rate(sonar: Sonar, track: Track, ranges: NDArray) -> list[Findin
             f"{far:.4g} m, ends {last:.4g} s after its ping, when the next one has been sent",
             rate,
             1 / last,
+            "ping more slowly, or image a smaller range",
         )
     ]
 

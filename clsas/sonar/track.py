@@ -75,9 +75,15 @@ class Track:
         put("velocity_m_s", (self.pings, 3), broadcast=True)
         for name in ("yaw_rad", "pitch_rad", "roll_rad"):
             put(name, (self.pings,), broadcast=True)
-        shortest = np.diff(self.time_s).min(initial=np.inf)
-        if shortest <= 0:
-            raise ValueError(f"time_s must ascend strictly, got a step of {shortest:g} s")
+        step_s = np.diff(self.time_s)
+        if step_s.min(initial=np.inf) <= 0:
+            wrong = np.flatnonzero(step_s <= 0)
+            how = "repeated" if step_s[wrong[0]] == 0 else "out of order"
+            raise ValueError(
+                f"time_s must ascend strictly, got a step of {step_s[wrong[0]]:g} s from ping "
+                f"{wrong[0]} to the next ({how}; {len(wrong)} such steps): sort pings by time and "
+                "drop repeated ones"
+            )
 
     @property
     def pings(self) -> int:

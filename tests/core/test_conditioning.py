@@ -125,6 +125,12 @@ def test_weights_multiply_their_channels(weights):
     np.testing.assert_allclose(weighted.samples, samples * np.array(weights)[:, None], rtol=1e-6)
 
 
+@pytest.mark.parametrize("weights", [[1e300, 1, 1], [1e300j, 1, 1], [3e38, 1, 1], [1e-300] * 3])
+def test_weights_that_overflow_are_refused(weights):
+    with pytest.raises(ValueError, match=r"weights must (have a largest value|keep the samples)"):
+        lines_of(np.full((3, 2), 2 + 0j)).weighted(weights)
+
+
 @pytest.mark.parametrize("weights", [[1.0, 2.0], [np.nan, 1, 1], 3.0, ["a", "b", "c"]])
 def test_weights_must_be_numbers_one_per_channel(weights):
     with pytest.raises((TypeError, ValueError), match="weights must"):

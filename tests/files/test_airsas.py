@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 import clsas
+from clsas.core.validate import ClsasWarning
 from clsas.files.airsas import read_airsas
 from clsas.files.hdf5 import FileFormatError
 
@@ -140,6 +141,41 @@ def test_scenes_that_disagree_are_refused(still, tmp_path, name, value, said):
             file[name] = value
     with pytest.raises(FileFormatError, match=rf"scene\.h5 .*{said}"):
         read_airsas(path, shared=still.parent.parent / "characterization data")
+
+
+def swapped(rail):
+    rail[:, [90, 95]] = rail[:, [95, 90]]
+    return rail
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (np.zeros_like, "all 201 pings have one position"),
+        (swapped, r"turns back \d times \(first after ping 9\d\)"),
+    ],
+)
+def test_navigation_that_is_missing_or_out_of_order_is_reported(still, tmp_path, change, said):
+    path = tmp_path / "scene.h5"
+    path.write_bytes(still.read_bytes())
+    with h5py.File(path, "r+") as file:
+        file["na/position"][...] = change(file["na/position"][...])
+    with pytest.warns(ClsasWarning, match=rf"scene\.h5: .*{said}"):
+        lines = read_airsas(
+            path, channels=[1], shared=still.parent.parent / "characterization data"
+        )
+    assert lines.channels == len(RAIL_M)
+
+
+def test_other_hdf5_files_are_refused_by_name(tmp_path):
+    lines = clsas.RangeLines(np.ones((2, 3), complex), 1.0, 0.1, [0] * 3, [0] * 3, 1e5, 1500.0)
+    clsas.save(tmp_path / "lines.h5", lines)
+    with h5py.File(tmp_path / "other.h5", "w") as file:
+        file["na/position"] = [1.0]
+    for name, got in (("lines.h5", "first_range_m"), ("other.h5", "na")):
+        said = rf"{name} is an HDF5 file, but no scene of AirSAS: .* got \['{got}'"
+        with pytest.raises(FileFormatError, match=said):
+            read_airsas(tmp_path / name)
 
 
 @pytest.mark.parametrize(

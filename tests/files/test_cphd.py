@@ -11,6 +11,7 @@ from scipy.constants import speed_of_light
 import clsas
 from clsas import cli
 from clsas.core import validate
+from clsas.core.validate import ClsasWarning
 from clsas.files import cphd, cphd_writing
 from clsas.files.cphd import read_cphd
 from clsas.files.cphd_writing import write_cphd
@@ -264,6 +265,58 @@ def test_files_that_claim_something_else_are_refused(tmp_path, old, new, said):
     path.write_bytes(content.replace(old, new))
     with pytest.raises(FileFormatError, match=rf"pass\.cphd .*({said})"):
         clsas.load(path)
+
+
+def lost(vectors):
+    vectors["TxPos"][20:23, 1] = np.nan
+
+
+def repeated(vectors):
+    vectors["TxTime"][30] = vectors["TxTime"][29]
+
+
+def everywhere(vectors):
+    vectors["SRPPos"] = np.nan
+
+
+def at_one_place(vectors):
+    vectors["TxPos"], vectors["RcvPos"] = vectors["TxPos"][0], vectors["RcvPos"][0]
+
+
+@pytest.mark.parametrize(
+    ("change", "said", "channels"),
+    [
+        (lost, r"3 of 48 vectors lack finite positions .* vector 20\): they are left out", 44),
+        (repeated, r"TxTime does not ascend after 1 of 47 vectors \(first after vector 29\)", 47),
+        (at_one_place, "all 47 pings have one position", 47),
+        (everywhere, "must hold vectors with a signal and complete positions, got none", None),
+    ],
+)
+@pytest.mark.parametrize("domain", ["FX", "TOA"])
+def test_navigation_that_is_missing_or_repeated_is_reported(
+    tmp_path, change, said, channels, domain
+):
+    path = tmp_path / "pass.cphd"
+    foreign(path, domain=domain)
+    change_vectors(path, change)
+    if channels is None:
+        with pytest.raises(FileFormatError, match=rf"pass\.cphd {said}"):
+            read_cphd(path)
+        return
+    with pytest.warns(ClsasWarning, match=rf"pass\.cphd: {said}"):
+        assert read_cphd(path).channels == channels
+
+
+def change_vectors(path, change):
+    """Change the parameters of a file's vectors."""
+    with path.open("rb") as file:
+        reader = sarkit.cphd.Reader(file)
+        tree = reader.metadata.xmltree
+        vectors, signal = reader.read_pvps("1"), reader.read_signal("1")
+    vectors = np.array(vectors)
+    change(vectors)
+    with path.open("wb") as file:
+        cphd_writing.write_vectors(sarkit.cphd, file, tree, vectors, signal)
 
 
 def test_a_signal_beyond_memory_is_refused_unread(tmp_path, monkeypatch):

@@ -9,6 +9,7 @@ from scipy.constants import speed_of_light
 from scipy.io import savemat
 
 import clsas
+from clsas.core.validate import ClsasWarning
 from clsas.files import matlab
 from clsas.files.full_matrix import read_full_matrix
 from clsas.files.hdf5 import FileFormatError
@@ -161,12 +162,42 @@ def test_captures_that_disagree_are_refused(tmp_path, change, said):
         ({"fp": np.full((128, 90), np.nan * 1j)}, "samples must be finite"),
         ({"r0": np.full((1, 90), np.nan)}, "reference_range_m must be finite"),
         ({"y": "text"}, "y as real numbers"),
+        ({"z": np.full((1, 90), np.nan)}, "tx_m must be finite, got 90 NaN .* first at .0, 2."),
+        ({"x": np.zeros((1, 0))}, "x(, y, z and r0 of every pulse| as real numbers)"),
     ],
 )
 def test_histories_that_disagree_are_refused(tmp_path, change, said):
     path = save(tmp_path / "pass.mat", {"data": phase_history() | change})
     with pytest.raises(ValueError, match=rf"pass\.mat.* {said}"):
         clsas.load(path)
+
+
+def swapped(values):
+    order = np.arange(90)
+    order[[40, 44]] = 44, 40
+    return {name: each if name == "freq" else each[:, order] for name, each in values.items()}
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (
+            lambda values: values | {axis: np.full((1, 90), 50.0) for axis in "xyz"},
+            "all 90 pings have one position, so that the navigation seems to be missing",
+        ),
+        (swapped, r"the track turns back \d times \(first after ping 4\d\): .* order of the file"),
+    ],
+)
+def test_navigation_that_is_missing_or_out_of_order_is_reported(tmp_path, change, said):
+    path = save(tmp_path / "pass.mat", {"data": change(phase_history(offset_m=1.0))})
+    with pytest.warns(ClsasWarning, match=rf"pass\.mat: {said}"):
+        assert clsas.load(path).channels == 90
+
+
+def test_one_ping_is_read(tmp_path):
+    history = phase_history()
+    one = {name: each if name == "freq" else each[:, :1] for name, each in history.items()}
+    assert clsas.load(save(tmp_path / "one.mat", one)).channels == 1
 
 
 def test_files_without_a_recording_and_with_several_are_refused(tmp_path):

@@ -249,11 +249,22 @@ def test_track_file(tmp_path):
         ("time_s,x_m,y_m,z_m,yaw_deg,yaw_deg\n", "column 'yaw_deg' must be there once"),
         ("time_s,x_m,y_m,z_m,vx_m_s\n", "column 'vy_m_s' must be there once"),
         ("", "column 'time_s' must be there once"),
-        ("time_s,x_m,y_m,z_m\n", "must have shape"),
+        ("time_s,x_m,y_m,z_m\n", "must hold at least one ping under the names of columns"),
         ("time_s,x_m,y_m,z_m\n0,0,0,0\n1,2,3\n", "line 3 must be 4 numbers, got '1,2,3'"),
         ("time_s,x_m,y_m,z_m\n0,0,0,zero\n", "line 2 must be 4 numbers, got '0,0,0,zero'"),
         ("time_s,x_m,y_m,z_m\n0,0,0,nan\n", "positions_m must be finite"),
+        ("time_s,x_m,y_m,z_m\n0,0,0,0\n1,inf,0,0\n", "of 6 values, the first at [1, 0]"),
+        ("time_s,x_m,y_m,z_m\nnan,0,0,0\n", "time_s must be finite"),
+        ("time_s,x_m,y_m,z_m,yaw_deg\n0,0,0,0,nan\n", "yaw_rad must be finite"),
         ("time_s,x_m,y_m,z_m\n1,0,0,0\n0,0,0,0\n", "time_s must ascend"),
+        (
+            "time_s,x_m,y_m,z_m\n0,0,0,0\n2,1,0,0\n1,2,0,0\n3,3,0,0\n",
+            "got a step of -1 s from ping 1 to the next (out of order; 1 such steps)",
+        ),
+        (
+            "time_s,x_m,y_m,z_m\n0,0,0,0\n1,1,0,0\n1,2,0,0\n1,3,0,0\n",
+            "got a step of 0 s from ping 1 to the next (repeated; 2 such steps): sort pings",
+        ),
     ],
 )
 def test_bad_track_files(tmp_path, text, message):

@@ -103,6 +103,16 @@ def test_oversampling_only_interpolates():
         ({"oversampling": 1e12}, "oversampling must ask for at most"),
         ({"window": "nonsense"}, "window must be 'none' or"),
         ({"sound_speed_m_s": 0}, "sound_speed_m_s must be"),
+        ({"first_frequency_hz": 1e300}, "first_frequency_hz must be <= 1e.15 Hz, got 1e.300"),
+        ({"first_frequency_hz": -1e9}, "first_frequency_hz must be > 0, got -1e"),
+        ({"first_frequency_hz": np.nan}, "first_frequency_hz must be finite"),
+        ({"frequency_step_hz": 1e300}, "frequency_step_hz must be <= 1e.15 Hz, got 1e.300"),
+        ({"frequency_step_hz": 1e308}, "frequency_step_hz must be <= 1e.15 Hz"),
+        ({"frequency_step_hz": 1e-300}, "makes .* cycles over"),
+        ({"frequency_step_hz": np.nan}, "frequency_step_hz must be finite"),
+        ({"reference_range_m": 1e300}, "makes .* cycles over 1e.300 m"),
+        ({"sound_speed_m_s": 1e-300}, "makes .* cycles over"),
+        ({"sound_speed_m_s": 1e300}, "sound_speed_m_s must be .* <= 3e.08 m/s, got 1e.300"),
     ],
 )
 def test_wrong_arguments_are_named(wrong, said):

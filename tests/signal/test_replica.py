@@ -78,7 +78,8 @@ def test_a_replica_of_the_nominal_pulse_gives_the_lines_of_the_pulse():
 @pytest.mark.parametrize(
     ("samples", "rate", "said"),
     [
-        ([1.0, 2.0], 1e3, "samples must be complex"),
+        ([1.0, 2.0], 1e3, "samples must be complex.*got real ones: form the analytic signal"),
+        (np.arange(3), 1e3, "multiply it by exp"),
         ([1j], 1e3, "samples must be at least 2"),
         ([0j, 0j], 1e3, "not all zero"),
         ([1j, np.nan], 1e3, "samples must be finite"),

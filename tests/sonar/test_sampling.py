@@ -5,6 +5,8 @@ import pytest
 
 from clsas.core.geometry import bistatic_range_m
 from clsas.core.grid import Grid
+from clsas.core.lines import RangeLines
+from clsas.sonar.beam import BeamWindow
 from clsas.sonar.sampling import (
     check_sampling,
     far_field_m,
@@ -163,6 +165,39 @@ def test_any_grid_is_checked():
     assert check_sampling(sonar, survey, heights) == expected
 
 
+def lines_of(sonar, survey):
+    tx_m, rx_m, _ = channels(sonar, survey)
+    samples = np.ones((len(tx_m), 2), complex)
+    return RangeLines(samples, 40.0, 0.01, tx_m, rx_m, sonar.pulse.carrier_hz, 1500.0)
+
+
+def test_lines_are_held_to_the_same_limits():
+    survey = track(WIDE, 0.528)
+    expected = check_sampling(WIDE, survey, GRID)
+    assert check_sampling(lines_of(WIDE, survey), GRID, element_length_m=0.015) == expected
+    omnidirectional = Sonar(Pulse(100e3, 20e3, 1e-3), [[0, 0, 0]])
+    survey = track(omnidirectional, 0.2)
+    expected = check_sampling(omnidirectional, survey, GRID)
+    assert len(expected) == 1
+    lines = lines_of(omnidirectional, survey)
+    assert check_sampling(lines, GRID) == check_sampling(lines, grid=GRID) == expected
+    on_carrier = replace(lines, carrier_hz=0.0)
+    assert check_sampling(on_carrier, GRID, wavelength_m=0.015) == expected
+
+
+def test_a_beam_leaves_grating_lobes_out():
+    lines = lines_of(Sonar(Pulse(100e3, 20e3, 1e-3), [[0, 0, 0]]), track(WIDE, 0.05))
+    limit = 0.015 / (4 * np.sin(np.radians(10)))
+    (finding,) = check_sampling(lines, beam=BeamWindow(20.0))
+    assert finding.limit == pytest.approx(limit)
+    assert finding.message.endswith("what keeps grating lobes out of the beam of 20 degrees")
+    assert "with a beam" in finding.remedy
+    assert check_sampling(lines, beam=BeamWindow(8.0)) == []
+    # The narrower of beam and grid decides.
+    narrow = Grid.plane(x=(0, 1, 4), y=(200, 201, 4))
+    assert check_sampling(lines, narrow, beam=BeamWindow(60.0)) == []
+
+
 def test_one_ping_of_one_receiver_and_one_point():
     sonar = Sonar(Pulse(100e3, 20e3, 1e-3), [[0, 0, 0]])
     assert check_sampling(sonar, Track([[0, 0, 0]], [0.0]), Grid.points([[0, 0, 0]])) == []
@@ -185,6 +220,26 @@ def test_one_ping_of_one_receiver_and_one_point():
 def test_bad_arguments(call, message):
     with pytest.raises(ValueError, match=message):
         call()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({}, "one of grid, beam and element_length_m must be given with lines"),
+        ({"grid": 3}, "grid must be of type Grid, got int"),
+        ({"beam": 20.0}, "beam must be of type BeamWindow, got float"),
+        (
+            {"element_length_m": 0, "wavelength_m": 1},
+            "element_length_m must be finite and > 0 m, got 0",
+        ),
+        ({"grid": GRID, "wavelength_m": -1}, "wavelength_m must be finite and > 0 m, got -1"),
+        ({"grid": GRID}, "wavelength_m must be given for lines with carrier_hz 0"),
+    ],
+)
+def test_arguments_beside_lines(arguments, message):
+    lines = replace(lines_of(WIDE, track(WIDE, 0.5)), carrier_hz=0.0)
+    with pytest.raises((TypeError, ValueError), match=message):
+        check_sampling(lines, **arguments)
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""Pictures: images, mosaics, volumes, point responses, geometry, range lines and trade-offs.
+"""Pictures: images, mosaics, volumes, point responses, geometry, lines, recordings, trade-offs.
 
 Functions that return a `matplotlib.figure.Figure` touch no window and no global state; `save`
 writes it as PNG, PDF or SVG. `image` draws into axes of your own, or into a new pyplot figure.
@@ -14,6 +14,7 @@ from clsas.products.plot.levels import image_html as image_html
 from clsas.products.plot.levels import range_lines as range_lines
 from clsas.products.plot.mosaics import mosaic as mosaic
 from clsas.products.plot.mosaics import patch_borders as patch_borders
+from clsas.products.plot.recordings import inspection as inspection
 from clsas.products.plot.survey import geometry as geometry
 from clsas.products.plot.volumes import volume as volume
 
@@ -23,6 +24,7 @@ __all__ = [
     "image",
     "image_db",
     "image_html",
+    "inspection",
     "mosaic",
     "patch_borders",
     "range_lines",

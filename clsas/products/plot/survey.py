@@ -41,7 +41,7 @@ def geometry(lines: RangeLines | Echoes, grid: Grid | None = None) -> Figure:
         validate.instance("grid", grid, Grid)
     shown = _coordinates(grid)
     # Metres, unless the whole geometry is small.
-    ends_m = [lines.rx_m, lines.tx_m] + ([] if grid is None else [_outline(grid)[0]])
+    ends_m = [lines.rx_m, lines.tx_m] + ([] if grid is None else [outline(grid)[0]])
     scale, unit = length_unit(max(float(np.abs(each[:, shown]).max()) for each in ends_m))
     figure = new_figure(7.0, 6.0)
     axes = figure.subplots()
@@ -54,7 +54,7 @@ def geometry(lines: RangeLines | Echoes, grid: Grid | None = None) -> Figure:
             *(scale * places.T), marker, markersize=5, label=f"{name} ({len(places)} positions)"
         )
     if grid is not None:
-        outline_m, style = _outline(grid)
+        outline_m, style = outline(grid)
         axes.plot(
             *(scale * outline_m[:, shown].T),
             style,
@@ -80,7 +80,7 @@ def _coordinates(grid: Grid | None) -> list[int]:
     return [0, 1]
 
 
-def _outline(grid: Grid) -> tuple[NDArray, str]:
+def outline(grid: Grid) -> tuple[NDArray, str]:
     """Return the points or corners to draw for a grid, [n, 3], and the style of their line."""
     if grid.points_m is not None:
         return grid.points_m.reshape(-1, 3), "."

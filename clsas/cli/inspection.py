@@ -1,0 +1,61 @@
+"""Command that looks at a recording before it is imaged: inspect."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import click
+
+import clsas
+from clsas.cli import options
+from clsas.cli.inputs import load, read_beam, read_grid, read_scene
+from clsas.cli.outputs import report
+from clsas.cli.parameters import INPUT
+from clsas.files.scene_files import SceneFile
+
+
+@click.command()
+@click.argument("recording", metavar="FILE", type=INPUT)
+@options.grid
+@options.beam
+@options.device
+@options.picture("levels of the lines, their spectrum and the track")
+@options.as_json
+def inspect(
+    recording: Path,
+    scene: Path | None,
+    device: str | None,
+    picture: Path | None,
+    as_json: bool,
+    **given: Any,
+) -> None:
+    """Show what a recording looks like, and what is wrong with it.
+
+    FILE is any that `clsas image` reads, or echoes. Every finding comes with its number and what to
+    do. Grid, beam and element length of --scene, or of the options, are compared with the lines.
+    `clsas convert` has options that drop, filter and fade what is wrong.
+
+    \b
+    Example:  clsas inspect recording.h5 --scene scene.toml --picture recording.png
+    """
+    described = SceneFile(name="") if scene is None else read_scene(scene)
+    grid = described.grid
+    if any(given[name] is not None for name in ("x", "y", "z")):
+        described, grid = read_grid(scene, given, memory=False)
+    beam = read_beam(described, given)
+    sonar = described.sonar
+    found = clsas.inspect(
+        load(recording, clsas.RangeLines, clsas.Echoes),
+        grid,
+        device=device,
+        beam=beam,
+        element_length_m=None if sonar is None else sonar.element_length_m,
+    )
+    if picture is not None:
+        from clsas.products import plot
+
+        plot.save(plot.inspection(found, grid), picture)
+    numbers = {f.name: getattr(found, f.name) for f in fields(found) if f.name != "lines"}
+    report(as_json, found.describe(), file=recording, picture=picture, **numbers)

@@ -1,0 +1,114 @@
+"""Transmissions of range lines: where each was made, and which were made standing still."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsas.core import validate
+
+if TYPE_CHECKING:
+    from clsas.core.lines import RangeLines
+
+STILL = 0.1
+"""Share of the usual advance within which a platform counts as standing still."""
+_LOCAL = 11  # steps whose mean is the local course
+_USUAL_QUANTILE = 0.95  # of steps: leaves out up to 5 % of gaps, and holds with 95 % standing still
+
+
+@dataclass(frozen=True, eq=False)
+class Transmissions:
+    """Channels by transmission.
+
+    A transmission ends where the transmitter's position changes, and also where its first
+    receiver's position comes again: a platform that stands still repeats its positions.
+
+    Attributes
+    ----------
+    starts : int64 [transmissions + 1]
+        First channel of every transmission, and one past the last.
+    centres_m : float64 [transmissions, 3]
+        Mean phase centre of every transmission.
+    """
+
+    starts: NDArray[np.int64]
+    centres_m: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, lines: RangeLines) -> Transmissions:
+        """Return the transmissions of range lines."""
+        runs = lines.ping_starts
+        run = np.repeat(np.arange(len(runs)), np.diff(np.append(runs, lines.channels)))
+        starts = np.flatnonzero((lines.rx_m == lines.rx_m[runs][run]).all(axis=1))
+        counts = np.diff(np.append(starts, lines.channels))
+        centres_m = np.add.reduceat(lines.phase_centres_m, starts, axis=0) / counts[:, None]
+        return cls(np.append(starts, lines.channels), centres_m)
+
+    @property
+    def count(self) -> int:
+        """Number of transmissions."""
+        return len(self.centres_m)
+
+    @property
+    def receivers(self) -> NDArray[np.int64]:
+        """Channels of every transmission."""
+        return np.diff(self.starts)
+
+    @property
+    def steps_m(self) -> NDArray[np.float64]:
+        """Distance from every transmission to the next, metres."""
+        steps_m: NDArray[np.float64] = np.linalg.norm(np.diff(self.centres_m, axis=0), axis=1)
+        return steps_m
+
+    @property
+    def usual_step_m(self) -> float:
+        """Median advance while the platform moves, metres; 0 if it never does."""
+        steps_m = self.steps_m[self.steps_m > 0]
+        if not steps_m.size:
+            return 0.0
+        most_m = np.quantile(steps_m, _USUAL_QUANTILE, method="lower")
+        return float(np.median(steps_m[steps_m >= STILL * most_m]))
+
+    def advancing(self, least_m: float | None = None) -> NDArray[np.bool_]:
+        """Return which transmissions lie at least `least_m` from the last one that did.
+
+        By default `STILL` of the usual advance. The first transmission always counts.
+        """
+        least_m = STILL * self.usual_step_m if least_m is None else least_m
+        kept = np.zeros(self.count, bool)
+        last_m = None
+        for number, place_m in enumerate(self.centres_m.tolist()):
+            if last_m is None or math.dist(place_m, last_m) >= least_m > 0:
+                kept[number], last_m = True, place_m
+        return kept
+
+    @property
+    def turns(self) -> NDArray[np.int64]:
+        """Transmissions after which the track leads against its local course."""
+        from scipy.ndimage import uniform_filter1d  # slow to import
+
+        numbers = np.flatnonzero(self.advancing())
+        moves_m = np.diff(self.centres_m[numbers], axis=0)
+        if len(moves_m) < 2:
+            return np.zeros(0, np.int64)
+        # The mean direction of a few steps: a track may turn, but not from one ping to the next.
+        moves_m /= np.linalg.norm(moves_m, axis=1, keepdims=True)
+        course = uniform_filter1d(moves_m, min(_LOCAL, len(moves_m)), axis=0)
+        return numbers[np.flatnonzero(np.einsum("pi,pi->p", moves_m, course) < 0)]
+
+    def channels(self, some: NDArray[np.bool_]) -> NDArray[np.int64]:
+        """Return the channels of some transmissions, given as a mask."""
+        return np.flatnonzero(np.repeat(some, self.receivers))
+
+
+def without_still_pings(lines: RangeLines, least_advance_m: float | None) -> RangeLines:
+    """Drop pings taken standing still; see `RangeLines.without_still_pings`."""
+    if least_advance_m is not None:
+        least_advance_m = validate.positive("least_advance_m", least_advance_m, "m")
+    found = Transmissions.of(lines)
+    kept = found.advancing(least_advance_m)
+    return lines if kept.all() else lines.select(found.channels(kept))

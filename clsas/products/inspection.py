@@ -1,0 +1,194 @@
+"""Inspection of a recording before it is imaged: its numbers, and what is wrong with it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsas.core import validate
+from clsas.core.grid import Grid
+from clsas.core.lines import RangeLines
+from clsas.core.pings import Transmissions
+from clsas.opencl.device import Device
+from clsas.products.inspection_result import Inspection, PhaseSign
+from clsas.products.phase_sign import check_sign, phase_sign
+from clsas.products.recording_checks import (
+    Levels,
+    check_background,
+    check_band,
+    check_ends,
+    check_levels,
+    check_offset,
+)
+from clsas.products.track_checks import check_ranges, check_spacing, check_track
+from clsas.signal.compression import compress
+from clsas.signal.echoes import Echoes
+from clsas.signal.spectrum import Spectrum, cycles_per_m_at, measure_spectrum
+from clsas.sonar.beam import BeamWindow
+from clsas.sonar.sampling import Finding
+
+_FARTHEST_M = 1e12
+
+
+def inspect(
+    lines: RangeLines | Echoes,
+    grid: Grid | None = None,
+    *,
+    device: Device | str | int | None = None,
+    beam: BeamWindow | None = None,
+    element_length_m: float | None = None,
+) -> Inspection:
+    """Say what a recording looks like and what is wrong with it, before an image is formed.
+
+    Parameters
+    ----------
+    lines : RangeLines or Echoes
+        The recording. Channels of echoes are looked at as they were recorded, the rest after
+        compression.
+    grid : Grid, optional
+        Grid of the image to come: its ranges are compared with those of the lines, and the spacing
+        of pings with what it needs.
+    device : Device, str or int, optional
+        Device that forms the patch that tells the sign of the phase. See
+        `clsas.opencl.device.choose`.
+    beam : BeamWindow, optional
+        Beam of the image to come, for the spacing.
+    element_length_m : float, optional
+        Length of the elements, metres, for the spacing: at most half of it.
+
+    Returns
+    -------
+    Inspection
+        `print(inspection.describe())` shows it.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If an argument is of the wrong kind or outside its limits.
+    DeviceError
+        If there is no such device.
+
+    Notes
+    -----
+    Findings, by name:
+
+    - "dead_channels": 20 dB fainter than the median channel, or without signal.
+    - "clipped_channels": 8 or more samples at the largest level, and hardly one just below it.
+    - "offset": a constant of the recorder. "background": what all pings have in common.
+    - "ends": lines that do not fade towards their ends.
+    - "oversampling": a band that fills all that is sampled. "band": one beyond its carrier.
+    - "still_pings", "gaps", "order", "advance": of the track.
+    - "along_track_spacing": see `check_sampling`.
+    - "grid_outside", "range_offset": slips of time or units.
+    - "phase_sign": the conjugate lines give a sharper image.
+
+    Samples that are NaN or infinite never get here: `RangeLines` and `load` refuse them, and say
+    how many there are and where the first one is.
+    """
+    validate.instance("lines", lines, RangeLines, Echoes)
+    if grid is not None:
+        validate.instance("grid", grid, Grid)
+    if beam is not None:
+        validate.instance("beam", beam, BeamWindow)
+    if element_length_m is not None:
+        element_length_m = validate.positive("element_length_m", element_length_m, "m")
+    recorded = lines.samples
+    is_echoes = isinstance(lines, Echoes)
+    if isinstance(lines, Echoes):
+        lines = compress(lines)
+    _check_distances(lines)
+    pings = Transmissions.of(lines)
+    alike = None if np.ptp(pings.receivers) else int(pings.receivers[0])
+    found = check_levels(Levels.of(recorded, magnitudes=not is_echoes), alike)
+    found += check_track(pings, float(lines.last_range_m.max()))
+    moving = lines.without_still_pings() if pings.usual_step_m else lines
+    spectrum = measure_spectrum(moving)
+    band = _Band.of(moving, spectrum)
+    sign = None
+    if moving.samples.any():
+        background = check_background(moving, Transmissions.of(moving))
+        found += check_offset(moving) + background + check_ends(moving)
+        found += check_band(moving, spectrum, band.ends_hz)
+        clean = moving.without_background("median", receivers=alike) if background else moving
+        sign = phase_sign(clean, grid, band.wavelength_m, band.cell_m, device)
+    limits: dict[str, Any] = {"beam": beam, "element_length_m": element_length_m}
+    found += check_spacing(moving, grid, wavelength_m=band.wavelength_m, **limits)
+    found += check_ranges(lines, grid) + check_sign(sign)
+    return _inspection(lines, pings, band, sign, found)
+
+
+def _check_distances(lines: RangeLines) -> None:
+    """Raise ValueError for positions and ranges whose squares or differences float64 loses."""
+    for name in ("first_range_m", "tx_m", "rx_m"):
+        farthest_m = float(np.abs(getattr(lines, name)).max())
+        validate.number(f"the largest of {name}", farthest_m, "m", most=_FARTHEST_M)
+    extent_m = lines.length * lines.range_step_m
+    validate.number("the length of lines", extent_m, "m", most=_FARTHEST_M)
+
+
+@dataclass(frozen=True)
+class _Band:
+    """The occupied band, as measured."""
+
+    ends_hz: tuple[float, float]
+    oversampling: float
+    wavelength_m: float
+    cell_m: float
+
+    @classmethod
+    def of(cls, lines: RangeLines, spectrum: Spectrum) -> _Band:
+        rate_hz = lines.sound_speed_m_s / (2 * lines.range_step_m)
+        middle_hz = lines.carrier_hz + spectrum.centre * rate_hz
+        oversampling = max(spectrum.oversampling, 1.0)
+        half_hz = rate_hz / oversampling / 2
+        return cls(
+            ends_hz=(middle_hz - half_hz, middle_hz + half_hz),
+            oversampling=spectrum.oversampling,
+            wavelength_m=2 / max(abs(cycles_per_m_at(lines, spectrum.centre)), 1e-30),
+            cell_m=lines.range_step_m * oversampling,
+        )
+
+
+def _inspection(
+    lines: RangeLines,
+    pings: Transmissions,
+    band: _Band,
+    sign: PhaseSign | None,
+    found: list[Finding],
+) -> Inspection:
+    receivers, depths_m = pings.receivers, lines.phase_centres_m[:, 2]
+    if receivers.max() > 1:
+        geometry = "array"
+    else:
+        geometry = "monostatic" if np.array_equal(lines.tx_m, lines.rx_m) else "bistatic"
+    speed_m_s = None
+    if lines.rx_velocity_m_s is not None:
+        speed_m_s = float(np.median(np.linalg.norm(lines.rx_velocity_m_s, axis=1)))
+    return Inspection(
+        lines=lines,
+        geometry=geometry,
+        channels=lines.channels,
+        pings=pings.count,
+        receivers=(int(receivers.min()), int(receivers.max())),
+        track_m=float(pings.steps_m.sum()),
+        advance_m=pings.usual_step_m,
+        depths_m=_span(depths_m),
+        speed_m_s=speed_m_s,
+        carrier_hz=lines.carrier_hz,
+        band_hz=band.ends_hz,
+        oversampling=band.oversampling,
+        wavelength_m=band.wavelength_m,
+        length=lines.length,
+        range_step_m=lines.range_step_m,
+        first_range_m=_span(lines.first_range_m),
+        last_range_m=_span(lines.last_range_m),
+        sign=sign,
+        findings=tuple(found),
+    )
+
+
+def _span(values: NDArray[np.float64]) -> tuple[float, float]:
+    return float(values.min()), float(values.max())

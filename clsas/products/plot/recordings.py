@@ -1,0 +1,207 @@
+"""Pictures of recordings: levels of lines over pings, their spectrum, and the track."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsas.core import validate
+from clsas.core.decibels import level_db
+from clsas.core.grid import Grid
+from clsas.core.lines import RangeLines
+from clsas.core.pings import Transmissions
+from clsas.products.inspection_result import Inspection
+from clsas.products.plot.canvas import axis_label, length_unit, new_figure, plain_ticks
+from clsas.products.plot.levels import Scale, draw_levels
+from clsas.products.plot.survey import outline as outline_of
+from clsas.signal.spectrum import power_spectrum
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+_MOST_CHANNELS, _MOST_ROWS = 1500, 800  # drawn; pictures have fewer dots
+_LEVELS_DB = 30.0, 80.0  # least and most dynamic range of the levels
+_SPECTRUM_DB = 80.0  # below the strongest frequency
+_PREFIXES = ((1e9, "GHz"), (1e6, "MHz"), (1e3, "kHz"))
+
+
+def inspection(found: Inspection, grid: Grid | None = None) -> Figure:
+    """Draw what `inspect` found: levels of the lines, their spectrum, and the track.
+
+    The track is drawn twice: as the advance from ping to ping, and from above. Dead and clipped
+    channels and pings taken standing still are marked over the levels, halts and gaps on the track.
+
+    Parameters
+    ----------
+    found : Inspection
+    grid : Grid, optional
+        Grid whose outline the track's picture shows.
+
+    Raises
+    ------
+    ImportError
+        If matplotlib is not installed.
+    TypeError
+        If an argument is of another type.
+    """
+    validate.instance("found", found, Inspection)
+    if grid is not None:
+        validate.instance("grid", grid, Grid)
+    figure = new_figure(13.0, 9.0)
+    places = figure.add_gridspec(2, 3, height_ratios=(3, 2))
+    _draw_lines(figure.add_subplot(places[0, :]), found)
+    _draw_spectrum(figure.add_subplot(places[1, 0]), found)
+    _draw_steps(figure.add_subplot(places[1, 1]), found)
+    _draw_track(figure.add_subplot(places[1, 2]), found, grid)
+    names = ", ".join(each.name.replace("_", " ") for each in found.findings)
+    figure.suptitle(f"Found: {names}" if names else "Nothing found that is wrong", fontsize=11)
+    return figure
+
+
+def _draw_lines(axes: Axes, found: Inspection) -> None:
+    lines = found.lines
+    amplitude, first_m, last_m = _pooled(lines)
+    scale, unit = length_unit(max(abs(first_m), abs(last_m)))
+    extent = (-0.5, lines.channels - 0.5, scale * first_m, scale * last_m)
+    level = level_db(amplitude)
+    faintest = -float(np.percentile(np.maximum(level, -_LEVELS_DB[1]), 2))
+    draw_levels(axes, level, extent, Scale(dynamic_range_db=max(faintest, _LEVELS_DB[0])))
+    axes.set(
+        xlabel=f"Channel (of {found.pings} pings)", ylabel=f"Range ({unit})", aspect="auto",
+        title="Levels of the lines",
+    )  # fmt: skip
+    pings = Transmissions.of(lines)
+    marks = (
+        ("still_pings", "tab:red", "taken standing still"),
+        ("dead_channels", "tab:cyan", "dead"),
+        ("clipped_channels", "tab:green", "clipped"),
+    )
+    for row, (name, colour, label) in enumerate(marks):
+        if name not in found:
+            continue
+        where = np.array(found[name].where, np.int64)
+        if name == "still_pings":
+            still = np.zeros(pings.count, bool)
+            still[where] = True
+            where = pings.channels(still)
+        axes.plot(
+            where, np.full(len(where), 0.985 - 0.03 * row), "|", color=colour, markersize=9,
+            transform=axes.get_xaxis_transform(), label=f"{label} ({len(where)})",
+        )  # fmt: skip
+    if axes.get_legend_handles_labels()[0]:
+        axes.legend(loc="lower right", fontsize="small", framealpha=0.9, markerscale=1.5)
+
+
+def _pooled(lines: RangeLines) -> tuple[NDArray[np.float32], float, float]:
+    """Return the largest amplitudes of few ranges and channels, [range, channel], and both ends.
+
+    The ranges that nearly all lines begin and end within are drawn: a slip of single ones would
+    hide the rest.
+    """
+    first_m, step_m = lines.first_range_m, lines.range_step_m
+    low_m = float(np.quantile(first_m, 0.01)) - step_m / 2
+    high_m = float(np.quantile(lines.last_range_m, 0.99)) + step_m / 2
+    if not high_m > low_m:
+        low_m, high_m = float(first_m.min()), float(lines.last_range_m.max()) + step_m
+    rows = int(np.clip((high_m - low_m) / step_m, 1, _MOST_ROWS))
+    columns = min(lines.channels, _MOST_CHANNELS)
+    column = np.arange(lines.channels) * columns // lines.channels
+    result = np.zeros((rows, columns), np.float32)
+    for channel in range(lines.channels):
+        range_m = first_m[channel] + np.arange(lines.length) * step_m
+        row = np.floor((range_m - low_m) / (high_m - low_m) * rows).astype(np.int64)
+        inside = slice(*np.searchsorted(row, [0, rows]))
+        if row[inside].size:
+            starts = np.flatnonzero(np.diff(row[inside], prepend=-1))
+            amplitude = np.maximum.reduceat(np.abs(lines.samples[channel, inside]), starts)
+            at = row[inside][starts], column[channel]
+            result[at] = np.maximum(result[at], amplitude)
+    return result, low_m, high_m
+
+
+def _draw_spectrum(axes: Axes, found: Inspection) -> None:
+    lines = found.lines
+    frequency, power = power_spectrum(lines)
+    rate_hz = lines.sound_speed_m_s / (2 * lines.range_step_m)
+    low_hz, high_hz = found.band_hz
+    # The band is shown whole, also where it lies across the edge of the sampled frequencies.
+    middle = ((low_hz + high_hz) / 2 - lines.carrier_hz) / rate_hz
+    frequency = middle + (frequency - middle + 0.5) % 1.0 - 0.5
+    order = np.argsort(frequency)
+    at_hz = lines.carrier_hz + rate_hz * frequency[order]
+    level = 10 * np.log10(np.maximum(power[order] / power.max(), 1e-12))
+    scale, unit = next((each for each in _PREFIXES if np.abs(at_hz).max() >= each[0]), (1.0, "Hz"))
+    axes.plot(at_hz / scale, level, linewidth=0.8)
+    axes.axvspan(
+        low_hz / scale, high_hz / scale, alpha=0.15, color="tab:orange", label="Band found"
+    )
+    if lines.carrier_hz:
+        axes.axvline(lines.carrier_hz / scale, color="0.4", linestyle=":", label="Carrier")
+    axes.set(
+        xlabel=f"Frequency ({unit})", ylabel="Power (dB re max)", ylim=(-_SPECTRUM_DB, 3),
+        title="Mean spectrum",
+    )  # fmt: skip
+    axes.grid(alpha=0.3)
+    axes.legend(fontsize="small", loc="lower center")
+    plain_ticks(axes)
+
+
+def _draw_steps(axes: Axes, found: Inspection) -> None:
+    steps_m = Transmissions.of(found.lines).steps_m
+    largest_m = float(steps_m.max(initial=0.0))
+    scale, unit = length_unit(largest_m)
+    number = np.arange(1, len(steps_m) + 1)
+    axes.plot(number, scale * steps_m, ".", markersize=3, color="0.3")
+    for name, colour, label, later in (
+        ("still_pings", "tab:red", "Standing still", 0),
+        ("gaps", "tab:orange", "Gaps", 1),
+        ("order", "tab:purple", "Turns back", 1),
+    ):
+        if name in found:
+            # A halt is known by the ping that does not advance, a gap by the ping before it.
+            at = np.array(found[name].where, np.int64) + later
+            at = at[(at > 0) & (at <= len(steps_m))]
+            axes.plot(at, scale * steps_m[at - 1], "o", color=colour, fillstyle="none",
+                      markersize=6, label=f"{label} ({len(at)})")  # fmt: skip
+    axes.set(xlabel="Ping", ylabel=f"Advance ({unit})", title="Advance from the ping before")
+    if largest_m:
+        axes.set_ylim(-0.05 * scale * largest_m, 1.1 * scale * largest_m)
+    axes.grid(alpha=0.3)
+    if axes.get_legend_handles_labels()[0]:
+        axes.legend(fontsize="small", loc="best")
+    plain_ticks(axes)
+
+
+def _draw_track(axes: Axes, found: Inspection, grid: Grid | None) -> None:
+    pings = Transmissions.of(found.lines)
+    shown = pings.centres_m[:, :2]
+    outline = None if grid is None else outline_of(grid)
+    ends_m = [shown] if outline is None else [shown, outline[0][:, :2]]
+    scale, unit = length_unit(max(float(np.abs(each).max()) for each in ends_m))
+    axes.plot(*(scale * shown.T), ".-", markersize=3, linewidth=0.5, color="0.3", label="Pings")
+    still = np.array(found["still_pings"].where if "still_pings" in found else (), np.int64)
+    if still.size:
+        axes.plot(*(scale * shown[still].T), "o", color="tab:red", fillstyle="none", markersize=7,
+                  label=f"Standing still ({still.size})")  # fmt: skip
+    if "dead_channels" in found:
+        starts = np.searchsorted(pings.starts, found["dead_channels"].where, side="right") - 1
+        dead = np.unique(starts)
+        axes.plot(*(scale * shown[dead].T), "x", color="tab:cyan", markersize=5,
+                  label=f"With dead channels ({dead.size})")  # fmt: skip
+    if "gaps" in found:
+        moving = np.flatnonzero(pings.advancing())
+        for index, gap in enumerate(found["gaps"].where):
+            after = moving[np.searchsorted(moving, gap) + 1]
+            axes.plot(*(scale * shown[[gap, after]].T), color="tab:orange", linewidth=3,
+                      label="" if index else f"Gaps ({len(found['gaps'].where)})")  # fmt: skip
+    if outline is not None:
+        places_m, style = outline
+        axes.plot(*(scale * places_m[:, :2].T), style, linewidth=1.5, markersize=2, label="Grid")
+    axes.set(xlabel=axis_label("x", unit), ylabel=axis_label("y", unit), title="Track from above")
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.grid(alpha=0.3)
+    axes.legend(fontsize="small", loc="best")
+    plain_ticks(axes)

@@ -1,0 +1,454 @@
+"""Inspections of recordings: a clean one, and one for every defect planted in it."""
+
+import json
+from dataclasses import replace
+
+import h5py
+import numpy as np
+import pytest
+from cases import noise
+from click.testing import CliRunner
+
+import clsas
+from clsas.cli import main
+from clsas.core.pings import Transmissions
+from clsas.products.inspection_result import runs
+from clsas.products.recording_checks import Levels, check_levels, check_offset
+
+PINGS, ADVANCE_M = 200, 0.02
+GRID = clsas.Grid.plane((1.0, 3.0, 100), (18.0, 20.5, 120))
+BEAM = clsas.BeamWindow(20.0)
+RNG = np.random.default_rng(3)
+
+
+def scene():
+    count = 800
+    at = np.stack(
+        [RNG.uniform(-5, 9, count), RNG.uniform(18.0, 20.5, count), np.zeros(count)], axis=1
+    )
+    level = 0.05 * (RNG.standard_normal((count, 2)) @ [1, 1j])
+    level[:20] = np.exp(2j * np.pi * RNG.random(20))
+    at[:20, 0] = RNG.uniform(0.5, 3.5, 20)
+    return clsas.PointTargets(at, level)
+
+
+@pytest.fixture(scope="module")
+def echoes():
+    sonar = clsas.Sonar(
+        clsas.Pulse(100e3, 30e3, 1e-3), [[0.0, 0, 0]], tx_length_m=0.06, rx_length_m=0.06
+    )
+    track = clsas.Track.straight((0, 0, 0), (ADVANCE_M, 0, 0), PINGS, 1.0)
+    return clsas.simulate(sonar, track, scene(), range_m=(16.5, 24.0))
+
+
+@pytest.fixture(scope="module")
+def lines(echoes):
+    return clsas.compress(echoes)
+
+
+def names(found):
+    return [finding.name for finding in found.findings]
+
+
+def with_samples(lines, change):
+    samples = np.array(lines.samples)
+    change(samples)
+    return replace(lines, samples=samples)
+
+
+def moved(lines, change):
+    position_m = np.array(lines.tx_m)
+    position_m = change(position_m)
+    return replace(lines, tx_m=position_m, rx_m=position_m)
+
+
+def test_a_clean_recording_has_no_findings(lines, echoes, platform):
+    found = clsas.inspect(lines, GRID, beam=BEAM, device=platform)
+    assert found.findings == ()
+    assert "Nothing found that is wrong." in found.describe()
+    assert (found.geometry, found.channels, found.pings) == ("monostatic", PINGS, PINGS)
+    assert found.advance_m == pytest.approx(ADVANCE_M)
+    assert found.track_m == pytest.approx(ADVANCE_M * (PINGS - 1))
+    assert found.wavelength_m == pytest.approx(0.015, rel=0.01)
+    assert np.diff(found.band_hz) == pytest.approx(30e3, rel=0.05)
+    assert found.oversampling == pytest.approx(2, rel=0.05)
+    assert found.sign.ratio < 0.3
+    assert found.speed_m_s is None
+    assert names(clsas.inspect(echoes, device=platform)) == []
+    assert repr(found).endswith("monostatic, findings: none)")
+
+
+def dead(samples):
+    samples[5:7] = 0
+    samples[100] *= 0.01
+
+
+def clipped(samples):
+    level = np.abs(samples[40])
+    ceiling = 0.3 * level.max()
+    samples[40, level > ceiling] *= ceiling / level[level > ceiling]
+
+
+def common(samples):
+    samples += 0.1 * noise(1, samples.shape[1], occupied=0.4)[0]
+
+
+SAMPLES = {
+    "dead": (dead, {"dead_channels": (5, 6, 100)}, ("3 of 200 channels", "lines.select")),
+    "clipped": (clipped, {"clipped_channels": (40,)}, ("1 of 200 channels", "less gain")),
+    "common": (common, {"background": ()}, ("in common", 'without_background("median")')),
+    "constant": (
+        lambda samples: np.add(samples, 0.1, out=samples),
+        {"offset": (), "background": (), "ends": ()},
+        ("a constant at 0 Hz of the lines has", "mean before compression"),
+    ),
+}
+
+
+@pytest.mark.parametrize("defect", SAMPLES)
+def test_defects_of_samples_are_found(lines, defect):
+    plant, wanted, words = SAMPLES[defect]
+    found = clsas.inspect(with_samples(lines, plant))
+    assert {each.name: each.where for each in found.findings} == wanted
+    for word in words:
+        assert word in found.describe()
+
+
+def test_the_remedy_of_a_background_leaves_nothing_to_find(lines):
+    found = clsas.inspect(with_samples(lines, common).without_background("median"))
+    assert names(found) == []
+
+
+def test_a_constant_of_the_recorder_is_found_on_its_frequency():
+    """Range lines of 20 kHz at 60 kHz hold 0 Hz of the recorder at -20 kHz."""
+    rng = np.random.default_rng(0)
+    spectrum = rng.standard_normal((20, 600, 2)) @ [1, 1j]
+    spectrum[:, np.abs(np.fft.fftfreq(600)) > 0.25] = 0
+    step_m = 1500 / (2 * 60e3)
+    noise = clsas.RangeLines(
+        np.fft.ifft(spectrum), 10.0, step_m, [0, 0, 0], [0, 0, 0], 20e3, 1500.0
+    )
+    constant = 0.01 * np.exp(-2j * np.pi * 20e3 * np.arange(600) / 60e3)
+    assert check_offset(noise) == []
+    (finding,) = check_offset(replace(noise, samples=noise.samples + constant))
+    assert "0 Hz of the recorded signal" in finding.message
+    assert "lines.high_passed(hz)" in finding.remedy
+    power_db = 20 * np.log10(0.01) - 10 * np.log10(np.mean(np.abs(noise.samples) ** 2))
+    assert finding.value == pytest.approx(power_db, abs=0.5)
+    cleaned = replace(noise, samples=noise.samples + constant).high_passed(5e3)
+    assert check_offset(cleaned) == []
+
+
+def test_echoes_are_clipped_where_their_parts_are(echoes):
+    samples = np.array(echoes.samples)
+    ceiling = 0.4 * np.abs(samples[7].real).max()
+    samples[7] = np.clip(samples[7].real, -ceiling, ceiling) + 1j * np.clip(
+        samples[7].imag, -ceiling, ceiling
+    )
+    found = clsas.inspect(replace(echoes, samples=samples))
+    assert found["clipped_channels"].where == (7,)
+
+
+def test_quantised_samples_are_not_clipped():
+    rng = np.random.default_rng(0)
+    weak = np.rint(1.2 * rng.standard_normal((3, 4000))).astype(np.float32)
+    assert not Levels.of(weak, magnitudes=False).clipped.any()
+    strong = np.clip(np.rint(60 * rng.standard_normal((3, 4000))), -127, 127).astype(np.float32)
+    assert Levels.of(strong, magnitudes=False).clipped.all()
+
+
+def test_a_receiver_that_is_dead_in_every_ping_is_named():
+    power = np.ones((10, 4))
+    power[:, 2] = 1e-4
+    levels = Levels(power.ravel(), np.zeros(40, np.int64))
+    (finding,) = check_levels(levels, 4)
+    assert "receivers 2 of 4 (from 0) in every ping" in finding.message
+    assert finding.value == pytest.approx(-40)
+
+
+def halting(position_m):
+    """Eighty pings at the place of one."""
+    position_m[60:140] = position_m[60]
+    position_m[140:, 0] -= 79 * ADVANCE_M
+    return position_m
+
+
+def test_pings_taken_standing_still(lines):
+    found = clsas.inspect(moved(lines, halting))
+    assert "still_pings" in found
+    assert found["still_pings"].where == tuple(range(61, 140))
+    assert "79 of 200 pings" in found["still_pings"].message
+    assert found.advance_m == pytest.approx(ADVANCE_M)
+    remedied = moved(lines, halting).without_still_pings()
+    assert remedied.channels == 121
+    assert "still_pings" not in clsas.inspect(remedied)
+
+
+def test_a_long_halt_hides_what_the_moving_pings_show(lines, platform):
+    """The remedy of the finding brings the targets back."""
+
+    def peak_over_median_db(recording):
+        image = clsas.backproject(recording, GRID, device=platform, accuracy_db=-40)
+        return 20 * np.log10(np.abs(image.pixels).max() / np.median(np.abs(image.pixels)))
+
+    recording = lines.select(np.r_[0:100, np.full(355, 100), 101:PINGS])
+    found = clsas.inspect(recording, GRID, device=platform)
+    assert names(found) == ["still_pings"]
+    assert "354 of 554 pings" in found["still_pings"].message
+    clean_db = peak_over_median_db(lines)
+    assert peak_over_median_db(recording) < clean_db - 10
+    remedied_db = peak_over_median_db(recording.without_still_pings())
+    assert remedied_db == pytest.approx(clean_db, abs=0.1)
+
+
+def test_jitter_of_a_halt_is_no_motion(lines):
+    def change(position_m):
+        position_m = halting(position_m)
+        return position_m + np.random.default_rng(0).normal(0, 1e-4, position_m.shape)
+
+    assert len(clsas.inspect(moved(lines, change))["still_pings"].where) == 79
+
+
+def test_gaps(lines):
+    found = clsas.inspect(lines.select(np.r_[0:50, 51:120, 140:PINGS]), GRID, beam=BEAM)
+    assert names(found) == ["gaps"]
+    assert found["gaps"].where == (49, 118)
+    assert found["gaps"].value == pytest.approx(21 * ADVANCE_M)
+
+
+def test_pings_out_of_order(lines):
+    order = np.arange(PINGS)
+    order[[80, 82]] = 82, 80
+    found = clsas.inspect(lines.select(order))
+    assert "order" in found
+    assert 80 in found["order"].where
+    assert "sort the pings by time" in found["order"].remedy
+
+
+def test_positions_that_are_missing(lines):
+    found = clsas.inspect(moved(lines, np.zeros_like))
+    assert "all 200 pings were taken at one place" in found["still_pings"].message
+
+
+def test_ends_that_do_not_fade(lines):
+    cut = replace(
+        lines, samples=lines.samples[:, 160:300],
+        first_range_m=lines.first_range_m + 160 * lines.range_step_m,
+    )  # fmt: skip
+    found = clsas.inspect(cut)
+    assert names(found) == ["ends"]
+    assert found["ends"].value > -10
+    assert names(clsas.inspect(cut.tapered_ends(0.2))) == []
+
+
+def test_a_band_that_is_not_sampled_finely_enough(lines):
+    coarse = replace(lines, samples=lines.samples[:, ::2], range_step_m=2 * lines.range_step_m)
+    found = clsas.inspect(coarse)
+    assert "oversampling" in found
+    assert found["oversampling"].value < 1.05
+
+
+def test_a_band_beyond_its_carrier(lines):
+    found = clsas.inspect(replace(lines, range_step_m=lines.range_step_m / 1000))
+    assert found["band"].value == pytest.approx(30e6, rel=0.05)
+    assert "check units: range_step_m in metres" in found["band"].remedy
+
+
+def test_spacing_against_beam_grid_and_element(lines):
+    sparse = lines.select(slice(None, None, 2))
+    found = clsas.inspect(sparse, beam=BEAM)
+    assert names(found) == ["along_track_spacing"]
+    assert found["along_track_spacing"].limit == pytest.approx(
+        0.015 / (4 * np.sin(np.radians(10))), rel=0.01
+    )
+    assert names(clsas.inspect(sparse)) == []
+    found = clsas.inspect(sparse, element_length_m=0.06)
+    assert found["along_track_spacing"].limit == 0.03
+
+
+@pytest.mark.parametrize("words", ["first_range_m, now in samples", "milliseconds"])
+def test_slips_of_the_first_range_are_named(lines, words):
+    scale = 1000 if words == "milliseconds" else 1 / lines.range_step_m
+    found = clsas.inspect(replace(lines, first_range_m=scale * lines.first_range_m), GRID)
+    assert found["grid_outside"].value == 1
+    assert words in found["grid_outside"].remedy
+
+
+@pytest.mark.parametrize(
+    ("scale", "words"), [(1000, "millimetres were metres"), (1e-3, "kilometres were metres")]
+)
+def test_slips_of_all_ranges_are_named(lines, scale, words):
+    slipped = replace(
+        lines, first_range_m=scale * lines.first_range_m, range_step_m=scale * lines.range_step_m
+    )
+    found = clsas.inspect(slipped, GRID)
+    assert found["grid_outside"].value == 1
+    assert words in found["grid_outside"].remedy
+
+
+def test_positions_in_millimetres(lines):
+    found = clsas.inspect(moved(lines, lambda m: 1000 * (m - [0, 1, 0])), GRID)
+    assert "positions, now in millimetres" in found["grid_outside"].remedy
+    assert "order" not in found
+
+
+def test_a_time_in_samples_is_beyond_any_range(lines):
+    first_m = lines.first_range_m / lines.range_step_m * lines.sound_speed_m_s / 2
+    found = clsas.inspect(replace(lines, first_range_m=first_m), GRID)
+    assert "in seconds, not in samples" in found["range_offset"].remedy
+    before = clsas.inspect(replace(lines, first_range_m=-100.0))
+    assert "range_offset" in before
+
+
+def test_a_grid_partly_beyond_the_lines(lines):
+    grid = clsas.Grid.plane((1.0, 3.0, 50), (18.0, 34.0, 100))
+    found = clsas.inspect(lines, grid, beam=BEAM)
+    assert names(found) == ["grid_outside"]
+    assert found["grid_outside"].value == pytest.approx(10 / 16, abs=0.08)
+    assert "choose another grid" in found["grid_outside"].remedy
+
+
+@pytest.mark.parametrize("grid", [None, GRID])
+def test_a_phase_of_the_opposite_sign(lines, grid, platform):
+    conjugate = replace(lines, samples=lines.samples.conj())
+    found = clsas.inspect(conjugate, grid, device=platform)
+    assert names(found) == ["phase_sign"]
+    assert found["phase_sign"].value > 3
+    assert "opposite" in found.describe()
+
+
+def test_speckle_does_not_tell_its_sign(lines):
+    rng = np.random.default_rng(0)
+    samples = rng.standard_normal((*lines.samples.shape, 2)) @ [1, 1j]
+    noise = replace(lines, samples=samples).high_passed(95e3)
+    found = clsas.inspect(noise, GRID)
+    assert "phase_sign" not in found
+    assert "not clear" in found.describe()
+
+
+def test_a_track_about_the_scene_needs_a_grid(lines):
+    """On a circle about the scene ranges do not change: both signs look alike."""
+    angle = np.linspace(-0.1, 0.1, PINGS)
+    circle = 19.0 * np.stack([np.sin(angle), -np.cos(angle) + 1, 0 * angle], axis=1)
+    found = clsas.inspect(moved(lines, lambda _: circle))
+    assert found.sign is None
+    assert "a grid is needed" in found.describe()
+
+
+def test_lines_of_zeros_and_short_recordings(lines):
+    silent = clsas.inspect(with_samples(lines, lambda samples: samples.fill(0)))
+    assert len(silent["dead_channels"].where) == PINGS
+    assert silent.sign is None
+    for some in ([3], [3, 4], [3, 4, 5]):
+        assert clsas.inspect(lines.select(some), GRID).pings == len(some)
+    single = replace(lines, samples=lines.samples[:, 200:201])
+    assert clsas.inspect(single).length == 1
+    for carrier_hz in (0.0, 100e3):
+        scaled = replace(lines, samples=1e36 * lines.samples, carrier_hz=carrier_hz)
+        assert clsas.inspect(scaled).findings == ()
+
+
+def test_samples_that_are_not_finite_are_refused_with_their_place(lines, tmp_path):
+    def plant(samples):
+        samples[3, 120:125] = np.nan
+
+    with pytest.raises(ValueError, match=r"got 5 NaN or infinite of \d+ .* first at \[3, 120\]"):
+        with_samples(lines, plant)
+    clsas.save(tmp_path / "lines.h5", lines)
+    with h5py.File(tmp_path / "lines.h5", "r+") as file:
+        file["samples"][3, 120:125] = np.nan
+    result = CliRunner().invoke(main, ["inspect", str(tmp_path / "lines.h5")])
+    assert result.exit_code == 1
+    assert "the first at [3, 120]" in result.stderr
+
+
+def test_arrays_moving_receivers_and_carriers(lines):
+    tx_m = np.repeat(lines.tx_m[::2], 2, axis=0)
+    rx_m = tx_m + np.tile([[0.1, 0, 0], [0.12, 0, 0]], (PINGS // 2, 1))
+    array = replace(lines, tx_m=tx_m, rx_m=rx_m, rx_velocity_m_s=[2.0, 0, 0])
+    found = clsas.inspect(array)
+    assert (found.geometry, found.pings, found.receivers) == ("array", 100, (2, 2))
+    assert found.speed_m_s == 2.0
+    assert clsas.inspect(replace(lines, rx_m=lines.rx_m + [0.2, 0, 0])).geometry == "bistatic"
+    halt = array.select(np.r_[0:60, np.tile([60, 61], 30), 60:PINGS])
+    assert Transmissions.of(halt).count == 130
+    assert halt.without_still_pings().channels == PINGS
+
+
+def test_arguments_of_another_kind(lines):
+    for wrong, words in (
+        ({"lines": GRID}, "lines must be of type RangeLines or Echoes"),
+        ({"grid": lines}, "grid must be of type Grid"),
+        ({"beam": 3}, "beam must be of type BeamWindow"),
+        ({"lines": replace(lines, first_range_m=1e300)}, "the largest of first_range_m must be"),
+        ({"lines": replace(lines, tx_m=[1e200, 0, 0])}, r"the largest of tx_m .* got 1e\+200"),
+        ({"lines": replace(lines, range_step_m=1e300)}, "the length of lines must be"),
+        ({"element_length_m": -1}, "element_length_m must be finite and > 0 m"),
+    ):
+        with pytest.raises((TypeError, ValueError), match=words):
+            clsas.inspect(**({"lines": lines} | wrong))
+
+
+def test_runs_of_indices():
+    assert runs([0, 1, 2, 7, 9, 10]) == "0-2, 7, 9-10"
+    assert runs(range(0, 100, 2)).endswith("22 and 38 more runs")
+
+
+def test_the_command(lines, tmp_path):
+    recording, picture = tmp_path / "lines.h5", tmp_path / "lines.png"
+    clsas.save(recording, moved(lines, halting))
+    grid = ["--x", "1:3:100", "--y", "18:20.5:120", "--beam-deg", "20"]
+    run = CliRunner().invoke(main, ["inspect", str(recording), *grid, "--picture", str(picture)])
+    assert run.exit_code == 0, run.output
+    assert "still_pings: 79 of 200 pings" in run.stdout
+    assert "Which: 61-139" in run.stdout
+    assert picture.read_bytes().startswith(b"\x89PNG")
+    run = CliRunner().invoke(main, ["inspect", str(recording), "--json"])
+    found = json.loads(run.stdout)
+    assert found["pings"] == PINGS
+    assert found["findings"][0]["name"] == "still_pings"
+    assert found["findings"][0]["where"] == list(range(61, 140))
+    mended = tmp_path / "mended.h5"
+    options = ["--without-still-pings", "--without-background", "median", "--taper-m", "0.2"]
+    run = CliRunner().invoke(main, ["convert", str(recording), str(mended), *options])
+    assert run.exit_code == 0, run.output
+    wanted = moved(lines, halting).without_still_pings().without_background("median")
+    np.testing.assert_array_equal(clsas.load(mended).samples, wanted.tapered_ends(0.2).samples)
+
+
+def test_a_scene_gives_grid_beam_and_element(lines, tmp_path):
+    (tmp_path / "scene.toml").write_text(
+        "[grid]\nx = { start_m = 1, stop_m = 3, count = 50 }\n"
+        "y = { start_m = 18, stop_m = 34, count = 100 }\n[image.beam]\nwidth_deg = 20\n"
+    )
+    clsas.save(tmp_path / "lines.h5", lines)
+    scene = ["--scene", str(tmp_path / "scene.toml"), "--json"]
+    run = CliRunner().invoke(main, ["inspect", str(tmp_path / "lines.h5"), *scene])
+    assert run.exit_code == 0, run.output
+    assert [each["name"] for each in json.loads(run.stdout)["findings"]] == ["grid_outside"]
+
+
+def test_files_without_a_recording_are_refused(tmp_path):
+    clsas.save(tmp_path / "image.h5", clsas.Image(np.ones((120, 100), complex), GRID))
+    for command in (["inspect"], ["convert", "--taper-m", "1"], ["convert"]):
+        to = [] if command == ["inspect"] else [str(tmp_path / "o.cphd")]
+        run = CliRunner().invoke(main, [*command, str(tmp_path / "image.h5"), *to])
+        assert run.exit_code == 1
+        assert "image.h5 must hold RangeLines" in run.stderr
+        assert "got Image" in run.stderr
+
+
+def test_the_picture_has_units_and_marks(lines):
+    pytest.importorskip("matplotlib")
+    bad = moved(with_samples(lines, dead), halting).select(np.r_[0:160, 170:PINGS])
+    found = clsas.inspect(bad, GRID)
+    figure = clsas.plot.inspection(found, GRID)
+    labels = {text for axes in figure.axes for text in (axes.get_xlabel(), axes.get_ylabel())}
+    assert {
+        "Range (m)", "Frequency (kHz)", "Power (dB re max)", "Amplitude (dB re max)",
+        "Along-track (m)", "Across-track (m)",
+    } <= labels  # fmt: skip
+    shown = {text for axes in figure.axes for text in axes.get_legend_handles_labels()[1]}
+    assert {"taken standing still (79)", "dead (3)", "Gaps (1)", "Grid"} <= shown
+    with pytest.raises(TypeError, match="found must be of type Inspection"):
+        clsas.plot.inspection(lines)
