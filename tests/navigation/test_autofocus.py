@@ -12,85 +12,36 @@ import clsas
 from clsas.cli import main
 from clsas.core.validate import ClsasWarning
 from clsas.navigation.autofocus import autofocus
-
-WAVELENGTH_M = 0.015
-PINGS, STEP_M = 400, 0.02
-GRID = clsas.Grid.plane(x=(1.5, 6.5, 320), y=(18.0, 21.0, 220))
-SONAR = clsas.Sonar(
-    clsas.Pulse(100e3, 30e3, 1e-3), [[0.0, 0.0, 0.0]], tx_length_m=0.06, rx_length_m=0.06
+from clsas.trials.focusing import (
+    GRID,
+    PINGS,
+    SCENES,
+    SONAR,
+    STEP_M,
+    WAVELENGTH_M,
+    peak_db,
+    points,
+    recorded,
+    smooth_m,
+    smooth_residual_m,
+    speckle,
+    white_m,
 )
+from clsas.trials.navigating import detrended
 
-
-def smooth_m(rms_m, seed=0):
-    """Displacements that change over some metres, without what no image shows."""
-    noise = np.random.default_rng(seed).standard_normal(PINGS + 1000)
-    return scaled(detrended(gaussian_filter1d(noise, 75)[500 : 500 + PINGS]), rms_m)
-
-
-def white_m(rms_m, seed=1):
-    return scaled(np.random.default_rng(seed).standard_normal(PINGS), rms_m)
-
-
-def scaled(values, rms):
-    return values * (rms / np.std(values))
-
-
-def detrended(values):
-    at = np.arange(len(values))
-    return values - np.polyval(np.polyfit(at, values, 1), at)
-
-
-def points(seed=0):
-    rng = np.random.default_rng(seed)
-    at = np.stack([rng.uniform(1.8, 6.2, 60), rng.uniform(18.2, 20.8, 60), np.zeros(60)], axis=1)
-    return clsas.PointTargets(at, rng.uniform(0.3, 1, 60) * np.exp(2j * np.pi * rng.random(60)))
-
-
-def speckle(bright, seed=0):
-    """Speckle of fully developed density, with some bright points or none."""
-    rng = np.random.default_rng(seed)
-    count = 12000
-    at = np.stack([rng.uniform(-2, 10, count), rng.uniform(17.7, 21.3, count), np.zeros(count)], 1)
-    level = 0.02 * (rng.standard_normal(count) + 1j * rng.standard_normal(count))
-    level[:bright] = np.exp(2j * np.pi * rng.random(bright))
-    at[:bright, 0], at[:bright, 1] = rng.uniform(2, 6, bright), rng.uniform(18.2, 20.8, bright)
-    return clsas.PointTargets(at, level)
-
-
-def recorded(scene, sway_m):
-    """Lines of a swaying track: as they are, and as the navigation has them."""
-    course = (0, 0, 0), (STEP_M, 0, 0), PINGS, 1.0
-    track = clsas.Track.straight(*course, sway_m=sway_m)
-    true = clsas.compress(clsas.simulate(SONAR, track, scene, range_m=(17.2, 22.5)))
-    geometry = clsas.channels(SONAR, clsas.Track.straight(*course))
-    return true, replace(true, tx_m=geometry.tx_m, rx_m=geometry.rx_m)
-
-
-def peak_db(lines, true, device=None):
-    image, ideal = (
-        np.abs(clsas.factorize(each, GRID, -40.0, device=device).pixels).max()
-        for each in (lines, true)
-    )
-    return 20 * np.log10(image / ideal)
-
-
-CASES = {
-    "points-smooth": (points(), smooth_m(0.3 * WAVELENGTH_M)),
-    "points-beyond-resolution": (points(), smooth_m(2 * WAVELENGTH_M)),
-    "speckle-smooth": (speckle(20), smooth_m(2 * WAVELENGTH_M, seed=4)),
-}
+CASES = "points-smooth", "points-beyond-resolution", "speckle-smooth"
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", CASES)
 def test_smooth_sway_is_found(name):
-    scene, sway_m = CASES[name]
-    true, told = recorded(scene, sway_m)
+    scene = SCENES[name]
+    sway_m = scene.sway_m
+    true, told = recorded(scene.targets, sway_m)
     found = autofocus(told, GRID)
     assert peak_db(told, true) < -3
     assert abs(peak_db(found.lines, true)) <= 0.3
-    residual_m = detrended(found.correction_m[:, 1] - sway_m)
-    assert np.std(gaussian_filter1d(residual_m, 12)) <= WAVELENGTH_M / 100
+    assert smooth_residual_m(found, sway_m) <= WAVELENGTH_M / 100
     assert found.focused
     assert found.sharpness_after > 2 * found.sharpness_before
 
@@ -101,8 +52,7 @@ def test_smooth_sway_and_jitter():
     true, told = recorded(points(), sway_m)
     found = autofocus(told, GRID)
     assert abs(peak_db(found.lines, true)) <= 0.5
-    residual_m = detrended(found.correction_m[:, 1] - sway_m)
-    assert np.std(gaussian_filter1d(residual_m, 12)) <= WAVELENGTH_M / 100
+    assert smooth_residual_m(found, sway_m) <= WAVELENGTH_M / 100
 
 
 @pytest.mark.slow
