@@ -48,9 +48,8 @@ MOST_DISAGREEMENT = 1 / 32
 speckle disagree by 0.06 and more, bright ones by 0.01."""
 
 _DRIFTS = 3  # times that drift is measured at most
-_NEIGHBOURHOODS = (3.0, 2.0, 1.25, 0.75)  # Fresnel lengths around responses, along the track
-_SWEEPS = 2  # times that single pings are moved
-_RESPONSES, _RESPONSES_FOR_DRIFT = 200, 60
+_NEIGHBOURHOODS = (2.0, 1.0)  # Fresnel lengths around responses, along the track
+_RESPONSES, _RESPONSES_FOR_DRIFT = 200, 40
 _OFFSETS = np.arange(-4.0, 5.0)  # samples in range, of which drift sees images
 _LEAST_RESPONSES = 8  # halves of which can agree
 _LEAST_GRADIENT = 0.05  # of range per displacement, rms
@@ -282,8 +281,7 @@ class _Focus:
         fresnel_m = self.passage.fresnel_length_m(self._responses)
         for each_m in fresnel_m * np.array(_NEIGHBOURHOODS):
             yield f"phase gradient within {each_m:.2g} m", partial(self._gradient, each_m)
-        for _ in range(_SWEEPS):
-            yield "sharpness of single pings", self._pings
+        yield "sharpness of single pings", self._pings
 
     def _drift(self) -> NDArray[np.float64] | None:
         offsets_m = self.given.range_step_m * _OFFSETS

@@ -62,7 +62,7 @@ def drift_m(passage: Passage, found: Contributions) -> NDArray[np.float64] | Non
         at_m = channel_m[some] - starts_m[each]
         taper = np.sin(np.pi * at_m / length_m) ** 2
         turn = (taper * np.exp(-2j * np.pi * frequency[:, None] * at_m)).astype(np.complex64)
-        values = found.values[some].astype(np.complex64)
+        values = found.values[some]
         # Products of small matrices keep to one thread: waiting for others takes longer.
         image = turn @ values.transpose(1, 0, 2)
         images.append(image.real**2 + image.imag**2)

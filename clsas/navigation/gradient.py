@@ -13,7 +13,7 @@ from scipy.ndimage import gaussian_filter1d
 from clsas.core.lines import wavelength_m
 from clsas.navigation.responses import Contributions, Passage
 
-_PASSES = 6  # of alternating least squares: steps of the track, and the responses' own slopes
+_PASSES = 3  # of alternating least squares: steps of the track, and the responses' own slopes
 _TRIED = 9  # displacements within half a wavelength: 4 per cycle of the sharpness
 _NEWTON = 3  # steps from the best of them
 _SWEEPS = 2  # over all pings
@@ -33,9 +33,7 @@ def phase_gradient_m(
     spacing_m = float(np.median(np.diff(passage.along_m)))
     smoothed_m = passage.fresnel_length_m(found) ** 2 / neighbourhood_m
     width = min(smoothed_m / max(spacing_m, 1e-12) / 2, passage.pings)
-    smooth = gaussian_filter1d(values.real, width, axis=0, mode="constant") + 1j * (
-        gaussian_filter1d(values.imag, width, axis=0, mode="constant")
-    )
+    smooth = gaussian_filter1d(values, width, axis=0, mode="constant")
     product = smooth[1:] * smooth[:-1].conj()
     weights = np.abs(product)
     product = (product / np.maximum(weights, 1e-300)).astype(np.complex64)
@@ -88,10 +86,11 @@ def sharpest_m(
     values = passage.by_ping(found.values[..., 0])
     turns = _turns(passage, found)
     directions = _directions(turns, np.abs(values) ** 2)
-    turns = np.einsum("pau,upk->apk", directions, turns)
+    turns = np.einsum("pau,upk->apk", directions, turns).astype(np.float32)
     furthest_m = wavelength_m(passage.lines) / 4
     unknowns, pings, _ = turns.shape
-    moved_m, turned, total = np.zeros((unknowns, pings)), values.copy(), values.sum(axis=0)
+    moved_m = np.zeros((unknowns, pings), np.float32)
+    turned, total = values.copy(), values.sum(axis=0)
     for sweep in range(_SWEEPS):
         order = np.random.default_rng(sweep).permutation(pings)
         for some in np.array_split(order, min(_BLOCKS, pings)):
@@ -120,11 +119,11 @@ def _directions(turns: NDArray[np.float64], weights: NDArray[np.float64]) -> NDA
 
 
 def _sharpest(
-    level: NDArray[np.float64],
-    cross: NDArray[np.complex128],
-    turn: NDArray[np.float64],
+    level: NDArray[np.float32],
+    cross: NDArray[np.complex64],
+    turn: NDArray[np.float32],
     furthest_m: float,
-) -> NDArray[np.float64]:
+) -> NDArray[np.float32]:
     """Return the displacements of some pings that maximise the sharpness, [pings].
 
     The intensity of a response is level + 2 Re(cross exp(j turn displacement)); `level`, `cross`
@@ -133,11 +132,11 @@ def _sharpest(
     step_m = 2 * furthest_m / (_TRIED - 1)
     rotation = np.exp(1j * turn * step_m)
     tried = cross * np.exp(-1j * turn * furthest_m)
-    sharpness = np.empty((_TRIED, len(cross)))
+    sharpness = np.empty((_TRIED, len(cross)), np.float32)
     for number in range(_TRIED):
         sharpness[number] = np.sum((level + 2 * tried.real) ** 2, axis=1)
         tried = tried * rotation
-    first_m = step_m * np.argmax(sharpness, axis=0) - furthest_m
+    first_m = np.float32(step_m) * np.argmax(sharpness, axis=0).astype(np.float32) - furthest_m
     moved_m = first_m.copy()
     for _ in range(_NEWTON):
         at = cross * np.exp(1j * turn * moved_m[:, None])

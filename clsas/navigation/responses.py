@@ -110,14 +110,14 @@ class Contributions:
 
     Attributes
     ----------
-    values : complex128 [channels, points, offsets]
+    values : complex64 [channels, points, offsets]
         In phase with the point displaced by every offset in range.
     gradient : float64 [unknowns, channels, points]
         Change in range per metre of displacement.
     range_m : float64 [channels, points]
     """
 
-    values: NDArray[np.complex128]
+    values: NDArray[np.complex64]
     gradient: NDArray[np.float64]
     range_m: NDArray[np.float64]
 
@@ -147,7 +147,7 @@ def contributions(
     """
     offsets_m = np.zeros(1) if offsets_m is None else offsets_m
     shape = lines.channels, len(points_m)
-    values = np.empty((*shape, len(offsets_m)), np.complex128)
+    values = np.empty((*shape, len(offsets_m)), np.complex64)
     gradient, range_m = np.empty((len(passage.axes), *shape)), np.empty(shape)
     along = None if beam is None else beam.directions(lines)
     step = max(_READ_AT_ONCE // max(len(points_m) * len(offsets_m), lines.length), 1)
@@ -161,7 +161,8 @@ def contributions(
         range_m[some] = path_m
         at_m = (path_m[..., None] + offsets_m).reshape(len(some), -1)
         turns = lines.carrier_cycles_per_m * at_m
-        read = readout.read(some, at_m) * np.exp(2j * np.pi * (turns - np.rint(turns)))
+        phase = (2 * np.pi * (turns - np.rint(turns))).astype(np.float32)
+        read = readout.read(some, at_m) * np.exp(1j * phase)
         values[some] = read.reshape(len(some), len(points_m), -1)
         if beam is not None and along is not None:
             sine = sines(points_m, part.phase_centres_m, along[some])

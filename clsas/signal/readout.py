@@ -115,10 +115,18 @@ def between(
     weights = interpolator.weights(position - lower - 0.5).astype(upsampled.real.dtype)
     first = lower.astype(np.int64) + 1 - interpolator.taps // 2
     total = np.zeros(index.shape, upsampled.dtype)
+    last = resampling.length - 1
+    ends = first.min(initial=0) < 0 or first.max(initial=0) + interpolator.taps - 1 > last
+    lines = resampling.length * np.arange(len(upsampled))[:, None]
+    flat = np.ascontiguousarray(upsampled).reshape(-1)
     for tap in range(interpolator.taps):
-        inside = (first + tap >= 0) & (first + tap < resampling.length)
-        taken = np.take_along_axis(upsampled, np.where(inside, first + tap, 0), axis=1)
-        total += inside * weights[..., tap] * taken
-    turns = resampling.centre_cycles_per_sample * index
-    total *= np.exp(2j * np.pi * (turns - np.rint(turns)))
+        at = first + tap
+        weight = weights[..., tap]
+        if ends:
+            weight = weight * ((at >= 0) & (at <= last))
+            at = np.clip(at, 0, last)
+        total += weight * flat[lines + at]
+    if resampling.shift:
+        turns = resampling.centre_cycles_per_sample * index
+        total *= np.exp(2j * np.pi * (turns - np.rint(turns)))
     return total
