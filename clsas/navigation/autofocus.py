@@ -43,17 +43,19 @@ UNKNOWNS = ("sway", "heave", "surge")
 
 IMAGE_TOLERANCE_DB = -30.0
 """Tolerance of the images in between: errors far below responses."""
-MOST_DISAGREEMENT = 1 / 32
-"""Wavelengths that halves of the responses may disagree about single pings, rms. Responses of
-speckle disagree by 0.06 and more, bright ones by 0.01."""
+MOST_DISAGREEMENT = 1 / 50
+"""Wavelengths of range that halves of the responses may disagree about single pings. Responses of
+speckle disagree by 0.03 and more, bright ones by 0.01."""
 
 _DRIFTS = 3  # times that drift is measured at most
 _NEIGHBOURHOODS = (2.0, 1.0)  # Fresnel lengths around responses, along the track
+_SWEEPS = 2  # times that single pings are moved at most
 _RESPONSES, _RESPONSES_FOR_DRIFT = 200, 40
 _OFFSETS = np.arange(-4.0, 5.0)  # samples in range, of which drift sees images
 _LEAST_RESPONSES = 8  # halves of which can agree
 _LEAST_GRADIENT = 0.05  # of range per displacement, rms
 _APART = 4.0  # range resolution cells between responses
+_DEVIATION_PER_MEDIAN = 1.4826  # of the magnitude of normal errors
 _GAIN = 1.02  # of sharpness, for which a step is repeated
 
 
@@ -259,7 +261,7 @@ class _Focus:
         )
 
     def _disagreement_m(self) -> float:
-        """Return how far apart in range two halves of the responses want single pings, rms.
+        """Return how far apart in range two halves of the responses want single pings.
 
         Responses of a scene agree, as they all see the one track. Brightest pixels of speckle can
         be made brighter, but every one in its own way.
@@ -269,10 +271,11 @@ class _Focus:
             sharpest_m(self.passage, found.of(some))[0]
             for some in (slice(0, None, 2), slice(1, None, 2))
         )
-        apart = first - second - np.mean(first - second, axis=1, keepdims=True)
+        apart = first - second - np.median(first - second, axis=1, keepdims=True)
         gradient = found.gradient[:, self.passage.lines.ping_starts]
         apart_m = np.einsum("up,upk->pk", apart, gradient)
-        return float(np.sqrt(np.mean(apart_m**2))) / 2
+        # The median passes over single pings that one half puts half a wavelength of path off.
+        return float(np.median(np.abs(apart_m))) * _DEVIATION_PER_MEDIAN / 2
 
     def _stages(self) -> Iterator[tuple[str, Callable[[], NDArray[np.float64] | None]]]:
         """Yield what is tried, from coarse to fine."""
@@ -281,7 +284,8 @@ class _Focus:
         fresnel_m = self.passage.fresnel_length_m(self._responses)
         for each_m in fresnel_m * np.array(_NEIGHBOURHOODS):
             yield f"phase gradient within {each_m:.2g} m", partial(self._gradient, each_m)
-        yield "sharpness of single pings", self._pings
+        for _ in range(_SWEEPS):
+            yield "sharpness of single pings", self._pings
 
     def _drift(self) -> NDArray[np.float64] | None:
         offsets_m = self.given.range_step_m * _OFFSETS

@@ -196,18 +196,21 @@ def voyage(
     pings: int = 100,
     *,
     receivers: int = RECEIVERS,
-    range_m: tuple[float, float] = (12.0, 20.0),
-    points: int = 15000,
-    sway_m: float = 0.2,
-    yaw_rad: float = np.radians(1.0),
+    range_m: tuple[float, float] = (12.0, 30.0),
+    points: int = 20000,
+    sway_pings: float = 100.0,
+    yaw_pings: float = 50.0,
 ) -> Voyage:
-    """Return a voyage over speckle and a bright point, with sway and yaw that nobody tells."""
+    """Return a voyage over speckle and a bright point, with 0.2 m of sway and 1 degree of yaw.
+
+    `sway_pings` and `yaw_pings` are their periods.
+    """
     sonar, advance_m = overlapping_array(receivers, OVERLAPPING)
     course = (0, 0, 0), (advance_m, 0, 0), pings, 1.0
     true = Track.straight(
         *course,
-        sway_m=lambda t: sway_m * np.sin(2 * np.pi * t / 60 + 0.3),
-        yaw_rad=lambda t: yaw_rad * np.sin(2 * np.pi * t / 27 + 1),
+        sway_m=lambda t: 0.2 * np.sin(2 * np.pi * t / sway_pings + 0.3),
+        yaw_rad=lambda t: np.radians(1.0) * np.sin(2 * np.pi * t / yaw_pings + 1),
     )
     near_m, far_m = range_m
     target_m = float(true.positions_m[:, 0].mean()), near_m + 2, 0.0

@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,20 +16,26 @@ from clsas.navigation.autofocus import autofocus
 from clsas.trials.focusing import (
     GRID,
     PINGS,
+    RADAR_ERRORS,
+    RADAR_GRID,
     SCENES,
     SONAR,
     STEP_M,
     WAVELENGTH_M,
     peak_db,
     points,
+    radar_pass,
     recorded,
+    reflector_db,
     smooth_m,
     smooth_residual_m,
     speckle,
+    swaying,
     white_m,
 )
 from clsas.trials.navigating import detrended
 
+RECORDED = Path(__file__).parents[2] / "../shared/data/gotcha/data_3dsar_pass1_az001_HH.mat"
 CASES = "points-smooth", "points-beyond-resolution", "speckle-smooth"
 
 
@@ -97,6 +104,19 @@ def test_sway_and_heave():
     for axis, wanted_m in ((1, sway_m), (2, heave_m)):
         residual_m = detrended(found.correction_m[:, axis] - wanted_m)
         assert np.std(gaussian_filter1d(residual_m, 12)) <= WAVELENGTH_M / 30
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not RECORDED.exists(), reason=f"no recorded data at {RECORDED}")
+@pytest.mark.parametrize(("smooth", "white"), RADAR_ERRORS)
+def test_a_recorded_pass_comes_back(smooth, white):
+    """A radar's track is displaced; left alone, it is not made worse."""
+    lines = radar_pass(RECORDED)
+    told, given_db = swaying(lines, smooth, white), reflector_db(lines)
+    found = autofocus(told, RADAR_GRID)
+    assert found.focused
+    assert reflector_db(told) - given_db < -2 or not smooth + white
+    assert reflector_db(found.lines) - given_db >= (-0.3 if smooth + white else 0.0)
 
 
 def test_bad_arguments():
