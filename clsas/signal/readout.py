@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TypeVar
+from typing import TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -99,7 +99,8 @@ def interpolated(
         Places in samples; beyond the ends lines fade out as their interpolation does.
     interpolator, resampling : Interpolator, Resampling
     """
-    return between(resampling.apply(samples), index, interpolator, resampling)
+    upsampled = cast("NDArray[_Complex]", resampling.apply(samples))
+    return between(upsampled, index, interpolator, resampling)
 
 
 def between(

@@ -108,10 +108,14 @@ def straight_lines(pings: int = 21) -> RangeLines:
     return compress(simulate(sonar, track, seabed(track, *_RANGE_M, 20000), range_m=range_m))
 
 
-def noisy_runs(coherence: float, count: int, seed: int = 1) -> list[Micronavigation]:
-    """Return results for some realisations of noise on `straight_lines`."""
-    lines, random = straight_lines(), np.random.default_rng(seed)
-    near_m, far_m = _RANGE_M
+def noisy_runs(count: int = 8, seed: int = 1) -> dict[float, list[Micronavigation]]:
+    """Return results for some realisations of noise on `straight_lines`, by coherence."""
+    random = np.random.default_rng(seed)
+    return {each: _noisy_runs(each, count, random) for each in COHERENCES}
+
+
+def _noisy_runs(coherence: float, count: int, random: np.random.Generator) -> list[Micronavigation]:
+    lines, (near_m, far_m) = straight_lines(), _RANGE_M
     return [
         micronavigate(
             with_noise(lines, coherence, random),
@@ -155,10 +159,9 @@ def against_bound(
     return deviation / least, float(found.mean()) / least, cover
 
 
-def bound_rows(runs: int = 8) -> Iterator[list[str]]:
+def bound_rows() -> Iterator[list[str]]:
     """Yield the errors of steps against the bound, by coherence."""
-    for coherence in COHERENCES:
-        found = noisy_runs(coherence, runs)
+    for coherence, found in noisy_runs().items():
         for name in ("sway", "yaw"):
             deviation, bias, cover = against_bound(found, name, coherence)
             yield [f"{coherence:g}", name, f"{deviation:.2f}", f"{bias:+.2f}", f"{cover:.3f}"]
@@ -195,17 +198,19 @@ class Voyage:
 def voyage(
     pings: int = 100,
     *,
-    receivers: int = RECEIVERS,
-    range_m: tuple[float, float] = (12.0, 30.0),
-    points: int = 20000,
-    sway_pings: float = 100.0,
-    yaw_pings: float = 50.0,
+    overlapping: int = 48,
+    range_m: tuple[float, float] = (12.0, 20.0),
+    points: int = 30000,
+    bright: float = 5.0,
+    sway_pings: float = 200.0,
+    yaw_pings: float = 100.0,
 ) -> Voyage:
     """Return a voyage over speckle and a bright point, with 0.2 m of sway and 1 degree of yaw.
 
-    `sway_pings` and `yaw_pings` are their periods.
+    `sway_pings` and `yaw_pings` are their periods, and `bright` is the point's amplitude over that
+    of single points of the speckle.
     """
-    sonar, advance_m = overlapping_array(receivers, OVERLAPPING)
+    sonar, advance_m = overlapping_array(RECEIVERS, overlapping)
     course = (0, 0, 0), (advance_m, 0, 0), pings, 1.0
     true = Track.straight(
         *course,
@@ -214,7 +219,7 @@ def voyage(
     )
     near_m, far_m = range_m
     target_m = float(true.positions_m[:, 0].mean()), near_m + 2, 0.0
-    scene = seabed(true, near_m, far_m, points), PointTargets([target_m], [30.0])
+    scene = seabed(true, near_m, far_m, points), PointTargets([target_m], [bright])
     lines = compress(simulate(sonar, true, scene, range_m=(near_m - 0.5, far_m + 0.5)))
     told = said_to_be_on(lines, sonar, Track.straight(*course))
     return Voyage(told, said_to_be_on(lines, sonar, true), range_m, target_m)
@@ -250,7 +255,7 @@ def residual_m(voyage: Voyage, found: RangeLines) -> float:
 def point_against_true(
     voyage: Voyage, found: RangeLines, device: Device | str | None = None
 ) -> tuple[float, float]:
-    """Return the peak of the bright point (dB) and its width along the track, over the true ones'."""
+    """Return the bright point's peak (dB) and width along the track, over those of the true track."""
     x, y, _ = voyage.target_m
     grid = Grid.plane(x=(x - 0.5, x + 0.5, 401), y=(y - 0.5, y + 0.5, 201))
     made = [

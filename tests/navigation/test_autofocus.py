@@ -86,12 +86,13 @@ def test_speckle_is_reported_not_focused():
     np.testing.assert_array_equal(found.lines.tx_m, told.tx_m)
 
 
-@pytest.mark.slow
-def test_sway_and_heave():
-    """A track above the scene sees responses at different angles, which tell both apart."""
+def seen_from_above(motion, unknowns):
+    """What autofocus finds of a track above the scene, and the peak beside that of the true track.
+
+    Responses are seen at different angles, which tell displacements apart.
+    """
     course = (0, 0, 12.0), (STEP_M, 0, 0), PINGS, 1.0
-    sway_m, heave_m = smooth_m(0.3 * WAVELENGTH_M, 2), smooth_m(0.3 * WAVELENGTH_M, 3)
-    track = clsas.Track.straight(*course, sway_m=sway_m, heave_m=heave_m)
+    track = clsas.Track.straight(*course, **motion)
     rng = np.random.default_rng(0)
     at = np.stack([rng.uniform(1.8, 6.2, 80), rng.uniform(8.2, 20.8, 80), np.zeros(80)], axis=1)
     scene = clsas.PointTargets(at, np.exp(2j * np.pi * rng.random(80)))
@@ -100,10 +101,49 @@ def test_sway_and_heave():
     geometry = clsas.channels(SONAR, clsas.Track.straight(*course))
     told = replace(true, tx_m=geometry.tx_m, rx_m=geometry.rx_m)
     grid = clsas.Grid.plane(x=(1.5, 6.5, 256), y=(8.0, 21.0, 700))
-    found = autofocus(told, grid, unknowns=("sway", "heave"))
-    for axis, wanted_m in ((1, sway_m), (2, heave_m)):
+    found = autofocus(told, grid, unknowns=unknowns)
+    peaks = [
+        20 * np.log10(np.abs(clsas.factorize(each, grid, -40.0).pixels).max())
+        for each in (told, found.lines, true)
+    ]
+    assert peaks[0] < peaks[2] - 1
+    return found, peaks[1] - peaks[2]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("wavelengths", "most"), [(0.3, 1 / 100), (2.0, 1 / 20)])
+def test_sway_and_heave(wavelengths, most):
+    """Both are found together, also where they are beyond the range resolution."""
+    motion = {
+        "sway_m": smooth_m(wavelengths * WAVELENGTH_M, 2),
+        "heave_m": smooth_m(wavelengths * WAVELENGTH_M, 3),
+    }
+    found, peak = seen_from_above(motion, ("sway", "heave"))
+    for axis, wanted_m in zip((1, 2), motion.values(), strict=True):
         residual_m = detrended(found.correction_m[:, axis] - wanted_m)
-        assert np.std(gaussian_filter1d(residual_m, 12)) <= WAVELENGTH_M / 30
+        assert np.std(gaussian_filter1d(residual_m, 12)) <= most * WAVELENGTH_M
+    assert abs(peak) <= 0.3
+
+
+@pytest.mark.slow
+def test_sway_and_heave_of_single_pings():
+    motion = {
+        "sway_m": white_m(0.05 * WAVELENGTH_M, 12),
+        "heave_m": white_m(0.05 * WAVELENGTH_M, 13),
+    }
+    found, peak = seen_from_above(motion, ("sway", "heave"))
+    assert abs(peak) <= 0.5
+    for axis, wanted_m in zip((1, 2), motion.values(), strict=True):
+        residual_m = detrended(found.correction_m[:, axis] - wanted_m)
+        assert np.std(residual_m) <= 0.6 * np.std(wanted_m)
+
+
+@pytest.mark.slow
+def test_surge():
+    """Displacements along the track move responses from one subaperture to the next."""
+    found, peak = seen_from_above({"surge_m": smooth_m(WAVELENGTH_M, 2)}, ("surge",))
+    assert found.sharpness_after > 1.9 * found.sharpness_before
+    assert abs(peak) <= 0.3
 
 
 @pytest.mark.slow

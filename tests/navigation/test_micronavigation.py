@@ -48,7 +48,7 @@ def straight():
 @pytest.fixture(scope="module")
 def noisy():
     """Results for many realisations of noise, by coherence."""
-    return {each: noisy_runs(each, 8) for each in COHERENCES}
+    return noisy_runs()
 
 
 @pytest.mark.slow
