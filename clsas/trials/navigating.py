@@ -198,9 +198,9 @@ class Voyage:
 def voyage(
     pings: int = 100,
     *,
-    overlapping: int = 48,
+    overlapping: int = OVERLAPPING,
     range_m: tuple[float, float] = (12.0, 20.0),
-    points: int = 30000,
+    points: int = 60000,
     bright: float = 5.0,
     sway_pings: float = 200.0,
     yaw_pings: float = 100.0,
@@ -255,7 +255,7 @@ def residual_m(voyage: Voyage, found: RangeLines) -> float:
 def point_against_true(
     voyage: Voyage, found: RangeLines, device: Device | str | None = None
 ) -> tuple[float, float]:
-    """Return the bright point's peak (dB) and width along the track, over those of the true track."""
+    """Return the bright point's peak (dB) and width along the track, over the true track's."""
     x, y, _ = voyage.target_m
     grid = Grid.plane(x=(x - 0.5, x + 0.5, 401), y=(y - 0.5, y + 0.5, 201))
     made = [
