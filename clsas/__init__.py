@@ -6,6 +6,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from clsas.core.contrast import contrast, entropy
     from clsas.core.grid import Grid
     from clsas.core.image import Image
     from clsas.core.image_error import relative_error_db
@@ -34,7 +35,7 @@ if TYPE_CHECKING:
     from clsas.products.assessment_result import Assessment, Effect
     from clsas.products.inspection import inspect
     from clsas.products.inspection_result import Inspection, PhaseSign
-    from clsas.products.quality import contrast, entropy, measure_point
+    from clsas.products.quality import measure_point
     from clsas.products.tradeoff import tradeoff
     from clsas.products.tradeoff_result import Tradeoff
     from clsas.signal.compression import compress
@@ -114,6 +115,7 @@ __all__ = [
 ]
 
 _MODULES = {
+    "core.contrast": "contrast entropy",
     "core.grid": "Grid",
     "core.image": "Image",
     "core.image_error": "relative_error_db",
@@ -141,7 +143,7 @@ _MODULES = {
     "products.assessment_result": "Assessment Effect",
     "products.inspection": "inspect",
     "products.inspection_result": "Inspection PhaseSign",
-    "products.quality": "contrast entropy measure_point",
+    "products.quality": "measure_point",
     "products.tradeoff": "tradeoff",
     "products.tradeoff_result": "Tradeoff",
     "signal.compression": "compress",

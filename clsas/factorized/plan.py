@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import hashlib
 import json
+import weakref
 from dataclasses import replace
 from typing import Annotated, Any
 
@@ -240,6 +241,17 @@ class Plan:
             return replace(self, image=replace(self.image, **fields))
         except ValidationError as error:
             raise ValueError(explained(error, fields)) from None
+
+    def moved(self, lines: RangeLines) -> Plan:
+        """Return this plan for lines whose channels lie a little beside those it was made for.
+
+        For navigation, which forms many images of the same samples. The predictions hold as far as
+        both tracks are equally smooth.
+        """
+        plan = replace(self, lines_digest=lines_digest(lines))
+        plan.kept["lines"] = weakref.ref(lines)  # their band is that of the plan
+        plan.kept["warned"] = self.kept.get("warned", False)
+        return plan
 
     def to_json(self, *, filters: bool = True) -> str:
         """Return this plan as text that `from_json` reads.

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsas.core import reprs, validate
+from clsas.core.contrast import contrast
 from clsas.core.grid import Grid
 from clsas.core.image import Image
 from clsas.core.lines import RangeLines, wavelength_m
@@ -34,6 +35,7 @@ from clsas.navigation.responses import (
 )
 from clsas.opencl.device import Device, open_device
 from clsas.planning.factorize import factorize
+from clsas.planning.planner import plan
 from clsas.signal.readout import Readout
 from clsas.sonar.beam import BeamWindow
 
@@ -41,18 +43,19 @@ UNKNOWNS = ("sway", "heave", "surge")
 
 IMAGE_TOLERANCE_DB = -30.0
 """Tolerance of the images in between: errors far below responses."""
-MOST_DISAGREEMENT = 1 / 32
-"""Wavelengths that halves of the responses may disagree about single pings, rms. Responses of
-speckle disagree by 0.06 and more, bright ones by 0.01."""
+MOST_DISAGREEMENT = 1 / 50
+"""Wavelengths of range that halves of the responses may disagree about single pings. Responses of
+speckle disagree by 0.03 and more, bright ones by 0.01."""
 
 _DRIFTS = 3  # times that drift is measured at most
-_NEIGHBOURHOODS_M = (1.2, 0.8, 0.5, 0.3)  # around responses, along the track
-_SWEEPS = 2  # times that single pings are moved
-_RESPONSES, _RESPONSES_FOR_DRIFT = 200, 60
+_NEIGHBOURHOODS = (2.0, 1.0)  # Fresnel lengths around responses, along the track
+_SWEEPS = 2  # times that single pings are moved at most
+_RESPONSES, _RESPONSES_FOR_DRIFT = 200, 40
 _OFFSETS = np.arange(-4.0, 5.0)  # samples in range, of which drift sees images
 _LEAST_RESPONSES = 8  # halves of which can agree
 _LEAST_GRADIENT = 0.05  # of range per displacement, rms
 _APART = 4.0  # range resolution cells between responses
+_DEVIATION_PER_MEDIAN = 1.4826  # of the magnitude of normal errors
 _GAIN = 1.02  # of sharpness, for which a step is repeated
 
 
@@ -117,8 +120,7 @@ def autofocus(
         Weights of the channels.
     unknowns : sequence of {"sway", "heave", "surge"}
         Displacements to solve for, across the track, up and along it. Responses must see the sonar
-        from different directions to tell several apart. Drift, and the sharpness of single pings,
-        are given to the first one.
+        from different directions to tell several apart.
     device : Device, str or int, optional
         See `clsas.opencl.device.choose`.
     progress : callable, optional
@@ -182,12 +184,15 @@ class _Focus:
         oversampling = self.readout.spectrum.oversampling
         self.cell_m = lines.range_step_m * min(max(oversampling, 1.0), 64.0)
         self.steps: list[tuple[str, float]] = []
+        # The track changes little between images, so that one plan does for all of them.
+        self.plan = plan(lines, grid, tolerance_db=IMAGE_TOLERANCE_DB, beam=beam, device=device)
         self.image = self._form(self.moved_m)
+        self.found: Contributions | None = None
         self.sharpness = self.before = sharpness(self.image)
 
     def check_geometry(self, names: tuple[str, ...]) -> None:
         """Refuse unknowns that the responses do not tell apart."""
-        found = self._contributions(_RESPONSES)
+        found = self._responses
         weights = np.abs(found.values[..., 0]) ** 2
         total = max(float(weights.sum()), 1e-300)
         for name, gradient in zip(names, found.gradient, strict=True):
@@ -211,7 +216,7 @@ class _Focus:
 
     def result(self) -> Autofocus:
         """Focus, and return what was found."""
-        responses = self._contributions(_RESPONSES).points if self.before else 0
+        responses = self._responses.points if self.before else 0
         if responses < _LEAST_RESPONSES:
             return self._unfocused(
                 f"the grid shows {responses} responses, at least {_LEAST_RESPONSES} are needed"
@@ -256,41 +261,50 @@ class _Focus:
         )
 
     def _disagreement_m(self) -> float:
-        """Return how far apart two halves of the responses want single pings, rms.
+        """Return how far apart in range two halves of the responses want single pings.
 
         Responses of a scene agree, as they all see the one track. Brightest pixels of speckle can
         be made brighter, but every one in its own way.
         """
-        found = self._contributions(_RESPONSES)
-        halves = [
+        found = self._responses
+        first, second = (
             sharpest_m(self.passage, found.of(some))[0]
             for some in (slice(0, None, 2), slice(1, None, 2))
-        ]
-        return float(np.std(halves[0] - halves[1])) / 2
+        )
+        apart = first - second - np.median(first - second, axis=1, keepdims=True)
+        gradient = found.gradient[:, self.passage.lines.ping_starts]
+        apart_m = np.einsum("up,upk->pk", apart, gradient)
+        # The median passes over single pings that one half puts half a wavelength of path off.
+        return float(np.median(np.abs(apart_m))) * _DEVIATION_PER_MEDIAN / 2
 
     def _stages(self) -> Iterator[tuple[str, Callable[[], NDArray[np.float64] | None]]]:
         """Yield what is tried, from coarse to fine."""
         for _ in range(_DRIFTS):
             yield "drift between subapertures", self._drift
-        for each_m in _NEIGHBOURHOODS_M:
-            yield f"phase gradient within {each_m:g} m", partial(self._gradient, each_m)
+        fresnel_m = self.passage.fresnel_length_m(self._responses)
+        for each_m in fresnel_m * np.array(_NEIGHBOURHOODS):
+            yield f"phase gradient within {each_m:.2g} m", partial(self._gradient, each_m)
         for _ in range(_SWEEPS):
             yield "sharpness of single pings", self._pings
 
     def _drift(self) -> NDArray[np.float64] | None:
         offsets_m = self.given.range_step_m * _OFFSETS
         found = self._contributions(_RESPONSES_FOR_DRIFT, offsets_m)
-        drift = drift_m(self.passage, found)
-        if drift is None:
-            return None
-        return np.concatenate([drift[None], np.zeros_like(self.moved_m[1:])])
+        return drift_m(self.passage, found)
 
     def _gradient(self, neighbourhood_m: float) -> NDArray[np.float64]:
-        return phase_gradient_m(self.passage, self._contributions(_RESPONSES), neighbourhood_m)
+        return phase_gradient_m(self.passage, self._responses, neighbourhood_m)
 
     def _pings(self) -> NDArray[np.float64]:
-        found_m, self.deviation_m = sharpest_m(self.passage, self._contributions(_RESPONSES))
-        return np.concatenate([found_m[None], np.zeros_like(self.moved_m[1:])])
+        found_m, self.deviation_m = sharpest_m(self.passage, self._responses)
+        return found_m
+
+    @property
+    def _responses(self) -> Contributions:
+        """Contributions to the brightest responses of the present image."""
+        if self.found is None:
+            self.found = self._contributions(_RESPONSES)
+        return self.found
 
     def _contributions(
         self, count: int, offsets_m: NDArray[np.float64] | None = None
@@ -313,11 +327,12 @@ class _Focus:
         before = self.sharpness
         if reached > before:
             self.moved_m, self.image, self.sharpness = moved_m, image, reached
+            self.found = None
         return reached > _GAIN * before
 
     def _form(self, moved_m: NDArray[np.float64]) -> Image:
         lines = self._lines(moved_m)
-        return factorize(lines, self.grid, IMAGE_TOLERANCE_DB, beam=self.beam, device=self.device)
+        return factorize(lines, self.grid, self.plan.moved(lines), device=self.device)
 
     def _lines(self, moved_m: NDArray[np.float64]) -> RangeLines:
         vectors_m = self.passage.vectors_m(moved_m)
@@ -327,9 +342,7 @@ class _Focus:
 
 def sharpness(image: Image) -> float:
     """Return the mean squared intensity of an image over its squared mean intensity."""
-    intensity = np.abs(image.pixels.astype(np.complex128)) ** 2
-    mean = float(intensity.mean())
-    return float((intensity**2).mean()) / mean**2 if mean else 0.0
+    return 1 + contrast(image) ** 2 if image.pixels.any() else 0.0
 
 
 def _detrended(moved_m: NDArray[np.float64], along_m: NDArray[np.float64]) -> NDArray[np.float64]:

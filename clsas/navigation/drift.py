@@ -4,12 +4,13 @@ A subaperture in which the track is off by a slope shows every response displace
 by range times slope. Neighbouring subapertures see the same responses, so that the displacement
 between their images gives the change of slope, even where the track is off by more than the range
 resolution. This is the map drift autofocus of radar (Carrara, Goodman and Majewski 1995, chapter
-6), on small images around responses, so that it works on any grid and track.
+6), on small images around responses, so that it works on any grid and track. Responses that see
+the sonar from different directions are displaced differently, which tells several unknowns apart.
 """
 
 from __future__ import annotations
 
-import math
+from collections.abc import Sequence
 
 import numpy as np
 import scipy.fft
@@ -19,32 +20,30 @@ from clsas.core.lines import wavelength_m
 from clsas.navigation.responses import Contributions, Passage
 
 _LENGTH = 1.5
-"""Length of a subaperture in lengths of sqrt(wavelength range/2). A longer one makes a finer image,
-but errors bend more within it. With half or twice the length, errors of 2 wavelengths rms are not
-found."""
+"""Length of a subaperture in Fresnel lengths. A longer one makes a finer image, but errors bend
+more within it. With half or twice the length, errors of 2 wavelengths rms are not found."""
 _LEAST_PINGS = 4  # of a subaperture
 _CELLS = 12  # azimuth cells to either side of a response
-_PER_CELL = 4
+_PER_CELL = 2
 _LAGS = (1, 2, 3)  # subapertures apart that are compared; each starts half a length after the last
 
 
 def drift_m(passage: Passage, found: Contributions) -> NDArray[np.float64] | None:
-    """Return the displacement of every ping that lines its subaperture up with the others.
+    """Return displacements of the pings that line subapertures up with each other.
 
     Parameters
     ----------
     found : Contributions
-        With one unknown at least, the first of which is solved for, and offsets in range.
+        With offsets in range.
 
     Returns
     -------
-    float64 [pings] or None
+    float64 [unknowns, pings] or None
         None where the track is too short for three subapertures. Those in gaps of the track are
         left out.
     """
-    wave_m = wavelength_m(passage.lines)
     along_m = passage.along_m
-    length_m = _LENGTH * math.sqrt(wave_m * float(np.median(found.range_m)) / 2)
+    length_m = _LENGTH * passage.fresnel_length_m(found)
     length_m = max(length_m, _LEAST_PINGS * float(np.median(np.diff(along_m))))
     starts_m = np.arange(along_m[0], along_m[-1] - length_m, length_m / 2)
     channel_m = _along_channels_m(passage)
@@ -56,62 +55,144 @@ def drift_m(passage: Passage, found: Contributions) -> NDArray[np.float64] | Non
     if len(number) < 3:
         return None
     frequency = np.arange(-_CELLS * _PER_CELL, _CELLS * _PER_CELL + 1) / (_PER_CELL * length_m)
-    images, per_slope = [], []
+    groups = _groups(found)
+    images, views = [], []
     for each in number:
         some = channels[each]
         at_m = channel_m[some] - starts_m[each]
         taper = np.sin(np.pi * at_m / length_m) ** 2
-        turn = taper * np.exp(-2j * np.pi * frequency[:, None] * at_m)
+        turn = (taper * np.exp(-2j * np.pi * frequency[:, None] * at_m)).astype(np.complex64)
         values = found.values[some]
-        image = np.tensordot(turn.astype(np.complex64), values.astype(np.complex64), 1)
-        images.append(np.abs(image) ** 2)
-        per_slope.append(-2 / wave_m * float(found.gradient[0, some].mean()))
-    slopes = _slopes(images, number, frequency, per_slope)
-    return _integrated(passage, starts_m[number] + length_m / 2, slopes)
+        # Products of small matrices keep to one thread: waiting for others takes longer.
+        image = turn @ values.transpose(1, 0, 2)
+        images.append(image.real**2 + image.imag**2)
+        power = taper[:, None] * np.sum(values.real**2 + values.imag**2, axis=2)
+        views.append([_view(found.gradient[:, some], power, at_m, group) for group in groups])
+    pairs = [
+        (first, second)
+        for second in range(len(number))
+        for first in range(max(second - max(_LAGS), 0), second)
+        if number[second] - number[first] in _LAGS
+    ]
+    if not pairs:
+        return None
+    # The phase of an echo turns by -4 pi/wavelength per metre of range.
+    step = -wavelength_m(passage.lines) / 2 * (frequency[1] - frequency[0])
+    changes = step * _shifts(images, pairs, groups)
+    middles_m = starts_m[number] + length_m / 2
+    slopes = _slopes(changes, np.array(pairs), number, np.array(views), middles_m)
+    return np.stack([_integrated(along_m, middles_m, each) for each in slopes])
 
 
-def _slopes(
-    images: list[NDArray[np.float32]],
-    number: NDArray[np.int64],
-    frequency: NDArray[np.float64],
-    per_slope: list[float],
-) -> NDArray[np.float64]:
-    """Return the slope of the track's error in every subaperture, the least-squares solution.
+def _groups(found: Contributions) -> list[NDArray[np.int64]]:
+    """Return numbers of responses in groups that see the sonar from like directions.
 
-    Images are [frequencies, points, offsets], of subapertures of some numbers along the track;
-    `per_slope` is the frequency of a slope of 1.
+    A single unknown displaces all of them alike. With several, more groups than unknowns tell
+    these apart.
     """
-    count, step = len(images), frequency[1] - frequency[0]
-    size = [scipy.fft.next_fast_len(2 * images[0].shape[axis]) for axis in (0, 2)]
-    spectra = [scipy.fft.fftn(each, s=size, axes=(0, 2)) for each in images]
-    rows, right = [], []
-    for first in range(count):
-        for second in range(first + 1, min(first + max(_LAGS) + 1, count)):
-            lag = int(number[second] - number[first])
-            if lag not in _LAGS:
-                continue
-            both = np.sum(spectra[first].conj() * spectra[second], axis=1)
-            power = scipy.fft.ifftn(both).real
+    unknowns = len(found.gradient)
+    power = np.abs(found.values[..., 0]) ** 2
+    total = np.maximum(power.sum(axis=0), 1e-300)
+    direction = np.einsum("ucp,cp->up", found.gradient, power) / total
+    direction -= direction.mean(axis=1, keepdims=True)
+    along = np.linalg.svd(direction, full_matrices=False)[2][0]
+    return np.array_split(np.argsort(along, kind="stable"), 1 if unknowns == 1 else unknowns + 1)
+
+
+def _view(
+    gradient: NDArray[np.float64],
+    power: NDArray[np.float64],
+    at_m: NDArray[np.float64],
+    group: NDArray[np.int64],
+) -> NDArray[np.float64]:
+    """Return the range per displacement, and its change per metre along the track, [2, unknowns].
+
+    Both are means over a group of responses, weighted by what a subaperture receives of them.
+    """
+    weights = power[:, group]
+    total = max(float(weights.sum()), 1e-300)
+    mean = np.einsum("ucp,cp->u", gradient[:, :, group], weights) / total
+    away_m = at_m - float(weights.sum(axis=1) @ at_m) / total
+    spread = max(float(weights.sum(axis=1) @ away_m**2), 1e-300)
+    change = np.einsum("ucp,cp,c->u", gradient[:, :, group], weights, away_m) / spread
+    return np.stack([mean, change])
+
+
+def _shifts(
+    images: Sequence[NDArray[np.float32]],
+    pairs: Sequence[tuple[int, int]],
+    groups: Sequence[NDArray[np.int64]],
+) -> NDArray[np.float64]:
+    """Return the shift in frequency between pairs of images, in steps, [pairs, groups].
+
+    Images are [points, frequencies, offsets]. A shift maximises the sum over a group's responses
+    of their correlations.
+    """
+    size = [scipy.fft.next_fast_len(2 * images[0].shape[axis]) for axis in (1, 2)]
+    spectra: dict[int, NDArray[np.complex64]] = {}
+    shifts = np.zeros((len(pairs), len(groups)))
+    for number, (first, second) in enumerate(pairs):
+        for each in (first, second):
+            if each not in spectra:
+                spectra[each] = scipy.fft.rfftn(images[each], s=size, axes=(1, 2))
+                spectra.pop(each - max(_LAGS) - 1, None)
+        both = spectra[first].conj() * spectra[second]
+        for of, group in enumerate(groups):
+            power = scipy.fft.irfftn(both[group].sum(axis=0), s=size)
             row, column = np.unravel_index(int(np.argmax(power)), power.shape)
             before, at, after = (power[(row + n) % size[0], column] for n in (-1, 0, 1))
             bend = before - 2 * at + after
-            shift = (row + size[0] // 2) % size[0] - size[0] // 2
-            shift += 0.5 * (before - after) / bend if bend < 0 else 0.0
-            each = np.zeros(count)
-            each[second], each[first] = 1 / lag, -1 / lag
-            rows.append(each)
-            mean = (per_slope[first] + per_slope[second]) / 2
-            right.append(shift * step / mean / lag)
-    if not rows:
-        return np.zeros(count)
-    return np.linalg.lstsq(np.array(rows), np.array(right), rcond=None)[0]
+            shifts[number, of] = (row + size[0] // 2) % size[0] - size[0] // 2
+            shifts[number, of] += 0.5 * (before - after) / bend if bend < 0 else 0.0
+    return shifts
+
+
+def _slopes(
+    changes: NDArray[np.float64],
+    pairs: NDArray[np.int64],
+    number: NDArray[np.int64],
+    views: NDArray[np.float64],
+    middles_m: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """Return the slope of every unknown in every subaperture, the least-squares solution.
+
+    A displacement e changes the range by g e, and its slope by g e' + g' e, where e is the integral
+    of the slopes before.
+
+    Parameters
+    ----------
+    changes : float64 [pairs, groups]
+        Change of the range error's slope from the first subaperture of a pair to the second one.
+    pairs : int64 [pairs, 2]
+    number : int64 [subapertures]
+        Numbers along the track.
+    views : float64 [subapertures, groups, 2, unknowns]
+        See `_view`.
+    middles_m : float64 [subapertures]
+    """
+    count, _, _, unknowns = views.shape
+    integral = np.zeros((count, count))
+    for each, step_m in enumerate(np.diff(middles_m)):
+        integral[each + 1] = integral[each]
+        integral[each + 1, each : each + 2] += step_m / 2
+    # [subapertures, groups, unknowns, slopes]
+    of_slopes = views[:, :, 0, :, None] * np.eye(count)[:, None, None]
+    of_slopes = of_slopes + views[:, :, 1, :, None] * integral[:, None, None]
+    first, second = pairs.T
+    weights = 1 / (number[second] - number[first])  # the farther apart, the less they look alike
+    design = (of_slopes[second] - of_slopes[first]) * weights[:, None, None, None]
+    right = changes * weights[:, None]
+    # A common slope is a linear trend of the track, which is not observable.
+    level = np.kron(np.eye(unknowns), np.full(count, 1 / count))
+    design = np.concatenate([design.reshape(-1, unknowns * count), level])
+    right = np.concatenate([right.ravel(), np.zeros(unknowns)])
+    return np.linalg.lstsq(design, right, rcond=None)[0].reshape(unknowns, count)
 
 
 def _integrated(
-    passage: Passage, middles_m: NDArray[np.float64], slopes: NDArray[np.float64]
+    along_m: NDArray[np.float64], middles_m: NDArray[np.float64], slopes: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Return what undoes slopes at some places along the track, at every ping."""
-    along_m = passage.along_m
     slope = np.interp(along_m, middles_m, slopes)
     steps_m = np.diff(along_m) * (slope[1:] + slope[:-1]) / 2
     return np.concatenate([[0.0], np.cumsum(steps_m)])

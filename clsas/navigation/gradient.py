@@ -13,9 +13,11 @@ from scipy.ndimage import gaussian_filter1d
 from clsas.core.lines import wavelength_m
 from clsas.navigation.responses import Contributions, Passage
 
-_PASSES = 6  # of alternating least squares: steps of the track, and the responses' own slopes
-_TRIED = 33  # displacements of a ping within half a wavelength of path that are tried
+_PASSES = 3  # of alternating least squares: steps of the track, and the responses' own slopes
+_TRIED = 9  # displacements within half a wavelength: 4 per cycle of the sharpness
+_NEWTON = 3  # steps from the best of them
 _SWEEPS = 2  # over all pings
+_BLOCKS = 16  # of pings that are moved together: few enough to leave the sum over the others
 
 
 def phase_gradient_m(
@@ -26,20 +28,17 @@ def phase_gradient_m(
     Contributions are smoothed along the track so that they hold echoes within about
     `neighbourhood_m` of a response.
     """
-    wave_m = wavelength_m(passage.lines)
     values = passage.by_ping(found.values[..., 0])
-    counts = np.bincount(passage.ping)[:, None]
-    gradient = np.stack([passage.by_ping(each) / counts for each in found.gradient])
+    turns = _turns(passage, found)
     spacing_m = float(np.median(np.diff(passage.along_m)))
-    smoothed_m = wave_m * float(np.median(found.range_m)) / (2 * neighbourhood_m)
+    smoothed_m = passage.fresnel_length_m(found) ** 2 / neighbourhood_m
     width = min(smoothed_m / max(spacing_m, 1e-12) / 2, passage.pings)
-    smooth = gaussian_filter1d(values.real, width, axis=0, mode="constant") + 1j * (
-        gaussian_filter1d(values.imag, width, axis=0, mode="constant")
-    )
+    smooth = gaussian_filter1d(values, width, axis=0, mode="constant")
     product = smooth[1:] * smooth[:-1].conj()
     weights = np.abs(product)
-    turns = 4 * np.pi / wave_m * (gradient[:, 1:] + gradient[:, :-1]) / 2
-    slope = np.angle(product.sum(axis=0))
+    product = (product / np.maximum(weights, 1e-300)).astype(np.complex64)
+    turns = (turns[:, 1:] + turns[:, :-1]) / 2
+    slope = np.angle(np.sum(weights * product, axis=0))
     steps_m = np.zeros((len(turns), len(product)))
     normal = np.einsum("sp,usp,vsp->suv", weights, turns, turns)
     # Keeps the matrix regular where unknowns are much alike, or where nothing is received at all.
@@ -56,49 +55,96 @@ def phase_gradient_m(
     return np.concatenate([np.zeros((len(turns), 1)), np.cumsum(steps_m, axis=1)], axis=1)
 
 
-def _phase(product: NDArray[np.complex128], expected: NDArray[np.float64]) -> NDArray[np.float64]:
-    return np.angle(product * np.exp(-1j * expected))
+def _phase(product: NDArray[np.complex64], expected: NDArray[np.float64]) -> NDArray[np.float32]:
+    return np.angle(product * np.exp(-1j * expected.astype(np.float32)))
+
+
+def _turns(passage: Passage, found: Contributions) -> NDArray[np.float64]:
+    """Return the phase per displacement of a ping, rad/m, [unknowns, pings, points]."""
+    counts = np.bincount(passage.ping)[:, None]
+    gradient = np.stack([passage.by_ping(each) / counts for each in found.gradient])
+    return 4 * np.pi / wavelength_m(passage.lines) * gradient
 
 
 def sharpest_m(
     passage: Passage, found: Contributions
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return displacements of the first unknown, ping by ping, that make responses sharpest.
+    """Return displacements of single pings that make responses sharpest.
 
     Sharpness is the sum of squared intensities of the responses. With all other pings held, it
-    depends on one displacement only, as in closed-form backprojection autofocus (Ash 2012), where
-    it depends on one phase.
+    depends on the displacement of one ping only, as in closed-form backprojection autofocus (Ash
+    2012), where it depends on one phase. With several unknowns a ping is moved along one direction
+    after another, chosen so that responses see it move independently along each.
 
     Returns
     -------
-    moved_m, deviation_m : float64 [pings]
-        And the standard deviation of each, from the scatter of its contributions around those of
-        the other pings.
+    moved_m : float64 [unknowns, pings]
+    deviation_m : float64 [pings]
+        Standard deviation of the displacement's length, from the scatter of a ping's contributions
+        around those of the others.
     """
-    wave_m = wavelength_m(passage.lines)
     values = passage.by_ping(found.values[..., 0])
-    counts = np.bincount(passage.ping)[:, None]
-    turns = 4 * np.pi / wave_m * passage.by_ping(found.gradient[0]) / counts
-    tried_m = wave_m * np.linspace(-0.25, 0.25, _TRIED)
-    step_m = tried_m[1] - tried_m[0]
-    moved_m, total = np.zeros(passage.pings), values.sum(axis=0)
+    turns = _turns(passage, found)
+    directions = _directions(turns, np.abs(values) ** 2)
+    turns = np.einsum("pau,upk->apk", directions, turns).astype(np.float32)
+    furthest_m = wavelength_m(passage.lines) / 4
+    unknowns, pings, _ = turns.shape
+    moved_m = np.zeros((unknowns, pings), np.float32)
+    turned, total = values.copy(), values.sum(axis=0)
     for sweep in range(_SWEEPS):
-        for ping in np.random.default_rng(sweep).permutation(passage.pings):
-            mine, turn = values[ping], turns[ping]
-            others = total - mine * np.exp(1j * turn * moved_m[ping])
-            cross = others.conj() * mine
-            level = np.abs(others) ** 2 + np.abs(mine) ** 2
-            angle = turn * tried_m[:, None]
-            intensity = level + 2 * (cross.real * np.cos(angle) - cross.imag * np.sin(angle))
-            sharpness = np.sum(intensity**2, axis=1)
-            best = int(np.clip(np.argmax(sharpness), 1, _TRIED - 2))
-            before, at, after = sharpness[best - 1 : best + 2]
-            bend = before - 2 * at + after
-            shift = np.clip(0.5 * (before - after) / bend, -1, 1) if bend < 0 else 0.0
-            moved_m[ping] = tried_m[best] + shift * step_m
-            total = others + mine * np.exp(1j * turn * moved_m[ping])
-    turned = values * np.exp(1j * turns * moved_m[:, None])
-    mean = total / np.maximum(passage.pings, 1)
+        order = np.random.default_rng(sweep).permutation(pings)
+        for some in np.array_split(order, min(_BLOCKS, pings)):
+            for axis, turn in enumerate(turns[:, some]):
+                others = total - turned[some]
+                mine = turned[some] * np.exp(-1j * turn * moved_m[axis, some, None])
+                level = np.abs(others) ** 2 + np.abs(mine) ** 2
+                best_m = _sharpest(level, others.conj() * mine, turn, furthest_m)
+                mine *= np.exp(1j * turn * best_m[:, None])
+                total = total + np.sum(mine - turned[some], axis=0)
+                moved_m[axis, some], turned[some] = best_m, mine
+    mean = total / pings
     noise = np.mean(np.abs(turned - mean) ** 2, axis=1)
-    information = 2 * np.sum(turns**2 * np.abs(mean) ** 2, axis=1)
-    return moved_m, np.sqrt(noise / np.maximum(information, 1e-300))
+    information = 2 * np.einsum("apk,k->ap", turns**2, np.abs(mean) ** 2)
+    variance = np.sum(noise / np.maximum(information, 1e-300), axis=0)
+    return np.einsum("pau,ap->up", directions, moved_m), np.sqrt(variance)
+
+
+def _directions(turns: NDArray[np.float64], weights: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return unit vectors of independent displacements, [pings, directions, unknowns].
+
+    Responses see most of the first one.
+    """
+    normal = np.einsum("upk,vpk,pk->puv", turns, turns, weights)
+    return np.linalg.eigh(normal)[1].swapaxes(1, 2)[:, ::-1]
+
+
+def _sharpest(
+    level: NDArray[np.float32],
+    cross: NDArray[np.complex64],
+    turn: NDArray[np.float32],
+    furthest_m: float,
+) -> NDArray[np.float32]:
+    """Return the displacements of some pings that maximise the sharpness, [pings].
+
+    The intensity of a response is level + 2 Re(cross exp(j turn displacement)); `level`, `cross`
+    and `turn` are [pings, points].
+    """
+    step_m = 2 * furthest_m / (_TRIED - 1)
+    rotation = np.exp(1j * turn * step_m)
+    tried = cross * np.exp(-1j * turn * furthest_m)
+    sharpness = np.empty((_TRIED, len(cross)), np.float32)
+    for number in range(_TRIED):
+        sharpness[number] = np.sum((level + 2 * tried.real) ** 2, axis=1)
+        tried = tried * rotation
+    first_m = np.float32(step_m) * np.argmax(sharpness, axis=0).astype(np.float32) - furthest_m
+    moved_m = first_m.copy()
+    for _ in range(_NEWTON):
+        at = cross * np.exp(1j * turn * moved_m[:, None])
+        intensity = level + 2 * at.real
+        slope = -2 * turn * at.imag
+        bend = np.sum(slope**2 - 2 * intensity * turn**2 * at.real, axis=1)
+        gain = np.sum(intensity * slope, axis=1)
+        # Only where the sharpness is curved downwards does Newton's step lead up.
+        moved_m += np.where(bend < 0, -gain / np.where(bend < 0, bend, 1.0), 0.0)
+        moved_m = np.clip(moved_m, first_m - step_m, first_m + step_m)
+    return moved_m

@@ -8,8 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter
+from scipy.spatial.distance import cdist
 
 from clsas.core.geometry import pairwise_range_m
+from clsas.core.grid import Grid
 from clsas.core.image import Image
 from clsas.core.lines import RangeLines, wavelength_m
 from clsas.signal.readout import Readout
@@ -63,6 +65,10 @@ class Passage:
         """Number of pings."""
         return len(self.along_m)
 
+    def fresnel_length_m(self, found: Contributions) -> float:
+        """Return sqrt(wavelength range/2): a straight piece of track sees no curvature over it."""
+        return math.sqrt(wavelength_m(self.lines) * float(np.median(found.range_m)) / 2)
+
     def by_ping(self, values: NDArray) -> NDArray:
         """Return sums over the channels of every ping, [pings, ...], of values [channels, ...]."""
         return np.add.reduceat(values, self.lines.ping_starts, axis=0)
@@ -81,17 +87,21 @@ def brightest(image: Image, count: int, apart_m: float) -> NDArray[np.float64]:
     Each is the largest within `apart_m` along rows and columns.
     """
     amplitude = np.abs(image.pixels)
-    positions_m = image.grid.positions_m()
     size = []
-    for axis in range(2):
-        steps = np.diff(positions_m, axis=axis)
-        step_m = float(np.median(np.linalg.norm(steps, axis=-1))) if steps.size else 0.0
-        most = amplitude.shape[axis]
+    for step_m, most in zip(_steps_m(image.grid), amplitude.shape, strict=True):
         size.append(2 * math.ceil(min(apart_m / step_m, most)) + 1 if step_m > 0 else 1)
     largest = amplitude == maximum_filter(amplitude, size=tuple(size), mode="constant")
     found = np.flatnonzero((largest & (amplitude > 0)).ravel())
     found = found[np.argsort(-amplitude.ravel()[found], kind="stable")[:count]]
-    return positions_m.reshape(-1, 3)[found]
+    return image.grid.at(found)
+
+
+def _steps_m(grid: Grid) -> list[float]:
+    """Return the distances of neighbouring pixels along rows' and columns' numbers."""
+    if grid.points_m is None:
+        return [float(np.linalg.norm(each)) for each in grid.vectors_m[1:]]
+    steps = [np.diff(grid.points_m, axis=axis) for axis in range(grid.points_m.ndim - 1)]
+    return [float(np.median(np.linalg.norm(s, axis=-1))) if s.size else 0.0 for s in steps]
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,14 +110,14 @@ class Contributions:
 
     Attributes
     ----------
-    values : complex128 [channels, points, offsets]
+    values : complex64 [channels, points, offsets]
         In phase with the point displaced by every offset in range.
     gradient : float64 [unknowns, channels, points]
         Change in range per metre of displacement.
     range_m : float64 [channels, points]
     """
 
-    values: NDArray[np.complex128]
+    values: NDArray[np.complex64]
     gradient: NDArray[np.float64]
     range_m: NDArray[np.float64]
 
@@ -137,31 +147,42 @@ def contributions(
     """
     offsets_m = np.zeros(1) if offsets_m is None else offsets_m
     shape = lines.channels, len(points_m)
-    values = np.empty((*shape, len(offsets_m)), np.complex128)
+    values = np.empty((*shape, len(offsets_m)), np.complex64)
     gradient, range_m = np.empty((len(passage.axes), *shape)), np.empty(shape)
     along = None if beam is None else beam.directions(lines)
     step = max(_READ_AT_ONCE // max(len(points_m) * len(offsets_m), lines.length), 1)
     for first in range(0, lines.channels, step):
         some = np.arange(first, min(first + step, lines.channels))
-        legs_m = [points_m - each[some, None] for each in (lines.tx_m, lines.rx_m)]
-        lengths_m = [np.linalg.norm(each, axis=-1) for each in legs_m]
-        outward, back = (
-            leg / np.maximum(length_m, 1e-9)[..., None]
-            for leg, length_m in zip(legs_m, lengths_m, strict=True)
-        )
-        rays = (outward + back) / 2
-        axes = passage.axes[:, passage.ping[some]]
-        gradient[:, some] = -np.einsum("ucj,cpj->ucp", axes, rays)
         part = lines.select(slice(int(some[0]), int(some[-1]) + 1))
+        gradient[:, some] = _gradient(points_m, part, passage.axes[:, passage.ping[some]])
         path_m = pairwise_range_m(
             points_m, part.tx_m, part.rx_m, part.rx_velocity_m_s, part.sound_speed_m_s
         ).T
         range_m[some] = path_m
         at_m = (path_m[..., None] + offsets_m).reshape(len(some), -1)
         turns = lines.carrier_cycles_per_m * at_m
-        read = readout.read(some, at_m) * np.exp(2j * np.pi * (turns - np.rint(turns)))
+        phase = (2 * np.pi * (turns - np.rint(turns))).astype(np.float32)
+        read = readout.read(some, at_m) * np.exp(1j * phase)
         values[some] = read.reshape(len(some), len(points_m), -1)
         if beam is not None and along is not None:
             sine = sines(points_m, part.phase_centres_m, along[some])
             values[some] *= beam.weights(sine, wavelength_m(lines))[..., None]
     return Contributions(values, gradient, range_m)
+
+
+def _gradient(
+    points_m: NDArray[np.float64], lines: RangeLines, axes: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return the change in range to points per metre along axes, [unknowns, channels, points].
+
+    `axes` are [unknowns, channels, 3].
+    """
+    monostatic = np.array_equal(lines.tx_m, lines.rx_m)
+    ends_m = (lines.tx_m,) if monostatic else (lines.tx_m, lines.rx_m)
+    total = np.zeros((*axes.shape[:2], len(points_m)))
+    for end_m in ends_m:
+        # Relative to one place, so that large coordinates do not cancel.
+        along_m = axes @ (points_m - end_m[0]).T
+        along_m -= np.sum(axes * (end_m - end_m[0]), axis=-1)[..., None]
+        total -= along_m / np.maximum(cdist(end_m, points_m), 1e-9)
+    return total / len(ends_m)

@@ -1,4 +1,4 @@
-"""Image quality: point responses, image-to-image error, entropy and contrast."""
+"""Image quality: point responses."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ from numpy.typing import ArrayLike, NDArray
 from clsas.core import reprs, validate
 from clsas.core.grid import Axis, Grid
 from clsas.core.image import Image
-from clsas.core.image_error import complex_values
 from clsas.products.cuts import Cut, measure_cut
 
 _SEARCH = 10  # pixels around the given position within which the peak is searched
@@ -142,42 +141,6 @@ def measure_point(
             "by extent_m"
         )
     return response
-
-
-def entropy(image: Image | ArrayLike) -> float:
-    """Return the entropy of the intensity, nats: least when an image is best focused.
-
-    -sum p ln p with p = |I|^2 / sum |I|^2: 0 for one bright pixel, ln(size) for a flat image.
-
-    Raises
-    ------
-    ValueError
-        If the image is zero everywhere, or a value is not finite.
-    """
-    share = _intensity(image)
-    share = share[share > 0] / share.sum()
-    return float(-(share * np.log(share)).sum())
-
-
-def contrast(image: Image | ArrayLike) -> float:
-    """Return the contrast of the intensity |I|^2, its standard deviation over its mean.
-
-    0 for a flat image, 1 for fully developed speckle, and the more the sharper.
-
-    Raises
-    ------
-    ValueError
-        If the image is zero everywhere, or a value is not finite.
-    """
-    intensity = _intensity(image)
-    return float(intensity.std() / intensity.mean())
-
-
-def _intensity(image: Image | ArrayLike) -> NDArray[np.float64]:
-    amplitude = np.abs(complex_values("image", image))
-    if not amplitude.any():
-        raise ValueError("image must not be zero everywhere")
-    return (amplitude / amplitude.max()) ** 2
 
 
 def _find_peak(

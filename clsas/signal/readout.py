@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TypeVar
+from functools import cached_property
+from typing import TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +17,10 @@ _Complex = TypeVar("_Complex", np.complex64, np.complex128)
 
 ACCURACY_DB = -70.0
 """Default relative rms error of what is read."""
+_MOST_KEPT = (
+    1 << 29
+)  # bytes of upsampled lines, which are read many times; larger ones are made anew
+_UPSAMPLED_AT_ONCE = 256  # lines: bounds the memory of their FFTs
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,9 +65,23 @@ class Readout:
         """
         lines = self.lines
         index = (range_m - lines.first_range_m[channels, None]) / lines.range_step_m
-        values = interpolated(lines.samples[channels], index, self.interpolator, self.resampling)
+        kept = self._upsampled
+        some = self.resampling.apply(lines.samples[channels]) if kept is None else kept[channels]
+        values = between(some, index, self.interpolator, self.resampling)
         values[(index < 0) | (index > lines.length - 1)] = 0
         return values
+
+    @cached_property
+    def _upsampled(self) -> NDArray[np.complex64] | None:
+        """All lines upsampled, None if they are too large to be kept."""
+        lines = self.lines
+        if 8 * lines.channels * self.resampling.length > _MOST_KEPT:
+            return None
+        kept = np.empty((lines.channels, self.resampling.length), np.complex64)
+        for first in range(0, lines.channels, _UPSAMPLED_AT_ONCE):
+            some = slice(first, first + _UPSAMPLED_AT_ONCE)
+            kept[some] = self.resampling.apply(lines.samples[some])
+        return kept
 
 
 def interpolated(
@@ -80,17 +99,35 @@ def interpolated(
         Places in samples; beyond the ends lines fade out as their interpolation does.
     interpolator, resampling : Interpolator, Resampling
     """
-    upsampled = resampling.apply(samples)
+    upsampled = cast("NDArray[_Complex]", resampling.apply(samples))
+    return between(upsampled, index, interpolator, resampling)
+
+
+def between(
+    upsampled: NDArray[_Complex],
+    index: NDArray[np.float64],
+    interpolator: Interpolator,
+    resampling: Resampling,
+) -> NDArray[_Complex]:
+    """Return lines between their samples, as `interpolated`, from lines already upsampled."""
     index = index + resampling.lead
     position = index * resampling.ratio - resampling.first
     lower = np.floor(position)
-    weights = interpolator.weights(position - lower - 0.5).astype(samples.real.dtype)
+    weights = interpolator.weights(position - lower - 0.5).astype(upsampled.real.dtype)
     first = lower.astype(np.int64) + 1 - interpolator.taps // 2
-    total = np.zeros(index.shape, samples.dtype)
+    total = np.zeros(index.shape, upsampled.dtype)
+    last = resampling.length - 1
+    ends = first.min(initial=0) < 0 or first.max(initial=0) + interpolator.taps - 1 > last
+    lines = resampling.length * np.arange(len(upsampled))[:, None]
+    flat = np.ascontiguousarray(upsampled).reshape(-1)
     for tap in range(interpolator.taps):
-        inside = (first + tap >= 0) & (first + tap < resampling.length)
-        taken = np.take_along_axis(upsampled, np.where(inside, first + tap, 0), axis=1)
-        total += inside * weights[..., tap] * taken
-    turns = resampling.centre_cycles_per_sample * index
-    total *= np.exp(2j * np.pi * (turns - np.rint(turns)))
+        at = first + tap
+        weight = weights[..., tap]
+        if ends:
+            weight = weight * ((at >= 0) & (at <= last))
+            at = np.clip(at, 0, last)
+        total += weight * flat[lines + at]
+    if resampling.shift:
+        turns = resampling.centre_cycles_per_sample * index
+        total *= np.exp(2j * np.pi * (turns - np.rint(turns)))
     return total

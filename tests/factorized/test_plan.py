@@ -19,10 +19,12 @@ from factorizing import (
 
 from clsas.core.digests import grid_digest, lines_digest
 from clsas.core.grid import Grid
+from clsas.core.image_error import relative_error_db
 from clsas.exact.backprojection import backproject
 from clsas.factorized.plan import VERSION, Plan, _json_digest
 from clsas.opencl.device import open_device
 from clsas.planning import costs
+from clsas.planning.factorize import factorize
 from clsas.planning.planner import plan
 from clsas.sonar.beam import BeamWindow
 
@@ -424,3 +426,18 @@ def test_json_may_leave_out_filters(chosen):
     assert json.loads(short) == without(values)
     with pytest.raises(ValueError, match=r"lacks 'digest', as .* without filters"):
         Plan.from_json(short)
+
+
+# Moved
+
+
+def test_a_plan_serves_a_track_beside_its_own(chosen, platform):
+    lines, grid = made(swaying)
+    along = np.linspace(0, 2 * np.pi, lines.channels)
+    away_m = 0.01 * np.sin(along)[:, None] * [0.0, 1.0, 0.0]
+    moved = dataclasses.replace(lines, tx_m=lines.tx_m + away_m, rx_m=lines.rx_m + away_m)
+    with pytest.raises(ValueError, match="another line geometry"):
+        chosen.check(moved, grid)
+    image = factorize(moved, grid, chosen.moved(moved), device=platform)
+    ideal = backproject(moved, grid, accuracy_db=-75, device=platform)
+    assert relative_error_db(image, ideal) <= chosen.tolerance_db

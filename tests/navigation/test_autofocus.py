@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,85 +13,42 @@ import clsas
 from clsas.cli import main
 from clsas.core.validate import ClsasWarning
 from clsas.navigation.autofocus import autofocus
-
-WAVELENGTH_M = 0.015
-PINGS, STEP_M = 400, 0.02
-GRID = clsas.Grid.plane(x=(1.5, 6.5, 320), y=(18.0, 21.0, 220))
-SONAR = clsas.Sonar(
-    clsas.Pulse(100e3, 30e3, 1e-3), [[0.0, 0.0, 0.0]], tx_length_m=0.06, rx_length_m=0.06
+from clsas.trials.focusing import (
+    GRID,
+    PINGS,
+    RADAR_ERRORS,
+    RADAR_GRID,
+    SCENES,
+    SONAR,
+    STEP_M,
+    WAVELENGTH_M,
+    peak_db,
+    points,
+    radar_pass,
+    recorded,
+    reflector_db,
+    smooth_m,
+    smooth_residual_m,
+    speckle,
+    swaying,
+    white_m,
 )
+from clsas.trials.navigating import detrended
 
-
-def smooth_m(rms_m, seed=0):
-    """Displacements that change over some metres, without what no image shows."""
-    noise = np.random.default_rng(seed).standard_normal(PINGS + 1000)
-    return scaled(detrended(gaussian_filter1d(noise, 75)[500 : 500 + PINGS]), rms_m)
-
-
-def white_m(rms_m, seed=1):
-    return scaled(np.random.default_rng(seed).standard_normal(PINGS), rms_m)
-
-
-def scaled(values, rms):
-    return values * (rms / np.std(values))
-
-
-def detrended(values):
-    at = np.arange(len(values))
-    return values - np.polyval(np.polyfit(at, values, 1), at)
-
-
-def points(seed=0):
-    rng = np.random.default_rng(seed)
-    at = np.stack([rng.uniform(1.8, 6.2, 60), rng.uniform(18.2, 20.8, 60), np.zeros(60)], axis=1)
-    return clsas.PointTargets(at, rng.uniform(0.3, 1, 60) * np.exp(2j * np.pi * rng.random(60)))
-
-
-def speckle(bright, seed=0):
-    """Speckle of fully developed density, with some bright points or none."""
-    rng = np.random.default_rng(seed)
-    count = 12000
-    at = np.stack([rng.uniform(-2, 10, count), rng.uniform(17.7, 21.3, count), np.zeros(count)], 1)
-    level = 0.02 * (rng.standard_normal(count) + 1j * rng.standard_normal(count))
-    level[:bright] = np.exp(2j * np.pi * rng.random(bright))
-    at[:bright, 0], at[:bright, 1] = rng.uniform(2, 6, bright), rng.uniform(18.2, 20.8, bright)
-    return clsas.PointTargets(at, level)
-
-
-def recorded(scene, sway_m):
-    """Lines of a swaying track: as they are, and as the navigation has them."""
-    course = (0, 0, 0), (STEP_M, 0, 0), PINGS, 1.0
-    track = clsas.Track.straight(*course, sway_m=sway_m)
-    true = clsas.compress(clsas.simulate(SONAR, track, scene, range_m=(17.2, 22.5)))
-    geometry = clsas.channels(SONAR, clsas.Track.straight(*course))
-    return true, replace(true, tx_m=geometry.tx_m, rx_m=geometry.rx_m)
-
-
-def peak_db(lines, true, device=None):
-    image, ideal = (
-        np.abs(clsas.factorize(each, GRID, -40.0, device=device).pixels).max()
-        for each in (lines, true)
-    )
-    return 20 * np.log10(image / ideal)
-
-
-CASES = {
-    "points-smooth": (points(), smooth_m(0.3 * WAVELENGTH_M)),
-    "points-beyond-resolution": (points(), smooth_m(2 * WAVELENGTH_M)),
-    "speckle-smooth": (speckle(20), smooth_m(2 * WAVELENGTH_M, seed=4)),
-}
+RECORDED = Path(__file__).parents[2] / "../shared/data/gotcha/data_3dsar_pass1_az001_HH.mat"
+CASES = "points-smooth", "points-beyond-resolution", "speckle-smooth"
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", CASES)
 def test_smooth_sway_is_found(name):
-    scene, sway_m = CASES[name]
-    true, told = recorded(scene, sway_m)
+    scene = SCENES[name]
+    sway_m = scene.sway_m
+    true, told = recorded(scene.targets, sway_m)
     found = autofocus(told, GRID)
     assert peak_db(told, true) < -3
     assert abs(peak_db(found.lines, true)) <= 0.3
-    residual_m = detrended(found.correction_m[:, 1] - sway_m)
-    assert np.std(gaussian_filter1d(residual_m, 12)) <= WAVELENGTH_M / 100
+    assert smooth_residual_m(found, sway_m) <= WAVELENGTH_M / 100
     assert found.focused
     assert found.sharpness_after > 2 * found.sharpness_before
 
@@ -101,8 +59,7 @@ def test_smooth_sway_and_jitter():
     true, told = recorded(points(), sway_m)
     found = autofocus(told, GRID)
     assert abs(peak_db(found.lines, true)) <= 0.5
-    residual_m = detrended(found.correction_m[:, 1] - sway_m)
-    assert np.std(gaussian_filter1d(residual_m, 12)) <= WAVELENGTH_M / 100
+    assert smooth_residual_m(found, sway_m) <= WAVELENGTH_M / 100
 
 
 @pytest.mark.slow
@@ -129,12 +86,13 @@ def test_speckle_is_reported_not_focused():
     np.testing.assert_array_equal(found.lines.tx_m, told.tx_m)
 
 
-@pytest.mark.slow
-def test_sway_and_heave():
-    """A track above the scene sees responses at different angles, which tell both apart."""
+def seen_from_above(motion, unknowns):
+    """What autofocus finds of a track above the scene, and the peak beside that of the true track.
+
+    Responses are seen at different angles, which tell displacements apart.
+    """
     course = (0, 0, 12.0), (STEP_M, 0, 0), PINGS, 1.0
-    sway_m, heave_m = smooth_m(0.3 * WAVELENGTH_M, 2), smooth_m(0.3 * WAVELENGTH_M, 3)
-    track = clsas.Track.straight(*course, sway_m=sway_m, heave_m=heave_m)
+    track = clsas.Track.straight(*course, **motion)
     rng = np.random.default_rng(0)
     at = np.stack([rng.uniform(1.8, 6.2, 80), rng.uniform(8.2, 20.8, 80), np.zeros(80)], axis=1)
     scene = clsas.PointTargets(at, np.exp(2j * np.pi * rng.random(80)))
@@ -143,10 +101,62 @@ def test_sway_and_heave():
     geometry = clsas.channels(SONAR, clsas.Track.straight(*course))
     told = replace(true, tx_m=geometry.tx_m, rx_m=geometry.rx_m)
     grid = clsas.Grid.plane(x=(1.5, 6.5, 256), y=(8.0, 21.0, 700))
-    found = autofocus(told, grid, unknowns=("sway", "heave"))
-    for axis, wanted_m in ((1, sway_m), (2, heave_m)):
+    found = autofocus(told, grid, unknowns=unknowns)
+    peaks = [
+        20 * np.log10(np.abs(clsas.factorize(each, grid, -40.0).pixels).max())
+        for each in (told, found.lines, true)
+    ]
+    assert peaks[0] < peaks[2] - 1
+    return found, peaks[1] - peaks[2]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("wavelengths", "most"), [(0.3, 1 / 100), (2.0, 1 / 20)])
+def test_sway_and_heave(wavelengths, most):
+    """Both are found together, also where they are beyond the range resolution."""
+    motion = {
+        "sway_m": smooth_m(wavelengths * WAVELENGTH_M, 2),
+        "heave_m": smooth_m(wavelengths * WAVELENGTH_M, 3),
+    }
+    found, peak = seen_from_above(motion, ("sway", "heave"))
+    for axis, wanted_m in zip((1, 2), motion.values(), strict=True):
         residual_m = detrended(found.correction_m[:, axis] - wanted_m)
-        assert np.std(gaussian_filter1d(residual_m, 12)) <= WAVELENGTH_M / 30
+        assert np.std(gaussian_filter1d(residual_m, 12)) <= most * WAVELENGTH_M
+    assert abs(peak) <= 0.3
+
+
+@pytest.mark.slow
+def test_sway_and_heave_of_single_pings():
+    motion = {
+        "sway_m": white_m(0.05 * WAVELENGTH_M, 12),
+        "heave_m": white_m(0.05 * WAVELENGTH_M, 13),
+    }
+    found, peak = seen_from_above(motion, ("sway", "heave"))
+    assert abs(peak) <= 0.5
+    for axis, wanted_m in zip((1, 2), motion.values(), strict=True):
+        residual_m = detrended(found.correction_m[:, axis] - wanted_m)
+        assert np.std(residual_m) <= 0.6 * np.std(wanted_m)
+
+
+@pytest.mark.slow
+def test_surge():
+    """Displacements along the track move responses from one subaperture to the next."""
+    found, peak = seen_from_above({"surge_m": smooth_m(WAVELENGTH_M, 2)}, ("surge",))
+    assert found.sharpness_after > 1.9 * found.sharpness_before
+    assert abs(peak) <= 0.3
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not RECORDED.exists(), reason=f"no recorded data at {RECORDED}")
+@pytest.mark.parametrize(("smooth", "white"), RADAR_ERRORS)
+def test_a_recorded_pass_comes_back(smooth, white):
+    """A radar's track is displaced; left alone, it is not made worse."""
+    lines = radar_pass(RECORDED)
+    told, given_db = swaying(lines, smooth, white), reflector_db(lines)
+    found = autofocus(told, RADAR_GRID)
+    assert found.focused
+    assert reflector_db(told) - given_db < -2 or not smooth + white
+    assert reflector_db(found.lines) - given_db >= (-0.3 if smooth + white else 0.0)
 
 
 def test_bad_arguments():

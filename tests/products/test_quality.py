@@ -6,7 +6,7 @@ from clsas.core.grid import Grid
 from clsas.core.image import Image
 from clsas.core.image_error import relative_error_db
 from clsas.core.validate import ClsasWarning
-from clsas.products.quality import contrast, entropy, measure_point
+from clsas.products.quality import measure_point
 
 # Closed forms of the point responses, in units of 1 / bandwidth.
 PEDESTALS = {"sinc": 1.0, "Hamming": 0.54}
@@ -305,25 +305,3 @@ def test_relative_error_names_bad_input():
         relative_error_db(np.ma.array([1.0, 2.0], mask=[True, False]), [1.0, 2.0])
     with pytest.raises(ValueError, match="image must be finite"):
         relative_error_db(np.full((2, 3), np.nan), speckle(2, 3))
-
-
-def test_entropy_and_contrast_of_closed_forms():
-    flat = np.full((20, 30), 2 - 1j)
-    assert entropy(flat) == pytest.approx(np.log(600), rel=1e-12)
-    assert contrast(flat) == pytest.approx(0, abs=1e-12)
-    one = np.zeros((20, 30))
-    one[3, 4] = 7
-    assert entropy(one) == 0
-    assert contrast(one) == pytest.approx(np.sqrt(599))
-    # Intensities of speckle are exponential: their u ln u has the mean 1 - Euler's constant.
-    many = speckle(1000, 1000)
-    assert contrast(many) == pytest.approx(1, abs=0.01)
-    assert entropy(many) == pytest.approx(np.log(1e6) - 1 + np.euler_gamma, abs=0.01)
-
-
-def test_entropy_and_contrast_do_not_depend_on_scale():
-    image = speckle(50, 60)
-    for measure in (entropy, contrast):
-        assert measure(1e-170 * image) == pytest.approx(measure(image), rel=1e-12)
-        with pytest.raises(ValueError, match="image must not be zero everywhere"):
-            measure(0 * image)

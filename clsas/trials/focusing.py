@@ -1,0 +1,231 @@
+"""Autofocus against tracks that it is not told."""
+
+from __future__ import annotations
+
+import itertools
+import os
+import time
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter1d
+
+from clsas.core.grid import Grid
+from clsas.core.lines import RangeLines, wavelength_m
+from clsas.exact.backprojection import form_exactly
+from clsas.files.phase_histories import read_phase_history
+from clsas.navigation.autofocus import IMAGE_TOLERANCE_DB, Autofocus, autofocus
+from clsas.navigation.responses import Passage
+from clsas.opencl.device import Device
+from clsas.planning.factorize import factorize
+from clsas.signal.compression import compress
+from clsas.simulation.scenes import PointTargets
+from clsas.simulation.simulator import simulate
+from clsas.sonar.system import Pulse, Sonar
+from clsas.sonar.track import Track
+from clsas.trials.navigating import detrended, said_to_be_on
+
+WAVELENGTH_M = 0.015
+PINGS, STEP_M = 400, 0.02
+GRID = Grid.plane(x=(1.5, 6.5, 320), y=(18.0, 21.0, 220))
+SONAR = Sonar(Pulse(100e3, 30e3, 1e-3), [[0.0, 0.0, 0.0]], tx_length_m=0.06, rx_length_m=0.06)
+
+_SMOOTHED = 12  # pings, over which the smooth part of a residual is a mean
+_REPEATS = 3  # of which the fastest counts
+
+
+def smooth_m(
+    rms_m: float, seed: int = 0, *, pings: int = PINGS, correlated: float = 75
+) -> NDArray[np.float64]:
+    """Return displacements that change over some pings, without what no image shows."""
+    noise = np.random.default_rng(seed).standard_normal(pings + 1000)
+    return _scaled(detrended(gaussian_filter1d(noise, correlated)[500 : 500 + pings]), rms_m)
+
+
+def white_m(rms_m: float, seed: int = 1, *, pings: int = PINGS) -> NDArray[np.float64]:
+    """Return displacements that are independent from ping to ping."""
+    return _scaled(np.random.default_rng(seed).standard_normal(pings), rms_m)
+
+
+def _scaled(values: NDArray[np.float64], rms: float) -> NDArray[np.float64]:
+    return values * (rms / np.std(values)) if rms else np.zeros_like(values)
+
+
+def points(seed: int = 0) -> PointTargets:
+    """Return isolated points."""
+    random = np.random.default_rng(seed)
+    at = np.stack(
+        [random.uniform(1.8, 6.2, 60), random.uniform(18.2, 20.8, 60), np.zeros(60)], axis=1
+    )
+    return PointTargets(at, random.uniform(0.3, 1, 60) * np.exp(2j * np.pi * random.random(60)))
+
+
+def speckle(bright: int, seed: int = 0) -> PointTargets:
+    """Return speckle of fully developed density, with some bright points or none."""
+    random = np.random.default_rng(seed)
+    count = 12000
+    at = np.stack(
+        [random.uniform(-2, 10, count), random.uniform(17.7, 21.3, count), np.zeros(count)], axis=1
+    )
+    level = 0.02 * (random.standard_normal(count) + 1j * random.standard_normal(count))
+    level[:bright] = np.exp(2j * np.pi * random.random(bright))
+    at[:bright, 0] = random.uniform(2, 6, bright)
+    at[:bright, 1] = random.uniform(18.2, 20.8, bright)
+    return PointTargets(at, level)
+
+
+def recorded(scene: PointTargets, sway_m: NDArray[np.float64]) -> tuple[RangeLines, RangeLines]:
+    """Return lines of a swaying track: as they are, and as the navigation has them."""
+    course = (0, 0, 0), (STEP_M, 0, 0), PINGS, 1.0
+    track = Track.straight(*course, sway_m=sway_m)
+    true = compress(simulate(SONAR, track, scene, range_m=(17.2, 22.5)))
+    return true, said_to_be_on(true, SONAR, Track.straight(*course))
+
+
+def peak_db(lines: RangeLines, true: RangeLines, device: Device | str | None = None) -> float:
+    """Return the brightest pixel of lines over that of the true ones, dB."""
+    image, ideal = (
+        np.abs(factorize(each, GRID, -40.0, device=device).pixels).max() for each in (lines, true)
+    )
+    return float(20 * np.log10(image / ideal))
+
+
+def smooth_residual_m(found: Autofocus, sway_m: NDArray[np.float64]) -> float:
+    """Return the rms of what is left of the smooth part of a sway."""
+    left_m = detrended(found.correction_m[:, 1] - sway_m)
+    return float(np.std(gaussian_filter1d(left_m, _SMOOTHED)))
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A scene and a sway, in wavelengths rms.
+
+    Attributes
+    ----------
+    bright : int or None
+        Bright points in speckle; None for isolated points.
+    smooth, white : float
+        Sway that changes over some metres, and from ping to ping.
+    seed : int
+        Of the smooth sway.
+    """
+
+    bright: int | None
+    smooth: float
+    white: float
+    seed: int = 0
+
+    @property
+    def targets(self) -> PointTargets:
+        """Points of the scene."""
+        return points() if self.bright is None else speckle(self.bright)
+
+    @property
+    def sway_m(self) -> NDArray[np.float64]:
+        """Sway of every ping."""
+        return smooth_m(self.smooth * WAVELENGTH_M, self.seed) + white_m(self.white * WAVELENGTH_M)
+
+
+SCENES = {
+    "points-in-focus": Scene(None, 0, 0),
+    "points-smooth": Scene(None, 0.3, 0),
+    "points-beyond-resolution": Scene(None, 2, 0),
+    "points-smooth-and-white": Scene(None, 2, 0.05),
+    "points-white": Scene(None, 0, 0.1),
+    "speckle-smooth": Scene(20, 2, 0, seed=4),
+}
+COLUMNS = (
+    "scene",
+    "sway, wavelengths",
+    "before, dB",
+    "after, dB",
+    "residual, wavelengths",
+    "its smooth part",
+    "time in images",
+)
+
+
+def rows(devices: Iterable[str]) -> Iterator[list[str]]:
+    """Yield peaks before and after autofocus, the residual sway, and the processor time."""
+    for device in devices:
+        for name, scene in SCENES.items():
+            sway_m = scene.sway_m
+            true, told = recorded(scene.targets, sway_m)
+            found, images = _timed(told, GRID, device)
+            left = np.std(detrended(found.correction_m[:, 1] - sway_m)) / WAVELENGTH_M
+            yield [
+                f"{name}, {device}",
+                f"{scene.smooth:g} smooth, {scene.white:g} white",
+                f"{peak_db(told, true, device):.2f}",
+                f"{peak_db(found.lines, true, device):.2f}",
+                f"{left:.4f}",
+                f"{smooth_residual_m(found, sway_m) / WAVELENGTH_M:.4f}",
+                f"{images:.1f}",
+            ]
+
+
+def _timed(lines: RangeLines, grid: Grid, device: str) -> tuple[Autofocus, float]:
+    """Return the result of autofocus, and its processor time in planned images, least of a few."""
+
+    def image() -> None:
+        factorize(lines, grid, IMAGE_TOLERANCE_DB, device=device)
+
+    found = autofocus(lines, grid, device=device)
+    seconds = [
+        min(_seconds(each) for _ in range(_REPEATS))
+        for each in (image, partial(autofocus, lines, grid, device=device))
+    ]
+    return found, seconds[1] / seconds[0]
+
+
+def _seconds(work: Callable[[], object]) -> float:
+    start_s = time.process_time()
+    work()
+    return time.process_time() - start_s
+
+
+RADAR_GRID = Grid.plane(x=(-37.0, 37.0, 500), y=(-37.0, 37.0, 500))
+RADAR_ERRORS = (0.0, 0.0), (0.3, 0.0), (2.0, 0.0), (0.0, 0.1), (1.0, 0.05)
+"""Sway given to a recorded pass, wavelengths rms: smooth, and from ping to ping."""
+RADAR_COLUMNS = ("sway, wavelengths", "before, dB", "after, dB", "sharpness", "time in images")
+
+_REFLECTOR = Grid.plane(x=(-17.6, -13.6, 161), y=(19.6, 23.6, 161))  # around the brightest one
+_CORRELATED_PULSES = 15  # pulses over which the smooth sway changes
+
+
+def radar_pass(path: str | os.PathLike) -> RangeLines:
+    """Return one degree of the recorded radar pass (docs/recorded-data.md)."""
+    return read_phase_history(path, window="hamming").tapered_ends(1.0)
+
+
+def swaying(lines: RangeLines, smooth: float, white: float) -> RangeLines:
+    """Return lines said to be on a track with a sway, in wavelengths rms."""
+    passage, wave_m = Passage.of(lines, ("sway",)), wavelength_m(lines)
+    sway_m = smooth_m(smooth * wave_m, pings=passage.pings, correlated=_CORRELATED_PULSES)
+    sway_m = sway_m + white_m(white * wave_m, pings=passage.pings)
+    vectors_m = passage.vectors_m(sway_m[None])
+    return replace(lines, tx_m=lines.tx_m + vectors_m, rx_m=lines.rx_m + vectors_m)
+
+
+def reflector_db(lines: RangeLines, device: Device | str | None = None) -> float:
+    """Return the peak of the recording's brightest reflector, dB."""
+    image = form_exactly(lines, _REFLECTOR, device=device, accuracy_db=-50)
+    return float(20 * np.log10(np.abs(image.pixels).max()))
+
+
+def radar_rows(path: str | os.PathLike, devices: Iterable[str]) -> Iterator[list[str]]:
+    """Yield the reflector's peak beside that of the given track, before and after autofocus."""
+    lines = radar_pass(path)
+    for device, (smooth, white) in itertools.product(devices, RADAR_ERRORS):
+        told, given_db = swaying(lines, smooth, white), reflector_db(lines, device)
+        found, images = _timed(told, RADAR_GRID, device)
+        yield [
+            f"{smooth:g} smooth, {white:g} white; {device}",
+            f"{reflector_db(told, device) - given_db:.2f}",
+            f"{reflector_db(found.lines, device) - given_db:+.2f}",
+            f"{found.sharpness_before:.0f} to {found.sharpness_after:.0f}",
+            f"{images:.1f}",
+        ]
