@@ -305,6 +305,11 @@ class Plan:
                     f"the plan was made for another {name.removesuffix('s')} geometry than that "
                     f"of {name}; plan anew with clsas.plan"
                 )
+        if not self.is_exact:
+            # Sampled lines hold no frequency beyond: more would only cost memory.
+            most = abs(lines.carrier_cycles_per_m) + 1 / lines.range_step_m
+            given = self.factorization.highest_cycles_per_m
+            validate.number("highest_cycles_per_m", given, "cycles/m", most=most)
 
 
 def _check_version(values: dict[str, Any]) -> None:

@@ -22,7 +22,7 @@ from clsas.core import reprs, validate
 from clsas.core.contrast import contrast
 from clsas.core.grid import Grid
 from clsas.core.image import Image
-from clsas.core.lines import RangeLines, wavelength_m
+from clsas.core.lines import RangeLines
 from clsas.navigation.checks import check_navigation
 from clsas.navigation.drift import drift_m
 from clsas.navigation.gradient import phase_gradient_m, sharpest_m
@@ -37,6 +37,7 @@ from clsas.opencl.device import Device, open_device
 from clsas.planning.factorize import factorize
 from clsas.planning.planner import plan
 from clsas.signal.readout import Readout
+from clsas.signal.spectrum import cycles_per_m_at
 from clsas.sonar.beam import BeamWindow
 
 UNKNOWNS = ("sway", "heave", "surge")
@@ -57,6 +58,7 @@ _LEAST_GRADIENT = 0.05  # of range per displacement, rms
 _APART = 4.0  # range resolution cells between responses
 _DEVIATION_PER_MEDIAN = 1.4826  # of the magnitude of normal errors
 _GAIN = 1.02  # of sharpness, for which a step is repeated
+_LEAST_CYCLES = 0.02  # per sample, from lines about 0 Hz to those with a carrier
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,7 +154,9 @@ def autofocus(
     validate.progress(progress)
     names = _checked_unknowns(unknowns)
     check_navigation(lines, 10, "autofocus", may_stand=True)
-    focus = _Focus(lines, grid, Passage.of(lines, names), beam, open_device(device), progress)
+    readout = Readout.of(lines, READ_DB)
+    passage = Passage.of(lines, names, _mean_wavelength_m(readout))
+    focus = _Focus(readout, grid, passage, beam, open_device(device), progress)
     focus.check_geometry(names)
     return focus.result()
 
@@ -164,23 +168,34 @@ def _checked_unknowns(unknowns: Sequence[str]) -> tuple[str, ...]:
     return names
 
 
+def _mean_wavelength_m(readout: Readout) -> float:
+    """Return the wavelength at the centre of the lines' band, which may hold the carrier still."""
+    cycles_per_m = abs(cycles_per_m_at(readout.lines, readout.spectrum.centre))
+    if not cycles_per_m * readout.lines.range_step_m > _LEAST_CYCLES:
+        raise ValueError(
+            "carrier_hz must be that of the lines, or their samples must hold the carrier still; "
+            f"got {readout.lines.carrier_hz:g} Hz, and samples about 0 Hz"
+        )
+    return 2 / cycles_per_m
+
+
 class _Focus:
     """Lines on their way into focus."""
 
     def __init__(
         self,
-        lines: RangeLines,
+        readout: Readout,
         grid: Grid,
         passage: Passage,
         beam: BeamWindow | None,
         device: Device,
         progress: Callable[[int, int], None] | None,
     ) -> None:
+        self.readout, lines = readout, readout.lines
         self.given, self.grid, self.passage, self.beam = lines, grid, passage, beam
         self.device, self.progress = device, progress
         self.moved_m = np.zeros((len(passage.axes), passage.pings))
         self.deviation_m = np.full(passage.pings, np.inf)
-        self.readout = Readout.of(lines, READ_DB)
         oversampling = self.readout.spectrum.oversampling
         self.cell_m = lines.range_step_m * min(max(oversampling, 1.0), 64.0)
         self.steps: list[tuple[str, float]] = []
@@ -228,7 +243,7 @@ class _Focus:
                 dropped = name
             if self.progress is not None:
                 self.progress(number, len(stages))
-        wave_m = wavelength_m(self.given)
+        wave_m = self.passage.wavelength_m
         apart_m = self._disagreement_m()
         if apart_m > MOST_DISAGREEMENT * wave_m:
             return self._unfocused(

@@ -16,7 +16,6 @@ import numpy as np
 import scipy.fft
 from numpy.typing import NDArray
 
-from clsas.core.lines import wavelength_m
 from clsas.navigation.responses import Contributions, Passage
 
 _LENGTH = 1.5
@@ -77,7 +76,7 @@ def drift_m(passage: Passage, found: Contributions) -> NDArray[np.float64] | Non
     if not pairs:
         return None
     # The phase of an echo turns by -4 pi/wavelength per metre of range.
-    step = -wavelength_m(passage.lines) / 2 * (frequency[1] - frequency[0])
+    step = -passage.wavelength_m / 2 * (frequency[1] - frequency[0])
     changes = step * _shifts(images, pairs, groups)
     middles_m = starts_m[number] + length_m / 2
     slopes = _slopes(changes, np.array(pairs), number, np.array(views), middles_m)

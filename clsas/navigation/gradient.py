@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
-from clsas.core.lines import wavelength_m
 from clsas.navigation.responses import Contributions, Passage
 
 _PASSES = 3  # of alternating least squares: steps of the track, and the responses' own slopes
@@ -63,7 +62,7 @@ def _turns(passage: Passage, found: Contributions) -> NDArray[np.float64]:
     """Return the phase per displacement of a ping, rad/m, [unknowns, pings, points]."""
     counts = np.bincount(passage.ping)[:, None]
     gradient = np.stack([passage.by_ping(each) / counts for each in found.gradient])
-    return 4 * np.pi / wavelength_m(passage.lines) * gradient
+    return 4 * np.pi / passage.wavelength_m * gradient
 
 
 def sharpest_m(
@@ -87,7 +86,7 @@ def sharpest_m(
     turns = _turns(passage, found)
     directions = _directions(turns, np.abs(values) ** 2)
     turns = np.einsum("pau,upk->apk", directions, turns).astype(np.float32)
-    furthest_m = wavelength_m(passage.lines) / 4
+    furthest_m = passage.wavelength_m / 4
     unknowns, pings, _ = turns.shape
     moved_m = np.zeros((unknowns, pings), np.float32)
     turned, total = values.copy(), values.sum(axis=0)

@@ -37,15 +37,18 @@ class Passage:
         Distance travelled.
     axes : float64 [unknowns, pings, 3]
         Unit vectors of the displacements that are solved for.
+    wavelength_m : float
+        At the centre of the lines' band.
     """
 
     lines: RangeLines
     ping: NDArray[np.int64]
     along_m: NDArray[np.float64]
     axes: NDArray[np.float64]
+    wavelength_m: float
 
     @classmethod
-    def of(cls, lines: RangeLines, unknowns: tuple[str, ...]) -> Passage:
+    def of(cls, lines: RangeLines, unknowns: tuple[str, ...], wavelength_m: float) -> Passage:
         """Return the passage of lines; `unknowns` are some of "sway", "heave" and "surge"."""
         starts = lines.ping_starts
         counts = np.diff(np.append(starts, lines.channels))
@@ -58,7 +61,9 @@ class Passage:
         steps_m = np.linalg.norm(np.diff(centres_m, axis=0), axis=1)
         travelled_m = np.concatenate([[0.0], np.cumsum(steps_m)])
         axes = np.stack([vectors[name] for name in unknowns])
-        return cls(lines, np.repeat(np.arange(len(starts)), counts), travelled_m, axes)
+        return cls(
+            lines, np.repeat(np.arange(len(starts)), counts), travelled_m, axes, wavelength_m
+        )
 
     @property
     def pings(self) -> int:
@@ -67,7 +72,7 @@ class Passage:
 
     def fresnel_length_m(self, found: Contributions) -> float:
         """Return sqrt(wavelength range/2): a straight piece of track sees no curvature over it."""
-        return math.sqrt(wavelength_m(self.lines) * float(np.median(found.range_m)) / 2)
+        return math.sqrt(self.wavelength_m * float(np.median(found.range_m)) / 2)
 
     def by_ping(self, values: NDArray) -> NDArray:
         """Return sums over the channels of every ping, [pings, ...], of values [channels, ...]."""

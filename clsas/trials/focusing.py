@@ -203,7 +203,8 @@ def radar_pass(path: str | os.PathLike) -> RangeLines:
 
 def swaying(lines: RangeLines, smooth: float, white: float) -> RangeLines:
     """Return lines said to be on a track with a sway, in wavelengths rms."""
-    passage, wave_m = Passage.of(lines, ("sway",)), wavelength_m(lines)
+    wave_m = wavelength_m(lines)
+    passage = Passage.of(lines, ("sway",), wave_m)
     sway_m = smooth_m(smooth * wave_m, pings=passage.pings, correlated=_CORRELATED_PULSES)
     sway_m = sway_m + white_m(white * wave_m, pings=passage.pings)
     vectors_m = passage.vectors_m(sway_m[None])

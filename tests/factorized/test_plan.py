@@ -396,6 +396,13 @@ def test_a_plan_knows_its_lines_and_grid(chosen):
         chosen.check(lines, around(0, 41))
 
 
+def test_a_frequency_that_lines_cannot_hold_is_refused(chosen):
+    """It would take memory without bounds."""
+    lines, grid = made(swaying)
+    with pytest.raises(ValueError, match=r"highest_cycles_per_m must be .* cycles/m, got 1e\+09"):
+        factorize(lines, grid, chosen.changed(highest_cycles_per_m=1e9))
+
+
 def test_it_says_whether_times_are_of_this_device(chosen, monkeypatch, tmp_path):
     lines, grid = made(straight)
     monkeypatch.setenv("CLSAS_CACHE", str(tmp_path))

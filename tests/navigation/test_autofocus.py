@@ -1,6 +1,7 @@
 """Autofocus against tracks that it is not told."""
 
 import json
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -8,6 +9,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 from scipy.ndimage import gaussian_filter1d
+from scipy.signal import resample
 
 import clsas
 from clsas.cli import main
@@ -159,6 +161,26 @@ def test_a_recorded_pass_comes_back(smooth, white):
     assert reflector_db(found.lines) - given_db >= (-0.3 if smooth + white else 0.0)
 
 
+def with_carrier(lines):
+    """Lines whose samples hold the carrier still: finer ones, of no carrier."""
+    finer = math.ceil(4 * lines.range_step_m * lines.carrier_cycles_per_m)
+    samples = resample(lines.samples, finer * lines.length, axis=1)
+    step_m = lines.range_step_m / finer
+    range_m = lines.first_range_m[:, None] + step_m * np.arange(samples.shape[1])
+    samples = samples * np.exp(2j * np.pi * lines.carrier_cycles_per_m * range_m)
+    return replace(lines, samples=samples, range_step_m=step_m, carrier_hz=0.0)
+
+
+@pytest.mark.slow
+def test_lines_that_hold_their_carrier_still_are_focused_alike():
+    sway_m = smooth_m(2 * WAVELENGTH_M)
+    _, told = recorded(points(), sway_m)
+    usual, found = autofocus(told, GRID), autofocus(with_carrier(told), GRID)
+    assert found.focused
+    assert np.abs(found.correction_m - usual.correction_m).max() <= WAVELENGTH_M / 30
+    assert smooth_residual_m(found, sway_m) <= WAVELENGTH_M / 100
+
+
 def test_bad_arguments():
     _, told = recorded(points(), np.zeros(PINGS))
     with pytest.raises(ValueError, match="at least 10 pings"):
@@ -171,6 +193,8 @@ def test_bad_arguments():
         autofocus(told.samples, GRID)
     with pytest.raises(TypeError, match="grid"):
         autofocus(told, None)
+    with pytest.raises(ValueError, match=r"carrier_hz must be that of the lines, .* got 0 Hz"):
+        autofocus(replace(told, carrier_hz=0.0), GRID)
 
 
 @pytest.mark.slow
