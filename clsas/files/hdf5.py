@@ -305,7 +305,9 @@ def _attribute(group: h5py.Group, name: str) -> Any:
 def _check_header(file: h5py.File) -> None:
     if _attribute(file, "format") != FORMAT:
         raise FileFormatError("is an HDF5 file, but not one of clsas (attribute format)")
-    version = int(file.attrs["version"])
+    version = _attribute(file, "version")
+    if not isinstance(version, int):
+        raise FileFormatError(f"is damaged: attribute version is {version!r}, not a number")
     if version > VERSION:
         raise FileFormatError(
             f"is of format version {version}, newer than this clsas, which reads up to {VERSION}"

@@ -87,6 +87,11 @@ def factorize(
     validate.progress(progress)
     device = open_device(device)
     if not isinstance(plan_or_tolerance, Plan):
+        if isinstance(plan_or_tolerance, str):
+            got = validate.shown(plan_or_tolerance)
+            raise TypeError(
+                f"plan_or_tolerance must be a Plan (Plan.from_json reads texts) or dB, got {got}"
+            )
         validate.number(
             "plan_or_tolerance",
             plan_or_tolerance,

@@ -200,6 +200,8 @@ def change(file, name):
             file.attrs["version"] = 2
         case "of version 0":
             file.attrs["version"] = 0
+        case "of a version in words":
+            file.attrs["version"] = "zzz"
         case "without version":
             del file.attrs["version"]
         case "of unknown kind":
@@ -226,6 +228,7 @@ def change(file, name):
         ("of another format", "is an HDF5 file, but not one of clsas"),
         ("newer", "is of format version 2, newer than this clsas, which reads up to 1"),
         ("of version 0", "is of format version 0, but the first one is 1"),
+        ("of a version in words", "is damaged: attribute version is 'zzz', not a number"),
         ("without version", "is damaged: .*version"),
         ("of unknown kind", "holds an object of unknown kind 'hologram'"),
         ("without kind", "holds an object of unknown kind None"),
