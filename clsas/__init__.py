@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from clsas.mosaics.mosaic import Mosaic, Patch, mosaic
     from clsas.mosaics.store import Store
     from clsas.navigation.autofocus import Autofocus, autofocus
+    from clsas.navigation.known_points import Calibration, calibrate_track
     from clsas.navigation.micronavigation import Micronavigation, micronavigate
     from clsas.opencl.device import DeviceError, list_devices
     from clsas.planning.factorize import factorize
@@ -56,6 +57,7 @@ __all__ = [
     "Assessment",
     "Autofocus",
     "BeamWindow",
+    "Calibration",
     "ClsasWarning",
     "DeviceError",
     "Echoes",
@@ -83,6 +85,7 @@ __all__ = [
     "assess",
     "autofocus",
     "backproject",
+    "calibrate_track",
     "channels",
     "check_sampling",
     "compress",
@@ -135,6 +138,7 @@ _MODULES = {
     "mosaics.mosaic": "Mosaic Patch mosaic",
     "mosaics.store": "Store",
     "navigation.autofocus": "Autofocus autofocus",
+    "navigation.known_points": "Calibration calibrate_track",
     "navigation.micronavigation": "Micronavigation micronavigate",
     "opencl.device": "DeviceError list_devices",
     "planning.factorize": "factorize",

@@ -1,4 +1,4 @@
-"""Commands that correct a track by the echoes themselves: navigate, focus."""
+"""Commands that correct a track by the echoes: known-points, navigate, focus."""
 
 from __future__ import annotations
 
@@ -13,14 +13,76 @@ import clsas
 from clsas.cli import options
 from clsas.cli.inputs import load, read_beam, read_grid
 from clsas.cli.outputs import progress_bar, report
-from clsas.cli.parameters import INPUT, RANGE
+from clsas.cli.parameters import INPUT, POSITION, RANGE
 from clsas.core import validate
 from clsas.navigation.autofocus import UNKNOWNS as FOCUSED
+from clsas.navigation.known_points import DEFAULT_UNKNOWNS
+from clsas.navigation.known_points import UNKNOWNS as CALIBRATED
 from clsas.navigation.micronavigation import UNKNOWNS as NAVIGATED
 
 
 def _positive(name: str, unit: str) -> Any:
     return options.checked(partial(validate.positive, name, unit=unit))
+
+
+@click.command("known-points")
+@click.argument("lines_file", metavar="LINES.H5", type=INPUT)
+@options.output("Corrected range lines")
+@click.option(
+    "--point",
+    "points",
+    multiple=True,
+    required=True,
+    type=POSITION,
+    help="Position of a reflector (m), at z = 0 unless given; repeat the option.",
+)
+@click.option(
+    "--unknown",
+    "unknowns",
+    multiple=True,
+    type=click.Choice(CALIBRATED),
+    help="What to solve for, the most important first; repeat the option. "
+    "[default: time_offset and sound_speed]",
+)
+@click.option(
+    "--search-m",
+    type=float,
+    callback=_positive("search_m", "m"),
+    help="Largest error of a range that is looked for (m). [default: 50 resolution cells]",
+)
+@options.as_json
+def known_points(
+    lines_file: Path,
+    output: Path,
+    points: tuple[tuple[float, ...], ...],
+    unknowns: tuple[str, ...],
+    search_m: float | None,
+    as_json: bool,
+) -> None:
+    """Correct time offset, sound speed and lever arm by reflectors at known positions.
+
+    Ranges of all reflectors are measured in all channels, and fitted together. The lever arm
+    (forward, port, up) is a displacement along, across and above the track.
+
+    \b
+    Example:  clsas known-points lines.h5 --point 3,12 --point 5,19,-1 -o corrected.h5
+    """
+    lines = load(lines_file, clsas.RangeLines)
+    positions = [(*point, 0.0)[:3] for point in points]
+    with progress_bar("measuring ranges") as progress:
+        found = clsas.calibrate_track(
+            lines, positions, unknowns=unknowns or DEFAULT_UNKNOWNS, search_m=search_m,
+            progress=progress,
+        )  # fmt: skip
+    clsas.save(output, found.lines)
+    results = found.figures
+    seen = ", ".join(map(str, results["seen"]))
+    report(
+        as_json,
+        f"{output}: {found.describe()}\n  seen in {seen} channels",
+        file=output,
+        **results,
+    )
 
 
 @click.command()
