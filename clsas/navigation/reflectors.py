@@ -145,7 +145,7 @@ class Reader:
     def _offsets_m(self, half_m: float) -> NDArray[np.float64]:
         """Return offsets from -half_m to half_m, with 0 in the middle."""
         count = max(math.ceil(half_m / self.cell_m * _STEPS), 2)
-        return self.cell_m / _STEPS * np.arange(-count, count + 1)
+        return self.cell_m / _STEPS * np.arange(-count, count + 1, dtype=np.float64)
 
     def _read(
         self,
