@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from clsas.opencl.device import DeviceError, list_devices
     from clsas.planning.factorize import factorize
     from clsas.planning.planner import plan
+    from clsas.processing.chain import Processed, process
     from clsas.products import plot
     from clsas.products.assessment import assess, survey_lines
     from clsas.products.assessment_result import Assessment, Effect
@@ -74,6 +75,7 @@ __all__ = [
     "Plan",
     "PointTargets",
     "Pointing",
+    "Processed",
     "Pulse",
     "RangeLines",
     "Replica",
@@ -102,6 +104,7 @@ __all__ = [
     "mosaic",
     "plan",
     "plot",
+    "process",
     "read_airsas",
     "read_cphd",
     "read_full_matrix",
@@ -143,6 +146,7 @@ _MODULES = {
     "opencl.device": "DeviceError list_devices",
     "planning.factorize": "factorize",
     "planning.planner": "plan",
+    "processing.chain": "Processed process",
     "products.assessment": "assess survey_lines",
     "products.assessment_result": "Assessment Effect",
     "products.inspection": "inspect",

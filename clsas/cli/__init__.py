@@ -44,6 +44,10 @@ _COMMANDS = {
     ),
     "navigate": ("navigation", "Correct an array's track by displaced phase centres."),
     "focus": ("navigation", "Correct a track by the bright responses of an image (autofocus)."),
+    "process": (
+        "processing",
+        "Take a recording to a focused image, by the steps of a scene file: recorded, resumable.",
+    ),
     "mosaic": ("mosaics", "Form an image of any size patch by patch, into a Zarr store."),
     "quality": (
         "measures",

@@ -19,6 +19,7 @@ from clsas.navigation.autofocus import UNKNOWNS as FOCUSED
 from clsas.navigation.known_points import DEFAULT_UNKNOWNS
 from clsas.navigation.known_points import UNKNOWNS as CALIBRATED
 from clsas.navigation.micronavigation import UNKNOWNS as NAVIGATED
+from clsas.processing import numbers
 
 
 def _positive(name: str, unit: str) -> Any:
@@ -164,17 +165,7 @@ def navigate(
             progress=progress,
         )  # fmt: skip
     clsas.save(output, found.lines)
-    measured = np.isfinite(found.sway_steps_sd_m)
-    results = {
-        "pings": len(found.sway_m),
-        "overlap": int(found.overlap.min()),
-        "coherence": float(np.median(found.coherence)),
-        "sway_rms_m": float(np.std(found.sway_m)),
-        "yaw_rms_rad": float(np.std(found.yaw_rad)),
-        "surge_rms_m": float(np.std(found.surge_m)),
-        "sway_step_sd_m": float(np.median(found.sway_steps_sd_m[measured])),
-        "yaw_step_sd_rad": float(np.median(found.yaw_steps_sd_rad[measured])),
-    }
+    results = numbers.of_navigation(found)
     report(
         as_json,
         f"{output}: {results['pings']} pings, {results['overlap']} overlapping phase centres or "
@@ -229,14 +220,8 @@ def focus(
             progress=progress,
         )  # fmt: skip
     clsas.save(output, found.lines)
-    rms_m = float(np.sqrt(np.mean(np.sum(found.correction_m**2, axis=1))))
-    results = {
-        "focused": found.focused,
-        "correction_rms_m": rms_m,
-        "correction_sd_m": float(np.median(found.correction_sd_m)) if found.focused else None,
-        "sharpness_before": found.sharpness_before,
-        "sharpness_after": found.sharpness_after,
-    }
+    results = numbers.of_focus(found)
+    rms_m = results["correction_rms_m"]
     how = f"corrected by {1e3 * rms_m:.3g} mm rms" if found.focused else "left as they were"
     steps = "".join(f"\n  {name}: {value:.4g}" for name, value in found.sharpness)
     report(

@@ -324,8 +324,8 @@ def _unambiguous_slope(found: Correlation) -> float:
 
     Beyond it the array's pairs see grating lobes: the same phases as of a smaller yaw.
     """
-    apart_m = np.diff(np.sort(found.along_m))
-    apart_m = float(np.median(apart_m)) if len(apart_m) else 0.0
+    steps_m = np.diff(np.sort(found.along_m))
+    apart_m = float(np.median(steps_m)) if len(steps_m) else 0.0
     return 0.5 / max(abs(found.cycles_per_m) * apart_m, 1e-9)
 
 

@@ -323,9 +323,10 @@ def _warn_of(alike: Alike, lines: RangeLines) -> None:
 
 def _with_deviation(value: float, deviation: float, unit: str) -> str:
     """Return "4.00 ± 0.15 mm": a value and its standard deviation, with the digits that count."""
-    shown, prefixed = reprs.quantity(value, unit).split(maxsplit=1)
-    if not (value and 0 < deviation < math.inf):
-        return f"{shown} {prefixed}"
-    factor = 10.0 ** round(math.log10(value / float(shown)))
+    if not 0 < deviation < math.inf:
+        return reprs.quantity(value, unit)
+    larger = max(abs(value), deviation)
+    shown, prefixed = reprs.quantity(larger, unit).split(maxsplit=1)
+    factor = 10.0 ** round(math.log10(larger / float(shown)))
     digits = max(1 - math.floor(math.log10(deviation / factor)), 0)
     return f"{value / factor:.{digits}f} ± {deviation / factor:.{digits}f} {prefixed}"

@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from clsas.core.grid import Grid
 from clsas.core.image import Image
 from clsas.core.lines import RangeLines
 from clsas.products.quality import measure_point
@@ -20,22 +19,45 @@ from clsas.signal.compression import compress
 from clsas.simulation.scenes import PointTargets
 from clsas.simulation.seabeds import wreck as seabed
 from clsas.simulation.simulator import simulate
-from clsas.sonar.beam import BeamWindow
 from clsas.sonar.system import Sonar
 from clsas.sonar.track import Track, channels
 from clsas.trials import wreck
 
-BEAM = BeamWindow(5.0, "hann")
-GRID = Grid.plane((-9.0, 9.0, 361), (50.0, 74.0, 961))
 POINT_M = (-6.0, 54.0, 0.0)
 """A reflector on the sand before the wreck."""
 RANGE_M = (54.0, 78.0)
-"""Ranges that every channel has, for micronavigation."""
+"""Ranges on the sand and the wreck, for micronavigation."""
 
 _PINGS, _ADVANCE_M, _HEIGHT_M = 120, 0.2, 20.0
 _SWAY_M, _PERIOD = 0.2, 80.0  # pings: of the sway in the scene of the wreck, 16 m
 _AMPLITUDE = 60.0  # of the reflector: 30 dB above the sand
 _DENSITY_M2 = 400.0
+
+
+SCENE = f"""
+[grid]
+x = {{ start_m = -9.0, stop_m = 9.0, count = 361 }}
+y = {{ start_m = 50.0, stop_m = 74.0, count = 961 }}
+
+[image]
+tolerance_db = -40
+
+[image.beam]
+width_deg = 5.0
+shape = "hann"
+
+[process]
+steps = ["inspect", "navigate", "image"]
+
+[process.navigate]
+range_m = [{RANGE_M[0]}, {RANGE_M[1]}]
+seabed_z_m = 0.0
+element_length_m = 0.2
+sway_sd_m = 0.3
+yaw_sd_deg = 3.0
+surge_sd_m = 0.02
+"""
+"""The scene file of the chain: what a user would write."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,15 +95,21 @@ class Measures:
 
     @classmethod
     def of(cls, image: Image, shadow: wreck.Shadow) -> Measures:
-        """Return the measures of an image."""
+        """Return the measures of an image; raises ValueError if the reflector shows no peak."""
         point = measure_point(image, near=POINT_M[:2], extent_m=1.0)
-        largest = 20 * np.log10(float(np.abs(image.pixels).max()))
         return cls(
-            largest,
+            level_db(image),
             point.azimuth.resolution_m,
             point.range.resolution_m,
             shadow.contrast_db(image, POINT_M[:2]),
         )
+
+
+def level_db(image: Image) -> float:
+    """Return the largest level within half a metre of the reflector, dB."""
+    x_m, y_m = image.grid.axes_m
+    near = np.ix_(np.abs(y_m - POINT_M[1]) < 0.5, np.abs(x_m - POINT_M[0]) < 0.5)
+    return 20 * float(np.log10(np.abs(image.pixels[near]).max()))
 
 
 def recorded(progress: Callable[[int, int], None] | None = None) -> Recording:
