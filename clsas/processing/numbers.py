@@ -22,6 +22,7 @@ def of_navigation(found: Micronavigation) -> dict[str, Any]:
         "sway_rms_m": float(np.std(found.sway_m)),
         "yaw_rms_rad": float(np.std(found.yaw_rad)),
         "surge_rms_m": float(np.std(found.surge_m)),
+        "shape_sd_m": float(np.max(found.shape_sd_m)),
         "sway_step_sd_m": float(np.median(found.sway_steps_sd_m[measured])),
         "yaw_step_sd_rad": float(np.median(found.yaw_steps_sd_rad[measured])),
     }

@@ -251,7 +251,15 @@ def _write_track(path: Path, found: Micronavigation | Autofocus) -> None:
     columns |= {f"{name}_m": at_m[:, axis] for axis, name in enumerate("xyz")}
     if isinstance(found, Micronavigation):
         columns["heading_rad"] = found.track.yaw_rad
-        for name in ("sway_m", "sway_sd_m", "yaw_rad", "yaw_sd_rad", "surge_m", "surge_sd_m"):
+        for name in (
+            "sway_m",
+            "sway_sd_m",
+            "shape_sd_m",
+            "yaw_rad",
+            "yaw_sd_rad",
+            "surge_m",
+            "surge_sd_m",
+        ):
             columns[name] = getattr(found, name)
     else:
         starts = found.lines.ping_starts

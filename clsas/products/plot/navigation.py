@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from clsas.products.plot.canvas import new_figure
 from clsas.products.plot.levels import image as draw_image
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 _INTERVAL = 1.96  # standard deviations to either side: 95 %
@@ -27,8 +29,9 @@ def corrections(found: Micronavigation | Autofocus) -> Figure:
     Parameters
     ----------
     found : Micronavigation or Autofocus
-        The interval of micronavigation includes what is unknown of the track's start and heading.
-        That of autofocus is the one of the changes from ping to ping, about the correction.
+        Of micronavigation the interval of the whole track includes its unknown start and heading.
+        That of its shape does not: it is what an image's sharpness depends on. Of autofocus the
+        interval is that of the changes from ping to ping, about the correction.
 
     Raises
     ------
@@ -41,20 +44,31 @@ def corrections(found: Micronavigation | Autofocus) -> Figure:
     curves = _curves(found)
     figure = new_figure(7.0, 1.0 + 1.9 * len(curves))
     panels = np.atleast_1d(figure.subplots(len(curves), sharex=True))
-    for axes, (label, value, deviation) in zip(panels, curves, strict=True):
-        ping = np.arange(len(value))
-        width = np.where(np.isfinite(deviation), _INTERVAL * deviation, np.nan)
-        if np.isfinite(width).any():
-            axes.fill_between(
-                ping, value - width, value + width, alpha=0.3, linewidth=0, label="95 % interval"
-            )
-        axes.plot(ping, value, linewidth=1.0)
-        axes.set(ylabel=label, xlim=(0, max(len(value) - 1, 1)))
-        axes.grid(alpha=0.3)
+    for axes, curve in zip(panels, curves, strict=True):
+        _draw_curve(axes, curve)
     panels[-1].set_xlabel("Ping")
-    if panels[0].get_legend_handles_labels()[0]:
-        panels[0].legend(loc="upper right", fontsize="small")
     return figure
+
+
+def _draw_curve(axes: Axes, curve: _Curve) -> None:
+    """Draw values over pings with their intervals; limits are those of the values."""
+    ping, value = np.arange(len(curve.value)), curve.value
+    axes.plot(ping, value, linewidth=1.0)
+    reach = max(float(np.ptp(value)), 1e-6)
+    limits = [float(value.min()) - 0.5 * reach, float(value.max()) + 0.7 * reach]
+    for deviation, label, alpha in curve.intervals:
+        width = _INTERVAL * deviation
+        if not np.isfinite(width).any():
+            continue
+        widest = float(np.nanmax(width[np.isfinite(width)]))
+        axes.fill_between(
+            ping, value - width, value + width, alpha=alpha, linewidth=0, color="tab:blue",
+            label=f"{label}: ± {widest:.2g} {curve.unit} at most",
+        )  # fmt: skip
+    axes.set(ylabel=f"{curve.name} ({curve.unit})", xlim=(0, max(len(value) - 1, 1)), ylim=limits)
+    axes.grid(alpha=0.3)
+    if axes.get_legend_handles_labels()[0]:
+        axes.legend(loc="upper right", fontsize="x-small", ncols=2)
 
 
 def coherence(found: Micronavigation) -> Figure:
@@ -81,7 +95,7 @@ def coherence(found: Micronavigation) -> Figure:
         values.T, origin="lower", aspect="auto", vmin=0, vmax=1, cmap="cividis",
         extent=(-0.5, len(values) - 0.5, low_m, high_m), interpolation="nearest",
     )  # fmt: skip
-    axes.set(xlabel="Ping, and the next one")
+    axes.set(xlabel="Ping (with the next one)")
     median, *spread = (np.quantile(values, share, axis=0) for share in (0.5, 0.1, 0.9))
     beside.fill_betweenx(range_m, *spread, alpha=0.3, linewidth=0, label="10 to 90 %")
     beside.plot(median, range_m, marker=".", linewidth=1.0, label="median")
@@ -152,7 +166,7 @@ def before_and_after(before: Image, after: Image, **options: Any) -> Figure:
         peak_db = 20 * np.log10(max(float(np.abs(image.pixels).max()) / largest, 1e-12))
         draw_image(
             image, axes, reference=largest, colour_bar=axes is panels[-1],
-            title=f"{title}: peak {peak_db:.1f} dB", **options,
+            title=f"{title}: peak {peak_db:.1f} dB".replace("-", "−"), **options,
         )  # fmt: skip
     _label_bar(panels)
     return figure
@@ -167,22 +181,37 @@ def _label_bar(panels: NDArray[Any]) -> None:
             axes.set_ylabel("Amplitude (dB re larger peak)")
 
 
-def _curves(
-    found: Micronavigation | Autofocus,
-) -> list[tuple[str, NDArray[np.float64], NDArray[np.float64]]]:
-    """Return label, value and standard deviation of all that was corrected, ping by ping."""
+@dataclass(frozen=True, eq=False)
+class _Curve:
+    """Corrections ping by ping, with standard deviations, their labels and opacities."""
+
+    name: str
+    unit: str
+    value: NDArray[np.float64]
+    intervals: list[tuple[NDArray[np.float64], str, float]]
+
+
+def _curves(found: Micronavigation | Autofocus) -> list[_Curve]:
+    """Return all that was corrected."""
     if isinstance(found, Micronavigation):
+        whole = "95 % of the track"
         every = [
-            ("Sway (mm)", 1e3 * found.sway_m, 1e3 * found.sway_sd_m),
-            ("Yaw (mrad)", 1e3 * found.yaw_rad, 1e3 * found.yaw_sd_rad),
-            ("Surge (mm)", 1e3 * found.surge_m, 1e3 * found.surge_sd_m),
-        ]
+            _Curve("Sway", "mm", 1e3 * found.sway_m, [
+                (1e3 * found.sway_sd_m, whole, 0.15),
+                (1e3 * found.shape_sd_m, "of its shape", 0.5),
+            ]),
+            _Curve("Yaw", "mrad", 1e3 * found.yaw_rad, [(1e3 * found.yaw_sd_rad, whole, 0.15)]),
+            _Curve("Surge", "mm", 1e3 * found.surge_m, [(1e3 * found.surge_sd_m, whole, 0.15)]),
+        ]  # fmt: skip
     else:
         starts = found.lines.ping_starts
         deviation = 1e3 * found.correction_sd_m[starts]
         every = [
-            (f"{name} (mm)", 1e3 * found.correction_m[starts, axis], deviation)
-            for axis, name in enumerate(("Along x", "Along y", "Along z"))
-        ]
-    moved = [each for each in every if np.abs(each[1]).max() > 1e3 * _LEAST_SHOWN]
+            _Curve(
+                f"Along {name}", "mm", 1e3 * found.correction_m[starts, axis],
+                [(deviation, "95 % of its changes", 0.3)],
+            )
+            for axis, name in enumerate("xyz")
+        ]  # fmt: skip
+    moved = [each for each in every if np.abs(each.value).max() > 1e3 * _LEAST_SHOWN]
     return moved or every[:1]
