@@ -55,20 +55,24 @@ def _draw_curve(axes: Axes, curve: _Curve) -> None:
     ping, value = np.arange(len(curve.value)), curve.value
     axes.plot(ping, value, linewidth=1.0)
     reach = max(float(np.ptp(value)), 1e-6)
-    limits = [float(value.min()) - 0.5 * reach, float(value.max()) + 0.7 * reach]
+    limits = [float(value.min()) - 0.3 * reach, float(value.max()) + 0.7 * reach]
     for deviation, label, alpha in curve.intervals:
         width = _INTERVAL * deviation
         if not np.isfinite(width).any():
             continue
         widest = float(np.nanmax(width[np.isfinite(width)]))
+        shown = f"{label}: ±{widest:.3g} {curve.unit} at most"
+        if widest > reach:  # it would fill the panel
+            axes.plot([], [], " ", label=f"{shown}, not drawn")
+            continue
         axes.fill_between(
             ping, value - width, value + width, alpha=alpha, linewidth=0, color="tab:blue",
-            label=f"{label}: ± {widest:.2g} {curve.unit} at most",
+            label=shown,
         )  # fmt: skip
     axes.set(ylabel=f"{curve.name} ({curve.unit})", xlim=(0, max(len(value) - 1, 1)), ylim=limits)
     axes.grid(alpha=0.3)
     if axes.get_legend_handles_labels()[0]:
-        axes.legend(loc="upper right", fontsize="x-small", ncols=2)
+        axes.legend(loc="upper right", fontsize="x-small")
 
 
 def coherence(found: Micronavigation) -> Figure:
@@ -194,11 +198,11 @@ class _Curve:
 def _curves(found: Micronavigation | Autofocus) -> list[_Curve]:
     """Return all that was corrected."""
     if isinstance(found, Micronavigation):
-        whole = "95 % of the track"
+        whole = "95 % interval of the track"
         every = [
             _Curve("Sway", "mm", 1e3 * found.sway_m, [
                 (1e3 * found.sway_sd_m, whole, 0.15),
-                (1e3 * found.shape_sd_m, "of its shape", 0.5),
+                (1e3 * found.shape_sd_m, "95 % interval of its shape", 0.5),
             ]),
             _Curve("Yaw", "mrad", 1e3 * found.yaw_rad, [(1e3 * found.yaw_sd_rad, whole, 0.15)]),
             _Curve("Surge", "mm", 1e3 * found.surge_m, [(1e3 * found.surge_sd_m, whole, 0.15)]),
@@ -209,7 +213,7 @@ def _curves(found: Micronavigation | Autofocus) -> list[_Curve]:
         every = [
             _Curve(
                 f"Along {name}", "mm", 1e3 * found.correction_m[starts, axis],
-                [(deviation, "95 % of its changes", 0.3)],
+                [(deviation, "95 % interval of its changes", 0.3)],
             )
             for axis, name in enumerate("xyz")
         ]  # fmt: skip
