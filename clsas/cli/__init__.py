@@ -46,7 +46,7 @@ _COMMANDS = {
     "focus": ("navigation", "Correct a track by the bright responses of an image (autofocus)."),
     "process": (
         "processing",
-        "Take a recording to a focused image, by the steps of a scene file: recorded, resumable.",
+        "Take a recording to a focused image, by the steps of a scene file.",
     ),
     "mosaic": ("mosaics", "Form an image of any size patch by patch, into a Zarr store."),
     "quality": (

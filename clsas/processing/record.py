@@ -25,7 +25,7 @@ _BLOCK = 1 << 22  # bytes that are read at once
 
 @dataclass(frozen=True)
 class StepRecord:
-    """What a step was given, and what it found and wrote.
+    """Inputs, results and files of a step.
 
     Attributes
     ----------

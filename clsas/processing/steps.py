@@ -39,7 +39,7 @@ Progress = Callable[[int, int], None] | None
 
 @dataclass(frozen=True, eq=False)
 class Job:
-    """What every step is given.
+    """Inputs of a step.
 
     Attributes
     ----------
@@ -73,7 +73,7 @@ class Job:
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """What a step found.
+    """Results of a step.
 
     Attributes
     ----------

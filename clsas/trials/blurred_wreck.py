@@ -76,7 +76,7 @@ class Recording:
 
 @dataclass(frozen=True)
 class Measures:
-    """What an image of the wreck shows.
+    """Measures of an image of the wreck.
 
     Attributes
     ----------
