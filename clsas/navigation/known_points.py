@@ -29,6 +29,9 @@ DEFAULT_UNKNOWNS = UNKNOWNS[:2]
 
 _UNITS = {"time_offset": "s", "sound_speed": "m/s", "forward": "m", "port": "m", "up": "m"}
 _SEARCHED_CELLS = 50.0  # range resolution cells to either side, unless given
+_OF_DISTANCE = 0.7  # of the distance in range between two points, that is searched at most
+_LEAST_CELLS = 4.0  # that are searched in any case
+_MOST_MISFIT = 1 / 3  # of a resolution cell, beyond which points may be mistaken for others
 _LEAST_SEEN = 3  # channels, that a reflector must be seen by
 
 
@@ -170,7 +173,7 @@ def calibrate_track(
         receivers that keeps its direction on the platform.
     search_m : float, optional
         Largest error of a range that is looked for, metres: less than the distance in range
-        between two reflectors. 50 range resolution cells unless given.
+        between two reflectors. Unless given, 50 range resolution cells, or 70 % of that distance.
     track : Track, optional
         The platform's attitude, ping by ping, in which the lever arm is measured. Unless given,
         forward is along the track, and up is perpendicular to it.
@@ -191,7 +194,8 @@ def calibrate_track(
     -----
     ClsasWarning
         If the points do not tell two unknowns apart: the one named last is then left as it was. If
-        a point is not seen: the others decide alone.
+        a point is not seen: the others decide alone. If measured ranges contradict each other by
+        more than a third of a resolution cell.
 
     Notes
     -----
@@ -209,8 +213,8 @@ def calibrate_track(
         raise ValueError(f"unknowns must be one or several of {UNKNOWNS}, got {names}")
     validate.progress(progress)
     reader = Reader.of(Readout.of(lines))
-    search_m = _checked_search(reader, search_m)
     model = Model(lines, points, _axes(lines, names, track))
+    search_m = _checked_search(model, reader, search_m)
     _check_within(model, search_m)
     steps = iter(range(1, 5))
 
@@ -224,17 +228,32 @@ def calibrate_track(
     _check_seen(result, responses.snr, search_m)
     for each in alike:
         _warn_of(each, lines)
+    if result.misfit_m > _MOST_MISFIT * reader.cell_m:
+        validate.warn(
+            f"ranges of the points differ from those of the corrected lines by "
+            f"{reprs.quantity(result.misfit_m, 'm')} rms beside the noise, more than a third of a "
+            f"resolution cell: positions or track are wrong by as much, or search_m "
+            f"({search_m:.3g} m) lets a reflector be mistaken for another"
+        )
     if progress is not None:
         progress(4, 4)
     return result
 
 
-def _checked_search(reader: Reader, search_m: float | None) -> float:
+def _checked_search(model: Model, reader: Reader, search_m: float | None) -> float:
+    """Return the search given; by default reflectors are not mistaken for each other."""
     lines = reader.readout.lines
     longest_m = (lines.length - 1) * lines.range_step_m
-    if search_m is None:
-        return min(_SEARCHED_CELLS * reader.cell_m, longest_m)
-    return validate.number("search_m", search_m, "m", least=reader.cell_m, most=longest_m)
+    if search_m is not None:
+        return validate.number("search_m", search_m, "m", least=reader.cell_m, most=longest_m)
+    range_m = model.range_m(np.zeros(5))
+    apart_m = [
+        float(np.median(np.abs(range_m[:, one] - range_m[:, other])))
+        for one in range(range_m.shape[1])
+        for other in range(one)
+    ]
+    wanted_m = min([_SEARCHED_CELLS * reader.cell_m, *(_OF_DISTANCE * each for each in apart_m)])
+    return min(max(wanted_m, _LEAST_CELLS * reader.cell_m), longest_m)
 
 
 def _axes(lines: RangeLines, names: tuple[str, ...], track: Track | None) -> NDArray[np.float64]:

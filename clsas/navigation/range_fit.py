@@ -22,7 +22,8 @@ and of the points' positions grow as much."""
 _MOST_TURN_RAD = 0.8  # standard deviation of a phase's prediction, up to which it is followed
 _LEAST_AGREEMENT = 0.7  # of the phases of a reflector: a residual of 0.85 rad rms
 _OUTLIER = 4.0  # standard deviations
-_ROUNDS = 4  # of measuring around the model, and fitting it
+_ROUNDS = 4  # of measuring around the model and fitting it, and of errors beside the noise
+_SETTLED = 1e-3  # resolution cells by which a fit moves expected ranges in the end
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,23 +126,36 @@ def _settled(
 ) -> tuple[Fit | None, Responses]:
     """Return the fit around a state, or None if phases cannot be followed."""
     followed = np.zeros(len(model.points_m), bool)
-    for _ in range(_ROUNDS):
-        responses = _measured(model, reader, state, noise)
-        equations = _Equations(model, reader, responses, state, free, followed)
-        fit = equations.solved()
-        state = fit.state
+    equations, fit = _converged(model, reader, free, state, noise, followed)
     if not phases:
-        return fit, responses
+        return fit, equations.responses
     followed = equations.can_be_followed(fit)
+    while followed.any():
+        equations, fit = _converged(model, reader, free, fit.state, noise, followed)
+        agreed = followed & (equations.agreement(fit) >= _LEAST_AGREEMENT)
+        if (agreed == followed).all():
+            return fit, equations.responses
+        followed = agreed
+    return None, equations.responses
+
+
+def _converged(
+    model: Model,
+    reader: Reader,
+    free: tuple[int, ...],
+    state: NDArray[np.float64],
+    noise: NDArray[np.float64],
+    followed: NDArray[np.bool_],
+) -> tuple[_Equations, Fit]:
+    """Measure around the model and fit it, until the expected ranges settle."""
     for _ in range(_ROUNDS):
-        if not followed.any():
-            return None, responses
         responses = _measured(model, reader, state, noise)
         equations = _Equations(model, reader, responses, state, free, followed)
         fit = equations.solved()
         state = fit.state
-        followed = followed & (equations.agreement(fit) >= _LEAST_AGREEMENT)
-    return fit, responses
+        if np.abs(model.range_m(state) - equations.expected_m).max() <= _SETTLED * reader.cell_m:
+            break
+    return equations, fit
 
 
 class _Equations:

@@ -220,6 +220,16 @@ def test_receivers_of_an_array_that_move():
     assert (np.abs(errors(found)) < [SIZES[name] for name in UNKNOWNS]).all(), found
 
 
+def test_reflectors_are_not_mistaken_for_each_other(lines):
+    """Two of the reflectors lie 1.2 m apart, less than 50 resolution cells."""
+    given = claimed(with_noise(lines, 40, np.random.default_rng(1)), passage(), TRUE)
+    found = calibrate_track(given, POINTS, unknowns=UNKNOWNS, track=passage())
+    assert (np.abs(errors(found)) < 4 * found.sd).all(), found
+    with pytest.warns(ClsasWarning, match="lets a reflector be mistaken for another"):
+        wrong = POINTS + [0.0, 0.03, 0.0] * np.array([[1], [-1], [1], [-1]])
+        calibrate_track(lines, wrong)
+
+
 def test_bad_input(lines):
     with pytest.raises(TypeError, match="lines must be of type RangeLines"):
         calibrate_track(POINTS, POINTS)
