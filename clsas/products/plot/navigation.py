@@ -128,14 +128,14 @@ def sharpness(found: Autofocus) -> Figure:
     names = ["before", *(name for name, _ in found.sharpness)]
     values = np.array([found.sharpness_before, *(value for _, value in found.sharpness)])
     kept = np.concatenate([[True], values[1:] > np.maximum.accumulate(values)[:-1]])
-    figure = new_figure(7.0, 4.0)
+    figure = new_figure(7.0, 5.0)
     axes = figure.subplots()
     step = np.arange(len(values))
     axes.plot(step, np.maximum.accumulate(values), color="0.7", linewidth=1.0, zorder=1)
     axes.plot(step[kept], values[kept], "o", label="kept")
     if not kept.all():
         axes.plot(step[~kept], values[~kept], "o", fillstyle="none", label="tried, and left out")
-    axes.set(ylabel="Sharpness (mean squared intensity over squared mean)")
+    axes.set(ylabel="Sharpness (2 is that of speckle)")
     axes.set_xticks(step, names, rotation=45, ha="right")
     axes.grid(alpha=0.3)
     axes.legend(loc="lower right", fontsize="small")
