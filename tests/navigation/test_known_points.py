@@ -225,8 +225,8 @@ def test_reflectors_are_not_mistaken_for_each_other(lines):
     given = claimed(with_noise(lines, 40, np.random.default_rng(1)), passage(), TRUE)
     found = calibrate_track(given, POINTS, unknowns=UNKNOWNS, track=passage())
     assert (np.abs(errors(found)) < 4 * found.sd).all(), found
+    wrong = POINTS + [0.0, 0.03, 0.0] * np.array([[1], [-1], [1], [-1]])
     with pytest.warns(ClsasWarning, match="lets a reflector be mistaken for another"):
-        wrong = POINTS + [0.0, 0.03, 0.0] * np.array([[1], [-1], [1], [-1]])
         calibrate_track(lines, wrong)
 
 
