@@ -133,9 +133,12 @@ def process(
     chosen = steps if steps is not None else scene.process.get("steps")
     names = checked_steps(chosen, scene.process)
     if {"focus", "image", "mosaic"} & set(names):
-        scene.need("grid")
+        (grid,) = scene.need("grid")
+        if "image" in names:
+            validate.memory("[grid]", 16 * grid.size)  # two images
     recording = _Recording.of(scene, lines)
     folder = _folder(scene, output)
+    _check_apart(recording, folder)
     folder.mkdir(exist_ok=True)
     check_pictures()
     chain = _Chain(scene, folder, recording, open_device(device))
@@ -279,3 +282,10 @@ def _folder(scene: SceneFile, output: str | os.PathLike | None) -> Path:
     if not Path(scene.name).suffix:
         raise ValueError("output must be given: the scene has no file that names a folder")
     return Path(scene.name).with_suffix("")
+
+
+def _check_apart(recording: _Recording, folder: Path) -> None:
+    """Refuse a recording that a step could overwrite."""
+    file = recording.described["file"]
+    if file is not None and Path(file).parent.resolve() == folder.resolve():
+        raise ValueError(f"output must not be the folder of the recording, got {str(folder)!r}")

@@ -217,6 +217,12 @@ def test_bad_arguments(scene, tmp_path):
         clsas.process(empty)
     with pytest.raises(ValueError, match="missing key 'lines' in \\[process\\]"):
         clsas.process(empty, steps=("inspect",))
+    with pytest.raises(ValueError, match="output must not be the folder of the recording"):
+        clsas.process(scene, output=scene.parent)
+    huge = tmp_path / "huge.toml"
+    huge.write_text(SCENE.replace("count = 161", "count = 1000000000"))
+    with pytest.raises(ValueError, match="\\[grid\\] must ask for at most"):
+        clsas.process(huge)
     described = clsas.Grid.plane((0, 1, 2), (0, 1, 2))
     clsas.save(tmp_path / "grid.h5", described)
     with pytest.raises(ValueError, match="must hold RangeLines or Echoes, got Grid"):
