@@ -52,25 +52,25 @@ def focused(focused=True):
     return Autofocus(given, correction_m, sd_m, 2.0, 5.0, steps, focused)
 
 
-def labels(figure):
-    return [axes.get_ylabel() for axes in figure.axes]
-
-
 def legend(axes):
     return [text.get_text() for text in axes.get_legend().get_texts()]
 
 
 def test_corrections_have_their_intervals():
-    figure = clsas.plot.corrections(navigated())
-    assert labels(figure) == ["Sway (mm)", "Yaw (mrad)"]  # there is no surge
-    assert [text.split(":")[0] for text in legend(figure.axes[0])] == [
-        "95 % interval of the track", "95 % interval of its shape",
-    ]  # fmt: skip
-    assert "±1.96 mm" in legend(figure.axes[0])[0]
-    assert "not drawn" in legend(figure.axes[1])[0]  # wider than the panel
-    assert len(legend(clsas.plot.corrections(navigated(coherent=False)).axes[0])) == 1
-    assert labels(clsas.plot.corrections(focused())) == ["Along y (mm)"]
-    assert clsas.plot.corrections(focused(focused=False)).axes[0].get_legend() is None
+    sway, of_sway, yaw, of_yaw = clsas.plot.corrections(navigated()).axes  # there is no surge
+    assert sway.get_ylabel() == "Sway (mm)"
+    assert yaw.get_ylabel() == "Yaw (mrad)"
+    assert legend(of_sway) == ["whole track", "its shape"]
+    np.testing.assert_allclose(of_sway.lines[0].get_ydata(), 1.96)
+    np.testing.assert_allclose(of_yaw.lines[0].get_ydata(), 392)
+    assert len(sway.collections) == 2
+    assert len(yaw.collections) == 0  # its interval is wider than the panel
+    apart = clsas.plot.corrections(navigated(coherent=False)).axes[1]
+    assert legend(apart) == ["whole track"]
+    focus, of_focus = clsas.plot.corrections(focused()).axes
+    assert focus.get_ylabel() == "Along y (mm)"
+    np.testing.assert_allclose(of_focus.lines[0].get_ydata(), 0.196)
+    assert not clsas.plot.corrections(focused(focused=False)).axes[1].lines
 
 
 def test_coherence_lies_over_pings_and_range():

@@ -42,37 +42,57 @@ def corrections(found: Micronavigation | Autofocus) -> Figure:
     """
     validate.instance("found", found, Micronavigation, Autofocus)
     curves = _curves(found)
-    figure = new_figure(7.0, 1.0 + 1.9 * len(curves))
-    panels = np.atleast_1d(figure.subplots(len(curves), sharex=True))
-    for axes, curve in zip(panels, curves, strict=True):
-        _draw_curve(axes, curve)
-    panels[-1].set_xlabel("Ping")
+    figure = new_figure(9.0, 1.2 + 1.8 * len(curves))
+    panels: NDArray[Any] = figure.subplots(
+        len(curves), 2, sharex=True, squeeze=False, width_ratios=(2, 1)
+    )
+    for (values, widths), curve in zip(panels, curves, strict=True):
+        _draw_curve(values, widths, curve)
+    for axes in panels[-1]:
+        axes.set_xlabel("Ping")
+    panels[0, 1].set_title("95 % interval", fontsize="medium")
     return figure
 
 
-def _draw_curve(axes: Axes, curve: _Curve) -> None:
-    """Draw values over pings with their intervals; limits are those of the values."""
+def _draw_curve(values: Axes, widths: Axes, curve: _Curve) -> None:
+    """Draw values over pings, and beside them half the widths of their intervals."""
     ping, value = np.arange(len(curve.value)), curve.value
-    axes.plot(ping, value, linewidth=1.0)
+    values.plot(ping, value, linewidth=1.0)
     reach = max(float(np.ptp(value)), 1e-6)
-    limits = [float(value.min()) - 0.3 * reach, float(value.max()) + 0.7 * reach]
-    for deviation, label, alpha in curve.intervals:
+    for deviation, label, colour in curve.intervals:
         width = _INTERVAL * deviation
-        if not np.isfinite(width).any():
+        if not (np.isfinite(width) & (width > 0)).any():
             continue
-        widest = float(np.nanmax(width[np.isfinite(width)]))
-        shown = f"{label}: ±{widest:.3g} {curve.unit} at most"
-        if widest > reach:  # it would fill the panel
-            axes.plot([], [], " ", label=f"{shown}, not drawn")
-            continue
-        axes.fill_between(
-            ping, value - width, value + width, alpha=alpha, linewidth=0, color="tab:blue",
-            label=shown,
-        )  # fmt: skip
-    axes.set(ylabel=f"{curve.name} ({curve.unit})", xlim=(0, max(len(value) - 1, 1)), ylim=limits)
-    axes.grid(alpha=0.3)
-    if axes.get_legend_handles_labels()[0]:
-        axes.legend(loc="upper right", fontsize="x-small")
+        if width[np.isfinite(width)].max() < reach:  # wider ones would fill the panel
+            values.fill_between(
+                ping, value - width, value + width, alpha=0.4, linewidth=0, color=colour
+            )
+        widths.semilogy(ping, width, color=colour, linewidth=1.0, label=label)
+    values.set(
+        ylabel=f"{curve.name} ({curve.unit})", xlim=(0, max(len(value) - 1, 1)),
+        ylim=(float(value.min()) - 0.3 * reach, float(value.max()) + 0.3 * reach),
+    )  # fmt: skip
+    widths.set_ylabel(f"± ({curve.unit})")
+    _show_decades(widths)
+    for axes in (values, widths):
+        axes.grid(alpha=0.3)
+    if len(curve.intervals) > 1 and widths.get_legend_handles_labels()[0]:
+        widths.legend(fontsize="small")
+
+
+def _show_decades(axes: Axes) -> None:
+    """Let a logarithmic axis begin and end at powers of ten, written as plain numbers."""
+    from matplotlib.ticker import LogLocator, NullLocator, StrMethodFormatter
+
+    drawn = [np.asarray(line.get_ydata()) for line in axes.lines]
+    shown = np.concatenate([each[np.isfinite(each) & (each > 0)] for each in drawn] or [[]])
+    if not shown.size:
+        return
+    low, high = np.floor(np.log10(shown.min())), np.ceil(np.log10(shown.max()))
+    axes.set_ylim(10.0**low, 10.0 ** max(high, low + 1))
+    axes.yaxis.set_major_locator(LogLocator(numticks=6))
+    axes.yaxis.set_minor_locator(NullLocator())
+    axes.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
 
 
 def coherence(found: Micronavigation) -> Figure:
@@ -187,25 +207,24 @@ def _label_bar(panels: NDArray[Any]) -> None:
 
 @dataclass(frozen=True, eq=False)
 class _Curve:
-    """Corrections ping by ping, with standard deviations, their labels and opacities."""
+    """Corrections ping by ping, with standard deviations, their labels and colours."""
 
     name: str
     unit: str
     value: NDArray[np.float64]
-    intervals: list[tuple[NDArray[np.float64], str, float]]
+    intervals: list[tuple[NDArray[np.float64], str, str]]
 
 
 def _curves(found: Micronavigation | Autofocus) -> list[_Curve]:
     """Return all that was corrected."""
     if isinstance(found, Micronavigation):
-        whole = "95 % interval of the track"
         every = [
             _Curve("Sway", "mm", 1e3 * found.sway_m, [
-                (1e3 * found.sway_sd_m, whole, 0.15),
-                (1e3 * found.shape_sd_m, "95 % interval of its shape", 0.5),
+                (1e3 * found.sway_sd_m, "whole track", "tab:gray"),
+                (1e3 * found.shape_sd_m, "its shape", "tab:blue"),
             ]),
-            _Curve("Yaw", "mrad", 1e3 * found.yaw_rad, [(1e3 * found.yaw_sd_rad, whole, 0.15)]),
-            _Curve("Surge", "mm", 1e3 * found.surge_m, [(1e3 * found.surge_sd_m, whole, 0.15)]),
+            _Curve("Yaw", "mrad", 1e3 * found.yaw_rad, [(1e3 * found.yaw_sd_rad, "", "tab:gray")]),
+            _Curve("Surge", "mm", 1e3 * found.surge_m, [(1e3 * found.surge_sd_m, "", "tab:gray")]),
         ]  # fmt: skip
     else:
         starts = found.lines.ping_starts
@@ -213,7 +232,7 @@ def _curves(found: Micronavigation | Autofocus) -> list[_Curve]:
         every = [
             _Curve(
                 f"Along {name}", "mm", 1e3 * found.correction_m[starts, axis],
-                [(deviation, "95 % interval of its changes", 0.3)],
+                [(deviation, "", "tab:blue")],
             )
             for axis, name in enumerate("xyz")
         ]  # fmt: skip
