@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 
+from clsas.core.contrast import contrast, entropy
 from clsas.core.image import Image
 from clsas.navigation.autofocus import Autofocus
 from clsas.navigation.micronavigation import Micronavigation
-from clsas.products.quality import contrast, entropy
 
 
 def of_navigation(found: Micronavigation) -> dict[str, Any]:
