@@ -26,10 +26,12 @@ if TYPE_CHECKING:
     from clsas.mosaics.mosaic import Mosaic, Patch, mosaic
     from clsas.mosaics.store import Store
     from clsas.navigation.autofocus import Autofocus, autofocus
+    from clsas.navigation.known_points import Calibration, calibrate_track
     from clsas.navigation.micronavigation import Micronavigation, micronavigate
     from clsas.opencl.device import DeviceError, list_devices
     from clsas.planning.factorize import factorize
     from clsas.planning.planner import plan
+    from clsas.processing.chain import Processed, process
     from clsas.products import plot
     from clsas.products.assessment import assess, survey_lines
     from clsas.products.assessment_result import Assessment, Effect
@@ -56,6 +58,7 @@ __all__ = [
     "Assessment",
     "Autofocus",
     "BeamWindow",
+    "Calibration",
     "ClsasWarning",
     "DeviceError",
     "Echoes",
@@ -72,6 +75,7 @@ __all__ = [
     "Plan",
     "PointTargets",
     "Pointing",
+    "Processed",
     "Pulse",
     "RangeLines",
     "Replica",
@@ -83,6 +87,7 @@ __all__ = [
     "assess",
     "autofocus",
     "backproject",
+    "calibrate_track",
     "channels",
     "check_sampling",
     "compress",
@@ -99,6 +104,7 @@ __all__ = [
     "mosaic",
     "plan",
     "plot",
+    "process",
     "read_airsas",
     "read_cphd",
     "read_full_matrix",
@@ -135,10 +141,12 @@ _MODULES = {
     "mosaics.mosaic": "Mosaic Patch mosaic",
     "mosaics.store": "Store",
     "navigation.autofocus": "Autofocus autofocus",
+    "navigation.known_points": "Calibration calibrate_track",
     "navigation.micronavigation": "Micronavigation micronavigate",
     "opencl.device": "DeviceError list_devices",
     "planning.factorize": "factorize",
     "planning.planner": "plan",
+    "processing.chain": "Processed process",
     "products.assessment": "assess survey_lines",
     "products.assessment_result": "Assessment Effect",
     "products.inspection": "inspect",

@@ -38,8 +38,16 @@ _COMMANDS = {
         "assess",
         "Show which effects an image needs, the error of leaving each out, and its cost.",
     ),
+    "known-points": (
+        "navigation",
+        "Correct time offset, sound speed and lever arm by reflectors at known positions.",
+    ),
     "navigate": ("navigation", "Correct an array's track by displaced phase centres."),
     "focus": ("navigation", "Correct a track by the bright responses of an image (autofocus)."),
+    "process": (
+        "processing",
+        "Take a recording to a focused image, by the steps of a scene file.",
+    ),
     "mosaic": ("mosaics", "Form an image of any size patch by patch, into a Zarr store."),
     "quality": (
         "measures",
@@ -75,7 +83,7 @@ class _Commands(click.Group):
         if cmd_name not in _COMMANDS:
             return None
         module, _ = _COMMANDS[cmd_name]
-        return getattr(importlib.import_module(f"clsas.cli.{module}"), cmd_name)
+        return getattr(importlib.import_module(f"clsas.cli.{module}"), cmd_name.replace("-", "_"))
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         with formatter.section("Commands"):

@@ -91,8 +91,7 @@ def read_request(
     described_exactly = {key: value for key, value in described.image.items() if key in EXACT_KEYS}
     if exact or exactly:
         return described_exactly | exactly
-    described_plan = {key: value for key, value in described.image.items() if key in PLAN_KEYS}
-    return described_plan or described_exactly or DEFAULT_REQUEST
+    return described.request or DEFAULT_REQUEST
 
 
 def read_beam(described: SceneFile, given: dict[str, Any]) -> clsas.BeamWindow | None:

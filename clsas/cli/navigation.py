@@ -1,4 +1,4 @@
-"""Commands that correct a track by the echoes themselves: navigate, focus."""
+"""Commands that correct a track by the echoes: known-points, navigate, focus."""
 
 from __future__ import annotations
 
@@ -13,14 +13,77 @@ import clsas
 from clsas.cli import options
 from clsas.cli.inputs import load, read_beam, read_grid
 from clsas.cli.outputs import progress_bar, report
-from clsas.cli.parameters import INPUT, RANGE
+from clsas.cli.parameters import INPUT, POSITION, RANGE
 from clsas.core import validate
 from clsas.navigation.autofocus import UNKNOWNS as FOCUSED
+from clsas.navigation.known_points import DEFAULT_UNKNOWNS
+from clsas.navigation.known_points import UNKNOWNS as CALIBRATED
 from clsas.navigation.micronavigation import UNKNOWNS as NAVIGATED
+from clsas.processing import numbers
 
 
 def _positive(name: str, unit: str) -> Any:
     return options.checked(partial(validate.positive, name, unit=unit))
+
+
+@click.command("known-points")
+@click.argument("lines_file", metavar="LINES.H5", type=INPUT)
+@options.output("Corrected range lines")
+@click.option(
+    "--point",
+    "points",
+    multiple=True,
+    required=True,
+    type=POSITION,
+    help="Position of a reflector (m), at z = 0 unless given; repeat the option.",
+)
+@click.option(
+    "--unknown",
+    "unknowns",
+    multiple=True,
+    type=click.Choice(CALIBRATED),
+    help="What to solve for, the most important first; repeat the option. "
+    "[default: time_offset and sound_speed]",
+)
+@click.option(
+    "--search-m",
+    type=float,
+    callback=_positive("search_m", "m"),
+    help="Largest error of a range that is looked for (m). [default: 50 resolution cells]",
+)
+@options.as_json
+def known_points(
+    lines_file: Path,
+    output: Path,
+    points: tuple[tuple[float, ...], ...],
+    unknowns: tuple[str, ...],
+    search_m: float | None,
+    as_json: bool,
+) -> None:
+    """Correct time offset, sound speed and lever arm by reflectors at known positions.
+
+    Ranges of all reflectors are measured in all channels, and fitted together. The lever arm
+    (forward, port, up) is a displacement along, across and above the track.
+
+    \b
+    Example:  clsas known-points lines.h5 --point 3,12 --point 5,19,-1 -o corrected.h5
+    """
+    lines = load(lines_file, clsas.RangeLines)
+    positions = [(*point, 0.0)[:3] for point in points]
+    with progress_bar("measuring ranges") as progress:
+        found = clsas.calibrate_track(
+            lines, positions, unknowns=unknowns or DEFAULT_UNKNOWNS, search_m=search_m,
+            progress=progress,
+        )  # fmt: skip
+    clsas.save(output, found.lines)
+    results = found.figures
+    seen = ", ".join(map(str, results["seen"]))
+    report(
+        as_json,
+        f"{output}: {found.describe()}\n  seen in {seen} channels",
+        file=output,
+        **results,
+    )
 
 
 @click.command()
@@ -102,17 +165,7 @@ def navigate(
             progress=progress,
         )  # fmt: skip
     clsas.save(output, found.lines)
-    measured = np.isfinite(found.sway_steps_sd_m)
-    results = {
-        "pings": len(found.sway_m),
-        "overlap": int(found.overlap.min()),
-        "coherence": float(np.median(found.coherence)),
-        "sway_rms_m": float(np.std(found.sway_m)),
-        "yaw_rms_rad": float(np.std(found.yaw_rad)),
-        "surge_rms_m": float(np.std(found.surge_m)),
-        "sway_step_sd_m": float(np.median(found.sway_steps_sd_m[measured])),
-        "yaw_step_sd_rad": float(np.median(found.yaw_steps_sd_rad[measured])),
-    }
+    results = numbers.of_navigation(found)
     report(
         as_json,
         f"{output}: {results['pings']} pings, {results['overlap']} overlapping phase centres or "
@@ -167,14 +220,8 @@ def focus(
             progress=progress,
         )  # fmt: skip
     clsas.save(output, found.lines)
-    rms_m = float(np.sqrt(np.mean(np.sum(found.correction_m**2, axis=1))))
-    results = {
-        "focused": found.focused,
-        "correction_rms_m": rms_m,
-        "correction_sd_m": float(np.median(found.correction_sd_m)) if found.focused else None,
-        "sharpness_before": found.sharpness_before,
-        "sharpness_after": found.sharpness_after,
-    }
+    results = numbers.of_focus(found)
+    rms_m = results["correction_rms_m"]
     how = f"corrected by {1e3 * rms_m:.3g} mm rms" if found.focused else "left as they were"
     steps = "".join(f"\n  {name}: {value:.4g}" for name, value in found.sharpness)
     report(

@@ -3,30 +3,53 @@
 from __future__ import annotations
 
 import json
-import math
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import fields, is_dataclass
-from pathlib import Path
+from functools import partial
 from typing import Any
 
 import click
-import numpy as np
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    Progress,
+    TaskID,
+    TaskProgressColumn,
+    TextColumn,
+    TimeRemainingColumn,
+)
+
+from clsas.core.json_types import json_able
 
 
 @contextmanager
 def progress_bar(what: str) -> Iterator[Callable[[int, int], None] | None]:
     """Yield a callback that moves a progress bar, or None without a terminal."""
+    with step_bar() as progress:
+        if progress is not None:
+            progress(what, 0, None)  # show it before the first step is done
+        yield None if progress is None else partial(progress, what)
+
+
+@contextmanager
+def step_bar() -> Iterator[Callable[[str, int, int | None], None] | None]:
+    """Yield a callback that moves the bar of the step it names, or None without a terminal."""
     if not sys.stderr.isatty():
         yield None
         return
-    columns = (TextColumn(what), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
+    columns = (
+        TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn(),
+    )  # fmt: skip
     with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task(what, total=None)
-        yield lambda done, total: bar.update(task, completed=done, total=total)
+        tasks: dict[str, TaskID] = {}
+
+        def tell(step: str, done: int, total: int | None) -> None:
+            if step not in tasks:
+                tasks[step] = bar.add_task(step, total=None)
+            bar.update(tasks[step], completed=done, total=total)
+
+        yield tell
 
 
 def report(as_json: bool, text: str, **results: Any) -> None:
@@ -40,17 +63,3 @@ def report(as_json: bool, text: str, **results: Any) -> None:
 def print_json(results: Any, indent: int | None = 2) -> None:
     """Print results as JSON; on one line if `indent` is None."""
     click.echo(json.dumps(json_able(results), indent=indent, allow_nan=False))
-
-
-def json_able(value: Any) -> Any:
-    """Return a value in types of JSON: paths as text, infinity as null, without arrays."""
-    if is_dataclass(value):
-        parts = {part.name: getattr(value, part.name) for part in fields(value)}
-        return json_able({k: v for k, v in parts.items() if not isinstance(v, np.ndarray)})
-    if isinstance(value, dict):
-        return {key: json_able(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [json_able(item) for item in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return str(value) if isinstance(value, Path) else value

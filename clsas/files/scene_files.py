@@ -20,13 +20,13 @@ from clsas.core import reading, validate
 from clsas.core.grid import Grid
 from clsas.core.version import __version__
 from clsas.files.mistakes import explain
-from clsas.files.scene_tables import SceneTables
+from clsas.files.scene_tables import EXACT_KEYS, PLAN_KEYS, SceneTables
 from clsas.simulation.scenes import Scene
 from clsas.sonar.system import Sonar
 from clsas.sonar.track import Track
 
 _MOST_MISTAKES = 20  # listed in one message
-_IMAGING = ("grid", "image", "mosaic")  # tables without influence on range lines
+_IMAGING = ("grid", "image", "mosaic", "process")  # tables without influence on range lines
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,8 +47,12 @@ class SceneFile:
     mosaic : dict
         Paths that `clsas mosaic` reads (`lines`) and writes (`store`), and its `patches` and
         `memory_mib`.
+    process : dict
+        Paths that `clsas process` reads (`lines`) and writes (`output`), its `steps`, and keyword
+        arguments of its steps: `calibrate`, `navigate` and `focus`.
     files : dict
-        Paths of the files that the scene refers to, by key: "track.file", "mosaic.lines".
+        Paths of the files that the scene refers to, by key: "track.file", "mosaic.lines",
+        "process.lines".
     """
 
     name: str
@@ -60,7 +64,14 @@ class SceneFile:
     compress: dict[str, Any] = field(default_factory=dict)
     image: dict[str, Any] = field(default_factory=dict)
     mosaic: dict[str, Any] = field(default_factory=dict)
+    process: dict[str, Any] = field(default_factory=dict)
     files: dict[str, Path] = field(default_factory=dict)
+
+    @property
+    def request(self) -> dict[str, Any]:
+        """How `[image]` wants an image: one of `PLAN_KEYS`, some of `EXACT_KEYS`, or nothing."""
+        planned = {key: value for key, value in self.image.items() if key in PLAN_KEYS}
+        return planned or {key: value for key, value in self.image.items() if key in EXACT_KEYS}
 
     def need(self, *tables: str) -> tuple[Any, ...]:
         """Return the attributes of these names; raises ValueError if one is missing."""

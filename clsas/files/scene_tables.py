@@ -17,6 +17,7 @@ from pydantic import Field
 from clsas.core import validate
 from clsas.core.grid import Grid
 from clsas.exact.backprojection import BEST_ACCURACY_DB
+from clsas.files.process_tables import ProcessTable
 from clsas.files.survey_tables import SonarTable, TrackTable
 from clsas.files.tables import Table, Vector, located
 from clsas.planning.planner import checked_pairs, tolerance_in_db
@@ -222,6 +223,7 @@ class SceneTables(Table):
     compress: _Compress = _Compress()
     image: _Image = _Image()
     mosaic: _Mosaic = _Mosaic()
+    process: ProcessTable = ProcessTable()
 
     def build(self, folder: Path) -> dict[str, Any]:
         """Return the fields of `clsas.files.scene_files.SceneFile`, without its name.
@@ -245,6 +247,7 @@ class SceneTables(Table):
         paths = {
             "track.file": self.track and self.track.file,
             "mosaic.lines": self.mosaic.lines,
+            "process.lines": self.process.lines,
         }
         return dict(
             sonar=self.sonar.build() if self.sonar else None,
@@ -255,5 +258,6 @@ class SceneTables(Table):
             compress=self.compress.build(),
             image=self.image.build(),
             mosaic=self.mosaic.build(folder),
+            process=self.process.build(folder),
             files={key: folder / file for key, file in paths.items() if file},
         )

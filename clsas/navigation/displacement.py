@@ -281,18 +281,19 @@ def displacement(found: Correlation, *, first: bool, yaw: bool) -> Displacement:
     """Return the displacement that explains a correlation best.
 
     The envelope's peak over lags decides between whole wavelengths; phases, fitted by a straight
-    line along the array, do the rest. `first` also tries yaw of up to 0.2 rad. Without `yaw` the
-    array does not turn: the line is level.
+    line along the array, do the rest. `first` also tries yaw of up to 0.2 rad, or as much as the
+    spacing of the channels tells. Without `yaw` the array does not turn: the line is level.
     """
     turns = 2 * np.pi * found.cycles_per_m * found.sensitivity
     slope = 0.0
     steer = turns * found.along_m[:, None]
     if first and yaw:
+        slopes = _SLOPES[np.abs(_SLOPES) <= _unambiguous_slope(found)]
         power = [
             np.sum(np.abs(np.einsum("kwm,kw->wm", found.values, np.exp(1j * steer * each))) ** 2)
-            for each in _SLOPES
+            for each in slopes
         ]
-        slope = float(_SLOPES[int(np.argmax(power))])
+        slope = float(slopes[int(np.argmax(power))])
     summed = np.einsum("kwm,kw->wm", found.values, np.exp(1j * steer * slope))
     sway_m = -_peak_m(summed, found.lags_m) / float(np.mean(found.sensitivity))
     lag = int(np.argmin(np.abs(found.lags_m + sway_m * np.mean(found.sensitivity))))
@@ -316,6 +317,16 @@ def displacement(found: Correlation, *, first: bool, yaw: bool) -> Displacement:
     return Displacement(
         sway_m + float(solution[0]), slope + float(solution[1]), covariance, coherence, misfit
     )
+
+
+def _unambiguous_slope(found: Correlation) -> float:
+    """Return the yaw up to which phases of neighbouring pairs differ by less than half a cycle.
+
+    Beyond it the array's pairs see grating lobes: the same phases as of a smaller yaw.
+    """
+    steps_m = np.diff(np.sort(found.along_m))
+    apart_m = float(np.median(steps_m)) if len(steps_m) else 0.0
+    return 0.5 / max(abs(found.cycles_per_m) * apart_m, 1e-9)
 
 
 def surge(

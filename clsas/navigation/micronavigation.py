@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -15,7 +16,7 @@ from clsas.navigation.checks import check_navigation
 from clsas.navigation.displacement import Correlator
 from clsas.navigation.overlap import Array, moved
 from clsas.navigation.passes import Displacements, measured
-from clsas.navigation.smoother import Step, smooth
+from clsas.navigation.smoother import Step, shape_deviation_m, smooth
 from clsas.navigation.swath import Swath
 from clsas.signal.compression import compress
 from clsas.signal.echoes import Echoes
@@ -75,6 +76,19 @@ class Micronavigation:
     coherence: NDArray[np.float64]
     range_m: NDArray[np.float64]
     overlap: NDArray[np.int64]
+
+    @cached_property
+    def shape_sd_m(self) -> NDArray[np.float64]:
+        """Standard deviation of the sway without a common shift and turn, metres, [pings].
+
+        An image is as sharp as this is small: a shift and a turn of the whole track move and turn
+        the image. NaN if echoes of some pings were not coherent.
+        """
+        deviations = self.sway_steps_sd_m, self.yaw_steps_sd_rad
+        if not all(np.isfinite(each).all() for each in deviations):
+            return np.full(len(self.sway_m), np.nan)
+        advance_m = np.linalg.norm(np.diff(self.lines.ping_centres_m, axis=0), axis=1)
+        return shape_deviation_m(*deviations, advance_m)
 
     def __repr__(self) -> str:
         """Return the size of what was found, and how coherent the echoes are."""

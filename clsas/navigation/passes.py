@@ -21,6 +21,8 @@ _PASSES = 6  # at most, and again after a surge
 _SETTLED = 0.1  # changes of the last pass, over their standard deviations
 _LATER_LAGS = 4  # samples to either side that later passes look at
 _SURGES = 3  # times that the advance is corrected and channels are paired anew
+_LEFT = 0.75  # of the progress, after a pass: of usually 8, or 3 without surge
+_PROGRESS = 1000  # steps that are told
 _LEAST_SURGE = 0.02  # spacings of the array, for which that is worth it
 
 
@@ -82,7 +84,34 @@ def measured(
             passes.settle(_LATER_LAGS * lines.range_step_m)
             if np.abs(found_m).max() <= _LEAST_SURGE * array.spacing_m:
                 break
+    passes.progress.finished()
     return passes.result(deviation_m)
+
+
+class _Progress:
+    """Progress of a work whose number of passes is not known before.
+
+    Every pass takes the same share of what is left, so that the bar never goes back.
+    """
+
+    def __init__(self, tell: Callable[[int, int], None] | None) -> None:
+        self.tell, self.left, self.told = tell, 1.0, 0
+
+    def done(self, number: int, count: int, passes: int = 1) -> None:
+        """Tell that `number` of `count` pairs of pings are done, in work of so many passes."""
+        left = self.left * _LEFT ** (passes * number / count)
+        if number == count:
+            self.left = left
+        self._tell(int(_PROGRESS * (1 - left)))
+
+    def finished(self) -> None:
+        """Tell that no pass is left."""
+        self._tell(_PROGRESS)
+
+    def _tell(self, steps: int) -> None:
+        if self.tell is not None and steps > self.told:
+            self.told = steps
+            self.tell(steps, _PROGRESS)
 
 
 class _Passes:
@@ -97,7 +126,7 @@ class _Passes:
         progress: Callable[[int, int], None] | None,
     ) -> None:
         self.lines, self.array, self.correlator = lines, array, correlator
-        self.yaw, self.progress = "yaw" in unknowns, progress
+        self.yaw, self.progress = "yaw" in unknowns, _Progress(progress)
         count = array.pings - 1
         self.moved, self.surge_m = np.zeros((count, 2)), np.zeros(count)
         self.coherent = np.ones(count, bool)
@@ -115,8 +144,7 @@ class _Passes:
                 step = displacement(correlation, first=first, yaw=self.yaw)
                 self.steps.append(step)
                 changes[ping] = step.sway_m, step.yaw_rad
-                if self.progress is not None and first:
-                    self.progress(ping + 1, len(self.overlaps))
+                self.progress.done(ping + 1, len(self.overlaps))
             self.coherent = np.array([self._is_coherent(step) for step in self.steps])
             changes[~self.coherent] = self.moved[~self.coherent] = 0.0
             self.moved = self.moved + changes
@@ -130,16 +158,16 @@ class _Passes:
         corrected, here = self._corrected()
         found = np.zeros((len(self.overlaps), 2))
         for ping in np.flatnonzero(self.coherent).tolist():
+            pairs = [overlap(corrected, here, ping, lag) for lag in (0, -1, 1)]
+            if not all(each.pairs for each in pairs):
+                found[ping] = 0.0, here.spacing_m  # too few channels overlap to tell
+                continue
             at, behind, ahead = (
-                self.correlator.correlate(
-                    corrected,
-                    here,
-                    overlap(corrected, here, ping, lag),
-                    self.lines.range_step_m,
-                )
-                for lag in (0, -1, 1)
+                self.correlator.correlate(corrected, here, each, self.lines.range_step_m)
+                for each in pairs
             )
             found[ping] = surge(at, behind, ahead, here.spacing_m)
+            self.progress.done(ping + 1, self.array.pings - 1, passes=3)
         return found[:, 0], found[:, 1]
 
     def result(self, surge_sd_m: NDArray[np.float64]) -> Displacements:

@@ -28,6 +28,7 @@ X_M, Y_M = (-32.0, 32.0), (36.0, 92.0)
 _FOOTPRINT_M = 2.5  # more than half the length of track that a pixel of the wreck is visible from
 _SPACING_M = 0.25  # of the points that are classified as lit or in shadow
 _FLAT_M = 0.3  # largest height that counts as sand
+_LEFT_OUT_M = 2.0  # to either side of a position that is left out
 _SURROUNDINGS_M = (12.0, 30.0)  # distance along and across up to which lit sand is compared
 
 
@@ -105,9 +106,15 @@ class Shadow:
         chosen = sand & near & (dark | light)
         return ground[chosen], dark[chosen], light[chosen]
 
-    def contrast_db(self, image: Image) -> float:
-        """Return the mean power of lit sand over that of the shadow, dB."""
+    def contrast_db(self, image: Image, without_m: tuple[float, float] | None = None) -> float:
+        """Return the mean power of lit sand over that of the shadow, dB.
+
+        Sand within 2 m along and across of the position `without_m` is left out.
+        """
         ground, dark, light = self.masks
+        if without_m is not None:
+            away = (np.abs(ground - without_m) > _LEFT_OUT_M).any(axis=1)
+            ground, dark, light = ground[away], dark[away], light[away]
         x_m, y_m = image.grid.axes_m
         column = np.rint((ground[:, 0] - x_m[0]) / (x_m[1] - x_m[0])).astype(int)
         row = np.rint((ground[:, 1] - y_m[0]) / (y_m[1] - y_m[0])).astype(int)

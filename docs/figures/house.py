@@ -32,6 +32,7 @@ FLOORS = (
     ),
     (
         (
+            ("processing", "from a recording to an image\nsteps, records"),
             ("trials", "is it right, is it fast?\noracle, selftest, benchmarks"),
             ("cli", "the command line\none file per group of commands"),
         ),

@@ -1,4 +1,4 @@
-"""Pictures: images, mosaics, volumes, point responses, geometry, lines, recordings, trade-offs.
+"""Pictures: images, mosaics, volumes, points, geometry, lines, recordings, tracks, trade-offs.
 
 Functions that return a `matplotlib.figure.Figure` touch no window and no global state; `save`
 writes it as PNG, PDF or SVG. `image` draws into axes of your own, or into a new pyplot figure.
@@ -14,11 +14,18 @@ from clsas.products.plot.levels import image_html as image_html
 from clsas.products.plot.levels import range_lines as range_lines
 from clsas.products.plot.mosaics import mosaic as mosaic
 from clsas.products.plot.mosaics import patch_borders as patch_borders
+from clsas.products.plot.navigation import before_and_after as before_and_after
+from clsas.products.plot.navigation import coherence as coherence
+from clsas.products.plot.navigation import corrections as corrections
+from clsas.products.plot.navigation import sharpness as sharpness
 from clsas.products.plot.recordings import inspection as inspection
 from clsas.products.plot.survey import geometry as geometry
 from clsas.products.plot.volumes import volume as volume
 
 __all__ = [
+    "before_and_after",
+    "coherence",
+    "corrections",
     "cuts",
     "geometry",
     "image",
@@ -30,6 +37,7 @@ __all__ = [
     "range_lines",
     "save",
     "save_png",
+    "sharpness",
     "tradeoff",
     "volume",
 ]

@@ -1,0 +1,109 @@
+"""Command that takes a recording to a focused image: process."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+import clsas
+from clsas.cli import options
+from clsas.cli.inputs import read_scene
+from clsas.cli.outputs import report, step_bar
+from clsas.cli.parameters import INPUT, keep_apart
+from clsas.files.process_tables import STEPS
+from clsas.processing.record import StepRecord
+
+
+@click.command()
+@click.argument("scene", metavar="SCENE.TOML", type=INPUT)
+@click.option("--lines", "lines_path", type=INPUT, help="Recording, instead of the scene's.")
+@click.option(
+    "-o",
+    "--output",
+    type=click.Path(file_okay=False, path_type=Path),
+    help="Folder for the results. [default: that of the scene, or the name of its file]",
+)
+@click.option(
+    "--step",
+    "steps",
+    multiple=True,
+    type=click.Choice(STEPS),
+    help="Step to run instead of the scene's; repeat the option.",
+)
+@options.device
+@options.as_json
+def process(
+    scene: Path,
+    lines_path: Path | None,
+    output: Path | None,
+    steps: tuple[str, ...],
+    device: str | None,
+    as_json: bool,
+) -> None:
+    """Take a recording to a focused image, by the steps of a scene file.
+
+    The table [process] of the scene names the recording and the steps: inspect, calibrate,
+    navigate, focus, image and mosaic. Results go into one folder, with a record of inputs, versions
+    and numbers in process.json. The same command continues after an interruption, and runs again
+    only what has changed.
+
+    \b
+    Example:  clsas process scene.toml --lines lines.h5 -o processed
+    """
+    described = read_scene(scene)
+    folder = output or described.process.get("output")
+    keep_apart("the recording", lines_path or described.process.get("lines"), "output", folder)
+    with step_bar() as progress:
+        found = clsas.process(
+            described, lines=lines_path, output=folder, steps=steps or None, device=device,
+            progress=progress,
+        )  # fmt: skip
+    rows = [f"  {_row(step, step.name in found.repeated)}" for step in found.steps]
+    report(
+        as_json,
+        "\n".join([f"{found.folder}:", *rows]),
+        folder=found.folder,
+        repeated=found.repeated,
+        steps={step.name: _figures(step) for step in found.steps},
+    )
+
+
+def _row(step: StepRecord, is_new: bool) -> str:
+    """Return a line about a step."""
+    done = f"{step.seconds:.2f} s" if is_new else "unchanged"
+    files = f": {', '.join(step.files)}" if step.files else ""
+    return f"{step.name}, {done}{files}{_in_words(step)}"
+
+
+def _in_words(step: StepRecord) -> str:
+    """Return the most important numbers of a step."""
+    numbers = step.numbers
+    if step.name == "inspect":
+        count = len(numbers["findings"])
+        return f"; {count} finding{'s' * (count != 1)}"
+    if step.name == "calibrate":
+        pairs = zip(numbers["unknowns"], numbers["values"], numbers["sd"], strict=True)
+        return "; " + ", ".join(f"{name} {value:.4g} ± {sd:.2g}" for name, value, sd in pairs)
+    if step.name == "navigate":
+        return (
+            f"; {1e3 * numbers['sway_rms_m']:.3g} mm of sway rms, coherence "
+            f"{numbers['coherence']:.2f}"
+        )
+    if step.name == "focus":
+        return (
+            f"; sharpness {numbers['sharpness_before']:.4g} to {numbers['sharpness_after']:.4g}"
+            + ("" if numbers["focused"] else ", left as it was")
+        )
+    if step.name == "image" and "before" in numbers and numbers["peak_db"] is not None:
+        gain_db = numbers["peak_db"] - (numbers["before"]["peak_db"] or 0.0)
+        return f"; peak {gain_db:+.1f} dB by the corrections"
+    return ""
+
+
+def _figures(step: StepRecord) -> dict[str, Any]:
+    return {
+        "seconds": step.seconds, "files": list(step.files), "warnings": list(step.warnings),
+        **step.numbers,
+    }  # fmt: skip

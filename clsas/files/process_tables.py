@@ -1,0 +1,141 @@
+"""The table `[process]` of scene files: steps from a recording to a focused image."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+from pydantic import Field
+
+from clsas.core import validate
+from clsas.files.tables import Table, Vector, located
+from clsas.navigation.autofocus import UNKNOWNS as FOCUSED
+from clsas.navigation.known_points import UNKNOWNS as CALIBRATED
+from clsas.navigation.micronavigation import UNKNOWNS as NAVIGATED
+
+STEPS = ("inspect", "calibrate", "navigate", "focus", "image", "mosaic")
+"""Steps of `clsas process`, in the order in which they run."""
+
+_USUAL = ("inspect", "image")
+_NAMED = ("calibrate", "navigate", "focus")  # which run if their table is there
+_Pair = Annotated[list[float], Field(min_length=2, max_length=2)]
+
+
+class _Calibrate(Table):
+    points_m: list[Vector]
+    unknowns: list[str] | None = None
+    search_m: float | None = None
+
+    def build(self) -> dict[str, Any]:
+        options = self.given()
+        with located("[process.calibrate]"):
+            options["points_m"] = validate.array("points_m", self.points_m, np.float64, (None, 3))
+            _check(options, validate.positive, search_m="m")
+            _check_unknowns(options, CALIBRATED)
+        return options
+
+
+class _Navigate(Table):
+    range_m: _Pair | None = None
+    window_m: float | None = None
+    side: str = "port"
+    seabed_z_m: float | None = None
+    element_length_m: float | None = None
+    sway_sd_m: float = 0.1
+    yaw_sd_deg: float = 1.0
+    surge_sd_m: float = 0.1
+    correlation_pings: float | None = None
+    unknowns: list[str] | None = None
+    most_step_m: float = 0.1
+
+    def build(self) -> dict[str, Any]:
+        options = self.given()
+        with located("[process.navigate]"):
+            validate.one_of("side", self.side, ("port", "starboard"))
+            _check(
+                options, validate.positive, window_m="m", element_length_m="m", sway_sd_m="m",
+                yaw_sd_deg="degrees", surge_sd_m="m", correlation_pings="pings", most_step_m="m",
+            )  # fmt: skip
+            _check(options, validate.number, seabed_z_m="m")
+            _check_unknowns(options, NAVIGATED)
+            if self.range_m is not None:
+                near, far = self.range_m
+                if not 0 <= near < far:
+                    raise ValueError(f"range_m must be [near, far], ascending, got {self.range_m}")
+                options["range_m"] = near, far
+        if "yaw_sd_deg" in options:
+            options["yaw_sd_rad"] = math.radians(options.pop("yaw_sd_deg"))
+        return options
+
+
+class _Focus(Table):
+    unknowns: list[str] | None = None
+
+    def build(self) -> dict[str, Any]:
+        options = self.given()
+        with located("[process.focus]"):
+            _check_unknowns(options, FOCUSED)
+        return options
+
+
+class ProcessTable(Table):
+    """The whole table."""
+
+    lines: str | None = None
+    output: str | None = None
+    steps: list[str] | None = None
+    calibrate: _Calibrate | None = None
+    navigate: _Navigate | None = None
+    focus: _Focus | None = None
+
+    def build(self, folder: Path) -> dict[str, Any]:
+        """Return paths, steps, and the options of every step."""
+        options: dict[str, Any] = {}
+        with located("[process]"):
+            for name in ("lines", "output"):
+                if (path := getattr(self, name)) is not None:
+                    if not path:
+                        raise ValueError(f"{name} must be a path, got an empty one")
+                    options[name] = folder / path
+            if "lines" in options and not options["lines"].exists():
+                raise ValueError(f"lines must be a file, there is no {options['lines']}")
+        for name in _NAMED:
+            if (table := getattr(self, name)) is not None:
+                options[name] = table.build()
+        with located("[process]"):
+            if self.steps is not None:
+                options["steps"] = checked_steps(self.steps, options)
+        return options
+
+
+def checked_steps(steps: Iterable[str] | None, options: dict[str, Any]) -> tuple[str, ...]:
+    """Return steps in their order; by default the usual ones, and those with options.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If there is no such step, or "calibrate" has no points.
+    """
+    if steps is None:
+        chosen = {*_USUAL, *(name for name in _NAMED if name in options)}
+    else:
+        chosen = set(validate.named("steps", list(steps), STEPS))
+    if not chosen:
+        raise ValueError(f"steps must name one or several of {STEPS}, got none")
+    if "calibrate" in chosen and "calibrate" not in options:
+        raise ValueError("steps: calibrate needs [process.calibrate] with points_m")
+    return tuple(name for name in STEPS if name in chosen)
+
+
+def _check(options: dict[str, Any], check: Callable[..., float], **units: str) -> None:
+    for name, unit in units.items():
+        if name in options:
+            check(name, options[name], unit)
+
+
+def _check_unknowns(options: dict[str, Any], allowed: tuple[str, ...]) -> None:
+    if "unknowns" in options:
+        options["unknowns"] = validate.named("unknowns", options["unknowns"], allowed)

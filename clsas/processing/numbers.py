@@ -1,0 +1,52 @@
+"""Numbers of the steps' results, in types of JSON: what reports and records hold."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from clsas.core.contrast import contrast, entropy
+from clsas.core.image import Image
+from clsas.navigation.autofocus import Autofocus
+from clsas.navigation.micronavigation import Micronavigation
+
+
+def of_navigation(found: Micronavigation) -> dict[str, Any]:
+    """Return how much a track was corrected by micronavigation, and how certainly."""
+    measured = np.isfinite(found.sway_steps_sd_m)
+    return {
+        "pings": len(found.sway_m),
+        "overlap": int(found.overlap.min()),
+        "coherence": float(np.median(found.coherence)),
+        "sway_rms_m": float(np.std(found.sway_m)),
+        "yaw_rms_rad": float(np.std(found.yaw_rad)),
+        "surge_rms_m": float(np.std(found.surge_m)),
+        "shape_sd_m": float(np.max(found.shape_sd_m)),
+        "sway_step_sd_m": float(np.median(found.sway_steps_sd_m[measured])),
+        "yaw_step_sd_rad": float(np.median(found.yaw_steps_sd_rad[measured])),
+    }
+
+
+def of_focus(found: Autofocus) -> dict[str, Any]:
+    """Return how much a track was corrected by autofocus, and what it gained."""
+    rms_m = float(np.sqrt(np.mean(np.sum(found.correction_m**2, axis=1))))
+    return {
+        "focused": found.focused,
+        "correction_rms_m": rms_m,
+        "correction_sd_m": float(np.median(found.correction_sd_m)) if found.focused else None,
+        "sharpness_before": found.sharpness_before,
+        "sharpness_after": found.sharpness_after,
+    }
+
+
+def of_image(image: Image) -> dict[str, Any]:
+    """Return what an image shows as a whole; all None of an image of zeros."""
+    peak = float(np.abs(image.pixels).max())
+    if peak == 0:
+        return {"peak_db": None, "contrast": None, "entropy": None}
+    return {
+        "peak_db": 20 * float(np.log10(peak)),
+        "contrast": contrast(image),
+        "entropy": entropy(image),
+    }

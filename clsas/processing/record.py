@@ -1,0 +1,147 @@
+"""Record of a processing: inputs, versions and numbers of every step, as JSON beside the image."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import platform
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import scipy
+
+from clsas.core import reading, reprs
+from clsas.core.atomic import replacing
+from clsas.core.json_types import json_able
+from clsas.core.lines import RangeLines
+from clsas.core.version import __version__
+
+NAME = "process.json"
+_FORMAT, _VERSION = "clsas processing", 1
+_BLOCK = 1 << 22  # bytes that are read at once
+
+
+@dataclass(frozen=True)
+class StepRecord:
+    """Inputs, results and files of a step.
+
+    Attributes
+    ----------
+    name : str
+        The step: "inspect", "calibrate", "navigate", "focus", "image" or "mosaic".
+    digest : str
+        Of its inputs, its options and clsas's version.
+    options : dict
+        Options of the step, in types of JSON.
+    numbers : dict
+        What it found, in types of JSON.
+    files : dict
+        Digest of every file that it wrote, by name.
+    warnings : tuple of str
+        Its warnings.
+    seconds : float
+    device : str
+        The device that it used.
+    """
+
+    name: str
+    digest: str
+    options: dict[str, Any] = field(default_factory=dict)
+    numbers: dict[str, Any] = field(default_factory=dict)
+    files: dict[str, str] = field(default_factory=dict)
+    warnings: tuple[str, ...] = ()
+    seconds: float = 0.0
+    device: str = ""
+
+    def __repr__(self) -> str:
+        """Return the step, its files and its time."""
+        return reprs.summary(
+            self, self.name, f"{len(self.files)} files", reprs.quantity(self.seconds, "s")
+        )
+
+    def is_intact(self, folder: Path) -> bool:
+        """Return whether all files of the step are there, as they were written."""
+        try:
+            return all(file_digest(folder / name) == each for name, each in self.files.items())
+        except (OSError, ValueError):
+            return False
+
+
+def read_records(folder: Path) -> dict[str, StepRecord]:
+    """Return the records of a folder by step; those that cannot be read are left out."""
+    try:
+        document = reading.parse_json(reading.read_bytes(folder / NAME))
+    except (OSError, ValueError):
+        return {}
+    if not isinstance(document, dict) or document.get("format") != _FORMAT:
+        return {}
+    if document.get("version") != _VERSION or not isinstance(document.get("steps"), list):
+        return {}
+    found = {}
+    for step in document["steps"]:
+        try:
+            record = StepRecord(**{**step, "warnings": tuple(step["warnings"])})
+            if isinstance(record.files, dict) and all(_is_plain(name) for name in record.files):
+                found[str(record.name)] = record
+        except (TypeError, LookupError):
+            continue
+    return found
+
+
+def write_records(
+    folder: Path, scene: str, given: dict[str, Any], records: list[StepRecord]
+) -> None:
+    """Write the record of a folder in one step."""
+    document = {
+        "format": _FORMAT,
+        "version": _VERSION,
+        "clsas": __version__,
+        "python": platform.python_version(),
+        "numpy": np.__version__,
+        "scipy": scipy.__version__,
+        "machine": platform.platform(),
+        "scene": scene,
+        "recording": given,
+        "steps": [asdict(record) for record in records],
+    }
+    text = json.dumps(json_able(document), indent=1, allow_nan=False)
+    with replacing(folder / NAME) as temporary:
+        temporary.write_text(text)
+
+
+def step_digest(name: str, options: dict[str, Any], *inputs: str) -> str:
+    """Return the digest of a step with its options and the digests of its inputs."""
+    text = json.dumps([__version__, name, json_able(options), *inputs], sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def file_digest(path: Path) -> str:
+    """Return a digest of a file's contents.
+
+    Raises
+    ------
+    OSError, ValueError
+        If it cannot be read, or is no ordinary file.
+    """
+    reading.check_ordinary(path)
+    sha = hashlib.sha256()
+    with path.open("rb") as file:
+        while block := file.read(_BLOCK):
+            sha.update(block)
+    return sha.hexdigest()[:16]
+
+
+def contents_digest(lines: RangeLines) -> str:
+    """Return a digest of lines, with their samples."""
+    scalars = [lines.range_step_m, lines.carrier_hz, lines.sound_speed_m_s]
+    sha = hashlib.sha256(np.array(scalars).tobytes())
+    for array in (lines.samples, *lines.per_channel.values()):
+        sha.update(np.ascontiguousarray(array).data)
+    return sha.hexdigest()[:16]
+
+
+def _is_plain(name: object) -> bool:
+    """Return whether a name is that of a file in the folder, and not a path out of it."""
+    return isinstance(name, str) and name not in ("", ".", "..") and Path(name).name == name

@@ -1,0 +1,280 @@
+"""Steps of a processing. Each takes lines, and writes what it finds into the folder."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from clsas.core.atomic import replacing
+from clsas.core.digests import grid_digest
+from clsas.core.extras import install_command, is_installed
+from clsas.core.grid import Grid
+from clsas.core.image import Image
+from clsas.core.lines import RangeLines
+from clsas.core.validate import warn
+from clsas.exact.backprojection import backproject
+from clsas.factorized.factorization import ExactImage
+from clsas.files.hdf5 import save
+from clsas.files.scene_files import SceneFile
+from clsas.files.scene_tables import EXACT_KEYS
+from clsas.mosaics.mosaic import mosaic
+from clsas.navigation.autofocus import Autofocus, autofocus
+from clsas.navigation.known_points import calibrate_track
+from clsas.navigation.micronavigation import Micronavigation, micronavigate
+from clsas.opencl.device import Device
+from clsas.planning.factorize import factorize
+from clsas.planning.planner import TOLERANCE_DB, plan
+from clsas.processing import numbers
+from clsas.products import plot
+from clsas.products.inspection import inspect
+
+Progress = Callable[[int, int], None] | None
+
+
+@dataclass(frozen=True, eq=False)
+class Job:
+    """Inputs of a step.
+
+    Attributes
+    ----------
+    scene : SceneFile
+    folder : Path
+        Where results go.
+    given, lines : Callable
+        Return the lines of the recording, and as far as they are corrected.
+    device : Device
+    progress : Progress
+    """
+
+    scene: SceneFile
+    folder: Path
+    given: Callable[[], RangeLines]
+    lines: Callable[[], RangeLines]
+    device: Device
+    progress: Progress
+
+    def options(self, step: str) -> dict[str, Any]:
+        """Return the scene's options of a step."""
+        return dict(self.scene.process.get(step, {}))
+
+    def draw(self, name: str, draw: Callable[[], Any]) -> list[str]:
+        """Write a picture, and return its name; without matplotlib there is none."""
+        if not is_installed("matplotlib"):
+            return []
+        plot.save(draw(), self.folder / name)
+        return [name]
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """Results of a step.
+
+    Attributes
+    ----------
+    numbers : dict
+        In types of JSON.
+    files : list of str
+        Names of files that it wrote.
+    lines : RangeLines or None
+        Corrected lines.
+    """
+
+    numbers: dict[str, Any]
+    files: list[str] = field(default_factory=list)
+    lines: RangeLines | None = None
+
+
+def options_of(step: str, scene: SceneFile) -> dict[str, Any]:
+    """Return all of a scene that a step depends on, in types of JSON once arrays are lists."""
+    options = dict(scene.process.get(step, {}))
+    if step in ("inspect", "focus", "image", "mosaic"):
+        options["grid"] = None if scene.grid is None else grid_digest(scene.grid)
+        options["beam"] = scene.image.get("beam")
+    if step == "inspect":
+        options["element_length_m"] = None if scene.sonar is None else scene.sonar.element_length_m
+    if step in ("image", "mosaic"):
+        options["request"] = request_of(scene)
+    if step == "mosaic":
+        options |= scene.mosaic
+    return options
+
+
+def request_of(scene: SceneFile) -> dict[str, Any]:
+    """Return how the scene wants an image."""
+    return scene.request or {"tolerance_db": TOLERANCE_DB}
+
+
+def inspected(job: Job) -> Outcome:
+    """Look at the recording; write its table."""
+    scene = job.scene
+    found = inspect(
+        job.given(), scene.grid, device=job.device, beam=scene.image.get("beam"),
+        element_length_m=None if scene.sonar is None else scene.sonar.element_length_m,
+    )  # fmt: skip
+    for finding in found.findings:
+        warn(f"{finding.name}: {finding.message}")
+    _write(job.folder / "inspect.txt", found.describe() + "\n")
+    files = ["inspect.txt", *job.draw("inspect.png", lambda: plot.inspection(found, scene.grid))]
+    findings = [{"name": each.name, "message": each.message} for each in found.findings]
+    return Outcome({"geometry": found.geometry, "pings": found.pings, "findings": findings}, files)
+
+
+def calibrated(job: Job) -> Outcome:
+    """Find time offset, sound speed and lever arm by known points."""
+    options = job.options("calibrate")
+    found = calibrate_track(job.lines(), options.pop("points_m"), **options, progress=job.progress)
+    return Outcome(found.figures, lines=found.lines)
+
+
+def navigated(job: Job) -> Outcome:
+    """Correct the track by displaced phase centres."""
+    found = micronavigate(job.lines(), **job.options("navigate"), progress=job.progress)
+    _write_track(job.folder / "navigate.csv", found)
+    files = ["navigate.csv"]
+    files += job.draw("navigate-track.png", lambda: plot.corrections(found))
+    files += job.draw("navigate-coherence.png", lambda: plot.coherence(found))
+    return Outcome(numbers.of_navigation(found), files, found.lines)
+
+
+def focused(job: Job) -> Outcome:
+    """Correct the track by the bright responses of an image."""
+    (grid,) = job.scene.need("grid")
+    found = autofocus(
+        job.lines(), grid, beam=job.scene.image.get("beam"), **job.options("focus"),
+        device=job.device, progress=job.progress,
+    )  # fmt: skip
+    _write_track(job.folder / "focus.csv", found)
+    files = ["focus.csv"]
+    files += job.draw("focus-track.png", lambda: plot.corrections(found))
+    files += job.draw("focus-sharpness.png", lambda: plot.sharpness(found))
+    return Outcome(numbers.of_focus(found), files, found.lines)
+
+
+def imaged(job: Job) -> Outcome:
+    """Form the image; where the lines were corrected, also the one that they gave before."""
+    (grid,) = job.scene.need("grid")
+    given, lines = job.given(), job.lines()
+    corrected = lines is not given
+    shares = (0, 2), (1, 2)
+    if not corrected:
+        image, error_db = _formed(job, lines, grid, (0, 1))
+    else:
+        before, _ = _formed(job, given, grid, shares[0])
+        image, error_db = _formed(job, lines, grid, shares[1])
+    save(job.folder / "image.h5", image)
+    files = ["image.h5", *job.draw("image.png", lambda: plot.image_db(image))]
+    found = numbers.of_image(image) | {"predicted_error_db": error_db}
+    if corrected:
+        save(job.folder / "before.h5", before)
+        found["before"] = numbers.of_image(before)
+        both = job.draw("before-and-after.png", lambda: plot.before_and_after(before, image))
+        files += ["before.h5", *both]
+    return Outcome(found, files)
+
+
+def joined(job: Job) -> Outcome:
+    """Form a mosaic in a Zarr store; patches that it has are not formed again."""
+    scene = job.scene
+    (grid,) = scene.need("grid")
+    request = request_of(scene)
+    if set(request) & {"taps", "upsampling"}:
+        raise ValueError(f"{scene.name}: [image] taps and upsampling have no effect in a mosaic")
+    store = scene.mosaic.get("store") or job.folder / "mosaic.zarr"
+    memory_mib = scene.mosaic.get("memory_mib")
+    formed = mosaic(
+        job.lines(), grid, store, **request, beam=scene.image.get("beam"),
+        patches=scene.mosaic.get("patches"), memory_bytes=memory_mib and memory_mib << 20,
+        device=job.device,
+    )  # fmt: skip
+    count, errors = formed.shape[0] * formed.shape[1], []
+    done = len(formed.finished)
+    for patch in formed:
+        done += 1
+        errors.append(patch.record.predicted_error_db)
+        if job.progress is not None:
+            job.progress(done, count)
+    return Outcome({"store": str(store), "patches": list(formed.shape), "formed": len(errors)})
+
+
+RUN: dict[str, Callable[[Job], Outcome]] = {
+    "inspect": inspected,
+    "calibrate": calibrated,
+    "navigate": navigated,
+    "focus": focused,
+    "image": imaged,
+    "mosaic": joined,
+}
+"""Function of every step, in the order in which they run."""
+
+
+def check_pictures() -> None:
+    """Warn if there will be no pictures."""
+    if not is_installed("matplotlib"):
+        warn(f"no pictures are written: they need matplotlib, {install_command('plot')}")
+
+
+def _formed(
+    job: Job, lines: RangeLines, grid: Grid, part: tuple[int, int]
+) -> tuple[Image, float | None]:
+    """Return the image of lines, and its predicted error; this is one part of several."""
+    number, parts = part
+
+    def progress(done: int, total: int) -> None:
+        if job.progress is not None:
+            job.progress(number * total + done, parts * total)
+
+    request, beam = request_of(job.scene), job.scene.image.get("beam")
+    if request.keys() & set(EXACT_KEYS):
+        image = backproject(lines, grid, **request, beam=beam, device=job.device, progress=progress)
+        return image, None
+    chosen = plan(lines, grid, **request, beam=beam, device=job.device)
+    if isinstance(chosen.image, ExactImage):
+        image = backproject(
+            lines, grid, accuracy_db=chosen.image.accuracy_db, beam=beam, device=job.device,
+            progress=progress,
+        )  # fmt: skip
+    else:
+        image = factorize(lines, grid, chosen, device=job.device, progress=progress)
+    return image, chosen.predicted_error_db
+
+
+def _write_track(path: Path, found: Micronavigation | Autofocus) -> None:
+    """Write the corrected track, with the corrections and their standard deviations, as CSV."""
+    at_m = found.lines.ping_centres_m
+    columns: dict[str, Any] = {"ping": np.arange(len(at_m))}
+    columns |= {f"{name}_m": at_m[:, axis] for axis, name in enumerate("xyz")}
+    if isinstance(found, Micronavigation):
+        columns["heading_rad"] = found.track.yaw_rad
+        for name in (
+            "sway_m",
+            "sway_sd_m",
+            "shape_sd_m",
+            "yaw_rad",
+            "yaw_sd_rad",
+            "surge_m",
+            "surge_sd_m",
+        ):
+            columns[name] = getattr(found, name)
+    else:
+        starts = found.lines.ping_starts
+        for axis, name in enumerate("xyz"):
+            columns[f"correction_{name}_m"] = found.correction_m[starts, axis]
+        columns["correction_sd_m"] = found.correction_sd_m[starts]
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(columns)
+    writer.writerows(
+        [f"{value:.9g}" for value in row] for row in zip(*columns.values(), strict=True)
+    )
+    _write(path, text.getvalue())
+
+
+def _write(path: Path, text: str) -> None:
+    with replacing(path) as temporary:
+        temporary.write_text(text)

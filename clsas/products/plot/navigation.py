@@ -1,0 +1,240 @@
+"""Pictures of corrected tracks: corrections with their intervals, coherence, sharpness."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsas.core import validate
+from clsas.core.image import Image
+from clsas.navigation.autofocus import Autofocus
+from clsas.navigation.micronavigation import Micronavigation
+from clsas.products.plot.canvas import new_figure
+from clsas.products.plot.levels import image as draw_image
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+_INTERVAL = 1.96  # standard deviations to either side: 95 %
+_LEAST_SHOWN = 1e-9  # metres and radians: what is smaller everywhere is not drawn
+
+
+def corrections(found: Micronavigation | Autofocus) -> Figure:
+    """Draw the corrections of a track ping by ping, with their 95 % intervals.
+
+    Parameters
+    ----------
+    found : Micronavigation or Autofocus
+        Of micronavigation the interval of the whole track includes its unknown start and heading.
+        That of its shape does not: it is what an image's sharpness depends on. Of autofocus the
+        interval is that of the changes from ping to ping, about the correction.
+
+    Raises
+    ------
+    ImportError
+        If matplotlib is not installed.
+    TypeError
+        If `found` is of another type.
+    """
+    validate.instance("found", found, Micronavigation, Autofocus)
+    curves = _curves(found)
+    figure = new_figure(9.0, 1.2 + 1.8 * len(curves))
+    panels: NDArray[Any] = figure.subplots(
+        len(curves), 2, sharex=True, squeeze=False, width_ratios=(2, 1)
+    )
+    for (values, widths), curve in zip(panels, curves, strict=True):
+        _draw_curve(values, widths, curve)
+    for axes in panels[-1]:
+        axes.set_xlabel("Ping")
+    panels[0, 1].set_title("95 % interval", fontsize="medium")
+    return figure
+
+
+def _draw_curve(values: Axes, widths: Axes, curve: _Curve) -> None:
+    """Draw values over pings, and beside them half the widths of their intervals."""
+    ping, value = np.arange(len(curve.value)), curve.value
+    values.plot(ping, value, linewidth=1.0)
+    reach = max(float(np.ptp(value)), 1e-6)
+    for deviation, label, colour in curve.intervals:
+        width = _INTERVAL * deviation
+        if not (np.isfinite(width) & (width > 0)).any():
+            continue
+        if width[np.isfinite(width)].max() < reach:  # wider ones would fill the panel
+            values.fill_between(
+                ping, value - width, value + width, alpha=0.4, linewidth=0, color=colour
+            )
+        widths.semilogy(ping, width, color=colour, linewidth=1.0, label=label)
+    values.set(
+        ylabel=f"{curve.name} ({curve.unit})", xlim=(0, max(len(value) - 1, 1)),
+        ylim=(float(value.min()) - 0.3 * reach, float(value.max()) + 0.3 * reach),
+    )  # fmt: skip
+    widths.set_ylabel(f"± ({curve.unit})")
+    _show_decades(widths)
+    for axes in (values, widths):
+        axes.grid(alpha=0.3)
+    if len(curve.intervals) > 1 and widths.get_legend_handles_labels()[0]:
+        widths.legend(fontsize="small")
+
+
+def _show_decades(axes: Axes) -> None:
+    """Let a logarithmic axis begin and end at powers of ten, written as plain numbers."""
+    from matplotlib.ticker import LogLocator, NullLocator, StrMethodFormatter
+
+    drawn = [np.asarray(line.get_ydata()) for line in axes.lines]
+    shown = np.concatenate([each[np.isfinite(each) & (each > 0)] for each in drawn] or [[]])
+    if not shown.size:
+        return
+    low, high = np.floor(np.log10(shown.min())), np.ceil(np.log10(shown.max()))
+    axes.set_ylim(10.0**low, 10.0 ** max(high, low + 1))
+    axes.yaxis.set_major_locator(LogLocator(numticks=6))
+    axes.yaxis.set_minor_locator(NullLocator())
+    axes.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+
+
+def coherence(found: Micronavigation) -> Figure:
+    """Draw the coherence of consecutive pings over range.
+
+    Parameters
+    ----------
+    found : Micronavigation
+
+    Raises
+    ------
+    ImportError
+        If matplotlib is not installed.
+    TypeError
+        If `found` is of another type.
+    """
+    validate.instance("found", found, Micronavigation)
+    values, range_m = found.coherence, found.range_m
+    step_m = float(np.median(np.diff(range_m))) if len(range_m) > 1 else 1.0
+    low_m, high_m = range_m[0] - step_m / 2, range_m[-1] + step_m / 2
+    figure = new_figure(7.0, 4.0)
+    beside, axes = figure.subplots(1, 2, sharey=True, width_ratios=(1, 3))
+    drawn = axes.imshow(
+        values.T, origin="lower", aspect="auto", vmin=0, vmax=1, cmap="cividis",
+        extent=(-0.5, len(values) - 0.5, low_m, high_m), interpolation="nearest",
+    )  # fmt: skip
+    axes.set(xlabel="Ping (with the next one)")
+    median, *spread = (np.quantile(values, share, axis=0) for share in (0.5, 0.1, 0.9))
+    beside.fill_betweenx(range_m, *spread, alpha=0.3, linewidth=0, label="10 to 90 %")
+    beside.plot(median, range_m, marker=".", linewidth=1.0, label="median")
+    beside.set(xlim=(0, 1), ylim=(low_m, high_m), xlabel="Coherence", ylabel="Range (m)")
+    beside.grid(alpha=0.3)
+    beside.legend(loc="lower left", fontsize="small")
+    figure.colorbar(drawn, label="Coherence")
+    return figure
+
+
+def sharpness(found: Autofocus) -> Figure:
+    """Draw the sharpness of the image after every step of an autofocus.
+
+    Parameters
+    ----------
+    found : Autofocus
+
+    Raises
+    ------
+    ImportError
+        If matplotlib is not installed.
+    TypeError
+        If `found` is of another type.
+    """
+    validate.instance("found", found, Autofocus)
+    names = ["before", *(name for name, _ in found.sharpness)]
+    values = np.array([found.sharpness_before, *(value for _, value in found.sharpness)])
+    kept = np.concatenate([[True], values[1:] > np.maximum.accumulate(values)[:-1]])
+    figure = new_figure(7.0, 5.0)
+    axes = figure.subplots()
+    step = np.arange(len(values))
+    axes.plot(step, np.maximum.accumulate(values), color="0.7", linewidth=1.0, zorder=1)
+    axes.plot(step[kept], values[kept], "o", label="kept")
+    if not kept.all():
+        axes.plot(step[~kept], values[~kept], "o", fillstyle="none", label="tried, and left out")
+    axes.set(ylabel="Sharpness (2 is that of speckle)")
+    axes.set_xticks(step, names, rotation=45, ha="right")
+    axes.grid(alpha=0.3)
+    axes.legend(loc="lower right", fontsize="small")
+    return figure
+
+
+def before_and_after(before: Image, after: Image, **options: Any) -> Figure:
+    """Draw an image before and after its track was corrected, with one scale of levels.
+
+    Parameters
+    ----------
+    before, after : Image
+        Images on one grid.
+    **options
+        Further arguments of `image`: `dynamic_range_db`, `percentiles`, `colour_map`.
+
+    Raises
+    ------
+    ImportError
+        If matplotlib is not installed.
+    TypeError, ValueError
+        If an argument is of a wrong kind, or the images differ in shape.
+    """
+    validate.instance("before", before, Image)
+    validate.instance("after", after, Image)
+    if before.shape != after.shape:
+        raise ValueError(f"after must have the pixels of before, {before.shape}, got {after.shape}")
+    largest = max(float(np.abs(each.pixels).max()) for each in (before, after)) or 1.0
+    figure = new_figure(11.0, 5.0, layout="compressed")
+    panels: NDArray[Any] = figure.subplots(1, 2, sharex=True, sharey=True)
+    for axes, image, title in zip(panels, (before, after), ("Before", "After"), strict=True):
+        peak_db = 20 * np.log10(max(float(np.abs(image.pixels).max()) / largest, 1e-12))
+        draw_image(
+            image, axes, reference=largest, colour_bar=axes is panels[-1],
+            title=f"{title}: peak {peak_db:.1f} dB".replace("-", "−"), **options,
+        )  # fmt: skip
+    _label_bar(panels)
+    return figure
+
+
+def _label_bar(panels: NDArray[Any]) -> None:
+    """Say what 0 dB is: the larger peak of both images."""
+    figure = panels[0].get_figure(root=True)
+    panels[-1].set_ylabel("")
+    for axes in figure.axes:
+        if axes not in panels:
+            axes.set_ylabel("Amplitude (dB re larger peak)")
+
+
+@dataclass(frozen=True, eq=False)
+class _Curve:
+    """Corrections ping by ping, with standard deviations, their labels and colours."""
+
+    name: str
+    unit: str
+    value: NDArray[np.float64]
+    intervals: list[tuple[NDArray[np.float64], str, str]]
+
+
+def _curves(found: Micronavigation | Autofocus) -> list[_Curve]:
+    """Return all that was corrected."""
+    if isinstance(found, Micronavigation):
+        every = [
+            _Curve("Sway", "mm", 1e3 * found.sway_m, [
+                (1e3 * found.sway_sd_m, "whole track", "tab:gray"),
+                (1e3 * found.shape_sd_m, "its shape", "tab:blue"),
+            ]),
+            _Curve("Yaw", "mrad", 1e3 * found.yaw_rad, [(1e3 * found.yaw_sd_rad, "", "tab:gray")]),
+            _Curve("Surge", "mm", 1e3 * found.surge_m, [(1e3 * found.surge_sd_m, "", "tab:gray")]),
+        ]  # fmt: skip
+    else:
+        starts = found.lines.ping_starts
+        deviation = 1e3 * found.correction_sd_m[starts]
+        every = [
+            _Curve(
+                f"Along {name}", "mm", 1e3 * found.correction_m[starts, axis],
+                [(deviation, "", "tab:blue")],
+            )
+            for axis, name in enumerate("xyz")
+        ]  # fmt: skip
+    moved = [each for each in every if np.abs(each.value).max() > 1e3 * _LEAST_SHOWN]
+    return moved or every[:1]

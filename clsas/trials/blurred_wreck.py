@@ -1,0 +1,131 @@
+"""The wreck, recorded by an array on a track that nobody knows: what micronavigation restores.
+
+A part of the scene of `clsas.trials.wreck`: 18 m of the wreck's 25 m along the track, with its
+shadow, from 120 of 200 pings. They are half as far apart, so that four of the six phase centres
+overlap. The navigation says that the track is straight.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from clsas.core.image import Image
+from clsas.core.lines import RangeLines
+from clsas.products.quality import measure_point
+from clsas.signal.compression import compress
+from clsas.simulation.scenes import PointTargets
+from clsas.simulation.seabeds import wreck as seabed
+from clsas.simulation.simulator import simulate
+from clsas.sonar.system import Sonar
+from clsas.sonar.track import Track, channels
+from clsas.trials import wreck
+
+POINT_M = (-6.0, 54.0, 0.0)
+"""A reflector on the sand before the wreck."""
+RANGE_M = (54.0, 78.0)
+"""Ranges on the sand and the wreck, for micronavigation."""
+
+_PINGS, _ADVANCE_M, _HEIGHT_M = 120, 0.2, 20.0
+_SWAY_M, _PERIOD = 0.2, 80.0  # pings: of the sway in the scene of the wreck, 16 m
+_AMPLITUDE = 60.0  # of the reflector: 30 dB above the sand
+_DENSITY_M2 = 400.0
+
+
+SCENE = f"""
+[grid]
+x = {{ start_m = -9.0, stop_m = 9.0, count = 361 }}
+y = {{ start_m = 50.0, stop_m = 74.0, count = 961 }}
+
+[image]
+tolerance_db = -40
+
+[image.beam]
+width_deg = 5.0
+shape = "hann"
+
+[process]
+steps = ["inspect", "navigate", "image"]
+
+[process.navigate]
+range_m = [{RANGE_M[0]}, {RANGE_M[1]}]
+seabed_z_m = 0.0
+element_length_m = 0.2
+sway_sd_m = 0.3
+yaw_sd_deg = 3.0
+surge_sd_m = 0.02
+"""
+"""The scene file of the chain: what a user would write."""
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """Lines of one passage, with two tracks.
+
+    Attributes
+    ----------
+    true, told : RangeLines
+        With the positions of the track itself, and of the navigation.
+    """
+
+    true: RangeLines
+    told: RangeLines
+
+
+@dataclass(frozen=True)
+class Measures:
+    """Measures of an image of the wreck.
+
+    Attributes
+    ----------
+    peak_db : float
+        Level of the reflector.
+    azimuth_m, range_m : float
+        Its widths at -3 dB.
+    contrast_db : float
+        Power of lit sand over that of the wreck's shadow.
+    """
+
+    peak_db: float
+    azimuth_m: float
+    range_m: float
+    contrast_db: float
+
+    @classmethod
+    def of(cls, image: Image, shadow: wreck.Shadow) -> Measures:
+        """Return the measures of an image; raises ValueError if the reflector shows no peak."""
+        point = measure_point(image, near=POINT_M[:2], extent_m=1.0)
+        return cls(
+            level_db(image),
+            point.azimuth.resolution_m,
+            point.range.resolution_m,
+            shadow.contrast_db(image, POINT_M[:2]),
+        )
+
+
+def level_db(image: Image) -> float:
+    """Return the largest level within half a metre of the reflector, dB."""
+    x_m, y_m = image.grid.axes_m
+    near = np.ix_(np.abs(y_m - POINT_M[1]) < 0.5, np.abs(x_m - POINT_M[0]) < 0.5)
+    return 20 * float(np.log10(np.abs(image.pixels[near]).max()))
+
+
+def recorded(progress: Callable[[int, int], None] | None = None) -> Recording:
+    """Simulate the recording, which takes about a minute on two cores."""
+    sonar = Sonar.edgetech()
+    course = (-_ADVANCE_M * (_PINGS - 1) / 2, 0.0, _HEIGHT_M), (_ADVANCE_M, 0, 0), _PINGS, 1.0
+    turn = 2 * np.pi / _PERIOD
+    true = Track.straight(
+        *course,
+        sway_m=lambda ping: _SWAY_M * np.sin(turn * ping),
+        yaw_rad=lambda ping: _SWAY_M * turn / _ADVANCE_M * np.cos(turn * ping),
+    )
+    targets = (
+        seabed((-17.0, 17.0), (47.0, 77.0), density_m2=_DENSITY_M2),
+        PointTargets([POINT_M], [_AMPLITUDE]),
+    )
+    lines = compress(simulate(sonar, true, targets, progress=progress), window="hamming")
+    told = channels(sonar, Track.straight(*course))
+    return Recording(lines, replace(lines, tx_m=told.tx_m, rx_m=told.rx_m))

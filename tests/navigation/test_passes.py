@@ -1,0 +1,66 @@
+"""Passes of micronavigation: coarse arrays, progress, and how certain a track's shape is."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import clsas
+from clsas.navigation.smoother import shape_deviation_m
+
+SPACING_M = 0.1  # of phase centres: yaw of 30 mrad turns neighbours by half a cycle
+PINGS = 12
+
+
+@pytest.fixture(scope="module")
+def coarse():
+    """An array of few receivers with large elements, which sways unknown to its navigation."""
+    rx_m = [[2 * SPACING_M * (n - 2.5), 0.0, 0.0] for n in range(6)]
+    pulse = clsas.Pulse(125e3, 15e3, 1e-3)
+    sonar = clsas.Sonar(pulse, rx_m, tx_length_m=0.2, rx_length_m=0.2)
+    course = (0, 0, 0), (0.2, 0, 0), PINGS, 1.0
+    sway_m = 0.03 * np.sin(np.arange(PINGS) / 2)
+    true = clsas.Track.straight(*course, sway_m=sway_m)
+    rng = np.random.default_rng(0)
+    at = np.stack([rng.uniform(-5, 8, 4000), rng.uniform(28, 40, 4000), np.zeros(4000)], axis=1)
+    scene = clsas.PointTargets(at, rng.standard_normal(4000) + 1j * rng.standard_normal(4000))
+    lines = clsas.compress(clsas.simulate(sonar, true, scene, range_m=(29, 39)))
+    told = clsas.channels(sonar, clsas.Track.straight(*course))
+    return replace(lines, tx_m=told.tx_m, rx_m=told.rx_m), sway_m
+
+
+def detrended(values):
+    at = np.arange(len(values))
+    return values - np.polyval(np.polyfit(at, values, 1), at)
+
+
+@pytest.mark.slow
+def test_coarse_arrays_do_not_turn_into_their_grating_lobes(coarse):
+    lines, sway_m = coarse
+    told = []
+    found = clsas.micronavigate(
+        lines, range_m=(30, 38), element_length_m=0.2, yaw_sd_rad=0.05,
+        progress=lambda *each: told.append(each),
+    )  # fmt: skip
+    assert np.abs(found.yaw_steps_rad).max() < 2e-3
+    residual_m = detrended(found.sway_m - sway_m)
+    assert np.std(residual_m) < 0.5e-3
+    assert np.std(residual_m) < 3 * found.shape_sd_m.max()
+    # Every pass counts, the bar never goes back, and in the end all is done.
+    done = [each / total for each, total in told]
+    assert done == sorted(done)
+    assert done[-1] == 1
+    assert sum(each > 0.25 for each in done) > PINGS
+
+
+def test_deviation_of_shape_is_that_of_walks():
+    count, random = 60, np.random.default_rng(1)
+    advance_m = np.full(count - 1, 0.3)
+    walks_m = []
+    for _ in range(300):
+        yaw = np.concatenate([[0.0], np.cumsum(1e-3 * random.standard_normal(count - 1))])
+        steps = 1e-4 * random.standard_normal(count - 1) + 0.3 * (yaw[1:] + yaw[:-1]) / 2
+        walks_m.append(detrended(np.concatenate([[0.0], np.cumsum(steps)])))
+    told = shape_deviation_m(np.full(count - 1, 1e-4), np.full(count - 1, 1e-3), advance_m)
+    np.testing.assert_allclose(told, np.std(walks_m, axis=0), rtol=0.25)
+    assert shape_deviation_m(np.zeros(4), np.zeros(4), np.ones(4)) == pytest.approx(np.zeros(5))

@@ -1,0 +1,245 @@
+"""The chain from a recording to a focused image: what runs, what is kept, what is written."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+import clsas
+from clsas.cli import main
+from clsas.core.validate import ClsasWarning
+from clsas.files.process_tables import STEPS
+
+pytest.importorskip("matplotlib")
+
+SCENE = """
+[grid]
+x = { start_m = 1.0, stop_m = 5.0, count = 161 }
+y = { start_m = 13.0, stop_m = 15.0, count = 121 }
+
+[image]
+tolerance_db = -40
+
+[process]
+lines = "lines.h5"
+"""
+CALIBRATE = """
+[process.calibrate]
+points_m = [[2.0, 11.5, 0.0], [4.0, 16.5, 0.0]]
+unknowns = ["time_offset"]
+search_m = 0.4
+"""
+FOCUS = """
+[process.focus]
+unknowns = ["sway"]
+"""
+
+
+def recording(sway_m=0.0, time_s=0.0):
+    """Points seen by a sonar on a swaying track, as its navigation has them."""
+    sonar = clsas.Sonar(
+        clsas.Pulse(100e3, 30e3, 1e-3), [[0.0, 0.0, 0.0]], tx_length_m=0.06, rx_length_m=0.06
+    )
+    course = (0, 0, 0), (0.025, 0, 0), 260, 1.0
+    track = clsas.Track.straight(*course, sway_m=lambda t: sway_m * np.sin(t / 40))
+    rng = np.random.default_rng(0)
+    at = np.stack([rng.uniform(1.2, 4.8, 60), rng.uniform(13.2, 14.8, 60), np.zeros(60)], axis=1)
+    at[:2] = [2.0, 11.5, 0.0], [4.0, 16.5, 0.0]
+    level = np.exp(2j * np.pi * rng.random(60)) * np.where(np.arange(60) < 2, 2, 1)
+    lines = clsas.compress(clsas.simulate(sonar, track, clsas.PointTargets(at, level)))
+    told = clsas.channels(sonar, clsas.Track.straight(*course))
+    return replace(
+        lines, tx_m=told.tx_m, rx_m=told.rx_m, first_range_m=lines.first_range_m - 750 * time_s
+    )
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    path = tmp_path_factory.mktemp("processing")
+    clsas.save(path / "lines.h5", recording(4e-3, 2e-4))
+    return path
+
+
+@pytest.fixture
+def scene(folder, tmp_path):
+    """A scene beside the recording, with all steps on lines."""
+    (tmp_path / "lines.h5").symlink_to(folder / "lines.h5")
+    path = tmp_path / "scene.toml"
+    path.write_text(SCENE + CALIBRATE + FOCUS)
+    return path
+
+
+STEPS_HERE = ("calibrate", "focus", "image")
+
+
+@pytest.mark.slow
+def test_steps_run_in_their_order_and_improve_the_image(scene):
+    told = []
+    found = clsas.process(scene, steps=STEPS_HERE[::-1], progress=lambda *each: told.append(each))
+    assert tuple(step.name for step in found.steps) == STEPS_HERE == found.repeated
+    assert [name for name in STEPS if name in {each[0] for each in told}] == list(STEPS_HERE)
+    for name in STEPS_HERE:
+        assert all(done <= total for step, done, total in told if step == name)
+        assert max(done / total for step, done, total in told if step == name) == 1
+    numbers = found["image"].numbers
+    assert numbers["peak_db"] > numbers["before"]["peak_db"] + 1
+    assert found["calibrate"].numbers["values"][0] == pytest.approx(2e-4, abs=5e-6)
+    assert found["focus"].numbers["focused"]
+    assert np.abs(found.image.pixels).max() == pytest.approx(10 ** (numbers["peak_db"] / 20))
+    assert found.lines.channels == 260
+    folder = scene.with_suffix("")
+    assert found.folder == folder
+    pictures = {"focus-track.png", "focus-sharpness.png", "image.png", "before-and-after.png"}
+    data = {"calibrate.h5", "focus.h5", "focus.csv", "image.h5", "before.h5", "process.json"}
+    assert {path.name for path in folder.iterdir()} == pictures | data
+    written = np.genfromtxt(folder / "focus.csv", delimiter=",", names=True)
+    np.testing.assert_allclose(written["y_m"], found.lines.ping_centres_m[:, 1], atol=1e-6)
+    record = json.loads((folder / "process.json").read_text())
+    assert record["clsas"] == clsas.__version__
+    assert record["recording"]["file"].endswith("lines.h5")
+    assert [step["name"] for step in record["steps"]] == list(STEPS_HERE)
+    assert record["steps"][0]["options"]["unknowns"] == ["time_offset"]
+    assert "calibrate, focus, image" in repr(found)
+
+
+@pytest.mark.slow
+def test_only_what_changed_runs_again(scene):
+    def repeated(**options):
+        return clsas.process(scene, steps=steps, **options).repeated
+
+    steps = "calibrate", "image"
+    assert repeated() == steps
+    assert repeated() == ()
+    scene.write_text(scene.read_text().replace("tolerance_db = -40", "tolerance_db = -30"))
+    assert repeated() == ("image",)
+    scene.write_text(scene.read_text().replace("search_m = 0.4", "search_m = 0.3"))
+    assert repeated() == steps
+    for name, again in (("calibrate.h5", steps), ("image.png", ("image",))):
+        path = scene.with_suffix("") / name
+        path.write_bytes(path.read_bytes()[:-3])  # damaged
+        assert set(repeated()) <= set(again)
+        path.unlink()
+        assert again[0] in repeated()
+    other = clsas.load(scene.parent / "lines.h5").weighted(np.full(260, 2.0))
+    assert repeated(lines=other) == steps
+
+
+def test_a_damaged_record_is_made_anew(scene):
+    clsas.process(scene, steps=("image",))
+    path = scene.with_suffix("") / "process.json"
+    for text in ("{", "[]", '{"format": "clsas processing", "version": 1, "steps": [{"name": 1}]}'):
+        path.write_text(text)
+        assert clsas.process(scene, steps=("image",)).repeated == ("image",)
+    record = json.loads(path.read_text())
+    record["steps"][0]["files"] = {"../lines.h5": "0"}
+    path.write_text(json.dumps(record))
+    assert clsas.process(scene, steps=("image",)).repeated == ("image",)
+
+
+def test_what_was_finished_before_an_error_is_kept(scene):
+    scene.write_text(scene.read_text() + '[process.navigate]\nside = "starboard"\n')
+    steps = "calibrate", "navigate", "image"
+    with pytest.raises(ValueError, match="every ping of lines must have at least 2 receivers"):
+        clsas.process(scene, steps=steps)
+    assert clsas.process(scene, steps=("calibrate", "image")).repeated == ("image",)
+
+
+@pytest.mark.slow
+def test_usual_steps_and_warnings_of_inspection(scene):
+    with pytest.warns(ClsasWarning):
+        found = clsas.process(scene)
+    assert tuple(step.name for step in found.steps) == ("inspect", *STEPS_HERE)
+    assert (found.folder / "inspect.txt").read_text().startswith("quantity")
+    assert (found.folder / "inspect.png").exists()
+    findings = found["inspect"].numbers["findings"]
+    assert len(found["inspect"].warnings) == len(findings) > 0
+    assert clsas.process(scene).repeated == ()  # and warns no more
+
+
+def test_lines_and_echoes_in_memory(scene, tmp_path):
+    lines = clsas.load(scene.parent / "lines.h5")
+    found = clsas.process(scene, lines=lines, output=tmp_path / "own", steps=("image",))
+    assert found.folder == tmp_path / "own"
+    assert "before" not in found["image"].numbers
+    np.testing.assert_array_equal(found.lines.samples, lines.samples)
+    with pytest.raises(KeyError):
+        _ = clsas.process(scene, lines=lines, steps=("calibrate",)).image
+
+
+def test_mosaic_continues(scene):
+    pytest.importorskip("zarr")
+    scene.write_text(scene.read_text() + "[mosaic]\npatches = [2, 2]\n")
+    found = clsas.process(scene, steps=("calibrate", "mosaic"))
+    assert found["mosaic"].numbers["formed"] == 4
+    again = clsas.process(scene, steps=("calibrate", "mosaic"))
+    assert again["mosaic"].numbers["formed"] == 0
+    assert clsas.Store.opened(found["mosaic"].numbers["store"]).image().shape == (121, 161)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ('[process]\nsteps = ["images"]', "must be one of"),
+        ("[process]\nsteps = []", "steps must name one or several"),
+        ('[process]\nsteps = ["calibrate"]', "calibrate needs"),
+        ('[process]\nlines = "nowhere.h5"', "there is no"),
+        ('[process]\noutput = ""', "output must be a path"),
+        ("[process]\nstep = 1", "unknown key 'step' in \\[process\\]"),
+        ("[process.calibrate]\npoints_m = [[1.0, 2.0]]", "points_m"),
+        ("[process.calibrate]\npoints_m = []", "points_m must have shape"),
+        ("[process.navigate]\nside = 'left'", "side must be one of"),
+        ("[process.navigate]\nrange_m = [5.0, 4.0]", "range_m must be"),
+        ("[process.navigate]\nsway_sd_m = 0.0", "sway_sd_m must be"),
+        ("[process.focus]\nunknowns = ['yaw']", "every entry of unknowns"),
+    ],
+)
+def test_mistakes_in_the_table_are_named(tmp_path, text, message):
+    path = tmp_path / "scene.toml"
+    path.write_text(text)
+    with pytest.raises(ValueError, match=message):
+        clsas.process(path)
+
+
+def test_bad_arguments(scene, tmp_path):
+    with pytest.raises(TypeError, match="scene must be a path"):
+        clsas.process(1)
+    with pytest.raises(TypeError, match="progress must be a function"):
+        clsas.process(scene, progress=1)
+    with pytest.raises(ValueError, match="every entry of steps"):
+        clsas.process(scene, steps=("images",))
+    with pytest.raises(FileNotFoundError):
+        clsas.process(scene, lines=tmp_path / "nowhere.h5")
+    empty = tmp_path / "empty.toml"
+    empty.write_text("")
+    with pytest.raises(ValueError, match="missing table \\[grid\\]"):
+        clsas.process(empty)
+    with pytest.raises(ValueError, match="missing key 'lines' in \\[process\\]"):
+        clsas.process(empty, steps=("inspect",))
+    with pytest.raises(ValueError, match="output must not be the folder of the recording"):
+        clsas.process(scene, output=scene.parent)
+    huge = tmp_path / "huge.toml"
+    huge.write_text(SCENE.replace("count = 161", "count = 1000000000"))
+    with pytest.raises(ValueError, match="\\[grid\\] must ask for at most"):
+        clsas.process(huge)
+    described = clsas.Grid.plane((0, 1, 2), (0, 1, 2))
+    clsas.save(tmp_path / "grid.h5", described)
+    with pytest.raises(ValueError, match="must hold RangeLines or Echoes, got Grid"):
+        clsas.process(scene, lines=tmp_path / "grid.h5", steps=("image",))
+
+
+@pytest.mark.slow
+def test_command(scene):
+    arguments = ["process", str(scene)]
+    for step in STEPS_HERE:
+        arguments += ["--step", step]
+    done = CliRunner().invoke(main, arguments)
+    assert done.exit_code == 0, done.output
+    assert "dB by the corrections" in done.output
+    assert "time_offset 0.0002" in done.output
+    done = CliRunner().invoke(main, [*arguments, "--json"])
+    results = json.loads(done.output)
+    assert results["repeated"] == []
+    assert list(results["steps"]) == list(STEPS_HERE)
+    assert CliRunner().invoke(main, ["process", str(scene), "--step", "x"]).exit_code == 2

@@ -1,0 +1,32 @@
+"""The whole chain: the wreck, by an array on a track that nobody knows."""
+
+import pytest
+
+import clsas
+from clsas.core.validate import ClsasWarning
+from clsas.files.scene_files import parse_scene
+from clsas.trials import blurred_wreck, wreck
+
+pytest.importorskip("matplotlib")
+
+
+@pytest.mark.slow
+def test_the_chain_restores_what_the_true_track_shows(tmp_path):
+    recording = blurred_wreck.recorded()
+    scene = parse_scene(blurred_wreck.SCENE.encode(), name="wreck.toml", folder=tmp_path)
+    with pytest.warns(ClsasWarning, match="inspect: "):
+        found = clsas.process(scene, lines=recording.told, output=tmp_path / "processed")
+    beam = scene.image["beam"]
+    true = clsas.factorize(recording.true, scene.grid, -40, beam=beam)
+    before = clsas.load(tmp_path / "processed" / "before.h5")
+    shadow = wreck.Shadow(wreck.scene())
+    ideal, measured = (blurred_wreck.Measures.of(each, shadow) for each in (true, found.image))
+    lost_db = ideal.peak_db - measured.peak_db
+    assert abs(lost_db) < 1
+    assert abs(ideal.contrast_db - measured.contrast_db) < 1
+    for name in ("azimuth_m", "range_m"):  # 1 dB is a factor of 1.26
+        assert getattr(ideal, name) / 1.26 < getattr(measured, name) < getattr(ideal, name) * 1.26
+    assert blurred_wreck.level_db(before) < ideal.peak_db - 6
+    assert shadow.contrast_db(before, blurred_wreck.POINT_M[:2]) < ideal.contrast_db - 3
+    pictures = {"navigate-track.png", "navigate-coherence.png", "before-and-after.png"}
+    assert pictures <= {path.name for path in found.folder.iterdir()}
