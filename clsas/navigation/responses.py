@@ -24,6 +24,18 @@ READ_DB = -40.0
 _READ_AT_ONCE = 1 << 21  # samples: bounds the memory
 
 
+def directions(lines: RangeLines, unknowns: tuple[str, ...]) -> NDArray[np.float64]:
+    """Return the unit vectors of "sway", "heave" and "surge" at every ping, [unknowns, pings, 3].
+
+    They point to port, up and along the track.
+    """
+    along = track_directions(lines)[lines.ping_starts]
+    sway = np.cross(np.array([0.0, 0.0, 1.0]), along)
+    sway /= np.maximum(np.linalg.norm(sway, axis=1, keepdims=True), 1e-9)
+    vectors = {"sway": sway, "heave": np.cross(along, sway), "surge": along}
+    return np.stack([vectors[name] for name in unknowns])
+
+
 @dataclass(frozen=True, eq=False)
 class Passage:
     """The sonar's passage: its pings, and the directions in which each may be moved.
@@ -52,15 +64,9 @@ class Passage:
         """Return the passage of lines; `unknowns` are some of "sway", "heave" and "surge"."""
         starts = lines.ping_starts
         counts = np.diff(np.append(starts, lines.channels))
-        centres_m = lines.ping_centres_m
-        along = track_directions(lines)[starts]
-        up = np.array([0.0, 0.0, 1.0])
-        sway = np.cross(up, along)
-        sway /= np.maximum(np.linalg.norm(sway, axis=1, keepdims=True), 1e-9)
-        vectors = {"sway": sway, "heave": np.cross(along, sway), "surge": along}
-        steps_m = np.linalg.norm(np.diff(centres_m, axis=0), axis=1)
+        steps_m = np.linalg.norm(np.diff(lines.ping_centres_m, axis=0), axis=1)
         travelled_m = np.concatenate([[0.0], np.cumsum(steps_m)])
-        axes = np.stack([vectors[name] for name in unknowns])
+        axes = directions(lines, unknowns)
         return cls(
             lines, np.repeat(np.arange(len(starts)), counts), travelled_m, axes, wavelength_m
         )
