@@ -1,13 +1,17 @@
-"""The mean track: a smooth curve along the channels, and phase rates along it.
+"""The mean track: smooth curves along the channels, and phase rates along them.
 
-An aperture coordinate is the curve's parameter: 0 at its first and 1 at its last channel.
+An aperture coordinate is a curve's parameter: 0 at its first and 1 at its last channel. A dense
+aperture has several curves, its strips, or is a sheet: a curve that moves sideways.
 """
 
 from __future__ import annotations
 
 import functools
-from dataclasses import dataclass
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from itertools import product
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,42 +30,174 @@ _MOST_POINTS = 9  # along a side of a box, at which rates are evaluated
 _RATES_AT_ONCE = 1 << 15  # stay in a core's cache
 _CHANNELS_PER_KNOT = 16
 _MOST_INTERVALS = 64
-_CLOSE_ENOUGH = 0.01  # distance of phase centres from the curve, wavelengths rms
+CLOSE_ENOUGH = 0.01
+"""Distance of phase centres from the mean track that needs no better one, wavelengths rms."""
+STRIP_SAMPLES = 40
+"""Samples of each of several strips, and of lines across a sheet."""
+APART = 16.0
+"""Aperture coordinates from one strip to the next, more than samples go past the ends."""
 
 
 @dataclass(frozen=True, eq=False)
 class MeanTrack:
-    """A smooth curve along the phase centres, (tx + rx)/2, continued straight past its ends.
+    """Smooth curves along the phase centres, (tx + rx)/2, continued straight past their ends.
 
     Attributes
     ----------
     spline : BSpline
-        Position in metres [3] over the aperture coordinate, 0 to 1.
+        Position in metres [3] over the aperture coordinate, 0 to 1. Of a sheet, coefficients of
+        the powers of the coordinate across it, [powers, 3].
     coordinate : float64 [channels]
-        Aperture coordinate of the point of the curve nearest to each phase centre.
+        Aperture coordinate of the point of the curve nearest to each phase centre. The coordinates
+        of strip n run from 16 n to 16 n + 1.
+    others : tuple of BSpline
+        The curves of further strips.
+    across : float64 [channels] or None
+        Coordinate of each phase centre across a sheet, 0 to 1; None without a sheet.
+    sampled : int
+        Samples of each strip at which rates are evaluated.
     """
 
     spline: BSpline
     coordinate: NDArray[np.float64]
+    others: tuple[BSpline, ...] = ()
+    across: NDArray[np.float64] | None = None
+    sampled: int = _SAMPLES
 
-    def positions_m(self, coordinate: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the curve's positions at aperture coordinates, [..., 3]."""
+    @property
+    def strips(self) -> int:
+        """Number of curves."""
+        return 1 + len(self.others)
+
+    @property
+    def is_dense(self) -> bool:
+        """True for several strips, or a sheet."""
+        return bool(self.others) or self.is_sheet
+
+    @property
+    def is_sheet(self) -> bool:
+        """True if the curve moves sideways."""
+        return self.across is not None
+
+    def some(self, channels: Any) -> MeanTrack:
+        """Return this track with some of the channels, in any order."""
+        across = None if self.across is None else self.across[channels]
+        return replace(self, coordinate=self.coordinate[channels], across=across)
+
+    @functools.cached_property
+    def alone(self) -> tuple[MeanTrack, ...]:
+        """The curve of each strip as a track of its own, without channels."""
+        curves = (self.spline, *self.others)
+        return tuple(MeanTrack(each, np.zeros(0), sampled=self.sampled) for each in curves)
+
+    def apart_of(self, strip: int) -> float:
+        """Return the aperture coordinate at the first end of a strip."""
+        return APART * strip
+
+    def strip_of(self, coordinate: NDArray[np.float64]) -> NDArray[np.int64]:
+        """Return the strip that each aperture coordinate belongs to."""
+        return np.clip(np.rint((coordinate - 0.5) / APART), 0, self.strips - 1).astype(np.int64)
+
+    def positions_m(
+        self, coordinate: NDArray[np.float64], across: NDArray[np.float64] | None = None
+    ) -> NDArray[np.float64]:
+        """Return positions at aperture coordinates, [..., 3]; in the middle across a sheet."""
+        return self._in_strips(self._position_m, coordinate, across)
+
+    def tangents_m(
+        self, coordinate: NDArray[np.float64], across: NDArray[np.float64] | None = None
+    ) -> NDArray[np.float64]:
+        """Return the derivative of the position by the aperture coordinate, [..., 3]."""
+        return self._in_strips(self._tangent_m, coordinate, across)
+
+    def _in_strips(
+        self,
+        evaluate: Callable[..., NDArray[np.float64]],
+        coordinate: NDArray[np.float64],
+        across: NDArray[np.float64] | None,
+    ) -> NDArray[np.float64]:
+        """Evaluate each coordinate on the curve of its strip."""
+        if not self.others:
+            return evaluate(self.spline, coordinate, across)
+        strip, result = self.strip_of(coordinate), np.empty((*coordinate.shape, 3))
+        for number, spline in enumerate((self.spline, *self.others)):
+            its = strip == number
+            result[its] = evaluate(spline, coordinate[its] - APART * number, None)
+        return result
+
+    def _position_m(
+        self,
+        spline: BSpline,
+        coordinate: NDArray[np.float64],
+        across: NDArray[np.float64] | None,
+    ) -> NDArray[np.float64]:
         inside = np.clip(coordinate, 0, 1)
-        position_m = self.spline(inside)
+        position_m = self._swept(spline(inside), across)
         beyond = inside != coordinate
         past = (coordinate - inside)[beyond]
-        position_m[beyond] += past[:, None] * self.spline(inside[beyond], 1)
+        if past.size:
+            sideways = None if across is None else across[beyond]
+            position_m[beyond] += past[:, None] * self._swept(spline(inside[beyond], 1), sideways)
         return position_m
 
-    def tangents_m(self, coordinate: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the derivative of the position by the aperture coordinate, [..., 3]."""
-        return self.spline(np.clip(coordinate, 0, 1), 1)
+    def _tangent_m(
+        self,
+        spline: BSpline,
+        coordinate: NDArray[np.float64],
+        across: NDArray[np.float64] | None,
+    ) -> NDArray[np.float64]:
+        return self._swept(spline(np.clip(coordinate, 0, 1), 1), across)
+
+    def _swept(
+        self, values: NDArray[np.float64], across: NDArray[np.float64] | None
+    ) -> NDArray[np.float64]:
+        """Return the polynomial across a sheet of coefficients [..., powers, 3], [..., 3]."""
+        if not self.is_sheet:
+            return values
+        return _polynomial(values, np.full(values.shape[:-2], 0.5) if across is None else across)
+
+    def positions_on_grid_m(
+        self, coordinate: NDArray[np.float64], across: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Return positions of a sheet at columns [n, columns] and rows [n, rows].
+
+        float64 [n, rows, columns, 3].
+        """
+        inside = np.clip(coordinate, 0, 1)
+        coefficients = self.spline(inside)
+        coefficients += (coordinate - inside)[..., None, None] * self.spline(inside, 1)
+        shape = (*across.shape, coordinate.shape[1])
+        return _polynomial(coefficients[:, None], np.broadcast_to(across[..., None], shape))
+
+    def line_along(self, across: float) -> MeanTrack:
+        """Return the curve along a sheet at a coordinate across it."""
+        powers = across ** np.arange(self.spline.c.shape[1])
+        coefficients = np.einsum("nki,k->ni", self.spline.c, powers)
+        return MeanTrack(BSpline(self.spline.t, coefficients, self.spline.k), np.zeros(0))
+
+    def line_across(self, coordinate: float) -> MeanTrack:
+        """Return the curve across a sheet at an aperture coordinate."""
+        powers = self.spline(coordinate)
+        degree = len(powers) - 1
+        # Bernstein's coefficients of a polynomial.
+        bernstein = np.array(
+            [[math.comb(i, k) / math.comb(degree, k) for k in range(degree + 1)] for i in range(degree + 1)]
+        )
+        knots = np.repeat([0.0, 1.0], degree + 1)
+        spline = BSpline(knots, bernstein @ powers, degree)
+        return MeanTrack(spline, np.zeros(0), sampled=STRIP_SAMPLES)
 
     @functools.cached_property
     def samples(self) -> NDArray[np.float64]:
-        """Aperture coordinates at which rates are evaluated, past the curve's ends too, [n]."""
+        """Aperture coordinates at which rates are evaluated, past the curves' ends too, [n]."""
         beyond = 2.0 ** np.arange(1 - _SAMPLES_BEYOND, 1) * 4
-        return np.concatenate([-beyond[::-1], np.linspace(0, 1, _SAMPLES), 1 + beyond])
+        one = np.concatenate([-beyond[::-1], np.linspace(0, 1, self.sampled), 1 + beyond])
+        return (APART * np.arange(self.strips)[:, None] + one).ravel()
+
+    @functools.cached_property
+    def on_track(self) -> NDArray[np.bool_]:
+        """False for samples past the curves' ends, [n]."""
+        return np.abs(self.samples - APART * self.strip_of(self.samples) - 0.5) <= 0.5
 
     @functools.cached_property
     def sampled_m(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -73,10 +209,10 @@ class MeanTrack:
         points_m: NDArray[np.float64],
         phase_centres_m: NDArray[np.float64],
         own_drift: NDArray[np.float64] | None = None,
-    ) -> NDArray[np.float64]:
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64] | None]:
         """Return the aperture coordinates at which phase centres appear from some points.
 
-        A channel off the curve is replaced by the point of the curve in the same direction. The
+        A channel off the track is replaced by the point of the track in the same direction. The
         remaining difference, of distance, matters least. A receiver's motion during flight moves
         the phase centre by half as much.
 
@@ -91,25 +227,64 @@ class MeanTrack:
         Returns
         -------
         float64 [points, channels]
+            Along the track.
+        float64 [points, channels] or None
+            Across a sheet.
         """
-        curve_m = self.positions_m(self.coordinate)
+        curve_m = self.positions_m(self.coordinate, self.across)
         off_m = (phase_centres_m - curve_m)[None]
         shape = (len(points_m), len(self.coordinate))
+        across = None if self.across is None else np.broadcast_to(self.across, shape)
         if own_drift is None and not np.abs(off_m).max() > 1e-9:
-            return np.broadcast_to(self.coordinate, shape)
-        tangent = self.tangents_m(self.coordinate)
+            return np.broadcast_to(self.coordinate, shape), across
+        tangent = self.tangents_m(self.coordinate, self.across)
         sight = points_m[:, None] - phase_centres_m
         square = np.einsum("pci,pci->pc", sight, sight)
         square = np.maximum(square, 1e-30)
         if own_drift is not None:
             off_m = off_m + np.sqrt(square)[..., None] * own_drift
+        if across is not None:
+            return self._apparent_on_sheet(sight / np.sqrt(square)[..., None], off_m, tangent)
         along = np.einsum("pci,ci->pc", sight, tangent)
-        across = np.sum(sight * off_m, axis=-1)
-        both = np.sum(tangent * off_m, axis=-1) - along * across / square
+        toward = np.sum(sight * off_m, axis=-1)
+        both = np.sum(tangent * off_m, axis=-1) - along * toward / square
         length = np.einsum("ci,ci->c", tangent, tangent)
         # Where the curve leads towards the point, the direction changes little along it.
         sideways = np.maximum(length - along**2 / square, 0.01 * length)
-        return self.coordinate + both / sideways
+        return self.coordinate + both / sideways, None
+
+    def _apparent_on_sheet(
+        self, sight: NDArray[np.float64], off_m: NDArray[np.float64], tangent: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return coordinates along and across a sheet; `sight` are unit vectors to the points."""
+        assert self.across is not None
+        sideways = self._sideways_m(self.coordinate, self.across)
+        axes = np.stack([tangent, sideways])
+        length = np.einsum("aci,aci->ac", axes, axes)
+        toward = np.einsum("pci,aci->apc", sight, axes)
+        off_toward = np.sum(sight * off_m, axis=-1)
+        first, second = np.sum(axes[:, None] * off_m, axis=-1) - toward * off_toward
+        # Where the sheet leads towards a point, directions change little along it.
+        square = length[:, None] - toward**2 + 0.01 * length[:, None]
+        mixed = np.einsum("ci,ci->c", tangent, sideways) - toward[0] * toward[1]
+        determinant = np.maximum(square[0] * square[1] - mixed**2, 1e-30)
+        return (
+            self.coordinate + (first * square[1] - second * mixed) / determinant,
+            self.across + (second * square[0] - first * mixed) / determinant,
+        )
+
+    def _sideways_m(
+        self, coordinate: NDArray[np.float64], across: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Return the derivative of a sheet's position by the coordinate across it, [..., 3]."""
+        coefficients = self.spline(np.clip(coordinate, 0, 1))
+        powers = np.arange(1, coefficients.shape[-2])
+        inside = np.clip(across, 0, 1)[..., None]
+        return np.einsum("...ki,...k->...i", coefficients[..., 1:, :], powers * inside ** (powers - 1))
+
+    def offsets_m(self, phase_centres_m: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the offsets of the channels' phase centres from the track, [channels, 3]."""
+        return phase_centres_m - self.positions_m(self.coordinate, self.across)
 
 
 def mean_track(lines: RangeLines) -> MeanTrack | None:
@@ -124,7 +299,7 @@ def mean_track(lines: RangeLines) -> MeanTrack | None:
     if along[-1] == 0:
         return None
     position_m, along = centres_m[order], along / along[-1]
-    close_m = _CLOSE_ENOUGH * lines.sound_speed_m_s / max(lines.carrier_hz, 1.0)
+    close_m = CLOSE_ENOUGH * lines.sound_speed_m_s / max(lines.carrier_hz, 1.0)
     best, best_m, intervals = None, np.inf, 1
     while intervals <= min(_MOST_INTERVALS, max(lines.channels // _CHANNELS_PER_KNOT, 1)):
         spline = _fit(along, position_m, intervals)
@@ -342,6 +517,19 @@ def _order(centres_m: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[n
         if steps_m.sum() < 0.999 * along_m[-1]:
             best, along_m = order, np.concatenate([[0.0], np.cumsum(steps_m)])
     return best, along_m
+
+
+def _polynomial(
+    coefficients: NDArray[np.float64], at: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return polynomials of coefficients [..., powers, 3], straight beyond 0 to 1, [..., 3]."""
+    inside = np.clip(at, 0, 1)[..., None]
+    powers = coefficients.shape[-2]
+    value, slope = np.zeros((2, *at.shape, 3))
+    for power in reversed(range(powers)):
+        slope = slope * inside + value
+        value = value * inside + coefficients[..., power, :]
+    return value + (at[..., None] - inside) * slope
 
 
 def _fit(along: NDArray[np.float64], position_m: NDArray[np.float64], intervals: int) -> BSpline:

@@ -129,6 +129,8 @@ class StageChannels:
         Virtual channels of a root along the whole aperture, at most.
     most : float
         Virtual channels of a subimage, at most.
+    bands : int
+        Bands of the stage's channels, at most: see `clsas.factorized.tree.Bands`.
     """
 
     used: float
@@ -136,6 +138,7 @@ class StageChannels:
     summed: float
     everywhere: float
     most: float
+    bands: int = 1
 
 
 @dataclass(frozen=True)

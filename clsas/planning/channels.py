@@ -39,7 +39,7 @@ def track_error_m(model: VisibilityModel) -> NDArray[np.float64]:
 
     The motion of receivers that differs from the mean is added, as it acts at the median range.
     """
-    away_m = model.lines.phase_centres_m - model.track.positions_m(model.track.coordinate)
+    away_m = model.track.offsets_m(model.lines.phase_centres_m)
     error_m = np.linalg.norm(away_m, axis=1)
     drift = own_drift(model)
     if drift is not None:
@@ -59,5 +59,6 @@ def peak_density(model: VisibilityModel) -> float:
     place = np.sort(model.track.coordinate)
     some = min(_NEIGHBOURS, len(place) - 1)
     closest = float((place[some:] - place[:-some]).min())
-    average = float(place[-1] - place[0]) * some / (len(place) - 1)
+    length = model.strips if model.strips > 1 else float(place[-1] - place[0])
+    average = length * some / (len(place) - 1)
     return average / closest if closest > 0 else np.inf

@@ -139,6 +139,7 @@ def predicted_plan(
         pitches=tuple(level.pitch for level in levels),
         root_channels=tuple(math.ceil(each.everywhere) for each in channels),
         most_channels=tuple(math.ceil(_ROOM * each.most) for each in channels),
+        bands=tuple(each.bands for each in channels),
         line_pitch=padded_length(lines.resampling),
         filtered=lines.upsampler is not None,
         half_precision=half_precision,
@@ -247,7 +248,7 @@ def _upsampled(view: VisibilityModel, candidate: Candidate, other_errors: ErrorB
     errors = replace(
         other_errors,
         range_filters=stages * power(align_db) + power(final.scatter_db),
-        aperture_filters=stages * power(aperture.filter.error_db),
+        aperture_filters=stages * aperture.dimensions * power(aperture.filter.error_db),
     )
     if gain is not None:
         most_db = in_db(UPSAMPLING_SHARE * errors.total)
@@ -271,8 +272,9 @@ def _stages(
 ) -> tuple[list[Stage], Work]:
     """Return the prediction of every stage and of the leaves, and the work of all."""
     width, aperture = device.info.width, candidate.aperture.filter
-    taps = candidate.align.taps + aperture.taps
-    error_db = in_db(power(lines.align_db) + power(aperture.error_db))
+    dimensions = candidate.aperture.dimensions
+    taps = candidate.align.taps + aperture.taps**dimensions
+    error_db = in_db(power(lines.align_db) + dimensions * power(aperture.error_db))
     stages, total = [], Work(call=1.0)
 
     def add(side: tuple[int, int], count: int, samples: int, work: Work, **figures: Any) -> None:
