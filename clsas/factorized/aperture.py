@@ -32,10 +32,16 @@ _CHANNELS_PER_KNOT = 16
 _MOST_INTERVALS = 64
 CLOSE_ENOUGH = 0.01
 """Distance of phase centres from the mean track that needs no better one, wavelengths rms."""
+_ALONG_AT = (0.0, 0.5, 1.0)
+_ACROSS_AT = tuple(np.linspace(0, 1, 9))
 STRIP_SAMPLES = 40
 """Samples of each of several strips, and of lines across a sheet."""
 APART = 16.0
 """Aperture coordinates from one strip to the next, more than samples go past the ends."""
+
+
+ON_TRACK_M = 1e-9
+"""Distance within which channels lie on the mean track."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -200,6 +206,16 @@ class MeanTrack:
         return np.abs(self.samples - APART * self.strip_of(self.samples) - 0.5) <= 0.5
 
     @functools.cached_property
+    def lines_along(self) -> tuple[MeanTrack, ...]:
+        """Lines along a sheet at which phase rates are evaluated."""
+        return tuple(self.line_along(each) for each in _ALONG_AT)
+
+    @functools.cached_property
+    def lines_across(self) -> tuple[MeanTrack, ...]:
+        """Lines across a sheet at which phase rates are evaluated."""
+        return tuple(self.line_across(each) for each in _ACROSS_AT)
+
+    @functools.cached_property
     def sampled_m(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Positions and tangents at `samples`, [n, 3] each."""
         return self.positions_m(self.samples), self.tangents_m(self.samples)
@@ -209,6 +225,7 @@ class MeanTrack:
         points_m: NDArray[np.float64],
         phase_centres_m: NDArray[np.float64],
         own_drift: NDArray[np.float64] | None = None,
+        on_sheet_m: float = 0.0,
     ) -> tuple[NDArray[np.float64], NDArray[np.float64] | None]:
         """Return the aperture coordinates at which phase centres appear from some points.
 
@@ -223,6 +240,8 @@ class MeanTrack:
             Those of the channels of `coordinate`.
         own_drift : float64 [channels, 3], optional
             See `own_drift`.
+        on_sheet_m : float
+            Distance from a sheet within which channels are taken to lie on it.
 
         Returns
         -------
@@ -235,7 +254,8 @@ class MeanTrack:
         off_m = (phase_centres_m - curve_m)[None]
         shape = (len(points_m), len(self.coordinate))
         across = None if self.across is None else np.broadcast_to(self.across, shape)
-        if own_drift is None and not np.abs(off_m).max() > 1e-9:
+        close_m = ON_TRACK_M if across is None else on_sheet_m
+        if own_drift is None and not np.abs(off_m).max() > close_m:
             return np.broadcast_to(self.coordinate, shape), across
         tangent = self.tangents_m(self.coordinate, self.across)
         sight = points_m[:, None] - phase_centres_m
@@ -397,8 +417,15 @@ def own_drift(lines: RangeLines) -> NDArray[np.float64] | None:
     return own if np.abs(own).max() > 1e-12 else None
 
 
+@dataclass(frozen=True, eq=False)
+class SampledLines:
+    """Positions and tangents of samples of some lines, [n, 3] each."""
+
+    sampled_m: tuple[NDArray[np.float64], NDArray[np.float64]]
+
+
 def cycles_per_extent(
-    track: MeanTrack,
+    track: MeanTrack | SampledLines,
     surface: Surface,
     centres_m: NDArray[np.float64],
     extents: NDArray[np.float64],
@@ -418,7 +445,7 @@ def cycles_per_extent(
 
     Parameters
     ----------
-    track : MeanTrack
+    track : MeanTrack or SampledLines
     surface : Surface
     centres_m : float64 [n, 3]
         Middles of boxes. The rates hold everywhere within these.

@@ -8,16 +8,16 @@ dimensions.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import BSpline
 
-from clsas.core.lines import RangeLines, wavelength_m
+from clsas.core.lines import RangeLines, some_channels, wavelength_m
 from clsas.factorized.aperture import (
     APART,
-    CLOSE_ENOUGH,
     STRIP_SAMPLES,
     MeanTrack,
     mean_track,
@@ -32,9 +32,15 @@ DENSE_SHAPES: tuple[Shape, ...] = ("strips", "sheet")
 _JUMP = 8.0  # median steps from channel to channel, from which on another pass begins
 _LEAST_OF_STRIP = 32  # channels
 _MOST_STRIPS = 128
-_FITTED = 1024  # channels to which a sheet is fitted
-_INTERVALS = (1, 4, 16, 64)  # of a sheet's splines
-_POWERS = (2, 3)  # coefficients across a sheet: straight, or bent
+_FITTED = 768  # channels to which a sheet is fitted
+_TRIED = (8, 2)  # intervals of a sheet's splines, and coefficients across it
+_REFINED = ((64, 2), (8, 3), (64, 3))  # the same, until all channels lie on the sheet
+_SHEET_CLOSE = 3e-5  # wavelengths rms: then nothing is to be aligned
+_OPEN = np.pi / 6  # of a ring's gap: then its ends are apart
+_OVERLAP = 0.08  # of a closed ring's ends
+_FLAT = 1e-6  # of the length: extents that are none
+_SCREENED = 512  # channels that tell whether one curve may serve
+_FAR_OFF = 2.0  # wavelengths rms, per axis: channels so far from a curve need several
 _CHANNELS_PER_TERM = 4
 _RIDGE = 1e-10  # of the normal equations, where no channel determines a coefficient
 
@@ -47,6 +53,16 @@ def mean_track_of(lines: RangeLines, shape: Shape) -> MeanTrack | None:
     if shape == "track":
         return mean_track(lines)
     return strips(lines) if shape == "strips" else sheet(lines)
+
+
+def simplest_track(lines: RangeLines) -> tuple[Shape, MeanTrack | None]:
+    """Return a mean track and its shape: one curve, unless channels are far from any."""
+    if not _follows_one_curve(lines):
+        for shape in DENSE_SHAPES:
+            track = mean_track_of(lines, shape)
+            if track is not None:
+                return shape, track
+    return "track", mean_track(lines)
 
 
 def strips(lines: RangeLines) -> MeanTrack | None:
@@ -81,51 +97,104 @@ def sheet(lines: RangeLines) -> MeanTrack | None:
     given the coordinates of the plane or the ring.
     """
     centres_m = lines.phase_centres_m
-    some = np.linspace(0, lines.channels - 1, min(_FITTED, lines.channels)).astype(int)
-    middle_m = centres_m.mean(axis=0)
-    close_m = CLOSE_ENOUGH * wavelength_m(lines)
-    best, best_m, chosen = None, np.inf, None
-    for along, across in _coordinates(centres_m - middle_m):
-        for powers in _POWERS:
-            for intervals in _INTERVALS:
-                terms = (intervals + 3) * powers
-                if len(some) < _CHANNELS_PER_TERM * terms or best_m <= close_m:
-                    break
-                spline = _fitted(along[some], across[some], centres_m[some] - middle_m, intervals, powers)
-                track = MeanTrack(spline, along[some], across=across[some])
-                off_m = centres_m[some] - middle_m - track.positions_m(along[some], across[some])
-                rms_m = float(np.sqrt(np.mean(np.sum(off_m**2, axis=1))))
-                if rms_m < 0.5 * best_m:
-                    best, best_m, chosen = spline, rms_m, (along, across)
-    if best is None or chosen is None:
+    some = some_channels(lines.channels, _FITTED)
+    middle_m = centres_m[some].mean(axis=0)
+    some_m = centres_m[some] - middle_m
+    ranked = []
+    for surface in _surfaces(some_m):
+        _, rms_m = _fitted(surface.coordinates(some_m), some_m, surface.closed, *_TRIED)
+        ranked.append((rms_m, len(ranked), surface))
+    if not ranked:
+        return None
+    surface = min(ranked)[2]
+    along, across = surface.coordinates(centres_m - middle_m)
+    best, best_m = None, np.inf
+    for intervals, powers in (_TRIED, *_REFINED):
+        if len(some) < _CHANNELS_PER_TERM * (intervals + 3) * powers:
+            continue
+        spline, rms_m = _fitted(
+            (along[some], across[some]), some_m, surface.closed, intervals, powers
+        )
+        if rms_m < 0.5 * best_m:
+            best, best_m = spline, rms_m
+        if best_m <= _SHEET_CLOSE * wavelength_m(lines):
+            break
+    if best is None:
         return None
     coefficients = best.c.copy()
     coefficients[:, 0] += middle_m
-    spline = BSpline(best.t, coefficients, best.k)
-    return MeanTrack(spline, chosen[0], across=chosen[1])
+    return MeanTrack(BSpline(best.t, coefficients, best.k), along, across=across)
 
 
-def _coordinates(
-    offset_m: NDArray[np.float64],
-) -> Iterator[tuple[NDArray[np.float64], NDArray[np.float64]]]:
-    """Yield coordinates of channels along and across a plane, and rings, each from 0 to 1."""
+def _follows_one_curve(lines: RangeLines) -> bool:
+    """Return whether one smooth curve may serve: False if channels are far from any.
+
+    A sample of the channels decides, so that no curve is fitted to a hundred thousand in vain.
+    """
+    some = some_channels(lines.channels, _SCREENED)
+    if len(some) == lines.channels:
+        return True
+    track = mean_track(lines.without_samples().select(some))
+    if track is None:
+        return True
+    off_m = track.offsets_m(lines.phase_centres_m[some])
+    return bool(np.sqrt(np.mean(off_m**2)) < _FAR_OFF * wavelength_m(lines))
+
+
+@dataclass(frozen=True, eq=False)
+class _Surface:
+    """A plane, or a ring around an axis, through the origin.
+
+    Attributes
+    ----------
+    axes : float64 [3, 3]
+        Of a plane, the first along it and the second across; of a ring, the last is its axis.
+    centre : (float, float) or None
+        Of the ring, along the first two axes; None for a plane.
+    start : float
+        Angle at which the ring is cut.
+    closed : bool
+        True for a whole ring: its ends meet.
+    """
+
+    axes: NDArray[np.float64]
+    centre: tuple[float, float] | None = None
+    start: float = 0.0
+    closed: bool = False
+
+    def coordinates(
+        self, offset_m: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return coordinates of channels along and across, each from 0 to 1."""
+        first, second, third = self.axes @ offset_m.T
+        if self.centre is None:
+            return _scaled(first), _scaled(second)
+        angle = np.arctan2(second - self.centre[1], first - self.centre[0])
+        turn = (angle - self.start) / (2 * np.pi) % 1.0
+        return turn if self.closed else _scaled(turn), _scaled(third)
+
+
+def _surfaces(offset_m: NDArray[np.float64]) -> Iterator[_Surface]:
+    """Yield the plane nearest to channels, and rings around two axes."""
     axes = np.linalg.eigh(offset_m.T @ offset_m)[1].T[::-1]
-    first, second, third = axes @ offset_m.T
-    if np.ptp(second) <= 1e-6 * np.ptp(first):
+    length_m = np.ptp(offset_m @ axes.T, axis=0)
+    if length_m[1] <= _FLAT * length_m[0]:
         return
-    yield _scaled(first), _scaled(second)
-    for one, other, axis in ((first, second, third), (second, third, first)):
-        if np.ptp(axis) <= 1e-6 * np.ptp(first):
+    yield _Surface(axes)
+    for order in ((0, 1, 2), (1, 2, 0)):
+        if length_m[order[2]] <= _FLAT * length_m[0]:
             continue
         # The circle of least squares: x^2 + y^2 = 2 a x + 2 b y + c.
+        turned = axes[list(order)]
+        one, other, _ = turned @ offset_m.T
         terms = np.stack([2 * one, 2 * other, np.ones_like(one)], axis=1)
         a, b, _ = np.linalg.lstsq(terms, one**2 + other**2, rcond=None)[0]
-        angle = np.arctan2(other - b, one - a)
-        ordered = np.sort(angle)
-        gaps = np.diff(ordered, append=ordered[0] + 2 * np.pi)
+        angle = np.sort(np.arctan2(other - b, one - a))
+        gaps = np.diff(angle, append=angle[0] + 2 * np.pi)
         # The ring is cut in its widest gap.
-        start = ordered[(int(gaps.argmax()) + 1) % len(ordered)]
-        yield _scaled((angle - start) % (2 * np.pi)), _scaled(axis)
+        widest = int(gaps.argmax())
+        closed = bool(gaps[widest] < _OPEN)
+        yield _Surface(turned, (a, b), float(angle[widest] + gaps[widest] / 2), closed)
 
 
 def _scaled(values: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -134,17 +203,29 @@ def _scaled(values: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _fitted(
-    along: NDArray[np.float64],
-    across: NDArray[np.float64],
+    coordinates: tuple[NDArray[np.float64], NDArray[np.float64]],
     position_m: NDArray[np.float64],
+    closed: bool,
     intervals: int,
     powers: int,
-) -> BSpline:
-    """Return the least-squares sheet of positions [n, 3]: cubic along, a polynomial across."""
-    knots = np.concatenate([[0.0] * 3, np.linspace(0, 1, intervals + 1), [1.0] * 3])
+) -> tuple[BSpline, float]:
+    """Return the least-squares sheet of positions [n, 3], and the rms distance from it.
+
+    Positions are cubic splines along it, and polynomials across.
+    """
+    (along, across), low, high = coordinates, 0.0, 1.0
+    if closed:  # on either side of the cut, channels of the other side guide the splines
+        low, high = -_OVERLAP, 1 + _OVERLAP
+        turned = np.concatenate([along - 1, along, along + 1])
+        near = np.flatnonzero((turned > low) & (turned < high))
+        along, across = turned[near], across[near % len(across)]
+        position_m = position_m[near % len(position_m)]
+    knots = np.concatenate([[low] * 3, np.linspace(low, high, intervals + 1), [high] * 3])
     basis = BSpline.design_matrix(along, knots, 3).toarray()
     terms = (basis[:, :, None] * across[:, None, None] ** np.arange(powers)).reshape(len(along), -1)
     normal = terms.T @ terms
     normal += _RIDGE * np.trace(normal) / len(normal) * np.eye(len(normal))
     coefficients = np.linalg.solve(normal, terms.T @ position_m)
-    return BSpline(knots, coefficients.reshape(basis.shape[1], powers, 3), 3)
+    off_m = terms @ coefficients - position_m
+    rms_m = float(np.sqrt(np.mean(np.sum(off_m**2, axis=1))))
+    return BSpline(knots, coefficients.reshape(basis.shape[1], powers, 3), 3), rms_m

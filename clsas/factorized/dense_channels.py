@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from clsas.factorized.aperture import MeanTrack, cycles_per_extent
+from clsas.factorized.aperture import MeanTrack, SampledLines, cycles_per_extent
 from clsas.factorized.surface import Surface
 from clsas.factorized.tree import (
     Bands,
@@ -17,9 +17,6 @@ from clsas.factorized.tree import (
     interpolated_channels,
 )
 from clsas.signal.interpolation import Interpolator
-
-_ALONG_AT = (0.0, 0.5, 1.0)  # lines along a sheet, at which phase rates are evaluated
-_ACROSS_AT = tuple(np.linspace(0, 1, 9))
 
 
 def strip_channels(
@@ -120,21 +117,24 @@ def sheet_rates(
     Rates are [axes, n, samples] as those of `cycles_per_extent`, which has the parameters. They are
     the largest of some lines each.
     """
-    lines_along = [track.line_along(each) for each in _ALONG_AT]
-    lines_across = [track.line_across(each) for each in _ACROSS_AT]
-    along, across = (
-        np.max(
-            [
-                cycles_per_extent(
-                    line, surface, centres_m, extents, cycles_per_m, nearest_m, every=every
-                )
-                for line in lines
-            ],
-            axis=0,
-        )
-        for lines in (lines_along, lines_across)
+    lines = track.lines_along + track.lines_across
+    sampled = [[each[::every] for each in line.sampled_m] for line in lines]
+    positions_m, tangents_m = (np.concatenate(each) for each in zip(*sampled, strict=True))
+    rates = cycles_per_extent(
+        SampledLines((positions_m, tangents_m)),
+        surface,
+        centres_m,
+        extents,
+        cycles_per_m,
+        nearest_m,
     )
-    return SheetRates(along, across)
+    first = len(track.lines_along) * len(sampled[0][0])
+    shape = rates.shape[:-1]
+    along, across = rates[..., :first], rates[..., first:]
+    return SheetRates(
+        along.reshape(*shape, len(track.lines_along), -1).max(axis=-2),
+        across.reshape(*shape, len(track.lines_across), -1).max(axis=-2),
+    )
 
 
 def first_on_sheet(

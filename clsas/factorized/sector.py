@@ -134,6 +134,7 @@ class Geometry:
         wavelength_m = lines.sound_speed_m_s / max(lines.carrier_hz, 1.0)
         if own is not None:
             off_m += np.linalg.norm(own, axis=1).max() * np.abs(lines.last_range_m).max()
+        self._on_sheet_m = _ON_TRACK * wavelength_m
         apart = lines.rx_velocity_m_s is not None or not np.array_equal(lines.tx_m, lines.rx_m)
         away = apart or off_m > _ON_TRACK * wavelength_m
         self.ramps = bool(away and image.aperture.aligns_phases)
@@ -247,7 +248,7 @@ class Geometry:
             )
         centres_m, some = self.phase_centres_m[channels], track.some(channels)
         own = None if self.own_drift is None else self.own_drift[channels]
-        place, across = some.apparent_coordinates(root_m, centres_m, own)
+        place, across = some.apparent_coordinates(root_m, centres_m, own, self._on_sheet_m)
         nodes = aperture.virtual_channels(self, roots, root_m, place, across, centres_m)
         if track.is_dense:
             needs = all_channels(nodes, place.shape[1], self._holding(inside))

@@ -233,11 +233,14 @@ def _fastest_of_shapes(
     """
     if view.track is None or view.grid.size == 1:
         return None, math.inf
-    best, least, dense = None, math.inf, True
+    best, least, others = None, math.inf, DENSE_SHAPES
     if _divisible(view):
         best, least = fastest(view, conditions, seconds, choices)
-        dense = off_track(view, conditions)
-    for shape in DENSE_SHAPES if dense else ():
+        if view.shape == "track" and not off_track(view, conditions):
+            others = ()
+    for shape in others:
+        if shape == view.shape:
+            continue
         if best is not None:
             seconds = _WORTH * best.predicted_seconds - _SEARCH_S
         model = view.with_shape(shape) if seconds > 0 else None

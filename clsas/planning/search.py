@@ -40,6 +40,7 @@ MOST_STAGES = 5
 # Share of the filters' error power that expanding a leaf may add. Half of it leaves some near grids
 # without a leaf, so that they are imaged exactly; twice gains 3 % of time.
 _LEAF_SHARE = 0.25
+_MOST_OVERHANG = 1.1  # of roots that fit an image, over its rows or columns
 _SPARE_SAMPLES = 16  # of a line, for filters and padding; twice moves times by 3 % at most
 
 
@@ -160,12 +161,30 @@ class Division:
     across: NDArray[np.float64] | None = None
 
 
+def _lengths(model: VisibilityModel) -> tuple[tuple[int, ...], ...]:
+    """Return rows and columns that subimages may have.
+
+    Every channel of a dense aperture is aligned for every root, so there roots fit the image too.
+    """
+    if not model.track.is_dense:
+        return _ROWS, _COLUMNS
+    found = []
+    for sides, n in zip((_ROWS, _COLUMNS), model.surface.plane.shape, strict=True):
+        least, fitting = sides[0], set(sides)
+        for parts in (1, 2, 4):
+            part = least * math.ceil(n / (least * parts))
+            if parts * part <= _MOST_OVERHANG * max(n, least):
+                fitting |= {part * 2**k for k in range(parts.bit_length())}
+        found.append(tuple(sorted(fitting)))
+    return tuple(found)
+
+
 @cached
 def all_sizes(model: VisibilityModel, most: Side, device: Device) -> Sizes:
     """Return the sizes of subimages up to `most` rows and columns."""
     rows, columns = (
         [side for side in sides if side <= limit and side < 2 * max(n, min(sides))]
-        for sides, n, limit in zip((_ROWS, _COLUMNS), model.surface.plane.shape, most, strict=True)
+        for sides, n, limit in zip(_lengths(model), model.surface.plane.shape, most, strict=True)
     )
     pairs = tuple(product(rows, columns))
     sides = np.array(pairs, np.int64).reshape(-1, 2)
@@ -371,7 +390,7 @@ def largest_root(model: VisibilityModel) -> Side:
     """Return the rows and columns of the largest roots of an image."""
     rows, columns = (
         min((side for side in sides if side >= n), default=sides[-1])
-        for sides, n in zip((_ROWS, _COLUMNS), model.surface.plane.shape, strict=True)
+        for sides, n in zip(_lengths(model), model.surface.plane.shape, strict=True)
     )
     return rows, columns
 

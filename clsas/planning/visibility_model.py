@@ -15,8 +15,8 @@ from scipy.spatial import KDTree
 from clsas.core.grid import Grid
 from clsas.core.lines import RangeLines
 from clsas.exact.tiles import STACK
-from clsas.factorized.aperture import cycles_per_extent, mean_track
-from clsas.factorized.dense_apertures import Shape, mean_track_of
+from clsas.factorized.aperture import cycles_per_extent
+from clsas.factorized.dense_apertures import Shape, mean_track_of, simplest_track
 from clsas.factorized.dense_channels import SheetRates, sheet_rates
 from clsas.factorized.surface import LEAST_SIDE, surface_of, within_roots
 from clsas.factorized.visibility import beam_directions, beam_rate
@@ -112,7 +112,8 @@ class VisibilityModel:
         self.rms_cycles_per_m = float(np.sqrt(mean_square)) / lines.range_step_m
         self.limits, self.root = None if beam is None else beam.limits, None
         self.channels_along = None if beam is None else beam.directions(lines)
-        self._put_track(mean_track(lines))
+        self.shape, track = simplest_track(lines)
+        self._put_track(track)
 
     def _put_track(self, track: Any) -> None:
         """Set what follows from the mean track."""
