@@ -17,7 +17,7 @@
  *   TAPS           of the range filter h, even, at most 8.
  *   APERTURE_TAPS  of the aperture filter a, even; 1: every channel adds to one virtual channel, with weight 1.
  *   ROWS           1: virtual channels lie in rows, and each channel adds to APERTURE_TAPS rows with the weights of a across
- *                  them; 0: each channel adds to one row.
+ *                  them; 2: so that all channels of a band have equal weights; 0: each channel adds to one row.
  *   SHIFTS_GIVEN   1: shifts and phases come from the host (the first stage, whose channels may be anywhere); 0: they
  *                  follow from the positions of virtual channels.
  *   RAMP           1: phases vary along the lines (only with SHIFTS_GIVEN); 0: every ramp is 0.
@@ -25,11 +25,10 @@
  *                  are written, and read again by the next.
  *
  * parent_lines, parent_pitch  lines of all parents (samples.h).
- * bands          int [roots][children_per_root][band_count][8]: the channels [begin, end) of the band that a child uses; the
+ * bands          int [roots][children_per_root][band_count][7]: the channels [begin, end) of the band that a child uses; the
  *                channel of the parent's first line; the child's first virtual channel in the band's first row, and how
  *                many the row has; the child's line of that first one; how many of the band's rows, the first ones, earlier
- *                bands have added to; how many rows before them no band adds to, which become 0. The children at work
- *                begin at number first_child, which begins a root.
+ *                bands have added to. The children at work begin at number first_child, which begins a root.
  * Per root and channel, [roots][channel_pitch]:
  * first_virtual  int: the first virtual channel that the channel contributes to, never decreasing in a band.
  * tap_position   float: aperture coordinate from the middle of the virtual channels it contributes to, in their spacing.
@@ -127,7 +126,7 @@ INLINE Child row_of(const Child *child, int row)
 /* What a chunk of channels is aligned and summed with. */
 typedef struct {
     float range_weight[TAPS][CHUNK], aperture_weight[APERTURE_TAPS][CHUNK];
-#if ROWS
+#if ROWS == 1
     float row_weight[ACROSS_TAPS][CHUNK];
 #endif
     float cosine[CHUNK], sine[CHUNK]; /* of the phase; with RAMP of its change over WIDTH samples */
@@ -275,6 +274,53 @@ INLINE void store_sum(vfloat re, vfloat im, const Child *child, int number, int 
     }
 }
 
+#if ROWS == 2
+/* Adds a sum along the band to virtual channel `number` of every row, with the row's weight. */
+INLINE void add_to_rows(vfloat re, vfloat im, const float *row_weight, const Child *child, int number, int k)
+{
+    if (!is_of(child, number))
+        return;
+    __global sample_t *line = virtual_line(child, number);
+    const size_t row_pitch = (size_t)(child->end - child->first) * 2 * child->pitch;
+#pragma unroll
+    for (int r = 0; r < ACROSS_TAPS; r++, line += row_pitch) {
+        STORE_RE(LOAD_RE(line, k, child->pitch) + row_weight[r] * re, line, k, child->pitch);
+        STORE_IM(LOAD_IM(line, k, child->pitch) + row_weight[r] * im, line, k, child->pitch);
+    }
+}
+
+/* As combine() below, where a chunk's channels have equal weights across the rows: sums along the band are finished first.
+ * The lines of the rows hold what was added to them before. */
+INLINE void combine_in_rows(const Aligned *aligned, int n, __local const Chunk *chunk, int count,
+                            __global const int *first_virtual, const float *row_weight, const Child *child, int k)
+{
+    vfloat re[APERTURE_TAPS], im[APERTURE_TAPS];
+#pragma unroll
+    for (int t = 0; t < APERTURE_TAPS; t++)
+        re[t] = im[t] = 0.0f;
+    int number = first_virtual[0];
+    for (int c = 0; c < count; c++) {
+        for (; number < first_virtual[c]; number++) {
+            add_to_rows(re[0], im[0], row_weight, child, number, k);
+#pragma unroll
+            for (int t = 0; t + 1 < APERTURE_TAPS; t++) {
+                re[t] = re[t + 1];
+                im[t] = im[t + 1];
+            }
+            re[APERTURE_TAPS - 1] = im[APERTURE_TAPS - 1] = 0.0f;
+        }
+        const vfloat line_re = aligned->re[n][c], line_im = aligned->im[n][c];
+#pragma unroll
+        for (int t = 0; t < APERTURE_TAPS; t++) {
+            re[t] += chunk->aperture_weight[t][c] * line_re;
+            im[t] += chunk->aperture_weight[t][c] * line_im;
+        }
+    }
+#pragma unroll
+    for (int t = 0; t < APERTURE_TAPS; t++)
+        add_to_rows(re[t], im[t], row_weight, child, number + t, k);
+}
+#else
 /* Adds a chunk's `count` aligned lines, vector `n` of their block, to samples k on of the virtual channels from `number`
  * on, in row `row` of the band. first_virtual is that of the chunk's channels; is_new is whether no earlier band has added
  * to the row.
@@ -305,7 +351,7 @@ INLINE void combine(const Aligned *aligned, int n, __local const Chunk *chunk, i
                 im[t] = im[t + 1];
             }
             re[APERTURE_TAPS - 1] = im[APERTURE_TAPS - 1] = 0.0f;
-#if ROWS
+#if ROWS == 1
             const int opened = number + APERTURE_TAPS;
             if (!is_new && is_of(child, opened)) {
                 re[APERTURE_TAPS - 1] = LOAD_RE(virtual_line(child, opened), k, child->pitch);
@@ -313,7 +359,7 @@ INLINE void combine(const Aligned *aligned, int n, __local const Chunk *chunk, i
             }
 #endif
         }
-#if ROWS
+#if ROWS == 1
         const vfloat line_re = chunk->row_weight[row][c] * aligned->re[n][c];
         const vfloat line_im = chunk->row_weight[row][c] * aligned->im[n][c];
 #else
@@ -329,6 +375,7 @@ INLINE void combine(const Aligned *aligned, int n, __local const Chunk *chunk, i
     for (int t = 0; t < APERTURE_TAPS; t++)
         store_sum(re[t], im[t], child, number + t, k);
 }
+#endif
 
 /* Sets samples `from` on, to `to`, of the virtual channels from `number` on to 0. */
 INLINE void clear_lines(const Child *child, int number, int from, int to, int item, int items)
@@ -390,16 +437,38 @@ __kernel void stage(__global const sample_t *parent_lines, int parent_pitch, __g
     const int first_sample = parent_centre - half_length + 1 - TAPS / 2;
 #endif
 
+#if ROWS == 2
+    /* Bands are as long as each other. All of them are taken up to a channel, so that the sums stay in the cache. */
+    __global const int *first_band = bands + 7 * child_number * band_count;
+    const Child all = {LINE(child_lines, get_group_id(0) * lines_per_child, child_pitch) + (WIDTH == 1 ? 2 : 1) * guard,
+                       child_pitch, 0, first_band[4] ? lines_per_child : 0};
+    clear_lines(&all, 0, from, to, item, items);
+    for (int step = 0; step < (first_band[1] - first_band[0] + CHUNK - 1) / CHUNK * band_count; step++) {
+        const int band = step % band_count, skipped = step / band_count * CHUNK;
+#else
     for (int band = 0; band < band_count; band++) {
-        __global const int *of_band = bands + 8 * (child_number * band_count + band);
+#endif
+        __global const int *of_band = bands + 7 * (child_number * band_count + band);
+#if ROWS == 2
+        const int begin = of_band[0] + skipped, end = min(of_band[1], begin + CHUNK);
+#else
         const int begin = of_band[0], end = of_band[1], old_rows = of_band[6];
+#endif
         const Child child = {LINE(child_lines, get_group_id(0) * lines_per_child + of_band[5], child_pitch)
                                  + (WIDTH == 1 ? 2 : 1) * guard,
                              child_pitch, of_band[3], of_band[3] + of_band[4]};
 #if !SHIFTS_GIVEN
         parent.first_channel = of_band[2];
 #endif
+#if ROWS == 2
+        vfloat share[ACROSS_TAPS];
+        filter_weights(aperture_filter, ACROSS_TAPS, (vfloat)row_position[of_band[0]], share);
+        float row_weight[ACROSS_TAPS];
+        for (int t = 0; t < ACROSS_TAPS; t++)
+            row_weight[t] = LANE(share[t], 0);
+#else
         int open = child.first - APERTURE_TAPS + 1; /* the first virtual channel that later channels may contribute to */
+#endif
         for (int first = begin; first < end; first += CHUNK) {
             const int count = end - first < CHUNK ? end - first : CHUNK;
             WAIT_FOR_GROUP;
@@ -416,7 +485,7 @@ __kernel void stage(__global const sample_t *parent_lines, int parent_pitch, __g
                                                       cycles_per_m, first_sample);
 #endif
                 store_weights(&chunk, c, shifts, range_filter, aperture_filter, LOAD(tap_position + channel));
-#if ROWS
+#if ROWS == 1
                 vfloat share[ACROSS_TAPS];
                 filter_weights(aperture_filter, ACROSS_TAPS, LOAD(row_position + channel), share);
 #pragma unroll
@@ -454,25 +523,30 @@ __kernel void stage(__global const sample_t *parent_lines, int parent_pitch, __g
                     align_line(&aligned, &chunk, c, line_of(&parent, first + c), parent_pitch, block, block_end, phase_re,
                                phase_im, next);
                 }
-                for (int k = block; k < block_end; k += WIDTH)
+                for (int k = block; k < block_end; k += WIDTH) {
+#if ROWS == 2
+                    combine_in_rows(&aligned, (k - block) / WIDTH, &chunk, count, first_virtual + first, row_weight, &child, k);
+#else
                     for (int r = 0; r < ACROSS_TAPS; r++) {
                         const Child of_row = row_of(&child, r);
-                        combine(&aligned, (k - block) / WIDTH, &chunk, count, first_virtual + first, first == begin, r >= old_rows,
-                                r, &of_row, open, k);
+                        combine(&aligned, (k - block) / WIDTH, &chunk, count, first_virtual + first, first == begin,
+                                r >= old_rows, r, &of_row, open, k);
                     }
+#endif
+                }
             }
+#if ROWS < 2
             /* A work-item without samples has passed no channel, so this does not rely on combine(). */
             open = max(open, first_virtual[first + count - 1]);
+#endif
         }
+#if ROWS < 2
         /* Virtual channels beyond the last that any channel contributes to, and rows without any. */
         const int beyond = end > begin ? max(open + APERTURE_TAPS, child.first) : child.first;
         for (int r = old_rows; r < ACROSS_TAPS; r++) {
             const Child of_row = row_of(&child, r);
             clear_lines(&of_row, beyond, from, to, item, items);
         }
-        for (int r = -of_band[7]; r < 0; r++) {
-            const Child of_row = row_of(&child, r);
-            clear_lines(&of_row, child.first, from, to, item, items);
-        }
+#endif
     }
 }

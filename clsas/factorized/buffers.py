@@ -90,7 +90,7 @@ def stage_tables(
     """
     row = (roots, row_pitch(channels))
     tables = {
-        f"bands{level}": Buffer((roots, subimages, bands, 8), np.int32),
+        f"bands{level}": Buffer((roots, subimages, bands, 7), np.int32),
         f"base{level}": Buffer(row, np.int32),
         f"between{level}": Buffer(row, np.float32),
     }

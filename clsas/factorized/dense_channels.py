@@ -50,7 +50,7 @@ def strip_channels(
     in_order = bool((order == np.arange(order.shape[1])).all())
     every = np.ones((roots, 1), np.int64)
     none = 0 * every * np.array(firsts)
-    bands = Bands(every * bounds, every * firsts, every * widths, none, none, None)
+    bands = Bands(every * bounds, every * firsts, every * widths, none, None)
     positions_m = track.positions_m(place)
     return VirtualChannels(
         place, positions_m, None if in_order else order, base, between, aperture, bands
@@ -170,7 +170,6 @@ def first_on_sheet(
         np.broadcast_to(width * numbers, shape),
         np.full(shape, width),
         np.broadcast_to(np.where(numbers > 0, taps - 1, 0), shape),
-        np.zeros(shape, np.int64),
         np.take_along_axis(row - above - 0.5, order, axis=1),
     )
     base += width * first_row
@@ -186,21 +185,15 @@ def later_on_sheet(
     lower, above = np.floor(column), np.floor(row)
     base, first_row = (each.astype(np.int64) - (taps // 2 - 1) for each in (lower, above))
     (roots, bands), channels = row.shape, column.shape[1]
-    rows, width = found.rows.shape[1], found.columns.shape[1]
-    # One more band, without channels, blanks the last rows.
-    first_row = np.concatenate([first_row, np.full((roots, 1), rows)], axis=1)
-    ends = np.concatenate([np.zeros((roots, 1), np.int64), first_row[:, :-1] + taps], axis=1)
-    shape = roots, bands, channels
+    width, shape = found.columns.shape[1], (roots, bands, channels)
     of_bands = Bands(
-        np.broadcast_to(channels * np.minimum(np.arange(bands + 2), bands), (roots, bands + 2)),
+        np.broadcast_to(channels * np.arange(bands + 1), (roots, bands + 1)),
         width * first_row,
-        np.full((roots, bands + 1), width),
-        np.clip(ends - first_row, 0, taps),
-        np.maximum(first_row - ends, 0),
+        np.full((roots, bands), width),
+        np.zeros((roots, bands), np.int64),
         np.broadcast_to((row - above - 0.5)[..., None], shape).reshape(roots, -1),
     )
-    of_bands.old[:, -1] = taps
-    every = base[:, None] + width * first_row[:, :-1, None]
+    every = base[:, None] + width * first_row[..., None]
     between = np.broadcast_to((column - lower - 0.5)[:, None], shape).reshape(roots, -1)
     return (
         _of_sheet(track, found, None, every.reshape(roots, -1), between, aperture, of_bands),
@@ -267,15 +260,15 @@ def all_channels(
 def band_table(
     bands: Bands | None, need: ChannelRanges, first_of_parent: NDArray[np.int64]
 ) -> NDArray[np.int64]:
-    """Return what the stage kernel is told of every subimage's bands, [roots, subimages, bands, 8].
+    """Return what the stage kernel is told of every subimage's bands, [roots, subimages, bands, 7].
 
     See `cl/stage.cl`. `first_of_parent` is the channel of each parent's first line.
     """
     if bands is None:
         none = np.zeros_like(need.first)
         of_one = [need.begin, need.end, first_of_parent, need.first, need.last - need.first]
-        return np.stack([*of_one, none, none, none], axis=-1)[:, :, None]
+        return np.stack([*of_one, none, none], axis=-1)[:, :, None]
     begin, end = bands.bounds[:, :-1], bands.bounds[:, 1:]
-    values = [begin, end, 0 * begin, bands.first, bands.width, bands.first, bands.old, bands.blank]
+    values = [begin, end, 0 * begin, bands.first, bands.width, bands.first, bands.old]
     needed = need.last > need.first
     return np.stack(values, axis=-1)[:, None] * needed[..., None, None]

@@ -149,11 +149,11 @@ class _Run:
         }
         options = {"WIDTH": self.width, "TAPS": image.align.taps}
         options |= {"APERTURE_TAPS": image.aperture.filter.taps, "HALF": int(self.half_precision)}
-        options |= {"ROWS": int(self.geometry.track.is_sheet)}
         options |= {"CHUNK": CHUNK, "PHASE_TERMS": phases.PRECISE_TERMS}
         ramp = int(self.geometry.ramps)
-        self.first_stage = device.kernel("stage", SHIFTS_GIVEN=1, RAMP=ramp, **options)
-        self.later_stage = device.kernel("stage", SHIFTS_GIVEN=0, RAMP=0, **options)
+        rows = int(self.geometry.track.is_sheet)
+        self.first_stage = device.kernel("stage", SHIFTS_GIVEN=1, RAMP=ramp, ROWS=rows, **options)
+        self.later_stage = device.kernel("stage", SHIFTS_GIVEN=0, RAMP=0, ROWS=2 * rows, **options)
         kind = PlaneLeaves if self.geometry.surface.is_plane else SurfaceLeaves
         self.leaves = kind(
             lines, self.geometry, self.levels[-1], device, pixels, self.half_precision, self.gain
@@ -288,6 +288,9 @@ class _Run:
         items = _GROUP if self.width == 1 else 1
         # Few children are divided, so that there is work for all.
         step = _GROUP if self.width == 1 else 8 * self.width
+        if self.geometry.track.is_dense and self.width > 1:
+            # All channels of a dense aperture go into few children: they need every core.
+            step = 2 * self.width if children < device.info.compute_units else step
         parts = -(-_GROUPS_PER_UNIT * device.info.compute_units // children)
         part_length = step * -(-shape.length // (step * parts))
         device.run(

@@ -114,7 +114,7 @@ class Geometry:
         self.samples_per_m = image.resampling.samples_per_m(lines)
         self.cycles_per_m = image.resampling.cycles_per_m(lines)
         self.division = Division(surface, image.sides)
-        track = mean_track_of(lines, image.aperture.shape)
+        track = chosen.kept.get("track") or mean_track_of(lines, image.aperture.shape)
         if track is None:
             raise ValueError(
                 "lines must have channels at more than one place for a plan that divides"

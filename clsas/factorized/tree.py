@@ -39,8 +39,6 @@ class Bands:
         Virtual channels of these rows.
     old : int64 [roots, bands]
         Of the rows, the number that earlier bands contribute to.
-    blank : int64 [roots, bands]
-        Rows before them that no band contributes to.
     between : float64 [roots, channels] or None
         Position of each channel from the middle of its rows, -0.5 to 0.5; None with single rows.
     """
@@ -49,7 +47,6 @@ class Bands:
     first: NDArray[np.int64]
     width: NDArray[np.int64]
     old: NDArray[np.int64]
-    blank: NDArray[np.int64]
     between: NDArray[np.float64] | None
 
 

@@ -33,17 +33,16 @@ def carriers(model: VisibilityModel, count: int) -> NDArray[np.float64]:
     return np.interp(index, np.arange(len(share)), cycles_per_m)
 
 
-@shared
-def track_error_m(model: VisibilityModel) -> NDArray[np.float64]:
-    """Distances of channels from the mean track, [channels].
+def track_error_m(model: VisibilityModel, channels: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Distances of some channels from the mean track, [channels].
 
     The motion of receivers that differs from the mean is added, as it acts at the median range.
     """
-    away_m = model.track.offsets_m(model.lines.phase_centres_m)
+    away_m = model.track.some(channels).offsets_m(model.lines.phase_centres_m[channels])
     error_m = np.linalg.norm(away_m, axis=1)
     drift = own_drift(model)
     if drift is not None:
-        error_m += np.linalg.norm(drift, axis=1) * np.median(model.distance_m)
+        error_m += np.linalg.norm(drift[channels], axis=1) * np.median(model.distance_m)
     return error_m
 
 

@@ -126,6 +126,8 @@ def predicted_plan(
     """
     sides, device, costs = candidate.sides, conditions.device, conditions.costs
     lines = _upsampled(view, candidate, other_errors)
+    if view.track is not None and view.track.is_dense:
+        lines = _trimmed(view, candidate, lines)
     half_lengths = view.half_lengths(sides, candidate.align, candidate.final, lines.resampling)
     channels = candidate.aperture.predicted_channels(view, sides)
     levels = [Level.of(half, device.info.width) for half in half_lengths]
@@ -230,8 +232,8 @@ def _plan(
         image=image,
         prediction=prediction,
         beam=view.beam,
-        lines_digest=lines_digest(view.lines),
-        grid_digest=grid_digest(view.grid),
+        lines_digest=view.from_cache("lines", lambda: lines_digest(view.lines)),
+        grid_digest=view.from_cache("grid", lambda: grid_digest(view.grid)),
     )
 
 
@@ -259,6 +261,28 @@ def _upsampled(view: VisibilityModel, candidate: Candidate, other_errors: ErrorB
             return _Lines(upsampler, resampling, align_db, errors)
     resampling = interpolation.resampling(samples, align, view.spectrum)
     return _Lines(None, resampling, align_db, errors)
+
+
+def _trimmed(view: VisibilityModel, candidate: Candidate, lines: _Lines) -> _Lines:
+    """Return upsampled lines without the samples that no pixel needs.
+
+    Dense apertures have so many channels that upsampling whole lines takes most of the time.
+    """
+    resampling = lines.resampling
+    low_m, high_m = view.range_window_m(candidate.sides[0])
+    step_m = view.lines.range_step_m
+    spare = len(candidate.sides) * (candidate.align.taps // 2 + 1) + candidate.final.taps + 2
+    first, last = (
+        math.floor((each_m / step_m + resampling.lead) * resampling.ratio) - resampling.first
+        for each_m in (low_m, high_m)
+    )
+    first, last = max(first - spare, 0), min(last + 1 + spare, resampling.length)
+    # Whole turns of the filters' phases, and a line at least.
+    first -= first % PHASES
+    if last - first < 1 or candidate.aperture.method != "interpolated":
+        return lines
+    window = replace(resampling, first=resampling.first + first, length=last - first)
+    return replace(lines, resampling=window)
 
 
 def _stages(

@@ -78,8 +78,8 @@ def spacing_error(
 _Place = tuple[Literal["track", "along", "across"], float]
 """A curve: the track, or a line along or across a sheet at some coordinate."""
 _TRACK: _Place = ("track", 0.0)
-_LINES_ALONG: tuple[_Place, ...] = (("along", 0.25), ("along", 0.75))
-_LINES_ACROSS: tuple[_Place, ...] = (("across", 0.15), ("across", 0.5), ("across", 0.85))
+_LINES_ALONG: tuple[_Place, ...] = (("along", 0.25),)
+_LINES_ACROSS: tuple[_Place, ...] = (("across", 0.2), ("across", 0.7))
 
 
 @dataclass(frozen=True, eq=False)

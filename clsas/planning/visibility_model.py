@@ -12,8 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
+from clsas.core.geometry import pairwise_range_m
 from clsas.core.grid import Grid
-from clsas.core.lines import RangeLines
+from clsas.core.lines import RangeLines, fastest, some_channels
 from clsas.exact.tiles import STACK
 from clsas.factorized.aperture import cycles_per_extent
 from clsas.factorized.dense_apertures import Shape, mean_track_of, simplest_track
@@ -35,6 +36,7 @@ _WEIGHTS = np.array([0.135, 0.24, 0.25, 0.24, 0.135])  # of these in means over 
 _POINT_WEIGHTS = np.outer(_WEIGHTS, _WEIGHTS).ravel() / _WEIGHTS.sum() ** 2
 _INNER = np.arange(len(_POINTS) ** 2).reshape(len(_POINTS), -1)[1:-1, 1:-1].ravel()
 _DENSE = 65  # points along either side, for the least distance of the grid; half: 0.05 dB
+_NEAREST_CHANNELS = 4096  # of a dense aperture, for that distance
 _MOST_OUTSIDE = 1e-6  # share of power above the highest frequency; half or twice: no change
 _SEARCH_STEP = 8  # the search uses every eighth sample of the track; a fourth chose the same trees
 
@@ -141,7 +143,10 @@ class VisibilityModel:
         steps_m = np.linalg.norm(self.surface.steps_m[:2], axis=1)
         step_m = steps_m @ (np.array(self.surface.plane.shape) - 1) / (_DENSE - 1)
         between_m = (step_m + self.surface.relief_m(LEAST_SIDE).max()) / 2
-        nearest_m = KDTree(dense_m).query(self.lines.phase_centres_m)[0].min() - between_m
+        centres_m = self.lines.phase_centres_m
+        if self.track.is_dense:
+            centres_m = centres_m[some_channels(len(centres_m), _NEAREST_CHANNELS)]
+        nearest_m = KDTree(dense_m).query(centres_m)[0].min() - between_m
         return max(float(nearest_m), 1e-9)
 
     def from_cache(self, key: Hashable, find: Callable[[], Any]) -> Any:
@@ -277,6 +282,29 @@ class VisibilityModel:
             return 1.02 * np.maximum(slopes[visible].max(axis=0), more.max(axis=(0, 1)))
         slopes = slopes[visible] if visible.any() else slopes.reshape(-1, slopes.shape[-1])
         return 1.02 * slopes.max(axis=0)
+
+    def range_window_m(self, root: Side) -> tuple[float, float]:
+        """Return the least and the largest range of any part of roots, from lines' first samples.
+
+        Ranges to a pixel and to the middle of the grid differ by their distance at most; receivers
+        that move change that by their speed over the sound's.
+        """
+        plane, lines = self.surface.plane, self.lines
+        whole = -(-plane.shape[0] // root[0]) * root[0], -(-plane.shape[1] // root[1]) * root[1]
+        origin_m: Any = plane.origin_m
+        middle_m = (origin_m + (np.array(whole) - 1) / 2 @ self.surface.steps_m[:2])[None]
+        relief_m = 0.0 if self.surface.is_plane else 2 * float(np.abs(self.surface.off_m).max())
+        extents = self.surface.extents(whole, relief_m)
+        radius_m = float(np.linalg.norm(np.abs(extents[:, None] * self.surface.steps_m).sum(axis=0)))
+        radius_m *= (1 + 2 * fastest(lines)) / 2
+        range_m = self.from_cache(
+            ("ranges", whole),
+            lambda: pairwise_range_m(
+                middle_m, lines.tx_m, lines.rx_m, lines.rx_velocity_m_s, lines.sound_speed_m_s
+            )[0]
+            - lines.first_range_m,
+        )
+        return float(range_m.min()) - radius_m, float(range_m.max()) + radius_m
 
     def half_lengths(
         self, sides: Sequence[Side], align: Interpolator, final: Interpolator, to: Resampling
