@@ -40,8 +40,7 @@ APART = 16.0
 """Aperture coordinates from one strip to the next, more than samples go past the ends."""
 
 
-ON_TRACK_M = 1e-9
-"""Distance within which channels lie on the mean track."""
+_SAME_PLACE_M = 1e-9  # within which channels lie on the mean track
 
 
 @dataclass(frozen=True, eq=False)
@@ -225,7 +224,6 @@ class MeanTrack:
         points_m: NDArray[np.float64],
         phase_centres_m: NDArray[np.float64],
         own_drift: NDArray[np.float64] | None = None,
-        on_sheet_m: float = 0.0,
     ) -> tuple[NDArray[np.float64], NDArray[np.float64] | None]:
         """Return the aperture coordinates at which phase centres appear from some points.
 
@@ -240,8 +238,6 @@ class MeanTrack:
             Those of the channels of `coordinate`.
         own_drift : float64 [channels, 3], optional
             See `own_drift`.
-        on_sheet_m : float
-            Distance from a sheet within which channels are taken to lie on it.
 
         Returns
         -------
@@ -250,12 +246,10 @@ class MeanTrack:
         float64 [points, channels] or None
             Across a sheet.
         """
-        curve_m = self.positions_m(self.coordinate, self.across)
-        off_m = (phase_centres_m - curve_m)[None]
         shape = (len(points_m), len(self.coordinate))
         across = None if self.across is None else np.broadcast_to(self.across, shape)
-        close_m = ON_TRACK_M if across is None else on_sheet_m
-        if own_drift is None and not np.abs(off_m).max() > close_m:
+        off_m = self.offsets_m(phase_centres_m)[None]
+        if own_drift is None and not np.abs(off_m).max() > _SAME_PLACE_M:
             return np.broadcast_to(self.coordinate, shape), across
         tangent = self.tangents_m(self.coordinate, self.across)
         sight = points_m[:, None] - phase_centres_m
@@ -550,8 +544,10 @@ def _polynomial(
     coefficients: NDArray[np.float64], at: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Return polynomials of coefficients [..., powers, 3], straight beyond 0 to 1, [..., 3]."""
-    inside = np.clip(at, 0, 1)[..., None]
     powers = coefficients.shape[-2]
+    if powers == 2:
+        return coefficients[..., 0, :] + at[..., None] * coefficients[..., 1, :]
+    inside = np.clip(at, 0, 1)[..., None]
     value, slope = np.zeros((2, *at.shape, 3))
     for power in reversed(range(powers)):
         slope = slope * inside + value

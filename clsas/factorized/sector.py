@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Hashable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -15,7 +15,7 @@ from scipy.spatial.distance import cdist
 from clsas.core.geometry import pairwise_range_m
 from clsas.core.lines import RangeLines, some_channels
 from clsas.factorized import tree, visibility
-from clsas.factorized.aperture import cycles_per_extent, drift, own_drift, stretches
+from clsas.factorized.aperture import MeanTrack, cycles_per_extent, drift, own_drift, stretches
 from clsas.factorized.dense_apertures import mean_track_of
 from clsas.factorized.dense_channels import SheetRates, all_channels, sheet_rates
 from clsas.factorized.interpolated import BEAM_MARGIN
@@ -132,9 +132,9 @@ class Geometry:
         # On the track itself there is nothing to align.
         off_m = np.abs(self.track.offsets_m(self.phase_centres_m)).max()
         wavelength_m = lines.sound_speed_m_s / max(lines.carrier_hz, 1.0)
+        self._on_sheet = off_m <= _ON_TRACK * wavelength_m
         if own is not None:
             off_m += np.linalg.norm(own, axis=1).max() * np.abs(lines.last_range_m).max()
-        self._on_sheet_m = _ON_TRACK * wavelength_m
         apart = lines.rx_velocity_m_s is not None or not np.array_equal(lines.tx_m, lines.rx_m)
         away = apart or off_m > _ON_TRACK * wavelength_m
         self.ramps = bool(away and image.aperture.aligns_phases)
@@ -248,13 +248,26 @@ class Geometry:
             )
         centres_m, some = self.phase_centres_m[channels], track.some(channels)
         own = None if self.own_drift is None else self.own_drift[channels]
-        place, across = some.apparent_coordinates(root_m, centres_m, own, self._on_sheet_m)
+        place, across = self._apparent(some, root_m, centres_m, own)
         nodes = aperture.virtual_channels(self, roots, root_m, place, across, centres_m)
         if track.is_dense:
             needs = all_channels(nodes, place.shape[1], self._holding(inside))
         else:
             needs = tree.channel_ranges(division, nodes, place, (begin, end), inside)
         return Sector(roots, root_m, channels, relative_m, nodes, needs, place, across)
+
+    def _apparent(
+        self,
+        some: MeanTrack,
+        root_m: NDArray[np.float64],
+        centres_m: NDArray[np.float64],
+        own: NDArray[np.float64] | None,
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64] | None]:
+        """Return coordinates at which channels appear: see `MeanTrack.apparent_coordinates`."""
+        if some.across is None or own is not None or not self._on_sheet:
+            return some.apparent_coordinates(root_m, centres_m, own)
+        shape = (len(root_m), len(centres_m))
+        return np.broadcast_to(some.coordinate, shape), np.broadcast_to(some.across, shape)
 
     def _holding(self, inside: NDArray[np.bool_]) -> list[NDArray[np.bool_]]:
         """Return which subimages hold a pixel, stage by stage, from those of the leaves."""
