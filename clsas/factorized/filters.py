@@ -29,6 +29,7 @@ _STEPS = 3
 _SLOPE_DB = 12.0  # per tap and factor e of oversampling; a quarter more: 0.15 dB
 _CLOSE_DB = 0.1  # of the aim
 _WORST_DB = -22.0  # aperture filters; with worse ones only pixels at the corners err
+_COHERENT = 0.08  # of their error power; half: helices err by 0.5 dB more than predicted
 _RATES = tuple(np.geomspace(1, 12, 16))  # at which errors of filters are evaluated
 _BINS = 64  # of the steering functions' spectrum
 
@@ -140,7 +141,7 @@ class FilterRates:
         final = interpolation.design(self.final_taps, upsampling, spectrum)
         in_range = stages * power(align.scatter_db) + power(final.scatter_db)
         rest = power(most_db) - in_range
-        allowed_db = min(in_db(rest / (stages * self.dimensions)), _WORST_DB)
+        allowed_db = min(in_db(rest / interpolations(stages, self.dimensions)), _WORST_DB)
         aperture = tried = interpolation.design(self.aperture_taps, self.oversampling, steering)
         for _ in range(_STEPS):
             # Errors fall by less than _SLOPE_DB per tap when the oversampling grows e-fold.
@@ -151,6 +152,18 @@ class FilterRates:
             if tried.error_db <= allowed_db and oversampling < aperture.upsampling:
                 aperture = tried
         return Filters(align, aperture, final)
+
+
+def interpolations(stages: int, dimensions: int) -> float:
+    """Return how many times the error power of an aperture's filter counts.
+
+    Interpolations along and across a sheet err with the same sign at low phase rates, so that some
+    of their errors add, not their powers.
+    """
+    if dimensions == 1:
+        return stages
+    count = stages * dimensions
+    return count * (1 + _COHERENT * (count - 1))
 
 
 def choose(
@@ -166,7 +179,7 @@ def choose(
     These are two in each stage, three for a sheet, and the last one. The result is None if no rate
     suffices.
     """
-    each_db = most_db - 10 * math.log10((1 + dimensions) * stages + 1)
+    each_db = most_db - 10 * math.log10(stages + interpolations(stages, dimensions) + 1)
     upsampling = _least_rate(align_taps, each_db, spectrum, "scatter_db")
     oversampling = _least_rate(aperture_taps, each_db, _STEERING, "error_db")
     if upsampling is None or oversampling is None:

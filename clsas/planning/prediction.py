@@ -21,7 +21,7 @@ from clsas.factorized.estimates import (
     upsampling,
 )
 from clsas.factorized.factorization import ExactImage, Factorization
-from clsas.factorized.filters import UPSAMPLING_SHARE
+from clsas.factorized.filters import UPSAMPLING_SHARE, interpolations
 from clsas.factorized.interpolated import InterpolatedAperture
 from clsas.factorized.plan import Plan, Prediction, Stage
 from clsas.factorized.thesis import NearestBeams
@@ -250,7 +250,8 @@ def _upsampled(view: VisibilityModel, candidate: Candidate, other_errors: ErrorB
     errors = replace(
         other_errors,
         range_filters=stages * power(align_db) + power(final.scatter_db),
-        aperture_filters=stages * aperture.dimensions * power(aperture.filter.error_db),
+        aperture_filters=interpolations(stages, aperture.dimensions)
+        * power(aperture.filter.error_db),
     )
     if gain is not None:
         most_db = in_db(UPSAMPLING_SHARE * errors.total)
