@@ -263,9 +263,9 @@ class Geometry:
         centres_m: NDArray[np.float64],
         own: NDArray[np.float64] | None,
     ) -> tuple[NDArray[np.float64], NDArray[np.float64] | None]:
-        """Return coordinates at which channels appear: see `MeanTrack.apparent_coordinates`."""
+        """Return coordinates at which channels appear: see `MeanTrack.apparent_places`."""
         if some.across is None or own is not None or not self._on_sheet:
-            return some.apparent_coordinates(root_m, centres_m, own)
+            return some.apparent_places(root_m, centres_m, own)
         shape = (len(root_m), len(centres_m))
         return np.broadcast_to(some.coordinate, shape), np.broadcast_to(some.across, shape)
 

@@ -139,7 +139,7 @@ def _mean_track_error(model: VisibilityModel, side: Side, extents: NDArray[np.fl
     points_m = model.points_m[points, None] + offsets_m
     centres_m, all_m = points_m[:, 0], points_m.reshape(-1, 3)
     range_m = pairwise_range_m(all_m, *antennas).reshape(*points_m.shape[:2], -1)
-    virtual_m = track.positions_m(*part.apparent_coordinates(centres_m, middle_m, own))
+    virtual_m = track.positions_m(*part.apparent_places(centres_m, middle_m, own))
     virtual_range_m = np.stack([cdist(*each) for each in zip(points_m, virtual_m, strict=True)])
     virtual_range_m -= (points_m @ drift(lines))[..., None]
     change_m, virtual_change_m = (each[:, 1:] - each[:, :1] for each in (range_m, virtual_range_m))
