@@ -1,4 +1,4 @@
-"""Mean tracks of dense apertures: strips, one for each pass, and sheets along which all channels lie.
+"""Mean tracks of dense apertures: a strip for each pass, or a sheet with all channels.
 
 One curve does not follow many passes, a raster scan, a helix or a planar array. Passes apart from
 each other get a curve each. Channels close to a smooth sheet are interpolated in both of its
@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Literal
 
 import numpy as np
@@ -16,12 +17,8 @@ from numpy.typing import NDArray
 from scipy.interpolate import BSpline
 
 from clsas.core.lines import RangeLines, some_channels, wavelength_m
-from clsas.factorized.aperture import (
-    APART,
-    STRIP_SAMPLES,
-    MeanTrack,
-    mean_track,
-)
+from clsas.factorized.aperture import mean_track
+from clsas.factorized.tracks import APART, STRIP_SAMPLES, MeanTrack
 
 Shape = Literal["track", "strips", "sheet"]
 """Mean tracks of one curve, of several, or of a curve that moves sideways."""
@@ -78,10 +75,7 @@ def strips(lines: RangeLines) -> MeanTrack | None:
     bounds = np.concatenate([[0], jumps, [lines.channels]])
     if not 1 <= len(jumps) < _MOST_STRIPS or np.diff(bounds).min() < _LEAST_OF_STRIP:
         return None
-    found = [
-        mean_track(bare.select(slice(int(a), int(b))))
-        for a, b in zip(bounds[:-1], bounds[1:], strict=True)
-    ]
+    found = [mean_track(bare.select(slice(int(a), int(b)))) for a, b in pairwise(bounds)]
     tracks = [track for track in found if track is not None]
     if len(tracks) < len(found):
         return None

@@ -1,4 +1,4 @@
-"""Virtual channels of dense apertures: in strips of their own, or in the rows and columns of a sheet."""
+"""Virtual channels of dense apertures: in strips, or in the rows and columns of a sheet."""
 
 from __future__ import annotations
 
@@ -7,8 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from clsas.factorized.aperture import MeanTrack, SampledLines, cycles_per_extent
+from clsas.factorized.aperture import SampledLines, cycles_per_extent
 from clsas.factorized.surface import Surface
+from clsas.factorized.tracks import MeanTrack
 from clsas.factorized.tree import (
     Bands,
     ChannelRanges,

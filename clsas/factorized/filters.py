@@ -189,9 +189,7 @@ def choose(
         for taps in _FINAL_TAPS
         if (_least_rate(taps, each_db, spectrum, "scatter_db") or math.inf) <= upsampling
     )
-    return FilterRates(
-        align_taps, upsampling, aperture_taps, oversampling, final_taps, dimensions
-    )
+    return FilterRates(align_taps, upsampling, aperture_taps, oversampling, final_taps, dimensions)
 
 
 def _least_rate(taps: int, most_db: float, spectrum: Spectrum, error: str) -> float | None:

@@ -18,7 +18,12 @@ from clsas.core import reprs
 from clsas.core.lines import RangeLines
 from clsas.factorized import tree, visibility
 from clsas.factorized.dense_apertures import Shape
-from clsas.factorized.dense_channels import first_on_sheet, later_on_sheet, strip_channels
+from clsas.factorized.dense_channels import (
+    SheetChannels,
+    first_on_sheet,
+    later_on_sheet,
+    strip_channels,
+)
 from clsas.factorized.estimates import StageChannels
 from clsas.factorized.fields import CONFIG, RangeFilter
 from clsas.factorized.filters import edges_gain
@@ -69,7 +74,9 @@ class VisiblePhases(Protocol):
     def virtual_channels(self, taps: Any, density: float, phase_cycles: Any) -> Any:
         """Return the number of virtual channels for some phase cycles."""
 
-    def rows(self, side: tuple[int, int], taps: int, density: float, *, most: bool = False) -> float:
+    def rows(
+        self, side: tuple[int, int], taps: int, density: float, *, most: bool = False
+    ) -> float:
         """Return the number of rows of virtual channels across a sheet; 1 without one."""
 
     @property
@@ -208,9 +215,10 @@ class InterpolatedAperture:
         """Return the virtual channels of a sheet, stage by stage."""
         sides, surface, track = geometry.factorization.sides, geometry.surface, geometry.track
         rates, nodes = geometry.sheet_rates(roots, root_m), list[VirtualChannels]()
+        parent: SheetChannels | None = None
         for oversampling, side in zip(self.oversampling, sides, strict=True):
             own = rates.times(oversampling * surface.extents_in(side, sides[0], roots))
-            if nodes:
+            if parent is not None:
                 virtual, parent = later_on_sheet(track, own, parent, self.filter)
             else:
                 virtual, parent = first_on_sheet(track, own, *places, self.filter)

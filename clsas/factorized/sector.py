@@ -15,16 +15,18 @@ from scipy.spatial.distance import cdist
 from clsas.core.geometry import pairwise_range_m
 from clsas.core.lines import RangeLines, some_channels
 from clsas.factorized import tree, visibility
-from clsas.factorized.aperture import MeanTrack, cycles_per_extent, drift, own_drift, stretches
+from clsas.factorized.aperture import cycles_per_extent, drift, own_drift, stretches
 from clsas.factorized.dense_apertures import mean_track_of
 from clsas.factorized.dense_channels import SheetRates, all_channels, sheet_rates
 from clsas.factorized.interpolated import BEAM_MARGIN
 from clsas.factorized.plan import Plan
 from clsas.factorized.surface import Surface
+from clsas.factorized.tracks import MeanTrack
 from clsas.factorized.tree import ChannelRanges, Division, VirtualChannels
 from clsas.opencl.buffers import MARGIN
 
 _ON_TRACK = 1e-4  # wavelengths; closer, channels lie on the mean track
+_SHAPES = {"strips": "several passes", "sheet": "a sheet"}
 _SAMPLED_LINES = 64  # whose power is measured, spread evenly
 _FAR = 1 << 28  # samples: off any line, and within int32
 MOST_KEPT_BYTES = 128 << 20
@@ -118,6 +120,9 @@ class Geometry:
         if track is None:
             raise ValueError(
                 "lines must have channels at more than one place for a plan that divides"
+                if image.aperture.shape == "track"
+                else f"lines must have channels that lie on {_SHAPES[image.aperture.shape]}, as "
+                "the plan has them"
             )
         self.channels = np.argsort(track.coordinate, kind="stable")
         self.track = track.some(self.channels)

@@ -14,8 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
-from clsas.factorized.aperture import MeanTrack, cumulative_cycles
+from clsas.factorized.aperture import cumulative_cycles
 from clsas.factorized.surface import Surface
+from clsas.factorized.tracks import MeanTrack
 from clsas.signal.interpolation import Interpolator
 
 _SMOOTHED_CHANNELS = 2.5  # rms width, virtual channels, over which their spacing is smoothed
@@ -173,10 +174,7 @@ class Spacing:
     def coordinates(self, position: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the aperture coordinates of positions from the curve's first sample."""
         return np.stack(
-            [
-                np.interp(v, p, self.track.samples)
-                for v, p in zip(position, self.phase, strict=True)
-            ]
+            [np.interp(v, p, self.track.samples) for v, p in zip(position, self.phase, strict=True)]
         )
 
 

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
+from clsas.core.geometry import pairwise_range_m
+from clsas.core.lines import fastest
 from clsas.factorized import aperture
 from clsas.planning.caching import shared
-from clsas.planning.visibility_model import VisibilityModel
+from clsas.planning.visibility_model import Side, VisibilityModel
 from clsas.signal.spectrum import cycles_per_m_at
 
 _NEIGHBOURS = 64  # channels over which density is measured; half or twice: no change
@@ -61,3 +65,29 @@ def peak_density(model: VisibilityModel) -> float:
     length = model.strips if model.strips > 1 else float(place[-1] - place[0])
     average = length * some / (len(place) - 1)
     return average / closest if closest > 0 else np.inf
+
+
+def range_window_m(model: VisibilityModel, root: Side) -> tuple[float, float]:
+    """Return the least and the largest range of any part of roots, from lines' first samples.
+
+    Ranges to a pixel and to the middle of the grid differ by their distance at most; receivers
+    that move change that by their speed over the sound's.
+    """
+    plane, lines = model.surface.plane, model.lines
+    whole = -(-plane.shape[0] // root[0]) * root[0], -(-plane.shape[1] // root[1]) * root[1]
+    origin_m: Any = plane.origin_m
+    middle_m = (origin_m + (np.array(whole) - 1) / 2 @ model.surface.steps_m[:2])[None]
+    relief_m = 0.0 if model.surface.is_plane else 2 * float(np.abs(model.surface.off_m).max())
+    extents = model.surface.extents(whole, relief_m)
+    radius_m = float(np.linalg.norm(np.abs(extents[:, None] * model.surface.steps_m).sum(axis=0)))
+    radius_m *= (1 + 2 * fastest(lines)) / 2
+    range_m = model.from_cache(
+        ("ranges", whole),
+        lambda: (
+            pairwise_range_m(
+                middle_m, lines.tx_m, lines.rx_m, lines.rx_velocity_m_s, lines.sound_speed_m_s
+            )[0]
+            - lines.first_range_m
+        ),
+    )
+    return float(range_m.min()) - radius_m, float(range_m.max()) + radius_m

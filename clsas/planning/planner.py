@@ -14,8 +14,8 @@ from clsas.core.decibels import in_db, power
 from clsas.core.grid import Grid
 from clsas.core.lines import RangeLines
 from clsas.exact.backprojection import ACCURACY_DB
-from clsas.factorized.estimates import ErrorBudget
 from clsas.factorized.dense_apertures import DENSE_SHAPES
+from clsas.factorized.estimates import ErrorBudget
 from clsas.factorized.filters import ALIGN_TAPS
 from clsas.factorized.left_out import with_left_out
 from clsas.factorized.plan import Plan

@@ -28,7 +28,7 @@ from clsas.factorized.thesis import NearestBeams
 from clsas.opencl import phases
 from clsas.opencl.buffers import padded_length
 from clsas.opencl.device import Device
-from clsas.planning.channels import peak_density
+from clsas.planning.channels import peak_density, range_window_m
 from clsas.planning.costs import Costs
 from clsas.planning.exact_image import Exact
 from clsas.planning.memory import BufferSizes, batches_within
@@ -132,7 +132,7 @@ def predicted_plan(
     channels = candidate.aperture.predicted_channels(view, sides)
     levels = [Level.of(half, device.info.width) for half in half_lengths]
     stages, work = _stages(view, candidate, lines, levels, channels, device, costs)
-    errors, half_precision = _with_arithmetic(view, lines, channels, conditions)
+    errors, half_precision = _with_arithmetic(view, candidate, lines, channels, conditions)
     sizes = BufferSizes(
         view=view,
         width=device.info.width,
@@ -270,7 +270,7 @@ def _trimmed(view: VisibilityModel, candidate: Candidate, lines: _Lines) -> _Lin
     Dense apertures have so many channels that upsampling whole lines takes most of the time.
     """
     resampling = lines.resampling
-    low_m, high_m = view.range_window_m(candidate.sides[0])
+    low_m, high_m = range_window_m(view, candidate.sides[0])
     step_m = view.lines.range_step_m
     spare = len(candidate.sides) * (candidate.align.taps // 2 + 1) + candidate.final.taps + 2
     first, last = (
@@ -346,7 +346,11 @@ def _stages(
 
 
 def _with_arithmetic(
-    view: VisibilityModel, lines: _Lines, channels: Sequence[StageChannels], conditions: Conditions
+    view: VisibilityModel,
+    candidate: Candidate,
+    lines: _Lines,
+    channels: Sequence[StageChannels],
+    conditions: Conditions,
 ) -> tuple[ErrorBudget, bool]:
     """Add the errors of polynomials and rounding; return whether lines have half precision."""
     tolerance_db, errors = conditions.tolerance_db, lines.errors
@@ -355,16 +359,19 @@ def _with_arithmetic(
     errors = replace(errors, phases=phases.error(phases.terms_within(tolerance_db)) ** 2)
     if lines.upsampler is None or not conditions.device.info.half_precision:
         return errors, False
-    rounding = _half_rounding(view, [stage.summed for stage in channels])
+    # Each row of a sheet is read and written for about twice as many bands as it has taps.
+    bands = 2 * candidate.aperture.filter.taps if candidate.aperture.dimensions == 2 else 0
+    rounding = _half_rounding(view, [stage.summed for stage in channels], bands)
     if rounding > _ROUNDING_SHARE * power(tolerance_db):
         return errors, False
     return replace(errors, half_precision=rounding), True
 
 
-def _half_rounding(view: VisibilityModel, summed: Sequence[float]) -> float:
+def _half_rounding(view: VisibilityModel, summed: Sequence[float], bands: int) -> float:
     """Return the error power of rounding lines to half precision.
 
-    `summed` is the number of channels that a virtual one sums, stage by stage. Upsampled lines are
+    `summed` is the number of channels that a virtual one sums, stage by stage, and `bands` that of
+    the bands that add to it one after another, in every stage of a sheet. Upsampled lines are
     rounded once. Lines of a stage are rounded once per chunk of channels, while the sum still
     grows, which counts as half. A sum of very many chunks loses what is added last.
     """
@@ -372,4 +379,4 @@ def _half_rounding(view: VisibilityModel, summed: Sequence[float]) -> float:
     chunks[0] *= peak_density(view)
     if chunks.max() > _MOST_CHUNKS:
         return np.inf
-    return HALF_ROUNDING * (1 + float(np.sum(1 + chunks / 2)))
+    return HALF_ROUNDING * (1 + float(np.sum(1 + (chunks + bands) / 2)))

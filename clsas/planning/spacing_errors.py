@@ -17,8 +17,8 @@ from scipy.sparse import csr_array
 
 from clsas.core.decibels import power
 from clsas.core.lines import wavelength_m
-from clsas.factorized.aperture import MeanTrack
 from clsas.factorized.dense_channels import strip_channels
+from clsas.factorized.tracks import MeanTrack
 from clsas.factorized.tree import interpolated_channels
 from clsas.factorized.visibility import interpolated_directions
 from clsas.planning.caching import cached
@@ -196,7 +196,10 @@ def _samples(
     first, count = first[points], count[points]
     # One channel more on either side: the edge of visibility lies in between.
     number = np.linspace(
-        first - 1, first + count, _SAMPLED_PLACES + _PLACES_OF_STRIP * len(line.track.others), axis=1
+        first - 1,
+        first + count,
+        _SAMPLED_PLACES + _PLACES_OF_STRIP * len(line.track.others),
+        axis=1,
     )
     number = np.clip(number, 0, len(channels) - 1)
     if line.track.others:  # there is nothing between two strips
@@ -207,7 +210,9 @@ def _samples(
     offsets_m = np.stack([each_m for each_m, _ in found])
     chosen = np.stack([cycles_per_m[(share * SAMPLED_PIXELS).astype(int)] for _, share in found])
     pixels = model.points_m[points], offsets_m, chosen
-    return _Samples(points, count, place, pixels, _steering(model, line.track, pixels, weighted, place))
+    return _Samples(
+        points, count, place, pixels, _steering(model, line.track, pixels, weighted, place)
+    )
 
 
 def _visible_channels(

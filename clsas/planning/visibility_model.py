@@ -12,9 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from clsas.core.geometry import pairwise_range_m
 from clsas.core.grid import Grid
-from clsas.core.lines import RangeLines, fastest, some_channels
+from clsas.core.lines import RangeLines, some_channels
 from clsas.exact.tiles import STACK
 from clsas.factorized.aperture import cycles_per_extent
 from clsas.factorized.dense_apertures import Shape, mean_track_of, simplest_track
@@ -282,29 +281,6 @@ class VisibilityModel:
             return 1.02 * np.maximum(slopes[visible].max(axis=0), more.max(axis=(0, 1)))
         slopes = slopes[visible] if visible.any() else slopes.reshape(-1, slopes.shape[-1])
         return 1.02 * slopes.max(axis=0)
-
-    def range_window_m(self, root: Side) -> tuple[float, float]:
-        """Return the least and the largest range of any part of roots, from lines' first samples.
-
-        Ranges to a pixel and to the middle of the grid differ by their distance at most; receivers
-        that move change that by their speed over the sound's.
-        """
-        plane, lines = self.surface.plane, self.lines
-        whole = -(-plane.shape[0] // root[0]) * root[0], -(-plane.shape[1] // root[1]) * root[1]
-        origin_m: Any = plane.origin_m
-        middle_m = (origin_m + (np.array(whole) - 1) / 2 @ self.surface.steps_m[:2])[None]
-        relief_m = 0.0 if self.surface.is_plane else 2 * float(np.abs(self.surface.off_m).max())
-        extents = self.surface.extents(whole, relief_m)
-        radius_m = float(np.linalg.norm(np.abs(extents[:, None] * self.surface.steps_m).sum(axis=0)))
-        radius_m *= (1 + 2 * fastest(lines)) / 2
-        range_m = self.from_cache(
-            ("ranges", whole),
-            lambda: pairwise_range_m(
-                middle_m, lines.tx_m, lines.rx_m, lines.rx_velocity_m_s, lines.sound_speed_m_s
-            )[0]
-            - lines.first_range_m,
-        )
-        return float(range_m.min()) - radius_m, float(range_m.max()) + radius_m
 
     def half_lengths(
         self, sides: Sequence[Side], align: Interpolator, final: Interpolator, to: Resampling
