@@ -94,7 +94,7 @@ def sheet(lines: RangeLines) -> MeanTrack | None:
     some = some_channels(lines.channels, _FITTED)
     middle_m = centres_m[some].mean(axis=0)
     some_m = centres_m[some] - middle_m
-    ranked = []
+    ranked: list[tuple[float, int, _Surface]] = []
     for surface in _surfaces(some_m):
         _, rms_m = _fitted(surface.coordinates(some_m), some_m, surface.closed, *_TRIED)
         ranked.append((rms_m, len(ranked), surface))

@@ -156,9 +156,9 @@ def first_on_sheet(
     first_row = np.take_along_axis(first_row, order, axis=1)
     if ((np.diff(column) < 0) & (np.diff(first_row) == 0)).any():
         again = np.lexsort((column, first_row))
-        order, column, first_row = (
-            np.take_along_axis(each, again, axis=1) for each in (order, column, first_row)
-        )
+        order = np.take_along_axis(order, again, axis=1)
+        column = np.take_along_axis(column, again, axis=1)
+        first_row = np.take_along_axis(first_row, again, axis=1)
     lower = np.floor(column)
     base = lower.astype(np.int64) - (taps // 2 - 1)
     rows, width = found.rows.shape[1], found.columns.shape[1]

@@ -278,7 +278,8 @@ class Geometry:
         """Return which subimages hold a pixel, stage by stage, from those of the leaves."""
         result = [inside]
         for level in range(len(self.division.sides) - 1, 0, -1):
-            result.insert(0, self.division.by_parent(level, result[0]).any(axis=-1))
+            held = self.division.by_parent(level, result[0])
+            result.insert(0, np.any(held, axis=-1))
         return result
 
     def phase_rates(

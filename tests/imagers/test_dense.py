@@ -14,12 +14,19 @@ from clsas.core.image_error import relative_error_db
 from clsas.exact import reference
 from clsas.exact.backprojection import backproject
 from clsas.factorized.plan import Plan
+from clsas.planning import planner
 from clsas.planning.factorize import factorize
 from clsas.planning.planner import plan
 from clsas.sonar.beam import BeamWindow
 
 SHAPES = {"passes": "strips"}  # sheets otherwise
 KINDS = ("hills", "volume", "bistatic", "moving")
+
+
+@pytest.fixture(autouse=True)
+def _searches_are_free(monkeypatch):
+    """These images are so small that no second search would pay."""
+    monkeypatch.setattr(planner, "_SEARCH_S", 0.0)
 
 
 @cache
@@ -44,7 +51,7 @@ def test_an_image_keeps_its_tolerance(name, tolerance_db):
     chosen = planned(name, tolerance_db)
     assert not chosen.is_exact
     # One curve is as fast for few small roots at low accuracy.
-    if tolerance_db < -50:
+    if tolerance_db < -50 or name in ("helix", "raster", "spiral", "planar"):
         assert chosen.factorization.aperture.shape == SHAPES.get(name, "sheet")
     assert_keeps(chosen, relative_error_db(factorize(*scene(name), chosen), exact(name)))
 
