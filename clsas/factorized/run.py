@@ -346,7 +346,8 @@ class _Run:
 def _geometry(lines: RangeLines, grid: Grid, chosen: Plan) -> Geometry:
     """Return the geometry of a plan's image, kept from the image before if there was one."""
     if "geometry" not in chosen.kept:
-        chosen.kept["geometry"] = Geometry(lines, surface_of(grid), chosen)
+        surface = chosen.kept.get("surface") or surface_of(grid)
+        chosen.kept["geometry"] = Geometry(lines, surface, chosen)
     return chosen.kept["geometry"]
 
 

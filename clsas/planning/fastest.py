@@ -159,7 +159,7 @@ def fastest(
             smaller = (rows // 2, columns) if rows > columns else (rows, columns // 2)
             trial = replace(trial, most_root=smaller, tree=None)
         else:
-            found.kept["track"] = view.track
+            found.kept.update(track=view.track, surface=view.surface)
             return found, needed
     return None, needed
 

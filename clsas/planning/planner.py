@@ -174,9 +174,9 @@ def plan(
     prediction = replace(
         found.prediction, error_db=errors.total_db, errors=errors, calibrated=calibrated
     )
-    track = found.kept.get("track")
+    kept = found.kept
     found = replace(found, tolerance_db=tolerance_db, prediction=prediction)
-    found.kept["track"] = track
+    found.kept.update(kept)
     if model.left_out:
         found = with_left_out(found, model, lines, grid, beam)
     found.kept["lines"] = weakref.ref(lines)

@@ -11,6 +11,7 @@ import numpy as np
 
 from clsas.core.decibels import in_db, power
 from clsas.core.digests import grid_digest, lines_digest
+from clsas.exact.lookup import lookup_room
 from clsas.factorized.buffers import CHUNK, Level
 from clsas.factorized.estimates import (
     ErrorBudget,
@@ -359,12 +360,28 @@ def _with_arithmetic(
     errors = replace(errors, phases=phases.error(phases.terms_within(tolerance_db)) ** 2)
     if lines.upsampler is None or not conditions.device.info.half_precision:
         return errors, False
+    if _looked_up_singly(view, candidate, lines, conditions.device):
+        return errors, False
     # Each row of a sheet is read and written for about twice as many bands as it has taps.
     bands = 2 * candidate.aperture.filter.taps if candidate.aperture.dimensions == 2 else 0
     rounding = _half_rounding(view, [stage.summed for stage in channels], bands)
     if rounding > _ROUNDING_SHARE * power(tolerance_db):
         return errors, False
     return replace(errors, half_precision=rounding), True
+
+
+def _looked_up_singly(
+    view: VisibilityModel, candidate: Candidate, lines: _Lines, device: Device
+) -> bool:
+    """Return whether leaves of points are too thick to look samples up in a register.
+
+    CPUs convert single samples of half precision ten times slower than whole registers.
+    """
+    if view.grid.points_m is None or device.info.width == 1:
+        return False
+    room = lookup_room(candidate.final.taps, device.info.width)
+    thickness_m = float(view.surface.relief_m(candidate.sides[-1]).max())
+    return thickness_m / 2 * lines.resampling.samples_per_m(view.lines) > room
 
 
 def _half_rounding(view: VisibilityModel, summed: Sequence[float], bands: int) -> float:

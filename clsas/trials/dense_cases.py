@@ -123,7 +123,7 @@ def _helix() -> NDArray[np.float64]:
 
 
 def _circle() -> NDArray[np.float64]:
-    return helix(1, 720, 0.83, 0.45, 0.0)
+    return helix(1, 4096, 15.0, 8.0, 0.0)
 
 
 def _passes() -> NDArray[np.float64]:
@@ -140,7 +140,7 @@ DENSE_CASES = {
     "ffbp-helix-fine": _in_air(600),
     "ffbp-passes": DenseCase(_passes, 120e3, 30e3, _WATER_M_S, (10.0, 10.0, 0.0), 10.0, 1024),
     "ffbp-volume": DenseCase(
-        _circle, 20e3, 20e3, _AIR_M_S, (0.24, 0.24, 0.16), 0.3, 256, slices=64
+        _circle, 120e3, 30e3, _WATER_M_S, (1.28, 1.28, 0.64), 1.27, 128, slices=64
     ),
 }
 """Cases of factorized imaging."""

@@ -33,10 +33,10 @@ def test_cases_are_sampled():
 
 def test_dense_cases_have_the_channels_that_they_promise():
     found = cases.DENSE_CASES
-    assert [each.channels for each in found.values()] == [54000, 54000, 16000, 720]
+    assert [each.channels for each in found.values()] == [54000, 54000, 16000, 4096]
     assert found["ffbp-helix"].grid.shape == (150, 150)
     assert found["ffbp-helix-fine"].grid.shape == (600, 600)
-    assert found["ffbp-volume"].grid.shape == (64, 256, 256)
+    assert found["ffbp-volume"].grid.shape == (64, 128, 128)
     helix_m = found["ffbp-helix"].track()
     assert np.linalg.norm(helix_m[:, :2], axis=1) == pytest.approx(0.83)
     assert (helix_m[0, 2], helix_m[-1, 2]) == pytest.approx((0.09, 0.84), abs=1e-4)
