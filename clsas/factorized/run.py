@@ -290,7 +290,8 @@ class _Run:
         step = _GROUP if self.width == 1 else 8 * self.width
         if self.geometry.track.is_dense and self.width > 1:
             # All channels of a dense aperture go into few children: they need every core.
-            step = 2 * self.width if children < device.info.compute_units else step
+            few = children < _GROUPS_PER_UNIT * device.info.compute_units
+            step = 2 * self.width if few else step
         parts = -(-_GROUPS_PER_UNIT * device.info.compute_units // children)
         part_length = step * -(-shape.length // (step * parts))
         device.run(

@@ -17,6 +17,7 @@ from clsas.factorized.estimates import (
     ErrorBudget,
     StageChannels,
     Work,
+    adding_in_rows,
     backprojecting_leaves,
     combining,
     upsampling,
@@ -29,7 +30,7 @@ from clsas.factorized.thesis import NearestBeams
 from clsas.opencl import phases
 from clsas.opencl.buffers import padded_length
 from clsas.opencl.device import Device
-from clsas.planning.channels import peak_density, range_window_m
+from clsas.planning.channels import peak_density, range_window_m, references
 from clsas.planning.costs import Costs
 from clsas.planning.exact_image import Exact
 from clsas.planning.memory import BufferSizes, batches_within
@@ -315,9 +316,11 @@ def _stages(
         samples = levels[level].length
         combined = count * of_stage.used
         work = combining(combined, samples, taps, given=level == 0) + Work(subimage=count)
+        if dimensions == 2:
+            work += adding_in_rows(count * of_stage.count, levels[level].pitch, aperture.taps)
         if level == 0:
             upsampled = view.lines.channels * lines.resampling.length
-            work += Work(reference=count * view.lines.channels)
+            work += Work(reference=count * references(view))
             work += upsampling(upsampled, filtered=lines.upsampler is not None)
         add(
             side,

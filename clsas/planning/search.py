@@ -17,7 +17,13 @@ from numpy.typing import NDArray
 
 from clsas.core.decibels import in_db, power
 from clsas.factorized.buffers import LEAST_BATCH
-from clsas.factorized.estimates import Work, backprojecting_leaves, combining, upsampling
+from clsas.factorized.estimates import (
+    Work,
+    adding_in_rows,
+    backprojecting_leaves,
+    combining,
+    upsampling,
+)
 from clsas.factorized.filters import (
     ALIGN_TAPS,
     APERTURE_TAPS,
@@ -25,8 +31,10 @@ from clsas.factorized.filters import (
     FilterRates,
     choose,
 )
+from clsas.opencl.buffers import GUARD
 from clsas.opencl.device import Device
 from clsas.planning.caching import cached
+from clsas.planning.channels import references
 from clsas.planning.costs import Costs
 from clsas.planning.errors import leaf_error, root_error
 from clsas.planning.visibility_model import Side, VisibilityModel, mean_over_points
@@ -231,6 +239,8 @@ class Options:
         Phase cycles that the beam's weights add to those of a leaf.
     rows : float64 [options, 1]
         Rows of virtual channels besides those for the phase across a sheet.
+    row_lines_s : float64 [options, sizes]
+        Each virtual channel of a sheet, for all subimages of a size: see `adding_in_rows`.
     """
 
     choices: list[FilterRates]
@@ -243,6 +253,7 @@ class Options:
     roots_s: NDArray[np.float64]
     leaf_beam_cycles: NDArray[np.float64]
     rows: NDArray[np.float64]
+    row_lines_s: NDArray[np.float64]
 
     def onward_s(
         self, division: Division, some: NDArray[np.int64]
@@ -273,11 +284,18 @@ class Options:
         if rows is not None:
             of_leaf = of_leaf * rows
         onward_s = of_leaf * self.leaves_s[some][:, index]
+        formed_s = np.zeros(1)
+        if rows is not None:
+            columns = density[..., 0] * np.diag(division.cycles) + ends[..., 0]
+            formed_s = columns * rows * self.row_lines_s[some][:, index]
+            onward_s = onward_s + formed_s
         by_stages = [onward_s]
         for left in range(2, int(self.stages[some].max()) + 1):
             more = int(np.count_nonzero(self.stages[some] >= left))
             onward_s = onward_s.copy()
             onward_s[:more] = (step_s[:more] + onward_s[:more, :, None]).min(axis=1)
+            if rows is not None:
+                onward_s[:more] += formed_s[:more]
             by_stages.append(onward_s)
         return by_stages, step_s
 
@@ -315,7 +333,7 @@ def all_options(
     samples += final_taps + _SPARE_SAMPLES
     roots = combining(counts * sizes.visible_share * channels, samples, taps, given=True)
     batches = np.maximum(counts / LEAST_BATCH, 1.0) * np.array(stages)[:, None]
-    roots += Work(reference=counts * channels, subimage=counts, batch=batches)
+    roots += Work(reference=counts * references(model), subimage=counts, batch=batches)
     most_db = filters_db + in_db(UPSAMPLING_SHARE)
     filtered = upsampler(model.spectrum, PHASES // 2, np.ones_like, most_db) is not None
     roots += upsampling(model.lines.samples.size * rate, filtered=filtered)
@@ -340,6 +358,9 @@ def all_options(
         roots_s=np.asarray(costs.seconds(roots)),
         leaf_beam_cycles=beam_cycles * sizes.beam_cycles,
         rows=aperture_taps[:, None],
+        row_lines_s=np.asarray(
+            costs.seconds(adding_in_rows(counts, samples + 2 * GUARD, aperture_taps[:, None]))
+        ),
     )
 
 
