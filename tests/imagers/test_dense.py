@@ -14,10 +14,12 @@ from clsas.core.image_error import relative_error_db
 from clsas.exact import reference
 from clsas.exact.backprojection import backproject
 from clsas.factorized.plan import Plan
+from clsas.opencl.device import open_device
 from clsas.planning import planner
 from clsas.planning.factorize import factorize
 from clsas.planning.planner import plan
 from clsas.sonar.beam import BeamWindow
+from clsas.trials.selftest import driven
 
 SHAPES = {"passes": "strips"}  # sheets otherwise
 KINDS = ("hills", "volume", "bistatic", "moving")
@@ -139,3 +141,13 @@ def test_samples_that_no_pixel_needs_are_not_upsampled():
     resampling = chosen.factorization.resampling
     assert resampling.length < 0.5 * resampling.ratio * longer.length
     assert relative_error_db(factorize(longer, grid, chosen), exact("helix")) < -39.7
+
+
+@pytest.mark.parametrize(("width", "permute"), [(1, False), (4, False), (8, True)])
+@pytest.mark.parametrize("name", ["helix", "passes"])
+def test_devices_of_any_width_agree(name, width, permute):
+    device = driven(open_device(), width, permute)
+    chosen = planned(name, -60, device=device)
+    assert chosen.factorization.aperture.shape == SHAPES.get(name, "sheet")
+    image = factorize(*scene(name), chosen, device=device)
+    assert_keeps(chosen, relative_error_db(image, exact(name)))
