@@ -243,12 +243,12 @@ def _fastest_of_shapes(
     for shape in others:
         if shape == view.shape:
             continue
-        if best is not None:
-            seconds = _WORTH * best.predicted_seconds - _SEARCH_S
-        model = view.with_shape(shape) if seconds > 0 else None
+        # Another search must pay for itself.
+        to_beat = seconds if best is None else _WORTH * best.predicted_seconds
+        model = view.with_shape(shape) if to_beat > _SEARCH_S else None
         if model is None or not _divisible(model):
             continue
-        found, needed = fastest(model, conditions, seconds, choices)
+        found, needed = fastest(model, conditions, to_beat - _SEARCH_S, choices)
         best, least = found or best, min(least, needed)
     return best, least
 

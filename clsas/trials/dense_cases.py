@@ -131,7 +131,7 @@ def _passes() -> NDArray[np.float64]:
 
 
 def _in_air(pixels: int) -> DenseCase:
-    return DenseCase(_helix, 20e3, 20e3, _AIR_M_S, (0.24, 0.24, 0.0), 0.3, pixels)
+    return DenseCase(_helix, 20e3, 20e3, _AIR_M_S, (0.24, 0.24, 0.0), 0.24, pixels)
 
 
 DENSE_CASES = {
