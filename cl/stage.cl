@@ -9,10 +9,15 @@
  * contribute to: channel n adds to APERTURE_TAPS consecutive ones from first_virtual[n] on, so that as many sums are open
  * at a time.
  *
+ * Virtual channels may lie in rows, beside each other. Channels then come in bands: those of a band add to the same
+ * consecutive rows, and their order is as above within the band. A single mean track is one band and one row.
+ *
  * Build options: WIDTH (vectors.h; lanes are consecutive samples of a line, or consecutive channels), HALF (samples.h, of
  * lines in and out), PHASE_TERMS (phases.h), and
  *   TAPS           of the range filter h, even, at most 8.
  *   APERTURE_TAPS  of the aperture filter a, even; 1: every channel adds to one virtual channel, with weight 1.
+ *   ROWS           1: virtual channels lie in rows, and each channel adds to APERTURE_TAPS rows with the weights of a across
+ *                  them; 2: so that all channels of a band have equal weights; 0: each channel adds to one row.
  *   SHIFTS_GIVEN   1: shifts and phases come from the host (the first stage, whose channels may be anywhere); 0: they
  *                  follow from the positions of virtual channels.
  *   RAMP           1: phases vary along the lines (only with SHIFTS_GIVEN); 0: every ramp is 0.
@@ -20,12 +25,14 @@
  *                  are written, and read again by the next.
  *
  * parent_lines, parent_pitch  lines of all parents (samples.h).
- * children       int [roots][children_per_root][5]: the channels [begin, end) that a child uses; the channel of the
- *                parent's first line; the child's first virtual channel, and how many it has. The children at work begin
- *                at number first_child, which begins a root.
+ * bands          int [roots][children_per_root][band_count][7]: the channels [begin, end) of the band that a child uses; the
+ *                channel of the parent's first line; the child's first virtual channel in the band's first row, and how
+ *                many the row has; the child's line of that first one; how many of the band's rows, the first ones, earlier
+ *                bands have added to. The children at work begin at number first_child, which begins a root.
  * Per root and channel, [roots][channel_pitch]:
- * first_virtual  int: the first virtual channel that the channel contributes to, never decreasing.
+ * first_virtual  int: the first virtual channel that the channel contributes to, never decreasing in a band.
  * tap_position   float: aperture coordinate from the middle of the virtual channels it contributes to, in their spacing.
+ * row_position   with ROWS, float: the same across the rows that the channel contributes to.
  * order, start, nu, cycles, ramp  with SHIFTS_GIVEN: the channel's line (int), the parent's sample of tap 0 for k = 0
  *                (int), and floats as in the equation; `ramp`, in cycles per sample, with RAMP only.
  * Without SHIFTS_GIVEN:
@@ -53,6 +60,9 @@
 #include "interpolation.h"
 #include "phases.h"
 #include "samples.h"
+
+/* Rows that a channel adds to. */
+#define ACROSS_TAPS (ROWS ? APERTURE_TAPS : 1)
 
 /* Samples that are aligned at a time: the first stage's long lines are fetched in long pieces. */
 #define BLOCK (WIDTH > 1 ? (SHIFTS_GIVEN ? 16 : 8) * WIDTH : 1)
@@ -106,9 +116,19 @@ INLINE __global sample_t *virtual_line(const Child *child, int number)
     return LINE(child->lines, number - child->first, child->pitch);
 }
 
+/* The same in the row `row` rows after. */
+INLINE Child row_of(const Child *child, int row)
+{
+    const int lines = row * (child->end - child->first);
+    return (Child){child->lines + (long)lines * 2 * child->pitch, child->pitch, child->first, child->end};
+}
+
 /* What a chunk of channels is aligned and summed with. */
 typedef struct {
     float range_weight[TAPS][CHUNK], aperture_weight[APERTURE_TAPS][CHUNK];
+#if ROWS == 1
+    float row_weight[ACROSS_TAPS][CHUNK];
+#endif
     float cosine[CHUNK], sine[CHUNK]; /* of the phase; with RAMP of its change over WIDTH samples */
 #if RAMP
     float phase[CHUNK]; /* at the child's centre, cycles */
@@ -254,28 +274,34 @@ INLINE void store_sum(vfloat re, vfloat im, const Child *child, int number, int 
     }
 }
 
-/* Adds a chunk's `count` aligned lines, vector `n` of their block, to samples k on of the virtual channels from `number`
- * on. first_virtual is that of the chunk's channels.
- *
- * The sums of the APERTURE_TAPS virtual channels that are open are two arrays of this function: with a structure of arrays
- * the stage took 1.4 times as long on Intel's runtime, and 1.1 times on PoCL with arrays that other functions are given. */
-INLINE void combine(const Aligned *aligned, int n, __local const Chunk *chunk, int count,
-                    __global const int *first_virtual, int is_first_chunk, const Child *child, int number, int k)
+#if ROWS == 2
+/* Adds a sum along the band to virtual channel `number` of every row, with the row's weight. */
+INLINE void add_to_rows(vfloat re, vfloat im, const float *row_weight, const Child *child, int number, int k)
+{
+    if (!is_of(child, number))
+        return;
+    __global sample_t *line = virtual_line(child, number);
+    const size_t row_pitch = (size_t)(child->end - child->first) * 2 * child->pitch;
+#pragma unroll
+    for (int r = 0; r < ACROSS_TAPS; r++, line += row_pitch) {
+        STORE_RE(LOAD_RE(line, k, child->pitch) + row_weight[r] * re, line, k, child->pitch);
+        STORE_IM(LOAD_IM(line, k, child->pitch) + row_weight[r] * im, line, k, child->pitch);
+    }
+}
+
+/* As combine() below, where a chunk's channels have equal weights across the rows: sums along the band are finished first.
+ * The lines of the rows hold what was added to them before. */
+INLINE void combine_in_rows(const Aligned *aligned, int n, __local const Chunk *chunk, int count,
+                            __global const int *first_virtual, const float *row_weight, const Child *child, int k)
 {
     vfloat re[APERTURE_TAPS], im[APERTURE_TAPS];
-    /* Earlier chunks have left the sums that are open. */
 #pragma unroll
-    for (int t = 0; t < APERTURE_TAPS; t++) {
+    for (int t = 0; t < APERTURE_TAPS; t++)
         re[t] = im[t] = 0.0f;
-        if (!is_first_chunk && is_of(child, number + t)) {
-            re[t] = LOAD_RE(virtual_line(child, number + t), k, child->pitch);
-            im[t] = LOAD_IM(virtual_line(child, number + t), k, child->pitch);
-        }
-    }
+    int number = first_virtual[0];
     for (int c = 0; c < count; c++) {
         for (; number < first_virtual[c]; number++) {
-            /* No later channel contributes to the first of them: another one opens after the last. */
-            store_sum(re[0], im[0], child, number, k);
+            add_to_rows(re[0], im[0], row_weight, child, number, k);
 #pragma unroll
             for (int t = 0; t + 1 < APERTURE_TAPS; t++) {
                 re[t] = re[t + 1];
@@ -292,12 +318,81 @@ INLINE void combine(const Aligned *aligned, int n, __local const Chunk *chunk, i
     }
 #pragma unroll
     for (int t = 0; t < APERTURE_TAPS; t++)
+        add_to_rows(re[t], im[t], row_weight, child, number + t, k);
+}
+#else
+/* Adds a chunk's `count` aligned lines, vector `n` of their block, to samples k on of the virtual channels from `number`
+ * on, in row `row` of the band. first_virtual is that of the chunk's channels; is_new is whether no earlier band has added
+ * to the row.
+ *
+ * The sums of the APERTURE_TAPS virtual channels that are open are two arrays of this function: with a structure of arrays
+ * the stage took 1.4 times as long on Intel's runtime, and 1.1 times on PoCL with arrays that other functions are given. */
+INLINE void combine(const Aligned *aligned, int n, __local const Chunk *chunk, int count,
+                    __global const int *first_virtual, int is_first_chunk, int is_new, int row, const Child *child,
+                    int number, int k)
+{
+    vfloat re[APERTURE_TAPS], im[APERTURE_TAPS];
+    /* Earlier chunks have left the sums that are open. */
+#pragma unroll
+    for (int t = 0; t < APERTURE_TAPS; t++) {
+        re[t] = im[t] = 0.0f;
+        if (!(is_first_chunk && is_new) && is_of(child, number + t)) {
+            re[t] = LOAD_RE(virtual_line(child, number + t), k, child->pitch);
+            im[t] = LOAD_IM(virtual_line(child, number + t), k, child->pitch);
+        }
+    }
+    for (int c = 0; c < count; c++) {
+        for (; number < first_virtual[c]; number++) {
+            /* No later channel contributes to the first of them: another one opens after the last. */
+            store_sum(re[0], im[0], child, number, k);
+#pragma unroll
+            for (int t = 0; t + 1 < APERTURE_TAPS; t++) {
+                re[t] = re[t + 1];
+                im[t] = im[t + 1];
+            }
+            re[APERTURE_TAPS - 1] = im[APERTURE_TAPS - 1] = 0.0f;
+#if ROWS == 1
+            const int opened = number + APERTURE_TAPS;
+            if (!is_new && is_of(child, opened)) {
+                re[APERTURE_TAPS - 1] = LOAD_RE(virtual_line(child, opened), k, child->pitch);
+                im[APERTURE_TAPS - 1] = LOAD_IM(virtual_line(child, opened), k, child->pitch);
+            }
+#endif
+        }
+#if ROWS == 1
+        const vfloat line_re = chunk->row_weight[row][c] * aligned->re[n][c];
+        const vfloat line_im = chunk->row_weight[row][c] * aligned->im[n][c];
+#else
+        const vfloat line_re = aligned->re[n][c], line_im = aligned->im[n][c];
+#endif
+#pragma unroll
+        for (int t = 0; t < APERTURE_TAPS; t++) {
+            re[t] += chunk->aperture_weight[t][c] * line_re;
+            im[t] += chunk->aperture_weight[t][c] * line_im;
+        }
+    }
+#pragma unroll
+    for (int t = 0; t < APERTURE_TAPS; t++)
         store_sum(re[t], im[t], child, number + t, k);
 }
+#endif
 
-__kernel void stage(__global const sample_t *parent_lines, int parent_pitch, __global const int *children,
+/* Sets samples `from` on, to `to`, of the virtual channels from `number` on to 0. */
+INLINE void clear_lines(const Child *child, int number, int from, int to, int item, int items)
+{
+    for (; number < child->end; number++)
+        for (int k = from + item * WIDTH; k < to; k += items * WIDTH) {
+            STORE_RE(0.0f, virtual_line(child, number), k, child->pitch);
+            STORE_IM(0.0f, virtual_line(child, number), k, child->pitch);
+        }
+}
+
+__kernel void stage(__global const sample_t *parent_lines, int parent_pitch, __global const int *bands, int band_count,
                     int first_child, int children_per_root, __global const int *first_virtual,
                     __global const float *tap_position, int channel_pitch,
+#if ROWS
+                    __global const float *row_position,
+#endif
 #if SHIFTS_GIVEN
                     __global const int *order, __global const int *start, __global const float *nu,
                     __global const float *cycles,
@@ -320,15 +415,14 @@ __kernel void stage(__global const sample_t *parent_lines, int parent_pitch, __g
     const int from = get_group_id(1) * part_length, to = length - from < part_length ? length : from + part_length;
     const int root = get_group_id(0) / children_per_root;
     const int child_number = first_child + get_group_id(0);
-    __global const int *of_child = children + 5 * child_number;
-    const int begin = of_child[0], end = of_child[1];
-    const Child child = {LINE(child_lines, get_group_id(0) * lines_per_child, child_pitch) + (WIDTH == 1 ? 2 : 1) * guard,
-                         child_pitch, of_child[3], of_child[3] + of_child[4]};
     const int row = (first_child / children_per_root + root) * channel_pitch;
     first_virtual += row;
     tap_position += row;
+#if ROWS
+    row_position += row;
+#endif
 #if SHIFTS_GIVEN
-    const Parent parent = {parent_lines, parent_pitch, order + row};
+    Parent parent = {parent_lines, parent_pitch, order + row};
     start += row;
     nu += row;
     cycles += row;
@@ -337,72 +431,122 @@ __kernel void stage(__global const sample_t *parent_lines, int parent_pitch, __g
 #endif
 #else
     const int parent_number = root * parents_per_root + parents[get_group_id(0) % children_per_root];
-    const Parent parent = {LINE(parent_lines, parent_number * lines_per_parent, parent_pitch), parent_pitch, of_child[2]};
+    Parent parent = {LINE(parent_lines, parent_number * lines_per_parent, parent_pitch), parent_pitch, 0};
     positions += 3 * row;
     offsets += 6 * child_number;
     const int first_sample = parent_centre - half_length + 1 - TAPS / 2;
 #endif
 
-    int open = child.first - APERTURE_TAPS + 1; /* the first virtual channel that later channels may contribute to */
-    for (int first = begin; first < end; first += CHUNK) {
-        const int count = end - first < CHUNK ? end - first : CHUNK;
-        WAIT_FOR_GROUP;
-        for (int c = item * WIDTH; c < count; c += items * WIDTH) {
-            const int channel = first + c;
+#if ROWS == 2
+    /* Bands are as long as each other. All of them are taken up to a channel, so that the sums stay in the cache. */
+    __global const int *first_band = bands + 7 * child_number * band_count;
+    const Child all = {LINE(child_lines, get_group_id(0) * lines_per_child, child_pitch) + (WIDTH == 1 ? 2 : 1) * guard,
+                       child_pitch, 0, first_band[4] ? lines_per_child : 0};
+    clear_lines(&all, 0, from, to, item, items);
+    for (int step = 0; step < (first_band[1] - first_band[0] + CHUNK - 1) / CHUNK * band_count; step++) {
+        const int band = step % band_count, skipped = step / band_count * CHUNK;
+#else
+    for (int band = 0; band < band_count; band++) {
+#endif
+        __global const int *of_band = bands + 7 * (child_number * band_count + band);
+#if ROWS == 2
+        const int begin = of_band[0] + skipped, end = min(of_band[1], begin + CHUNK);
+#else
+        const int begin = of_band[0], end = of_band[1], old_rows = of_band[6];
+#endif
+        const Child child = {LINE(child_lines, get_group_id(0) * lines_per_child + of_band[5], child_pitch)
+                                 + (WIDTH == 1 ? 2 : 1) * guard,
+                             child_pitch, of_band[3], of_band[3] + of_band[4]};
+#if !SHIFTS_GIVEN
+        parent.first_channel = of_band[2];
+#endif
+#if ROWS == 2
+        vfloat share[ACROSS_TAPS];
+        filter_weights(aperture_filter, ACROSS_TAPS, (vfloat)row_position[of_band[0]], share);
+        float row_weight[ACROSS_TAPS];
+        for (int t = 0; t < ACROSS_TAPS; t++)
+            row_weight[t] = LANE(share[t], 0);
+#else
+        int open = child.first - APERTURE_TAPS + 1; /* the first virtual channel that later channels may contribute to */
+#endif
+        for (int first = begin; first < end; first += CHUNK) {
+            const int count = end - first < CHUNK ? end - first : CHUNK;
+            WAIT_FOR_GROUP;
+            for (int c = item * WIDTH; c < count; c += items * WIDTH) {
+                const int channel = first + c;
 #if SHIFTS_GIVEN
-            Shifts shifts;
-            for (int lane = 0; lane < WIDTH; lane++)
-                ((int *)&shifts.start)[lane] = start[channel + lane];
-            shifts.nu = LOAD(nu + channel);
-            shifts.cycles = LOAD(cycles + channel);
+                Shifts shifts;
+                for (int lane = 0; lane < WIDTH; lane++)
+                    ((int *)&shifts.start)[lane] = start[channel + lane];
+                shifts.nu = LOAD(nu + channel);
+                shifts.cycles = LOAD(cycles + channel);
 #else
-            const Shifts shifts = shifts_to_child(positions + channel, channel_pitch, offsets, drift, samples_per_m,
-                                                  cycles_per_m, first_sample);
+                const Shifts shifts = shifts_to_child(positions + channel, channel_pitch, offsets, drift, samples_per_m,
+                                                      cycles_per_m, first_sample);
 #endif
-            store_weights(&chunk, c, shifts, range_filter, aperture_filter, LOAD(tap_position + channel));
-            vfloat sine, cosine;
+                store_weights(&chunk, c, shifts, range_filter, aperture_filter, LOAD(tap_position + channel));
+#if ROWS == 1
+                vfloat share[ACROSS_TAPS];
+                filter_weights(aperture_filter, ACROSS_TAPS, LOAD(row_position + channel), share);
+#pragma unroll
+                for (int t = 0; t < ACROSS_TAPS; t++)
+                    STORE_LOCAL(share[t], &chunk.row_weight[t][c]);
+#endif
+                vfloat sine, cosine;
 #if RAMP
-            STORE_LOCAL(shifts.cycles, &chunk.phase[c]);
-            sine_and_cosine(WIDTH * LOAD(ramp + channel), phase_polynomials, &sine, &cosine);
+                STORE_LOCAL(shifts.cycles, &chunk.phase[c]);
+                sine_and_cosine(WIDTH * LOAD(ramp + channel), phase_polynomials, &sine, &cosine);
 #else
-            sine_and_cosine(shifts.cycles, phase_polynomials, &sine, &cosine);
+                sine_and_cosine(shifts.cycles, phase_polynomials, &sine, &cosine);
 #endif
-            STORE_LOCAL(cosine, &chunk.cosine[c]);
-            STORE_LOCAL(sine, &chunk.sine[c]);
-        }
-        WAIT_FOR_GROUP;
-        for (int block = from + item * BLOCK; block < to; block += items * BLOCK) {
-            const int block_end = to - block < BLOCK ? to : block + BLOCK;
-            for (int c = 0; c < count; c++) {
-#ifdef PREFETCH
-                const int ahead = c + CHANNELS_AHEAD < count ? c + CHANNELS_AHEAD : count - 1;
-                __global const sample_t *next = line_of(&parent, first + ahead)
-                    + CLAMP(chunk.start[ahead] + block, 0, parent_pitch - BLOCK - WIDTH) - block;
-#else
-                __global const sample_t *next = 0;
-#endif
-#if RAMP
-                vfloat phase_re, phase_im;
-                sine_and_cosine(chunk.phase[c] + ramp[first + c] * (LANES + (float)(block - half_length)),
-                                phase_polynomials, &phase_im, &phase_re);
-#else
-                const float phase_re = chunk.cosine[c], phase_im = chunk.sine[c];
-#endif
-                align_line(&aligned, &chunk, c, line_of(&parent, first + c), parent_pitch, block, block_end, phase_re,
-                           phase_im, next);
+                STORE_LOCAL(cosine, &chunk.cosine[c]);
+                STORE_LOCAL(sine, &chunk.sine[c]);
             }
-            for (int k = block; k < block_end; k += WIDTH)
-                combine(&aligned, (k - block) / WIDTH, &chunk, count, first_virtual + first, first == begin, &child, open,
-                        k);
+            WAIT_FOR_GROUP;
+            for (int block = from + item * BLOCK; block < to; block += items * BLOCK) {
+                const int block_end = to - block < BLOCK ? to : block + BLOCK;
+                for (int c = 0; c < count; c++) {
+#ifdef PREFETCH
+                    const int ahead = c + CHANNELS_AHEAD < count ? c + CHANNELS_AHEAD : count - 1;
+                    __global const sample_t *next = line_of(&parent, first + ahead)
+                        + CLAMP(chunk.start[ahead] + block, 0, parent_pitch - BLOCK - WIDTH) - block;
+#else
+                    __global const sample_t *next = 0;
+#endif
+#if RAMP
+                    vfloat phase_re, phase_im;
+                    sine_and_cosine(chunk.phase[c] + ramp[first + c] * (LANES + (float)(block - half_length)),
+                                    phase_polynomials, &phase_im, &phase_re);
+#else
+                    const float phase_re = chunk.cosine[c], phase_im = chunk.sine[c];
+#endif
+                    align_line(&aligned, &chunk, c, line_of(&parent, first + c), parent_pitch, block, block_end, phase_re,
+                               phase_im, next);
+                }
+                for (int k = block; k < block_end; k += WIDTH) {
+#if ROWS == 2
+                    combine_in_rows(&aligned, (k - block) / WIDTH, &chunk, count, first_virtual + first, row_weight, &child, k);
+#else
+                    for (int r = 0; r < ACROSS_TAPS; r++) {
+                        const Child of_row = row_of(&child, r);
+                        combine(&aligned, (k - block) / WIDTH, &chunk, count, first_virtual + first, first == begin,
+                                r >= old_rows, r, &of_row, open, k);
+                    }
+#endif
+                }
+            }
+#if ROWS < 2
+            /* A work-item without samples has passed no channel, so this does not rely on combine(). */
+            open = max(open, first_virtual[first + count - 1]);
+#endif
         }
-        /* A work-item without samples has passed no channel, so this does not rely on combine(). */
-        open = max(open, first_virtual[first + count - 1]);
+#if ROWS < 2
+        /* Virtual channels beyond the last that any channel contributes to, and rows without any. */
+        const int beyond = end > begin ? max(open + APERTURE_TAPS, child.first) : child.first;
+        for (int r = old_rows; r < ACROSS_TAPS; r++) {
+            const Child of_row = row_of(&child, r);
+            clear_lines(&of_row, beyond, from, to, item, items);
+        }
+#endif
     }
-    /* Virtual channels beyond the last that any channel contributes to. */
-    const int beyond = end > begin ? max(open + APERTURE_TAPS, child.first) : child.first;
-    for (int number = beyond; number < child.end; number++)
-        for (int k = from + item * WIDTH; k < to; k += items * WIDTH) {
-            STORE_RE(0.0f, virtual_line(&child, number), k, child.pitch);
-            STORE_IM(0.0f, virtual_line(&child, number), k, child.pitch);
-        }
 }

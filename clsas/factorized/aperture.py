@@ -1,11 +1,7 @@
-"""The mean track: a smooth curve along the channels, and phase rates along it.
-
-An aperture coordinate is the curve's parameter: 0 at its first and 1 at its last channel.
-"""
+"""Mean tracks of one curve, and phase rates along mean tracks."""
 
 from __future__ import annotations
 
-import functools
 from dataclasses import dataclass
 from itertools import product
 
@@ -17,99 +13,15 @@ from clsas.core.geometry import pairwise_range_m
 from clsas.core.grid import Grid
 from clsas.core.lines import RangeLines
 from clsas.factorized.surface import Surface
+from clsas.factorized.tracks import MeanTrack
 
 # What half and twice change, by `scripts/bench sensitivity`, where they change anything:
-_SAMPLES = 257  # of the track, at which rates are evaluated; half: errors 0.1 dB larger
-# Past either end, each twice as far as the one before; half: images up to 16 % slower.
-_SAMPLES_BEYOND = 12
 _MOST_POINTS = 9  # along a side of a box, at which rates are evaluated
 _RATES_AT_ONCE = 1 << 15  # stay in a core's cache
 _CHANNELS_PER_KNOT = 16
 _MOST_INTERVALS = 64
-_CLOSE_ENOUGH = 0.01  # distance of phase centres from the curve, wavelengths rms
-
-
-@dataclass(frozen=True, eq=False)
-class MeanTrack:
-    """A smooth curve along the phase centres, (tx + rx)/2, continued straight past its ends.
-
-    Attributes
-    ----------
-    spline : BSpline
-        Position in metres [3] over the aperture coordinate, 0 to 1.
-    coordinate : float64 [channels]
-        Aperture coordinate of the point of the curve nearest to each phase centre.
-    """
-
-    spline: BSpline
-    coordinate: NDArray[np.float64]
-
-    def positions_m(self, coordinate: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the curve's positions at aperture coordinates, [..., 3]."""
-        inside = np.clip(coordinate, 0, 1)
-        position_m = self.spline(inside)
-        beyond = inside != coordinate
-        past = (coordinate - inside)[beyond]
-        position_m[beyond] += past[:, None] * self.spline(inside[beyond], 1)
-        return position_m
-
-    def tangents_m(self, coordinate: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the derivative of the position by the aperture coordinate, [..., 3]."""
-        return self.spline(np.clip(coordinate, 0, 1), 1)
-
-    @functools.cached_property
-    def samples(self) -> NDArray[np.float64]:
-        """Aperture coordinates at which rates are evaluated, past the curve's ends too, [n]."""
-        beyond = 2.0 ** np.arange(1 - _SAMPLES_BEYOND, 1) * 4
-        return np.concatenate([-beyond[::-1], np.linspace(0, 1, _SAMPLES), 1 + beyond])
-
-    @functools.cached_property
-    def sampled_m(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Positions and tangents at `samples`, [n, 3] each."""
-        return self.positions_m(self.samples), self.tangents_m(self.samples)
-
-    def apparent_coordinates(
-        self,
-        points_m: NDArray[np.float64],
-        phase_centres_m: NDArray[np.float64],
-        own_drift: NDArray[np.float64] | None = None,
-    ) -> NDArray[np.float64]:
-        """Return the aperture coordinates at which phase centres appear from some points.
-
-        A channel off the curve is replaced by the point of the curve in the same direction. The
-        remaining difference, of distance, matters least. A receiver's motion during flight moves
-        the phase centre by half as much.
-
-        Parameters
-        ----------
-        points_m : float64 [points, 3]
-        phase_centres_m : float64 [channels, 3]
-            Those of the channels of `coordinate`.
-        own_drift : float64 [channels, 3], optional
-            See `own_drift`.
-
-        Returns
-        -------
-        float64 [points, channels]
-        """
-        curve_m = self.positions_m(self.coordinate)
-        off_m = (phase_centres_m - curve_m)[None]
-        shape = (len(points_m), len(self.coordinate))
-        if own_drift is None and not np.abs(off_m).max() > 1e-9:
-            return np.broadcast_to(self.coordinate, shape)
-        tangent = self.tangents_m(self.coordinate)
-        sight = points_m[:, None] - phase_centres_m
-        square = np.einsum("pci,pci->pc", sight, sight)
-        square = np.maximum(square, 1e-30)
-        if own_drift is not None:
-            off_m = off_m + np.sqrt(square)[..., None] * own_drift
-        along = np.einsum("pci,ci->pc", sight, tangent)
-        across = np.sum(sight * off_m, axis=-1)
-        both = np.sum(tangent * off_m, axis=-1) - along * across / square
-        length = np.einsum("ci,ci->c", tangent, tangent)
-        # Where the curve leads towards the point, the direction changes little along it.
-        sideways = np.maximum(length - along**2 / square, 0.01 * length)
-        return self.coordinate + both / sideways
+CLOSE_ENOUGH = 0.01
+"""Distance of phase centres from the mean track that needs no better one, wavelengths rms."""
 
 
 def mean_track(lines: RangeLines) -> MeanTrack | None:
@@ -124,7 +36,7 @@ def mean_track(lines: RangeLines) -> MeanTrack | None:
     if along[-1] == 0:
         return None
     position_m, along = centres_m[order], along / along[-1]
-    close_m = _CLOSE_ENOUGH * lines.sound_speed_m_s / max(lines.carrier_hz, 1.0)
+    close_m = CLOSE_ENOUGH * lines.sound_speed_m_s / max(lines.carrier_hz, 1.0)
     best, best_m, intervals = None, np.inf, 1
     while intervals <= min(_MOST_INTERVALS, max(lines.channels // _CHANNELS_PER_KNOT, 1)):
         spline = _fit(along, position_m, intervals)
@@ -222,8 +134,15 @@ def own_drift(lines: RangeLines) -> NDArray[np.float64] | None:
     return own if np.abs(own).max() > 1e-12 else None
 
 
+@dataclass(frozen=True, eq=False)
+class SampledLines:
+    """Positions and tangents of samples of some lines, [n, 3] each."""
+
+    sampled_m: tuple[NDArray[np.float64], NDArray[np.float64]]
+
+
 def cycles_per_extent(
-    track: MeanTrack,
+    track: MeanTrack | SampledLines,
     surface: Surface,
     centres_m: NDArray[np.float64],
     extents: NDArray[np.float64],
@@ -243,7 +162,7 @@ def cycles_per_extent(
 
     Parameters
     ----------
-    track : MeanTrack
+    track : MeanTrack or SampledLines
     surface : Surface
     centres_m : float64 [n, 3]
         Middles of boxes. The rates hold everywhere within these.

@@ -61,7 +61,16 @@ def row_pitch(channels: int) -> int:
     return channel_pitch(channels) + VECTOR_ROOM
 
 
-def stage_tables(level: int, roots: int, subimages: int, channels: int, *, ramps: bool) -> Buffers:
+def stage_tables(
+    level: int,
+    roots: int,
+    subimages: int,
+    channels: int,
+    *,
+    ramps: bool,
+    bands: int = 1,
+    rows: bool = False,
+) -> Buffers:
     """Return the tables of a stage, which tell how channels are aligned and combined.
 
     Parameters
@@ -74,13 +83,19 @@ def stage_tables(level: int, roots: int, subimages: int, channels: int, *, ramps
         Channels of the stage before in each root; of the first stage raw ones.
     ramps : bool
         True if phases of raw channels are turned along their lines.
+    bands : int
+        Bands of channels: see `clsas.factorized.tree.Bands`.
+    rows : bool
+        True if virtual channels lie in the rows of a sheet.
     """
     row = (roots, row_pitch(channels))
     tables = {
-        f"children{level}": Buffer((roots, subimages, 5), np.int32),
+        f"bands{level}": Buffer((roots, subimages, bands, 7), np.int32),
         f"base{level}": Buffer(row, np.int32),
         f"between{level}": Buffer(row, np.float32),
     }
+    if rows:
+        tables[f"rows{level}"] = Buffer(row, np.float32)
     if level:
         tables[f"positions{level}"] = Buffer((roots, 3, row[1]), np.float32)
         tables[f"offsets{level}"] = Buffer((roots, subimages, 6), np.float32)

@@ -89,6 +89,11 @@ def combining(lines: Amount, samples: Amount, taps: int, *, given: bool) -> Work
     return Work(sample=aligned, sample_tap=aligned * taps, given_sample=aligned * given)
 
 
+def adding_in_rows(lines: Amount, samples: Amount, taps: Amount) -> Work:
+    """Return the work of adding to lines of a sheet, which many bands read and write in turn."""
+    return Work(given_sample=2 * lines * samples * taps)
+
+
 def backprojecting_leaves(
     lines: Amount, pixels: Amount, taps: int, *, tiled: bool, weighted: bool
 ) -> Work:
@@ -129,6 +134,8 @@ class StageChannels:
         Virtual channels of a root along the whole aperture, at most.
     most : float
         Virtual channels of a subimage, at most.
+    bands : int
+        Bands of the stage's channels, at most: see `clsas.factorized.tree.Bands`.
     """
 
     used: float
@@ -136,6 +143,7 @@ class StageChannels:
     summed: float
     everywhere: float
     most: float
+    bands: int = 1
 
 
 @dataclass(frozen=True)

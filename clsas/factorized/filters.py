@@ -29,6 +29,7 @@ _STEPS = 3
 _SLOPE_DB = 12.0  # per tap and factor e of oversampling; a quarter more: 0.15 dB
 _CLOSE_DB = 0.1  # of the aim
 _WORST_DB = -22.0  # aperture filters; with worse ones only pixels at the corners err
+_COHERENT = 0.08  # of their error power; half: helices err by 0.5 dB more than predicted
 _RATES = tuple(np.geomspace(1, 12, 16))  # at which errors of filters are evaluated
 _BINS = 64  # of the steering functions' spectrum
 
@@ -104,6 +105,8 @@ class FilterRates:
     oversampling : float
         Virtual channels per half a cycle of the highest phase rate.
     final_taps : int
+    dimensions : int
+        Of the aperture, in which virtual channels are interpolated.
     """
 
     align_taps: int
@@ -111,6 +114,12 @@ class FilterRates:
     aperture_taps: int
     oversampling: float
     final_taps: int
+    dimensions: int = 1
+
+    @property
+    def stage_taps(self) -> int:
+        """Multiplications of each sample that a stage aligns and combines."""
+        return self.align_taps + self.aperture_taps**self.dimensions
 
     def design(
         self, spectrum: Spectrum, steering: Spectrum, stages: int, most_db: float
@@ -132,7 +141,7 @@ class FilterRates:
         final = interpolation.design(self.final_taps, upsampling, spectrum)
         in_range = stages * power(align.scatter_db) + power(final.scatter_db)
         rest = power(most_db) - in_range
-        allowed_db = min(in_db(rest / stages), _WORST_DB)
+        allowed_db = min(in_db(rest / interpolations(stages, self.dimensions)), _WORST_DB)
         aperture = tried = interpolation.design(self.aperture_taps, self.oversampling, steering)
         for _ in range(_STEPS):
             # Errors fall by less than _SLOPE_DB per tap when the oversampling grows e-fold.
@@ -145,14 +154,32 @@ class FilterRates:
         return Filters(align, aperture, final)
 
 
+def interpolations(stages: int, dimensions: int) -> float:
+    """Return how many times the error power of an aperture's filter counts.
+
+    Interpolations along and across a sheet err with the same sign at low phase rates, so that some
+    of their errors add, not their powers.
+    """
+    if dimensions == 1:
+        return stages
+    count = stages * dimensions
+    return count * (1 + _COHERENT * (count - 1))
+
+
 def choose(
-    spectrum: Spectrum, align_taps: int, aperture_taps: int, stages: int, most_db: float
+    spectrum: Spectrum,
+    align_taps: int,
+    aperture_taps: int,
+    stages: int,
+    most_db: float,
+    dimensions: int = 1,
 ) -> FilterRates | None:
     """Return the least rates at which the joint error of all interpolations is at most `most_db`.
 
-    These are two in each stage, and the last one. The result is None if no rate suffices.
+    These are two in each stage, three for a sheet, and the last one. The result is None if no rate
+    suffices.
     """
-    each_db = most_db - 10 * math.log10(2 * stages + 1)
+    each_db = most_db - 10 * math.log10(stages + interpolations(stages, dimensions) + 1)
     upsampling = _least_rate(align_taps, each_db, spectrum, "scatter_db")
     oversampling = _least_rate(aperture_taps, each_db, _STEERING, "error_db")
     if upsampling is None or oversampling is None:
@@ -162,7 +189,7 @@ def choose(
         for taps in _FINAL_TAPS
         if (_least_rate(taps, each_db, spectrum, "scatter_db") or math.inf) <= upsampling
     )
-    return FilterRates(align_taps, upsampling, aperture_taps, oversampling, final_taps)
+    return FilterRates(align_taps, upsampling, aperture_taps, oversampling, final_taps, dimensions)
 
 
 def _least_rate(taps: int, most_db: float, spectrum: Spectrum, error: str) -> float | None:

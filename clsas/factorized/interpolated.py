@@ -6,6 +6,7 @@ interpolated from those of fewer, virtual channels; their lines are weighted sum
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Protocol
 
 import numpy as np
@@ -16,6 +17,13 @@ from pydantic.dataclasses import dataclass
 from clsas.core import reprs
 from clsas.core.lines import RangeLines
 from clsas.factorized import tree, visibility
+from clsas.factorized.dense_apertures import Shape
+from clsas.factorized.dense_channels import (
+    SheetChannels,
+    first_on_sheet,
+    later_on_sheet,
+    strip_channels,
+)
 from clsas.factorized.estimates import StageChannels
 from clsas.factorized.fields import CONFIG, RangeFilter
 from clsas.factorized.filters import edges_gain
@@ -66,6 +74,15 @@ class VisiblePhases(Protocol):
     def virtual_channels(self, taps: Any, density: float, phase_cycles: Any) -> Any:
         """Return the number of virtual channels for some phase cycles."""
 
+    def rows(
+        self, side: tuple[int, int], taps: int, density: float, *, most: bool = False
+    ) -> float:
+        """Return the number of rows of virtual channels across a sheet; 1 without one."""
+
+    @property
+    def strips(self) -> int:
+        """Number of curves that make the mean track."""
+
 
 @dataclass(frozen=True, eq=False, config=CONFIG)
 class InterpolatedAperture:
@@ -81,6 +98,8 @@ class InterpolatedAperture:
         their uneven spacing along the track.
     beam_cycles : float
         Cycles per edge of the beam for which the last stage's virtual channels are dense enough.
+    shape : str
+        Where they lie: on a curve ("track"), on several ("strips"), or on a "sheet".
     band : (centre, half width)
         Frequencies that all filters are made for, cycles per sample.
     """
@@ -89,6 +108,7 @@ class InterpolatedAperture:
     oversampling: tuple[Annotated[float, Field(ge=1.0, le=100.0)], ...]
     beam_cycles: Annotated[float, Field(ge=0.0, le=1e3)]
     band: tuple[_Cycles, _Cycles]
+    shape: Shape = "track"
     method: Literal["interpolated"] = "interpolated"
 
     aligns_phases: ClassVar[bool] = True
@@ -100,13 +120,22 @@ class InterpolatedAperture:
     __repr__ = reprs.of_fields
 
     @property
+    def dimensions(self) -> int:
+        """Dimensions of the aperture in which its filter interpolates."""
+        return 2 if self.shape == "sheet" else 1
+
+    @property
     def stages(self) -> int:
         """Number of stages."""
         return len(self.oversampling)
 
     def describe(self) -> str:
         """Return the filter in words."""
-        return f"{self.filter.taps} taps along the aperture at {self.filter.upsampling:.2f} x"
+        where = {"track": "along", "strips": "along strips of", "sheet": "along and across"}
+        return (
+            f"{self.filter.taps} taps {where[self.shape]} the aperture at "
+            f"{self.filter.upsampling:.2f} x"
+        )
 
     def lines_gain(self, align: Interpolator, final: Interpolator, ratio: float) -> Gain | None:
         """Return the gain of upsampled lines that makes up for what range filters attenuate."""
@@ -143,6 +172,7 @@ class InterpolatedAperture:
         roots: NDArray[np.int64],
         root_m: NDArray[np.float64],
         place: NDArray[np.float64],
+        across: NDArray[np.float64] | None,
         channels_m: NDArray[np.float64],
     ) -> list[VirtualChannels]:
         """Return the virtual channels of some roots, stage by stage.
@@ -154,10 +184,15 @@ class InterpolatedAperture:
             First pixels and centres.
         place : float64 [roots, channels]
             Aperture coordinates of the raw channels.
+        across : float64 [roots, channels] or None
+            Their coordinates across a sheet.
         channels_m : float64 [channels, 3]
             Their positions.
         """
         sides, surface, track = geometry.factorization.sides, geometry.surface, geometry.track
+        if across is not None:
+            return self._on_sheet(geometry, roots, root_m, (place, across))
+        interpolated = strip_channels if track.is_dense else tree.interpolated_channels
         rates, nodes = geometry.phase_rates(roots, root_m), list[VirtualChannels]()
         for oversampling, side in zip(self.oversampling, sides, strict=True):
             extents = oversampling * surface.extents_in(side, sides[0], roots)
@@ -166,8 +201,28 @@ class InterpolatedAperture:
             if last and geometry.beam is not None and geometry.along is not None:
                 beam_rate = visibility.beam_rate(geometry.beam, track, geometry.along, root_m)
                 rate += self.beam_cycles * beam_rate
-            nodes.append(tree.interpolated_channels(track, rate, place, self.filter))
+            nodes.append(interpolated(track, rate, place, self.filter))
             place = nodes[-1].coordinate
+        return nodes
+
+    def _on_sheet(
+        self,
+        geometry: Geometry,
+        roots: NDArray[np.int64],
+        root_m: NDArray[np.float64],
+        places: tuple[NDArray[np.float64], NDArray[np.float64]],
+    ) -> list[VirtualChannels]:
+        """Return the virtual channels of a sheet, stage by stage."""
+        sides, surface, track = geometry.factorization.sides, geometry.surface, geometry.track
+        rates, nodes = geometry.sheet_rates(roots, root_m), list[VirtualChannels]()
+        parent: SheetChannels | None = None
+        for oversampling, side in zip(self.oversampling, sides, strict=True):
+            own = rates.times(oversampling * surface.extents_in(side, sides[0], roots))
+            if parent is not None:
+                virtual, parent = later_on_sheet(track, own, parent, self.filter)
+            else:
+                virtual, parent = first_on_sheet(track, own, *places, self.filter)
+            nodes.append(virtual)
         return nodes
 
     def predicted_channels(
@@ -176,20 +231,25 @@ class InterpolatedAperture:
         """Predict the virtual channels of subimages, stage by stage."""
         taps, density = self.filter.taps, 2 * self.filter.upsampling
         found: list[StageChannels] = []
-        everywhere_seen = np.ones_like(view.visible(sides[0]))
+        everywhere_seen, bands = np.ones_like(view.visible(sides[0])), view.strips
         used = view.lines.channels * view.visible_share(sides[0])
         for level, (oversampling, side) in enumerate(zip(self.oversampling, sides, strict=True)):
             seen = view.visible(side)
             if level:
-                turns = self.oversampling[level - 1] * view.subimage_phase_cycles(
-                    sides[level - 1], seen
+                before = self.oversampling[level - 1]
+                turns = before * view.subimage_phase_cycles(sides[level - 1], seen)
+                columns = view.virtual_channels(taps, density, turns)
+                used = min(
+                    found[-1].count, columns * view.rows(sides[level - 1], taps, density * before)
                 )
-                used = min(found[-1].count, view.virtual_channels(taps, density, turns))
             turns = oversampling * view.subimage_phase_cycles(side, seen)
+            most_rows = view.rows(side, taps, density * oversampling, most=True)
             everywhere, most = (
-                density * oversampling * view.subimage_phase_cycles(side, where, most=True)
-                + taps
-                + 2
+                most_rows
+                * (
+                    density * oversampling * view.subimage_phase_cycles(side, where, most=True)
+                    + view.strips * (taps + 2)
+                )
                 for where in (everywhere_seen, seen)
             )
             if view.beam is not None:
@@ -199,5 +259,11 @@ class InterpolatedAperture:
                     most += density * self.beam_cycles * beam_cycles
                 most *= 1 + BEAM_MARGIN
             count = view.virtual_channels(taps, density, turns)
-            found.append(StageChannels(used, count, taps * used / count, everywhere, most))
+            count *= view.rows(side, taps, density * oversampling)
+            summed = taps**self.dimensions * used / count
+            if self.dimensions == 2 and level == 0:
+                bands = math.ceil(most_rows) + 2
+            found.append(StageChannels(used, count, summed, everywhere, most, bands))
+            if self.dimensions == 2:
+                bands = math.ceil(most_rows) + 3  # the rows, for the next stage
         return found

@@ -81,7 +81,7 @@ class Leaves:
             radius_m = self.surface.radius_m(self.geometry.division.sides[0])
             nearest_m = max(self.geometry.nearest_m - radius_m, 1e-6)
             wave_m, track = wavelength_m(self.lines), self.geometry.track
-            on_track = np.abs(track.samples - 0.5) <= 0.5
+            on_track = track.on_track
             centres_m = self.geometry.division.centres_m(0, self.geometry.division.roots)
             sine = sines(centres_m, track.sampled_m[0][on_track], self.geometry.along[on_track])
             error = layout.one_cubic_error(chosen.beam, nearest_m, wave_m)

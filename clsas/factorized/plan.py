@@ -31,8 +31,9 @@ from clsas.factorized.fields import (
 from clsas.opencl import phases
 from clsas.sonar.simplify import EFFECTS
 
-VERSION = 2
-"""Version of a plan's JSON. Version 1, of clsas before 0.1.0, had no number."""
+VERSION = 3
+"""Version of a plan's JSON. Version 1, of clsas before 0.1.0, had no number; version 2 had one mean
+track."""
 
 
 @dataclass(frozen=True, config=CONFIG)

@@ -20,6 +20,7 @@ from clsas.core.lines import RangeLines
 from clsas.exact.backprojection import form_exactly
 from clsas.exact.checks import check_numbers
 from clsas.factorized.buffers import CHUNK, Level, row_pitch, stage_lines, stage_tables
+from clsas.factorized.dense_channels import band_table
 from clsas.factorized.factorization import ExactImage
 from clsas.factorized.leaves import Finish
 from clsas.factorized.plan import Plan
@@ -101,11 +102,14 @@ class _Tables:
         Channels of a row, stage by stage.
     strides : list of int
         Lines of a subimage, stage by stage.
+    bands : list of int
+        Bands of channels, stage by stage: see `clsas.factorized.tree.Bands`.
     """
 
     slot: Slot
     pitches: list[int]
     strides: list[int]
+    bands: list[int]
 
 
 class _Run:
@@ -147,8 +151,9 @@ class _Run:
         options |= {"APERTURE_TAPS": image.aperture.filter.taps, "HALF": int(self.half_precision)}
         options |= {"CHUNK": CHUNK, "PHASE_TERMS": phases.PRECISE_TERMS}
         ramp = int(self.geometry.ramps)
-        self.first_stage = device.kernel("stage", SHIFTS_GIVEN=1, RAMP=ramp, **options)
-        self.later_stage = device.kernel("stage", SHIFTS_GIVEN=0, RAMP=0, **options)
+        rows = int(self.geometry.track.is_sheet)
+        self.first_stage = device.kernel("stage", SHIFTS_GIVEN=1, RAMP=ramp, ROWS=rows, **options)
+        self.later_stage = device.kernel("stage", SHIFTS_GIVEN=0, RAMP=0, ROWS=2 * rows, **options)
         kind = PlaneLeaves if self.geometry.surface.is_plane else SurfaceLeaves
         self.leaves = kind(
             lines, self.geometry, self.levels[-1], device, pixels, self.half_precision, self.gain
@@ -235,12 +240,19 @@ class _Run:
             values = self._stage_values(sector, level)
             ramps = self.geometry.ramps
             for name, buffer in stage_tables(
-                level, roots, subimages, channels, ramps=ramps
+                level,
+                roots,
+                subimages,
+                channels,
+                ramps=ramps,
+                bands=values[f"bands{level}"].shape[2],
+                rows=self.geometry.track.is_sheet,
             ).items():
                 slot.fill(name, buffer.holding(values[name]))
         self.leaves.fill(slot, sector)
         pitches = [row_pitch(nodes.base.shape[1]) for nodes in sector.nodes]
-        return _Tables(slot, pitches, strides)
+        bands = [1 if each.bands is None else each.bands.first.shape[1] for each in sector.nodes]
+        return _Tables(slot, pitches, strides, bands)
 
     def _stage_values(self, sector: Sector, level: int) -> dict[str, NDArray]:
         """Return what the tables of a stage hold, see `cl/stage.cl`."""
@@ -256,8 +268,9 @@ class _Run:
             values[f"positions{level}"] = sector.positions_m(level - 1).swapaxes(1, 2)
         else:
             values |= self.geometry.references(sector)
-        children = [need.begin, need.end, first_of_parent, need.first, need.last - need.first]
-        values[f"children{level}"] = np.stack(children, axis=-1)
+        values[f"bands{level}"] = band_table(nodes.bands, need, first_of_parent)
+        if nodes.bands is not None and nodes.bands.between is not None:
+            values[f"rows{level}"] = nodes.bands.between
         return values
 
     def _stage(self, tables: _Tables, level: int, batch: slice) -> None:
@@ -275,16 +288,22 @@ class _Run:
         items = _GROUP if self.width == 1 else 1
         # Few children are divided, so that there is work for all.
         step = _GROUP if self.width == 1 else 8 * self.width
+        if self.geometry.track.is_dense and self.width > 1:
+            # All channels of a dense aperture go into few children: they need every core.
+            few = children < _GROUPS_PER_UNIT * device.info.compute_units
+            step = 2 * self.width if few else step
         parts = -(-_GROUPS_PER_UNIT * device.info.compute_units // children)
         part_length = step * -(-shape.length // (step * parts))
         device.run(
             self.later_stage if level else self.first_stage,
             (children * items, -(-shape.length // part_length)),
-            children=table[f"children{level}"],
+            bands=table[f"bands{level}"],
+            band_count=tables.bands[level],
             first_child=batch.start * per_root,
             children_per_root=per_root,
             first_virtual=table[f"base{level}"],
             tap_position=table[f"between{level}"],
+            **({"row_position": table[f"rows{level}"]} if self.geometry.track.is_sheet else {}),
             channel_pitch=tables.pitches[level],
             **self._shifts(tables, level),
             half_length=shape.half,
@@ -328,7 +347,8 @@ class _Run:
 def _geometry(lines: RangeLines, grid: Grid, chosen: Plan) -> Geometry:
     """Return the geometry of a plan's image, kept from the image before if there was one."""
     if "geometry" not in chosen.kept:
-        chosen.kept["geometry"] = Geometry(lines, surface_of(grid), chosen)
+        surface = chosen.kept.get("surface") or surface_of(grid)
+        chosen.kept["geometry"] = Geometry(lines, surface, chosen)
     return chosen.kept["geometry"]
 
 

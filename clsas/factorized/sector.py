@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Hashable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -15,14 +15,18 @@ from scipy.spatial.distance import cdist
 from clsas.core.geometry import pairwise_range_m
 from clsas.core.lines import RangeLines, some_channels
 from clsas.factorized import tree, visibility
-from clsas.factorized.aperture import cycles_per_extent, drift, mean_track, own_drift, stretches
+from clsas.factorized.aperture import cycles_per_extent, drift, own_drift, stretches
+from clsas.factorized.dense_apertures import mean_track_of
+from clsas.factorized.dense_channels import SheetRates, all_channels, sheet_rates
 from clsas.factorized.interpolated import BEAM_MARGIN
 from clsas.factorized.plan import Plan
 from clsas.factorized.surface import Surface
+from clsas.factorized.tracks import MeanTrack
 from clsas.factorized.tree import ChannelRanges, Division, VirtualChannels
 from clsas.opencl.buffers import MARGIN
 
 _ON_TRACK = 1e-4  # wavelengths; closer, channels lie on the mean track
+_SHAPES = {"strips": "several passes", "sheet": "a sheet"}
 _SAMPLED_LINES = 64  # whose power is measured, spread evenly
 _FAR = 1 << 28  # samples: off any line, and within int32
 MOST_KEPT_BYTES = 128 << 20
@@ -49,6 +53,8 @@ class Sector:
         Virtual channels of each subimage, and the channels that it combines, stage by stage.
     coordinate : float64 [roots, channels]
         Aperture coordinates of the raw channels.
+    across : float64 [roots, channels] or None
+        Their coordinates across a sheet.
     """
 
     roots: NDArray[np.int64]
@@ -58,6 +64,7 @@ class Sector:
     nodes: list[VirtualChannels]
     needs: list[ChannelRanges]
     coordinate: NDArray[np.float64]
+    across: NDArray[np.float64] | None = None
 
     @property
     def nbytes(self) -> int:
@@ -109,13 +116,16 @@ class Geometry:
         self.samples_per_m = image.resampling.samples_per_m(lines)
         self.cycles_per_m = image.resampling.cycles_per_m(lines)
         self.division = Division(surface, image.sides)
-        track = mean_track(lines)
+        track = chosen.kept.get("track") or mean_track_of(lines, image.aperture.shape)
         if track is None:
             raise ValueError(
                 "lines must have channels at more than one place for a plan that divides"
+                if image.aperture.shape == "track"
+                else f"lines must have channels that lie on {_SHAPES[image.aperture.shape]}, as "
+                "the plan has them"
             )
         self.channels = np.argsort(track.coordinate, kind="stable")
-        self.track = replace(track, coordinate=track.coordinate[self.channels])
+        self.track = track.some(self.channels)
         self.along: NDArray[np.float64] | None = None
         if beam is not None:
             along = beam.directions(lines)[self.channels]
@@ -125,8 +135,9 @@ class Geometry:
         self.own_drift = own if own is None else own[self.channels]
         self._seen = Division(surface, (image.sides[0], self._together(), image.sides[-1]))
         # On the track itself there is nothing to align.
-        off_m = np.abs(self.phase_centres_m - self.track.positions_m(self.track.coordinate)).max()
+        off_m = np.abs(self.track.offsets_m(self.phase_centres_m)).max()
         wavelength_m = lines.sound_speed_m_s / max(lines.carrier_hz, 1.0)
+        self._on_sheet = off_m <= _ON_TRACK * wavelength_m
         if own is not None:
             off_m += np.linalg.norm(own, axis=1).max() * np.abs(lines.last_range_m).max()
         apart = lines.rx_velocity_m_s is not None or not np.array_equal(lines.tx_m, lines.rx_m)
@@ -228,21 +239,48 @@ class Geometry:
         seen_m = self._seen.centres_m(1, self._seen.corners(1, roots))
         half_m = surface.extents_in(together, sides[0], roots).max(axis=0) / 2
         half_m = half_m[:, None] * surface.steps_m
-        begin, end = (
-            each[:, self._seen.parents(2)]
-            for each in visibility.visible_stretches(
-                self.factorization.limits, track, self.along, seen_m, half_m
-            )
-        )
         inside = surface.holds(sides[-1], corners[-1])
-        channels = aperture.used_channels(track.coordinate, begin[inside], end[inside], self._slack)
-        centres_m = self.phase_centres_m[channels]
-        some = replace(track, coordinate=track.coordinate[channels])
+        channels = slice(0, len(self.channels))
+        if not track.is_dense:
+            begin, end = (
+                each[:, self._seen.parents(2)]
+                for each in visibility.visible_stretches(
+                    self.factorization.limits, track, self.along, seen_m, half_m
+                )
+            )
+            channels = aperture.used_channels(
+                track.coordinate, begin[inside], end[inside], self._slack
+            )
+        centres_m, some = self.phase_centres_m[channels], track.some(channels)
         own = None if self.own_drift is None else self.own_drift[channels]
-        place = some.apparent_coordinates(root_m, centres_m, own)
-        nodes = aperture.virtual_channels(self, roots, root_m, place, centres_m)
-        needs = tree.channel_ranges(division, nodes, place, (begin, end), inside)
-        return Sector(roots, root_m, channels, relative_m, nodes, needs, place)
+        place, across = self._apparent(some, root_m, centres_m, own)
+        nodes = aperture.virtual_channels(self, roots, root_m, place, across, centres_m)
+        if track.is_dense:
+            needs = all_channels(nodes, place.shape[1], self._holding(inside))
+        else:
+            needs = tree.channel_ranges(division, nodes, place, (begin, end), inside)
+        return Sector(roots, root_m, channels, relative_m, nodes, needs, place, across)
+
+    def _apparent(
+        self,
+        some: MeanTrack,
+        root_m: NDArray[np.float64],
+        centres_m: NDArray[np.float64],
+        own: NDArray[np.float64] | None,
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64] | None]:
+        """Return coordinates at which channels appear: see `MeanTrack.apparent_places`."""
+        if some.across is None or own is not None or not self._on_sheet:
+            return some.apparent_places(root_m, centres_m, own)
+        shape = (len(root_m), len(centres_m))
+        return np.broadcast_to(some.coordinate, shape), np.broadcast_to(some.across, shape)
+
+    def _holding(self, inside: NDArray[np.bool_]) -> list[NDArray[np.bool_]]:
+        """Return which subimages hold a pixel, stage by stage, from those of the leaves."""
+        result = [inside]
+        for level in range(len(self.division.sides) - 1, 0, -1):
+            held = self.division.by_parent(level, result[0])
+            result.insert(0, np.any(held, axis=-1))
+        return result
 
     def phase_rates(
         self, roots: NDArray[np.int64], root_m: NDArray[np.float64]
@@ -258,6 +296,18 @@ class Geometry:
             min(surface.radius_m(image.sides[-1]), image.closest_m),
             image.limits,
             self.along,
+        )
+
+    def sheet_rates(self, roots: NDArray[np.int64], root_m: NDArray[np.float64]) -> SheetRates:
+        """Return the largest phase rates of subimages in some roots, along and across a sheet."""
+        image, surface = self.factorization, self.surface
+        return sheet_rates(
+            self.track,
+            surface,
+            root_m,
+            surface.extents_in(image.sides[0], image.sides[0], roots).max(axis=0),
+            image.highest_cycles_per_m,
+            min(surface.radius_m(image.sides[-1]), image.closest_m),
         )
 
     def references(self, sector: Sector) -> dict[str, NDArray]:
@@ -303,7 +353,7 @@ class Geometry:
 
     def _ramp(self, sector: Sector) -> NDArray[np.float64]:
         """Return cycles per sample by which channels' phases grow faster than their stand-ins'."""
-        virtual_m = self.track.positions_m(sector.coordinate)
+        virtual_m = self.track.positions_m(sector.coordinate, sector.across)
         tx_m, rx_m, velocity, speed = self._antennas(sector)
         plane = self.surface.plane
         stretch = stretches(

@@ -206,7 +206,11 @@ def _through_points(grid: Grid) -> Surface:
     across /= np.linalg.norm(across)
     axes = np.stack([np.cross(normal, across), across])
     in_plane_m = offset_m @ axes.T
-    low_m, span_m = in_plane_m.min(axis=0), np.ptp(in_plane_m, axis=0)
+    # Axis by axis: NumPy reduces long columns slowly.
+    low_m, high_m = (
+        np.array([reduce(axis) for axis in in_plane_m.T.copy()]) for reduce in (np.min, np.max)
+    )
+    span_m = high_m - low_m
     step_m = max(math.sqrt(math.prod(span_m) / grid.size), span_m.max() / grid.size)
     step_m = max(1.000001 * step_m, _LEAST_CELL_M)
     rows, columns = (int(n) for n in span_m // step_m + 1)

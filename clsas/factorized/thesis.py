@@ -16,6 +16,7 @@ from clsas.core.grid import Grid
 from clsas.core.lines import RangeLines
 from clsas.factorized import tree
 from clsas.factorized.aperture import mean_track
+from clsas.factorized.dense_apertures import Shape
 from clsas.factorized.estimates import StageChannels
 from clsas.factorized.fields import CONFIG, Whole
 from clsas.factorized.interpolated import VisiblePhases
@@ -51,6 +52,10 @@ class NearestBeams:
     """A single tap of weight 1."""
     band: ClassVar[None] = None
     """Linear interpolation takes any band."""
+    dimensions: ClassVar[int] = 1
+    shape: ClassVar[Shape] = "track"
+    """Virtual channels are means of neighbours on one curve."""
+
     aligns_phases: ClassVar[bool] = False
     splits_leaves: ClassVar[bool] = True
     """Leaves as large as the stages ask for are backprojected in tiles."""
@@ -83,6 +88,7 @@ class NearestBeams:
         roots: NDArray[np.int64],
         root_m: NDArray[np.float64],
         place: NDArray[np.float64],
+        across: NDArray[np.float64] | None,
         channels_m: NDArray[np.float64],
     ) -> list[VirtualChannels]:
         """Return the beams of some roots, stage by stage."""

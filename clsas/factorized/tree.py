@@ -14,13 +14,41 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
-from clsas.factorized.aperture import MeanTrack, cumulative_cycles
+from clsas.factorized.aperture import cumulative_cycles
 from clsas.factorized.surface import Surface
+from clsas.factorized.tracks import MeanTrack
 from clsas.signal.interpolation import Interpolator
 
 _SMOOTHED_CHANNELS = 2.5  # rms width, virtual channels, over which their spacing is smoothed
 _LEAST_RATE = 0.3  # of the mean phase rate over the track
 _LEAST_CHANNELS = 2.0  # virtual channels between the track's ends
+
+
+@dataclass(frozen=True, eq=False)
+class Bands:
+    """Channels that contribute to the same rows of virtual channels, in the order of these.
+
+    The virtual channels of a row follow each other; so do rows. Strips are rows of their own.
+
+    Attributes
+    ----------
+    bounds : int64 [roots, bands + 1]
+        First channel of each band, in the order in which channels are added, and the end.
+    first : int64 [roots, bands]
+        First virtual channel of the first row that a band contributes to.
+    width : int64 [roots, bands]
+        Virtual channels of these rows.
+    old : int64 [roots, bands]
+        Of the rows, the number that earlier bands contribute to.
+    between : float64 [roots, channels] or None
+        Position of each channel from the middle of its rows, -0.5 to 0.5; None with single rows.
+    """
+
+    bounds: NDArray[np.int64]
+    first: NDArray[np.int64]
+    width: NDArray[np.int64]
+    old: NDArray[np.int64]
+    between: NDArray[np.float64] | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,7 +58,7 @@ class VirtualChannels:
     Attributes
     ----------
     coordinate : float64 [roots, virtual channels]
-        Aperture coordinate on the mean track.
+        Aperture coordinate on the mean track; of a sheet, of its columns.
     position_m : float64 [roots, virtual channels, 3]
     order : int64 [roots, channels] or None
         Order in which the channels of the stage before are added; None if it is theirs.
@@ -41,6 +69,8 @@ class VirtualChannels:
         0.5 of their spacing.
     aperture : Interpolator or None
         Filter that weights the contributions; None if each channel is added to a single one.
+    bands : Bands or None
+        The channels of strips, or of rows of a sheet; None for a single curve.
     """
 
     coordinate: NDArray[np.float64]
@@ -49,6 +79,7 @@ class VirtualChannels:
     base: NDArray[np.int64]
     between: NDArray[np.float64]
     aperture: Interpolator | None
+    bands: Bands | None = None
 
     @property
     def taps(self) -> int:
@@ -89,22 +120,62 @@ def interpolated_channels(
     aperture : Interpolator
         Its `upsampling` is the oversampling of virtual channels.
     """
-    taps, per_cycle = aperture.taps, 2 * aperture.upsampling
-    phase = per_cycle * cumulative_cycles(track, _smoothed_rates(track, rate, per_cycle))
-    position = np.stack(
-        [np.interp(c, track.samples, p) for c, p in zip(coordinate, phase, strict=True)]
-    )
-    position -= (origin := np.floor(position.min(axis=1, keepdims=True)) - (taps // 2 - 1))
+    spacing = Spacing.of(track, rate, aperture)
+    position, origin, taps = *spacing.positions(coordinate), aperture.taps
     order = None
     if (np.diff(position) < 0).any():
         order = np.argsort(position, axis=1, kind="stable")
         position = np.take_along_axis(position, order, axis=1)
     lower = np.floor(position)
     base = lower.astype(np.int64) - (taps // 2 - 1)
-    virtual = origin + np.arange(base.max() + taps)
-    found = np.stack([np.interp(v, p, track.samples) for v, p in zip(virtual, phase, strict=True)])
+    found = spacing.coordinates(origin + np.arange(base.max() + taps))
     between = position - lower - 0.5
     return VirtualChannels(found, track.positions_m(found), order, base, between, aperture)
+
+
+@dataclass(frozen=True, eq=False)
+class Spacing:
+    """Virtual channels along a curve, at equal steps of the phase.
+
+    Attributes
+    ----------
+    track : MeanTrack
+    phase : float64 [roots, samples]
+        The number of virtual channels up to `track.samples`.
+    taps : int
+        Of the filter between them.
+    """
+
+    track: MeanTrack
+    phase: NDArray[np.float64]
+    taps: int
+
+    @classmethod
+    def of(cls, track: MeanTrack, rate: NDArray[np.float64], aperture: Interpolator) -> Spacing:
+        """Return the spacing that phase rates ask for: see `interpolated_channels`."""
+        per_cycle = 2 * aperture.upsampling
+        rates = _smoothed_rates(track, rate, per_cycle)
+        return cls(track, per_cycle * cumulative_cycles(track, rates), aperture.taps)
+
+    def positions(
+        self, coordinate: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return positions among virtual channels, [roots, channels], and what number 0 is at."""
+        position = np.stack(
+            [
+                np.interp(c, self.track.samples, p)
+                for c, p in zip(coordinate, self.phase, strict=True)
+            ]
+        )
+        origin = np.floor(position.min(axis=1, keepdims=True)) - (self.taps // 2 - 1)
+        position -= origin
+        return position, origin
+
+    def coordinates(self, position: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the aperture coordinates of positions from the curve's first sample."""
+        return np.stack(
+            [np.interp(v, p, self.track.samples) for v, p in zip(position, self.phase, strict=True)]
+        )
 
 
 def _smoothed_rates(
@@ -117,7 +188,7 @@ def _smoothed_rates(
     the root is invisible (a rate of 0), beyond the track's ends and where phases nearly stand
     still, the spacing nearby is continued.
     """
-    on_track = np.flatnonzero(np.abs(track.samples - 0.5) <= 0.5)
+    on_track = np.flatnonzero(track.on_track)
     inside = rate[:, on_track]
     for root in np.flatnonzero((inside <= 0).any(axis=1)):
         visible = np.flatnonzero(inside[root] > 0)

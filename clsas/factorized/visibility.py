@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from clsas.factorized.aperture import MeanTrack
+from clsas.factorized.tracks import MeanTrack
 from clsas.sonar.beam import BeamWindow
 from clsas.sonar.visibility import BeamTrack, Boxes
 
@@ -70,7 +70,7 @@ def visible_stretches(
     shape = centres_m.shape[:-1]
     if limits is None or along is None:
         return np.full(shape, -np.inf), np.full(shape, np.inf)
-    on_track = np.flatnonzero(np.abs(track.samples - 0.5) <= 0.5)[::_STEP]
+    on_track = np.flatnonzero(track.on_track)[::_STEP]
     coordinate = track.samples[on_track]
     beam = BeamTrack(limits, track.sampled_m[0][on_track], along[on_track])
     boxes = Boxes.equal(centres_m.reshape(-1, 3), half_m)

@@ -53,11 +53,20 @@ def sweeps_once(model: VisibilityModel) -> bool:
         return True
     # Neighbours on the track must look in much the same direction. At a kink the beam may swing
     # past a point within a few channels, and a track may lead back beside itself.
-    along = model.channels_along[np.argsort(model.track.coordinate, kind="stable")]
-    turned = np.linalg.norm(np.diff(along, axis=0), axis=1)
+    order = np.argsort(model.track.coordinate, kind="stable")
+    strip = model.track.strip_of(model.track.coordinate[order])
+    turned = np.linalg.norm(np.diff(model.channels_along[order], axis=0), axis=1)
+    turned = turned[np.diff(strip) == 0]
     if turned.max(initial=0.0) > _MOST_TURNED * np.ptp(np.clip(model.beam.limits, -1, 1)):
         return False
-    on_track = model.on_track
+    strip = model.track.strip_of(model.track.samples)
+    return all(_sweeps_once(model, strip == each) for each in range(model.strips))
+
+
+def _sweeps_once(model: VisibilityModel, of_strip: NDArray[np.bool_]) -> bool:
+    """Return whether the beam sweeps evenly along one strip."""
+    assert model.beam is not None
+    on_track = model.on_track & of_strip
     position = model.track_m[on_track]
     along_m = np.concatenate([[0], np.linalg.norm(np.diff(position, axis=0), axis=1).cumsum()])
     sine = np.einsum("psi,si->ps", model.sight[:, on_track], model.along[on_track])

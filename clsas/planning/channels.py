@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
+from clsas.core.geometry import pairwise_range_m
+from clsas.core.lines import fastest
 from clsas.factorized import aperture
 from clsas.planning.caching import shared
-from clsas.planning.visibility_model import VisibilityModel
+from clsas.planning.visibility_model import Side, VisibilityModel
 from clsas.signal.spectrum import cycles_per_m_at
 
 _NEIGHBOURS = 64  # channels over which density is measured; half or twice: no change
+_SHEET_REFERENCES = 2.0  # that each channel of a sheet counts as, measured with 54 000 channels
 _LEAST_FREQUENCY = 1e-3  # of the highest: virtual channels sample a phase that hardly turns
 
 
@@ -33,17 +38,16 @@ def carriers(model: VisibilityModel, count: int) -> NDArray[np.float64]:
     return np.interp(index, np.arange(len(share)), cycles_per_m)
 
 
-@shared
-def track_error_m(model: VisibilityModel) -> NDArray[np.float64]:
-    """Distances of channels from the mean track, [channels].
+def track_error_m(model: VisibilityModel, channels: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Distances of some channels from the mean track, [channels].
 
     The motion of receivers that differs from the mean is added, as it acts at the median range.
     """
-    away_m = model.lines.phase_centres_m - model.track.positions_m(model.track.coordinate)
+    away_m = model.track.some(channels).offsets_m(model.lines.phase_centres_m[channels])
     error_m = np.linalg.norm(away_m, axis=1)
     drift = own_drift(model)
     if drift is not None:
-        error_m += np.linalg.norm(drift, axis=1) * np.median(model.distance_m)
+        error_m += np.linalg.norm(drift[channels], axis=1) * np.median(model.distance_m)
     return error_m
 
 
@@ -59,5 +63,37 @@ def peak_density(model: VisibilityModel) -> float:
     place = np.sort(model.track.coordinate)
     some = min(_NEIGHBOURS, len(place) - 1)
     closest = float((place[some:] - place[:-some]).min())
-    average = float(place[-1] - place[0]) * some / (len(place) - 1)
+    length = model.strips if model.strips > 1 else float(place[-1] - place[0])
+    average = length * some / (len(place) - 1)
     return average / closest if closest > 0 else np.inf
+
+
+def range_window_m(model: VisibilityModel, root: Side) -> tuple[float, float]:
+    """Return the least and the largest range of any part of roots, from lines' first samples.
+
+    Ranges to a pixel and to the middle of the grid differ by their distance at most; receivers
+    that move change that by their speed over the sound's.
+    """
+    plane, lines = model.surface.plane, model.lines
+    whole = -(-plane.shape[0] // root[0]) * root[0], -(-plane.shape[1] // root[1]) * root[1]
+    origin_m: Any = plane.origin_m
+    middle_m = (origin_m + (np.array(whole) - 1) / 2 @ model.surface.steps_m[:2])[None]
+    relief_m = 0.0 if model.surface.is_plane else 2 * float(np.abs(model.surface.off_m).max())
+    extents = model.surface.extents(whole, relief_m)
+    radius_m = float(np.linalg.norm(np.abs(extents[:, None] * model.surface.steps_m).sum(axis=0)))
+    radius_m *= (1 + 2 * fastest(lines)) / 2
+    range_m = model.from_cache(
+        ("ranges", whole),
+        lambda: (
+            pairwise_range_m(
+                middle_m, lines.tx_m, lines.rx_m, lines.rx_velocity_m_s, lines.sound_speed_m_s
+            )[0]
+            - lines.first_range_m
+        ),
+    )
+    return float(range_m.min()) - radius_m, float(range_m.max()) + radius_m
+
+
+def references(model: VisibilityModel) -> float:
+    """Return the references of a root, a channel each; on a sheet channels are sorted by rows."""
+    return model.lines.channels * (_SHEET_REFERENCES if model.track.is_sheet else 1.0)

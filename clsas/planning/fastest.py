@@ -28,7 +28,7 @@ from clsas.planning.prediction import (
     margin_db,
     predicted_plan,
 )
-from clsas.planning.search import Allowed, Tree, root_limits, search
+from clsas.planning.search import Allowed, Tree, largest_root, root_limits, search
 from clsas.planning.spacing_errors import spacing_error
 from clsas.planning.visibility_model import VisibilityModel
 
@@ -159,8 +159,15 @@ def fastest(
             smaller = (rows // 2, columns) if rows > columns else (rows, columns // 2)
             trial = replace(trial, most_root=smaller, tree=None)
         else:
+            found.kept.update(track=view.track, surface=view.surface)
             return found, needed
     return None, needed
+
+
+def off_track(view: VisibilityModel, conditions: Conditions) -> bool:
+    """Return whether channels lie too far from the mean track for the largest roots."""
+    problem = _Problem(view, conditions)
+    return root_error(problem.view, largest_root(view)) > _ROOTS_SHARE * problem.allowed
 
 
 def _searched(problem: _Problem, trial: _Trial) -> _Trial | None:
@@ -227,6 +234,7 @@ def _estimated(
         filter=filters.aperture,
         oversampling=trial.oversampling,
         beam_cycles=trial.beam_cycles,
+        shape=within.shape,
         band=band_of(within, OUTSIDE * problem.allowed),
     )
     candidate = Candidate(

@@ -55,6 +55,8 @@ class BufferSizes:
         Virtual channels of a root along the whole aperture, at most, stage by stage.
     most_channels : tuple of int
         Virtual channels of a subimage, at most, stage by stage.
+    bands : tuple of int
+        Bands of channels, stage by stage: see `clsas.factorized.tree.Bands`.
     line_pitch : int
         Samples of an upsampled line with zeros around it.
     filtered : bool
@@ -69,6 +71,7 @@ class BufferSizes:
     pitches: tuple[int, ...]
     root_channels: tuple[int, ...]
     most_channels: tuple[int, ...]
+    bands: tuple[int, ...]
     line_pitch: int
     filtered: bool
     half_precision: bool
@@ -88,7 +91,15 @@ class BufferSizes:
         channels, tables = self.view.lines.channels, Buffers()
         for level, side in enumerate(self.sides):
             subimages = self._divided(side)
-            tables |= stage_tables(level, roots, subimages, channels, ramps=True)
+            tables |= stage_tables(
+                level,
+                roots,
+                subimages,
+                channels,
+                ramps=True,
+                bands=self.bands[level],
+                rows=self.view.track.is_sheet,
+            )
             channels = self.root_channels[level]
         parts, pixels = self._parts()
         points = None if self.view.surface.is_plane else roots * pixels

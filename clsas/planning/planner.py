@@ -14,6 +14,7 @@ from clsas.core.decibels import in_db, power
 from clsas.core.grid import Grid
 from clsas.core.lines import RangeLines
 from clsas.exact.backprojection import ACCURACY_DB
+from clsas.factorized.dense_apertures import DENSE_SHAPES
 from clsas.factorized.estimates import ErrorBudget
 from clsas.factorized.filters import ALIGN_TAPS
 from clsas.factorized.left_out import with_left_out
@@ -26,7 +27,7 @@ from clsas.planning.costs import defaults as default_costs
 from clsas.planning.costs import measured as measured_costs
 from clsas.planning.errors import leaf_error, nearest_errors
 from clsas.planning.exact_image import Exact, expect
-from clsas.planning.fastest import fastest
+from clsas.planning.fastest import fastest, off_track
 from clsas.planning.prediction import (
     MARGIN_DB,
     OUTSIDE,
@@ -173,7 +174,9 @@ def plan(
     prediction = replace(
         found.prediction, error_db=errors.total_db, errors=errors, calibrated=calibrated
     )
+    kept = found.kept
     found = replace(found, tolerance_db=tolerance_db, prediction=prediction)
+    found.kept.update(kept)
     if model.left_out:
         found = with_left_out(found, model, lines, grid, beam)
     found.kept["lines"] = weakref.ref(lines)
@@ -208,9 +211,9 @@ def _chosen(
         if found.memory_bytes <= room:
             return found
         exact_fits, least = False, found.memory_bytes
-    elif stages is None and _worth_a_search(exact, costs, exact_fits, allowed) and _divisible(view):
+    elif stages is None and _worth_a_search(exact, costs, exact_fits, allowed):
         to_beat = _WORTH * costs.seconds(exact.work) if exact_fits and allowed is None else math.inf
-        faster, needed = fastest(view, conditions, to_beat, allowed or Allowed())
+        faster, needed = _fastest_of_shapes(view, conditions, to_beat, allowed or Allowed())
         if faster is not None:
             return faster
         least = min(least, needed)
@@ -220,6 +223,34 @@ def _chosen(
             f"image, got {room / 2**20:.3g} MiB"
         )
     return exact_plan(view, conditions)
+
+
+def _fastest_of_shapes(
+    view: VisibilityModel, conditions: Conditions, seconds: float, choices: Allowed
+) -> tuple[Plan | None, float]:
+    """Return the fastest plan with a mean track of any shape: see `fastest`.
+
+    Strips and sheets are tried where channels lie too far from one curve for roots as large as
+    the image.
+    """
+    if view.track is None or view.grid.size == 1:
+        return None, math.inf
+    best, least, others = None, math.inf, DENSE_SHAPES
+    if _divisible(view):
+        best, least = fastest(view, conditions, seconds, choices)
+        if view.shape == "track" and not off_track(view, conditions):
+            others = ()
+    for shape in others:
+        if shape == view.shape:
+            continue
+        # Another search must pay for itself.
+        to_beat = seconds if best is None else _WORTH * best.predicted_seconds
+        model = view.with_shape(shape) if to_beat > _SEARCH_S else None
+        if model is None or not _divisible(model):
+            continue
+        found, needed = fastest(model, conditions, to_beat - _SEARCH_S, choices)
+        best, least = found or best, min(least, needed)
+    return best, least
 
 
 def tolerance_in_db(
@@ -266,10 +297,13 @@ def _worth_a_search(exact: Exact, costs: Costs, exact_fits: bool, allowed: Allow
 
 def _divisible(view: VisibilityModel) -> bool:
     """Return whether an image can be factorized at all."""
-    if view.track is None or view.grid.size == 1 or not sweeps_once(view):
+    if not sweeps_once(view):
         return False
     if view.beam is None:
         return True
+    # Beams are not interpolated across a sheet, nor normalised over strips.
+    if view.track.is_sheet or (view.track.others and view.beam.normalise):
+        return False
     # Normalising divides by a small sum at the beam's edge, and amplifies errors there.
     if view.beam.normalise and coverage(view, 1).min() < _LEAST_COVERED:
         return False

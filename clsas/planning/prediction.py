@@ -11,24 +11,26 @@ import numpy as np
 
 from clsas.core.decibels import in_db, power
 from clsas.core.digests import grid_digest, lines_digest
+from clsas.exact.lookup import lookup_room
 from clsas.factorized.buffers import CHUNK, Level
 from clsas.factorized.estimates import (
     ErrorBudget,
     StageChannels,
     Work,
+    adding_in_rows,
     backprojecting_leaves,
     combining,
     upsampling,
 )
 from clsas.factorized.factorization import ExactImage, Factorization
-from clsas.factorized.filters import UPSAMPLING_SHARE
+from clsas.factorized.filters import UPSAMPLING_SHARE, interpolations
 from clsas.factorized.interpolated import InterpolatedAperture
 from clsas.factorized.plan import Plan, Prediction, Stage
 from clsas.factorized.thesis import NearestBeams
 from clsas.opencl import phases
 from clsas.opencl.buffers import padded_length
 from clsas.opencl.device import Device
-from clsas.planning.channels import peak_density
+from clsas.planning.channels import peak_density, range_window_m, references
 from clsas.planning.costs import Costs
 from clsas.planning.exact_image import Exact
 from clsas.planning.memory import BufferSizes, batches_within
@@ -126,11 +128,13 @@ def predicted_plan(
     """
     sides, device, costs = candidate.sides, conditions.device, conditions.costs
     lines = _upsampled(view, candidate, other_errors)
+    if view.track is not None and view.track.is_dense:
+        lines = _trimmed(view, candidate, lines)
     half_lengths = view.half_lengths(sides, candidate.align, candidate.final, lines.resampling)
     channels = candidate.aperture.predicted_channels(view, sides)
     levels = [Level.of(half, device.info.width) for half in half_lengths]
     stages, work = _stages(view, candidate, lines, levels, channels, device, costs)
-    errors, half_precision = _with_arithmetic(view, lines, channels, conditions)
+    errors, half_precision = _with_arithmetic(view, candidate, lines, channels, conditions)
     sizes = BufferSizes(
         view=view,
         width=device.info.width,
@@ -139,6 +143,7 @@ def predicted_plan(
         pitches=tuple(level.pitch for level in levels),
         root_channels=tuple(math.ceil(each.everywhere) for each in channels),
         most_channels=tuple(math.ceil(_ROOM * each.most) for each in channels),
+        bands=tuple(each.bands for each in channels),
         line_pitch=padded_length(lines.resampling),
         filtered=lines.upsampler is not None,
         half_precision=half_precision,
@@ -229,8 +234,8 @@ def _plan(
         image=image,
         prediction=prediction,
         beam=view.beam,
-        lines_digest=lines_digest(view.lines),
-        grid_digest=grid_digest(view.grid),
+        lines_digest=view.from_cache("lines", lambda: lines_digest(view.lines)),
+        grid_digest=view.from_cache("grid", lambda: grid_digest(view.grid)),
     )
 
 
@@ -247,7 +252,8 @@ def _upsampled(view: VisibilityModel, candidate: Candidate, other_errors: ErrorB
     errors = replace(
         other_errors,
         range_filters=stages * power(align_db) + power(final.scatter_db),
-        aperture_filters=stages * power(aperture.filter.error_db),
+        aperture_filters=interpolations(stages, aperture.dimensions)
+        * power(aperture.filter.error_db),
     )
     if gain is not None:
         most_db = in_db(UPSAMPLING_SHARE * errors.total)
@@ -258,6 +264,28 @@ def _upsampled(view: VisibilityModel, candidate: Candidate, other_errors: ErrorB
             return _Lines(upsampler, resampling, align_db, errors)
     resampling = interpolation.resampling(samples, align, view.spectrum)
     return _Lines(None, resampling, align_db, errors)
+
+
+def _trimmed(view: VisibilityModel, candidate: Candidate, lines: _Lines) -> _Lines:
+    """Return upsampled lines without the samples that no pixel needs.
+
+    Dense apertures have so many channels that upsampling whole lines takes most of the time.
+    """
+    resampling = lines.resampling
+    low_m, high_m = range_window_m(view, candidate.sides[0])
+    step_m = view.lines.range_step_m
+    spare = len(candidate.sides) * (candidate.align.taps // 2 + 1) + candidate.final.taps + 2
+    first, last = (
+        math.floor((each_m / step_m + resampling.lead) * resampling.ratio) - resampling.first
+        for each_m in (low_m, high_m)
+    )
+    first, last = max(first - spare, 0), min(last + 1 + spare, resampling.length)
+    # Whole turns of the filters' phases, and a line at least.
+    first -= first % PHASES
+    if last - first < 1 or candidate.aperture.method != "interpolated":
+        return lines
+    window = replace(resampling, first=resampling.first + first, length=last - first)
+    return replace(lines, resampling=window)
 
 
 def _stages(
@@ -271,8 +299,9 @@ def _stages(
 ) -> tuple[list[Stage], Work]:
     """Return the prediction of every stage and of the leaves, and the work of all."""
     width, aperture = device.info.width, candidate.aperture.filter
-    taps = candidate.align.taps + aperture.taps
-    error_db = in_db(power(lines.align_db) + power(aperture.error_db))
+    dimensions = candidate.aperture.dimensions
+    taps = candidate.align.taps + aperture.taps**dimensions
+    error_db = in_db(power(lines.align_db) + dimensions * power(aperture.error_db))
     stages, total = [], Work(call=1.0)
 
     def add(side: tuple[int, int], count: int, samples: int, work: Work, **figures: Any) -> None:
@@ -287,9 +316,11 @@ def _stages(
         samples = levels[level].length
         combined = count * of_stage.used
         work = combining(combined, samples, taps, given=level == 0) + Work(subimage=count)
+        if dimensions == 2:
+            work += adding_in_rows(count * of_stage.count, levels[level].pitch, aperture.taps)
         if level == 0:
             upsampled = view.lines.channels * lines.resampling.length
-            work += Work(reference=count * view.lines.channels)
+            work += Work(reference=count * references(view))
             work += upsampling(upsampled, filtered=lines.upsampler is not None)
         add(
             side,
@@ -319,7 +350,11 @@ def _stages(
 
 
 def _with_arithmetic(
-    view: VisibilityModel, lines: _Lines, channels: Sequence[StageChannels], conditions: Conditions
+    view: VisibilityModel,
+    candidate: Candidate,
+    lines: _Lines,
+    channels: Sequence[StageChannels],
+    conditions: Conditions,
 ) -> tuple[ErrorBudget, bool]:
     """Add the errors of polynomials and rounding; return whether lines have half precision."""
     tolerance_db, errors = conditions.tolerance_db, lines.errors
@@ -328,16 +363,35 @@ def _with_arithmetic(
     errors = replace(errors, phases=phases.error(phases.terms_within(tolerance_db)) ** 2)
     if lines.upsampler is None or not conditions.device.info.half_precision:
         return errors, False
-    rounding = _half_rounding(view, [stage.summed for stage in channels])
+    if _looked_up_singly(view, candidate, lines, conditions.device):
+        return errors, False
+    # Each row of a sheet is read and written for about twice as many bands as it has taps.
+    bands = 2 * candidate.aperture.filter.taps if candidate.aperture.dimensions == 2 else 0
+    rounding = _half_rounding(view, [stage.summed for stage in channels], bands)
     if rounding > _ROUNDING_SHARE * power(tolerance_db):
         return errors, False
     return replace(errors, half_precision=rounding), True
 
 
-def _half_rounding(view: VisibilityModel, summed: Sequence[float]) -> float:
+def _looked_up_singly(
+    view: VisibilityModel, candidate: Candidate, lines: _Lines, device: Device
+) -> bool:
+    """Return whether leaves of points are too thick to look samples up in a register.
+
+    CPUs convert single samples of half precision ten times slower than whole registers.
+    """
+    if view.grid.points_m is None or device.info.width == 1:
+        return False
+    room = lookup_room(candidate.final.taps, device.info.width)
+    thickness_m = float(view.surface.relief_m(candidate.sides[-1]).max())
+    return thickness_m / 2 * lines.resampling.samples_per_m(view.lines) > room
+
+
+def _half_rounding(view: VisibilityModel, summed: Sequence[float], bands: int) -> float:
     """Return the error power of rounding lines to half precision.
 
-    `summed` is the number of channels that a virtual one sums, stage by stage. Upsampled lines are
+    `summed` is the number of channels that a virtual one sums, stage by stage, and `bands` that of
+    the bands that add to it one after another, in every stage of a sheet. Upsampled lines are
     rounded once. Lines of a stage are rounded once per chunk of channels, while the sum still
     grows, which counts as half. A sum of very many chunks loses what is added last.
     """
@@ -345,4 +399,4 @@ def _half_rounding(view: VisibilityModel, summed: Sequence[float]) -> float:
     chunks[0] *= peak_density(view)
     if chunks.max() > _MOST_CHUNKS:
         return np.inf
-    return HALF_ROUNDING * (1 + float(np.sum(1 + chunks / 2)))
+    return HALF_ROUNDING * (1 + float(np.sum(1 + (chunks + bands) / 2)))

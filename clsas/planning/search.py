@@ -17,7 +17,13 @@ from numpy.typing import NDArray
 
 from clsas.core.decibels import in_db, power
 from clsas.factorized.buffers import LEAST_BATCH
-from clsas.factorized.estimates import Work, backprojecting_leaves, combining, upsampling
+from clsas.factorized.estimates import (
+    Work,
+    adding_in_rows,
+    backprojecting_leaves,
+    combining,
+    upsampling,
+)
 from clsas.factorized.filters import (
     ALIGN_TAPS,
     APERTURE_TAPS,
@@ -25,8 +31,10 @@ from clsas.factorized.filters import (
     FilterRates,
     choose,
 )
+from clsas.opencl.buffers import GUARD
 from clsas.opencl.device import Device
 from clsas.planning.caching import cached
+from clsas.planning.channels import references
 from clsas.planning.costs import Costs
 from clsas.planning.errors import leaf_error, root_error
 from clsas.planning.visibility_model import Side, VisibilityModel, mean_over_points
@@ -40,6 +48,7 @@ MOST_STAGES = 5
 # Share of the filters' error power that expanding a leaf may add. Half of it leaves some near grids
 # without a leaf, so that they are imaged exactly; twice gains 3 % of time.
 _LEAF_SHARE = 0.25
+_MOST_OVERHANG = 1.1  # of roots that fit an image, over its rows or columns
 _SPARE_SAMPLES = 16  # of a line, for filters and padding; twice moves times by 3 % at most
 
 
@@ -59,10 +68,14 @@ class Tree:
     sides: tuple[Side, ...]
     align_taps: int
     aperture_taps: int
+    dimensions: int = 1
 
     def filters(self, spectrum: Spectrum, filters_db: float) -> FilterRates | None:
         """Return filters whose errors together are no more than `filters_db`; None without any."""
-        return choose(spectrum, self.align_taps, self.aperture_taps, len(self.sides), filters_db)
+        stages = len(self.sides)
+        return choose(
+            spectrum, self.align_taps, self.aperture_taps, stages, filters_db, self.dimensions
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,7 +142,9 @@ class Sizes:
             extents = np.stack([self.model.extents(self.pairs[i], root=of_root) for i in index])
         cycles = self.model.phase_cycles_in_root(root, self.pairs)[index] @ extents.T
         smaller = self.divides[np.ix_(index, index)].T & (index[:, None] != index)
-        return Division(index, cycles, np.where(smaller, 0.0, np.inf))
+        of_axes = self.model.phase_cycles_across_root(root)
+        across = None if of_axes is None else extents @ of_axes
+        return Division(index, cycles, np.where(smaller, 0.0, np.inf), across)
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,11 +159,32 @@ class Division:
         Phase of a parent of size j, accumulated where a child of size i is visible.
     divisible_s : float64 [n, n]
         0 where a parent of size j may divide into children of size i, else infinite.
+    across : float64 [n] or None
+        Phase of subimages across a sheet; None without one.
     """
 
     index: NDArray[np.int64]
     cycles: NDArray[np.float64]
     divisible_s: NDArray[np.float64]
+    across: NDArray[np.float64] | None = None
+
+
+def _lengths(model: VisibilityModel) -> tuple[tuple[int, ...], ...]:
+    """Return rows and columns that subimages may have.
+
+    Every channel of a dense aperture is aligned for every root, so there roots fit the image too.
+    """
+    if not model.track.is_dense:
+        return _ROWS, _COLUMNS
+    found = []
+    for sides, n in zip((_ROWS, _COLUMNS), model.surface.plane.shape, strict=True):
+        least, fitting = sides[0], set(sides)
+        for parts in (1, 2, 4):
+            part = least * math.ceil(n / (least * parts))
+            if parts * part <= _MOST_OVERHANG * max(n, least):
+                fitting |= {part * 2**k for k in range(parts.bit_length())}
+        found.append(tuple(sorted(fitting)))
+    return tuple(found)
 
 
 @cached
@@ -156,7 +192,7 @@ def all_sizes(model: VisibilityModel, most: Side, device: Device) -> Sizes:
     """Return the sizes of subimages up to `most` rows and columns."""
     rows, columns = (
         [side for side in sides if side <= limit and side < 2 * max(n, min(sides))]
-        for sides, n, limit in zip((_ROWS, _COLUMNS), model.surface.plane.shape, most, strict=True)
+        for sides, n, limit in zip(_lengths(model), model.surface.plane.shape, most, strict=True)
     )
     pairs = tuple(product(rows, columns))
     sides = np.array(pairs, np.int64).reshape(-1, 2)
@@ -201,6 +237,10 @@ class Options:
         The first stage with roots of a size, and all that does not depend on the division.
     leaf_beam_cycles : float64 [sizes]
         Phase cycles that the beam's weights add to those of a leaf.
+    rows : float64 [options, 1]
+        Rows of virtual channels besides those for the phase across a sheet.
+    row_lines_s : float64 [options, sizes]
+        Each virtual channel of a sheet, for all subimages of a size: see `adding_in_rows`.
     """
 
     choices: list[FilterRates]
@@ -212,6 +252,8 @@ class Options:
     leaves_s: NDArray[np.float64]
     roots_s: NDArray[np.float64]
     leaf_beam_cycles: NDArray[np.float64]
+    rows: NDArray[np.float64]
+    row_lines_s: NDArray[np.float64]
 
     def onward_s(
         self, division: Division, some: NDArray[np.int64]
@@ -230,16 +272,30 @@ class Options:
         # A child uses those of its parent's channels whose beam touches it.
         step_s = density * division.cycles
         step_s += ends
+        rows = None
+        if division.across is not None:
+            rows = density[..., 0] * division.across + self.rows[some]
+            step_s *= rows[:, None]
         step_s *= self.channel_s[some][:, index, None]
         step_s += self.subimages_s[index, None]
         step_s += division.divisible_s
         leaf_cycles = np.diag(division.cycles) + self.leaf_beam_cycles[index]
-        onward_s = (density[..., 0] * leaf_cycles + ends[..., 0]) * self.leaves_s[some][:, index]
+        of_leaf = density[..., 0] * leaf_cycles + ends[..., 0]
+        if rows is not None:
+            of_leaf = of_leaf * rows
+        onward_s = of_leaf * self.leaves_s[some][:, index]
+        formed_s = np.zeros(1)
+        if rows is not None:
+            columns = density[..., 0] * np.diag(division.cycles) + ends[..., 0]
+            formed_s = columns * rows * self.row_lines_s[some][:, index]
+            onward_s = onward_s + formed_s
         by_stages = [onward_s]
         for left in range(2, int(self.stages[some].max()) + 1):
             more = int(np.count_nonzero(self.stages[some] >= left))
             onward_s = onward_s.copy()
             onward_s[:more] = (step_s[:more] + onward_s[:more, :, None]).min(axis=1)
+            if rows is not None:
+                onward_s[:more] += formed_s[:more]
             by_stages.append(onward_s)
         return by_stages, step_s
 
@@ -262,22 +318,22 @@ def all_options(
 ) -> Options | None:
     """Return all choices of filters that err by no more than `filters_db`; None without any."""
     model, counts, channels = sizes.model, sizes.counts, sizes.model.lines.channels
-    choices, stages = [], []
+    choices, stages, dimensions = [], [], 1 + model.track.is_sheet
     most_first = sorted(allowed.stages, reverse=True)
     for number, align, aperture in product(most_first, allowed.align_taps, allowed.aperture_taps):
-        choice = choose(model.spectrum, align, aperture, number, filters_db)
+        choice = choose(model.spectrum, align, aperture, number, filters_db, dimensions)
         if choice is not None:
             choices.append(choice)
             stages.append(number)
     if not choices:
         return None
-    numbers = [(c.upsampling, c.final_taps, c.align_taps + c.aperture_taps) for c in choices]
+    numbers = [(c.upsampling, c.final_taps, c.stage_taps) for c in choices]
     rate, final_taps, taps = np.array(numbers).T[..., None]
     samples = 2 * sizes.half_range_extent_m * rate / model.lines.range_step_m
     samples += final_taps + _SPARE_SAMPLES
     roots = combining(counts * sizes.visible_share * channels, samples, taps, given=True)
     batches = np.maximum(counts / LEAST_BATCH, 1.0) * np.array(stages)[:, None]
-    roots += Work(reference=counts * channels, subimage=counts, batch=batches)
+    roots += Work(reference=counts * references(model), subimage=counts, batch=batches)
     most_db = filters_db + in_db(UPSAMPLING_SHARE)
     filtered = upsampler(model.spectrum, PHASES // 2, np.ones_like, most_db) is not None
     roots += upsampling(model.lines.samples.size * rate, filtered=filtered)
@@ -301,6 +357,10 @@ def all_options(
         leaves_s=np.where(leaf, np.array([leaves_s[c.final_taps] for c in choices]), np.inf),
         roots_s=np.asarray(costs.seconds(roots)),
         leaf_beam_cycles=beam_cycles * sizes.beam_cycles,
+        rows=aperture_taps[:, None],
+        row_lines_s=np.asarray(
+            costs.seconds(adding_in_rows(counts, samples + 2 * GUARD, aperture_taps[:, None]))
+        ),
     )
 
 
@@ -343,7 +403,17 @@ def search(
     option, root = best
     path = options.path(sizes.in_root(root), option, root)
     choice = options.choices[option]
-    return Tree(tuple(sizes.pairs[i] for i in path), choice.align_taps, choice.aperture_taps)
+    sides = tuple(sizes.pairs[i] for i in path)
+    return Tree(sides, choice.align_taps, choice.aperture_taps, choice.dimensions)
+
+
+def largest_root(model: VisibilityModel) -> Side:
+    """Return the rows and columns of the largest roots of an image."""
+    rows, columns = (
+        min((side for side in sides if side >= n), default=sides[-1])
+        for sides, n in zip(_lengths(model), model.surface.plane.shape, strict=True)
+    )
+    return rows, columns
 
 
 def root_limits(model: VisibilityModel, allowed: float) -> Side | None:
@@ -351,10 +421,11 @@ def root_limits(model: VisibilityModel, allowed: float) -> Side | None:
 
     None where there are none.
     """
-    rows, columns = (
-        min((side for side in sides if side >= n), default=sides[-1])
-        for sides, n in zip((_ROWS, _COLUMNS), model.surface.plane.shape, strict=True)
-    )
+    rows, columns = largest_root(model)
+    if root_error(model, (rows, columns)) <= allowed:
+        return rows, columns
+    if root_error(model, (_ROWS[0], _COLUMNS[0])) > allowed:
+        return None
     while root_error(model, (rows, columns)) > allowed:
         smaller = [(rows // 2, columns), (rows, columns // 2)]
         smaller = [side for side in smaller if side[0] >= _ROWS[0] and side[1] >= _COLUMNS[0]]

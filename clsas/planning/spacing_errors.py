@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import functools
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +17,8 @@ from scipy.sparse import csr_array
 
 from clsas.core.decibels import power
 from clsas.core.lines import wavelength_m
+from clsas.factorized.dense_channels import strip_channels
+from clsas.factorized.tracks import MeanTrack
 from clsas.factorized.tree import interpolated_channels
 from clsas.factorized.visibility import interpolated_directions
 from clsas.planning.caching import cached
@@ -26,6 +29,7 @@ from clsas.signal.interpolation import Interpolator
 
 _Pixels = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]
 
+_PLACES_OF_STRIP = 16  # more, for each strip after the first
 _SAMPLED_PLACES = 96  # along the visible aperture; half as many move the error by 3 dB at most
 
 
@@ -52,14 +56,64 @@ def spacing_error(
         Phase cycles that an edge of the beam counts for. With None steering functions are not
         weighted by the beam.
     """
-    error = functools.partial(
-        _interpolation_error, model, side, aperture, oversampling, beam_cycles
-    )
-    return mean_over_relief(model, side, error)
+
+    def error(places: tuple[_Place, ...]) -> float:
+        found = [
+            mean_over_relief(
+                model,
+                side,
+                functools.partial(
+                    _interpolation_error, model, place, side, aperture, oversampling, beam_cycles
+                ),
+            )
+            for place in places
+        ]
+        return sum(found) / len(found)
+
+    if not model.track.is_sheet:
+        return error((_TRACK,))
+    return error(_LINES_ALONG) + error(_LINES_ACROSS)
+
+
+_Place = tuple[Literal["track", "along", "across"], float]
+"""A curve: the track, or a line along or across a sheet at some coordinate."""
+_TRACK: _Place = ("track", 0.0)
+_LINES_ALONG: tuple[_Place, ...] = (("along", 0.25),)
+_LINES_ACROSS: tuple[_Place, ...] = (("across", 0.2), ("across", 0.7))
+
+
+@dataclass(frozen=True, eq=False)
+class _Line:
+    """A curve along which steering functions are interpolated.
+
+    Attributes
+    ----------
+    track : MeanTrack
+    rates : float64 [axes, points, samples]
+        See `VisibilityModel.rates`.
+    channels : float64 [channels]
+        Aperture coordinates of channels, ascending.
+    """
+
+    track: MeanTrack
+    rates: NDArray[np.float64]
+    channels: NDArray[np.float64]
+
+
+@cached
+def _line(model: VisibilityModel, place: _Place) -> _Line:
+    kind, at = place
+    if kind == "track":
+        return _Line(model.track, model.rates, np.sort(model.track.coordinate))
+    evenly = np.linspace(0, 1, 4 * _SAMPLED_PLACES)
+    if kind == "along":
+        return _Line(model.track.line_along(at), model.rates, evenly)
+    return _Line(model.track.line_across(at), model.rates_across, evenly)
 
 
 def _interpolation_error(
     model: VisibilityModel,
+    line_at: _Place,
     side: Side,
     aperture: Interpolator,
     oversampling: float,
@@ -71,14 +125,16 @@ def _interpolation_error(
     The error is 1, as large as the image, if no beam touches a subimage.
     """
     weighted = model.beam is not None and beam_cycles is not None
-    samples = _samples(model, side, weighted, tuple(extents))
+    line = _line(model, line_at)
+    samples = _samples(model, line_at, side, weighted, tuple(extents))
     if samples is None:
         return 1.0
-    rates = oversampling * np.tensordot(extents, model.rates[:, samples.points], 1)
+    rates = oversampling * np.tensordot(extents, line.rates[:, samples.points], 1)
     if weighted:
         rates = rates + beam_cycles * model.beam_rates[samples.points]
-    nodes = interpolated_channels(model.track, rates, samples.coordinate, aperture)
-    of_nodes = _steering(model, samples.pixels, weighted, nodes.coordinate)
+    interpolated = strip_channels if line.track.others else interpolated_channels
+    nodes = interpolated(line.track, rates, samples.coordinate, aperture)
+    of_nodes = _steering(model, line.track, samples.pixels, weighted, nodes.coordinate)
     # One sparse matrix interpolates at all aperture coordinates of all subimages.
     index = nodes.base[..., None] + np.arange(nodes.taps)
     index += nodes.coordinate.shape[1] * np.arange(len(index))[:, None, None]
@@ -121,10 +177,15 @@ class _Samples:
 
 @cached
 def _samples(
-    model: VisibilityModel, side: Side, weighted: bool, extents: tuple[float, ...]
+    model: VisibilityModel,
+    line_at: _Place,
+    side: Side,
+    weighted: bool,
+    extents: tuple[float, ...],
 ) -> _Samples | None:
     """Return the samples for subimages of a size, None if no beam touches any."""
-    channels, first, count = _visible_channels(model, side)
+    line = _line(model, line_at)
+    channels, first, count = _visible_channels(model, line, side)
     if not count.any():
         return None
     points = np.flatnonzero(count)
@@ -134,19 +195,28 @@ def _samples(
         points = np.intersect1d(points, SPREAD_POINTS)
     first, count = first[points], count[points]
     # One channel more on either side: the edge of visibility lies in between.
-    number = np.linspace(first - 1, first + count, _SAMPLED_PLACES, axis=1)
+    number = np.linspace(
+        first - 1,
+        first + count,
+        _SAMPLED_PLACES + _PLACES_OF_STRIP * len(line.track.others),
+        axis=1,
+    )
     number = np.clip(number, 0, len(channels) - 1)
+    if line.track.others:  # there is nothing between two strips
+        number = np.rint(number)
     place = np.interp(number, np.arange(len(channels)), channels)
     cycles_per_m = carriers(model, SAMPLED_PIXELS)
     found = [pixels_m(model, np.array(extents), point) for point in points.tolist()]
     offsets_m = np.stack([each_m for each_m, _ in found])
     chosen = np.stack([cycles_per_m[(share * SAMPLED_PIXELS).astype(int)] for _, share in found])
     pixels = model.points_m[points], offsets_m, chosen
-    return _Samples(points, count, place, pixels, _steering(model, pixels, weighted, place))
+    return _Samples(
+        points, count, place, pixels, _steering(model, line.track, pixels, weighted, place)
+    )
 
 
 def _visible_channels(
-    model: VisibilityModel, side: Side
+    model: VisibilityModel, line: _Line, side: Side
 ) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.int64]]:
     """Return which channels' beams touch subimages of a size at the sample points.
 
@@ -154,7 +224,10 @@ def _visible_channels(
     number of channels, 0 where the track has a gap. The edges of visibility lie between samples of
     the track, so the range is one sample wider on either side.
     """
-    places, samples = np.sort(model.track.coordinate), model.track.samples
+    places, samples = line.channels, model.track.samples
+    if model.track.is_sheet:
+        none = np.zeros(len(model.points_m), np.int64)
+        return places, none, none + len(places)
     visible = model.visible(side)
     begin = samples[np.maximum(visible.argmax(axis=1) - 1, 0)]
     last = visible.shape[1] - visible[:, ::-1].argmax(axis=1)
@@ -166,6 +239,7 @@ def _visible_channels(
 
 def _steering(
     model: VisibilityModel,
+    track: MeanTrack,
     pixels: _Pixels,
     weighted: bool,
     at: NDArray[np.float64],
@@ -184,7 +258,7 @@ def _steering(
     at : float64 [n, places]
     """
     centres_m, offsets_m, cycles_per_m = pixels
-    sight = centres_m[:, None] - model.track.positions_m(at)
+    sight = centres_m[:, None] - track.positions_m(at)
     offsets_m = offsets_m.swapaxes(1, 2)
     square = np.einsum("nsi,nsi->ns", sight, sight)[..., None] + 2 * sight @ offsets_m
     square += np.einsum("nip,nip->np", offsets_m, offsets_m)[:, None]

@@ -13,9 +13,11 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from clsas.core.grid import Grid
-from clsas.core.lines import RangeLines
+from clsas.core.lines import RangeLines, some_channels
 from clsas.exact.tiles import STACK
-from clsas.factorized.aperture import cycles_per_extent, mean_track
+from clsas.factorized.aperture import cycles_per_extent
+from clsas.factorized.dense_apertures import Shape, mean_track_of, simplest_track
+from clsas.factorized.dense_channels import SheetRates, sheet_rates
 from clsas.factorized.surface import LEAST_SIDE, surface_of, within_roots
 from clsas.factorized.visibility import beam_directions, beam_rate
 from clsas.planning.caching import cached, shared
@@ -33,6 +35,7 @@ _WEIGHTS = np.array([0.135, 0.24, 0.25, 0.24, 0.135])  # of these in means over 
 _POINT_WEIGHTS = np.outer(_WEIGHTS, _WEIGHTS).ravel() / _WEIGHTS.sum() ** 2
 _INNER = np.arange(len(_POINTS) ** 2).reshape(len(_POINTS), -1)[1:-1, 1:-1].ravel()
 _DENSE = 65  # points along either side, for the least distance of the grid; half: 0.05 dB
+_NEAREST_CHANNELS = 4096  # of a dense aperture, for that distance
 _MOST_OUTSIDE = 1e-6  # share of power above the highest frequency; half or twice: no change
 _SEARCH_STEP = 8  # the search uses every eighth sample of the track; a fourth chose the same trees
 
@@ -78,12 +81,15 @@ class VisibilityModel:
         Change of the beam's weights along the track as a phase rate; see `visibility.beam_rate`.
     limits : (low, high) or None
         Sines of the aspect angle between which weights are not 0.
+    shape : str
+        Shape of the mean track: see `clsas.factorized.dense_apertures`.
     root : (rows, columns) or None
         Size of the roots within which `rates` holds; None for the sample points alone.
     """
 
     limits: tuple[float, float] | None
     root: Side | None
+    shape: Shape = "track"
     along: Any
     channels_along: Any
     beam_rates: Any
@@ -105,20 +111,26 @@ class VisibilityModel:
         self.highest_cycles_per_m = float(abs(centre) + half_band)
         mean_square = self.spectrum.share @ self.spectrum.frequency**2
         self.rms_cycles_per_m = float(np.sqrt(mean_square)) / lines.range_step_m
-        self.track: Any = mean_track(lines)
         self.limits, self.root = None if beam is None else beam.limits, None
-        self.along, self.channels_along = None, None if beam is None else beam.directions(lines)
-        if self.track is None:
+        self.channels_along = None if beam is None else beam.directions(lines)
+        self.shape, track = simplest_track(lines)
+        self._put_track(track)
+
+    def _put_track(self, track: Any) -> None:
+        """Set what follows from the mean track."""
+        self.track, self.along, beam = track, None, self.beam
+        if track is None:
             return
-        self.surface = surface_of(grid)
+        self.surface = surface_of(self.grid)
         self.points_m = self.pixels_m(_POINTS)
         self.track_m, _ = self.track.sampled_m
         self.spacing = _spacing(self.track.samples)
         sight = self.points_m[:, None] - self.track_m
         self.distance_m = np.maximum(np.linalg.norm(sight, axis=-1), 1e-9)
         self.sight = sight / self.distance_m[..., None]
-        self.on_track = np.abs(self.track.samples - 0.5) <= 0.5
-        self.nearest_m = self._nearest_m()
+        self.on_track = self.track.on_track
+        if not hasattr(self, "nearest_m"):
+            self.nearest_m = self._nearest_m()
         if beam is not None:
             self.along = beam_directions(self.channels_along, self.track, self.track.samples)
             self.beam_rates = beam_rate(beam, self.track, self.along, self.points_m)
@@ -130,7 +142,10 @@ class VisibilityModel:
         steps_m = np.linalg.norm(self.surface.steps_m[:2], axis=1)
         step_m = steps_m @ (np.array(self.surface.plane.shape) - 1) / (_DENSE - 1)
         between_m = (step_m + self.surface.relief_m(LEAST_SIDE).max()) / 2
-        nearest_m = KDTree(dense_m).query(self.lines.phase_centres_m)[0].min() - between_m
+        centres_m = self.lines.phase_centres_m
+        if self.track.is_dense:
+            centres_m = centres_m[some_channels(len(centres_m), _NEAREST_CHANNELS)]
+        nearest_m = KDTree(dense_m).query(centres_m)[0].min() - between_m
         return max(float(nearest_m), 1e-9)
 
     def from_cache(self, key: Hashable, find: Callable[[], Any]) -> Any:
@@ -138,6 +153,18 @@ class VisibilityModel:
         if key not in self._cache:
             self._cache[key] = find()
         return self._cache[key]
+
+    def with_shape(self, shape: Shape) -> VisibilityModel | None:
+        """Return this model with a mean track of another shape; None if channels have none."""
+        track = mean_track_of(self.lines, shape)
+        if track is None:
+            return None
+        model = copy.copy(self)
+        kept = VisibilityModel.ambiguity.fget.__qualname__  # type: ignore[attr-defined]
+        model._cache = {key: self._cache[key] for key in (kept,) if key in self._cache}
+        model._put_track(track)
+        model.shape = shape
+        return model
 
     def _with(self, **changes: Any) -> VisibilityModel:
         """Return this model with other limits or another root."""
@@ -246,6 +273,12 @@ class VisibilityModel:
         """Largest change of range per row, column and metre of relief, [axes]."""
         visible = self.visible(SMALL)
         slopes = np.abs(self.sight @ self.surface.steps_m.T)
+        if self.track.is_sheet:
+            edges = [self.track.line_along(across) for across in (0.0, 1.0)]
+            sight = self.points_m[:, None] - np.concatenate([each.sampled_m[0] for each in edges])
+            sight /= np.maximum(np.linalg.norm(sight, axis=-1, keepdims=True), 1e-9)
+            more = np.abs(sight @ self.surface.steps_m.T)[:, np.tile(self.on_track, 2)]
+            return 1.02 * np.maximum(slopes[visible].max(axis=0), more.max(axis=(0, 1)))
         slopes = slopes[visible] if visible.any() else slopes.reshape(-1, slopes.shape[-1])
         return 1.02 * slopes.max(axis=0)
 
@@ -270,7 +303,7 @@ class VisibilityModel:
     @cached
     def visible(self, side: Side) -> NDArray[np.bool_]:
         """Return which track samples touch a subimage with their beam, bool [points, samples]."""
-        if self.limits is None:
+        if self.limits is None or self.track.is_dense:
             return np.broadcast_to(self.on_track, self.distance_m.shape)
         return self.visible_by_size((side,))[0]
 
@@ -278,7 +311,7 @@ class VisibilityModel:
     def visible_by_size(self, sides: tuple[Side, ...]) -> NDArray[np.bool_]:
         """Return `visible` of subimages of some sizes, bool [sizes, points, samples]."""
         shape = len(sides), *self.distance_m.shape
-        if self.limits is None:
+        if self.limits is None or self.track.is_dense:  # whose virtual channels are all formed
             return np.broadcast_to(self.on_track, shape)
         half = np.stack([self.extents(side, most=True) for side in sides]) / 2
         boxes, (low, high) = self._boxes, self.limits
@@ -307,6 +340,8 @@ class VisibilityModel:
     @cached
     def visible_track_ends(self) -> float:
         """Mean number of the track's ends whose beam touches a sample point."""
+        if self.track.is_dense:
+            return 2.0 * self.strips
         ends = np.flatnonzero(self.on_track)[[0, -1]]
         return float(self.visible(SMALL)[:, ends].sum(axis=1).mean())
 
@@ -320,11 +355,33 @@ class VisibilityModel:
         float64 [axes, points, samples]; the largest within roots of the model's size, if it has
         any.
         """
+        return self._rates(self._root_extents, self.points_m)
+
+    @property
+    @cached
+    def rates_across(self) -> NDArray[np.float64]:
+        """The same per unit of the coordinate across a sheet, at the samples of a line across."""
+        return self._sheet_rates(self._root_extents, self.points_m).across
+
+    @property
+    def _root_extents(self) -> NDArray[np.float64]:
         if self.root is None:
-            extents = np.zeros(len(self.surface.steps_m))
-        else:
-            extents = self.extents(self.root, most=True)
-        return self._rates(extents, self.points_m)
+            return np.zeros(len(self.surface.steps_m))
+        return self.extents(self.root, most=True)
+
+    @property
+    def strips(self) -> int:
+        """Number of curves that make the mean track."""
+        return int(self.track.strips)
+
+    def rows(self, side: Side, taps: int, density: float, *, most: bool = False) -> float:
+        """Return the number of rows of virtual channels across a sheet; 1 without one."""
+        if not self.track.is_sheet:
+            return 1.0
+        rates = np.tensordot(self.extents(side, most=most), self.rates_across, 1)
+        line = self.track.line_across(0.5)
+        cycles = np.where(line.on_track, rates, 0.0) @ _spacing(line.samples)
+        return density * _over_points(cycles, most) + taps
 
     def visible_phase_cycles(
         self, rates: NDArray[np.float64], visible: NDArray[np.bool_], *, most: bool = False
@@ -348,7 +405,7 @@ class VisibilityModel:
         All may be arrays. `taps` and `density`, virtual channels per cycle, are the aperture
         filter's. The filter extends beyond the track's ends.
         """
-        return density * phase_cycles + 1 + self.visible_track_ends * (taps / 2 - 0.5)
+        return density * phase_cycles + self.strips + self.visible_track_ends * (taps / 2 - 0.5)
 
     def phase_cycles_in_root(self, root: Side, sides: tuple[Side, ...]) -> NDArray[np.float64]:
         """Estimate the phase per row, column and metre of relief in a root, cycles [sizes, axes].
@@ -360,6 +417,17 @@ class VisibilityModel:
         rates = self._rates(extents, self.points_m[_INNER], _SEARCH_STEP)
         return self._visible_spacing(sides) @ rates.reshape(len(rates), -1).T
 
+    def phase_cycles_across_root(self, root: Side) -> NDArray[np.float64] | None:
+        """Estimate the phase across a sheet as `phase_cycles_in_root`, [axes]; None without one."""
+        if not self.track.is_sheet:
+            return None
+        extents = self.extents(root, most=True) if any(root) else self.surface.extents(root)
+        rates = self._sheet_rates(extents, self.points_m[_INNER], _SEARCH_STEP).across
+        line = self.track.line_across(0.5)
+        spacing = (line.on_track * _spacing(line.samples))[::_SEARCH_STEP]
+        weights = _spacing(line.samples[::_SEARCH_STEP]) * (spacing > 0)
+        return (rates @ weights).mean(axis=1)
+
     @cached
     def _visible_spacing(self, sides: tuple[Side, ...]) -> NDArray[np.float64]:
         """Weights of track samples at inner points, 0 where a size is invisible, [sizes, n]."""
@@ -370,6 +438,8 @@ class VisibilityModel:
     def _rates(
         self, extents: NDArray[np.float64], centres_m: NDArray[np.float64], every: int = 1
     ) -> NDArray[np.float64]:
+        if self.track.is_sheet:
+            return self._sheet_rates(extents, centres_m, every).along
         return cycles_per_extent(
             self.track,
             self.surface,
@@ -377,9 +447,26 @@ class VisibilityModel:
             extents,
             self.highest_cycles_per_m,
             self.nearest_m,
-            self.limits,
+            None if self.track.is_dense else self.limits,
             self.along,
             every,
+        )
+
+    def _sheet_rates(
+        self, extents: NDArray[np.float64], centres_m: NDArray[np.float64], every: int = 1
+    ) -> SheetRates:
+        key = "sheet rates", tuple(extents), centres_m.tobytes(), every
+        return self.from_cache(
+            key,
+            lambda: sheet_rates(
+                self.track,
+                self.surface,
+                centres_m,
+                extents,
+                self.highest_cycles_per_m,
+                self.nearest_m,
+                every,
+            ),
         )
 
 

@@ -12,6 +12,7 @@ from clsas.core.lines import RangeLines
 from clsas.simulation.scenes import PointTargets
 from clsas.simulation.simulator import simulate_lines
 from clsas.sonar.beam import BeamWindow
+from clsas.trials.dense_cases import DENSE_CASES, DenseCase
 
 _POINTS = 1000
 _DUNES_M = 8.0  # length and width of a dune
@@ -93,9 +94,12 @@ EXACT_CASES = {
 
 _BEAM = BeamWindow(20.0, "hann")
 
-FACTORIZED_CASES = {
+FFBP_2K = Case(2000, 15e-3, 120e3, 30e3, (-20.48, 20.46), (40.0, 80.0), 2048, _BEAM)
+"""Square image of 4 million pixels from as many channels as it has rows."""
+
+FACTORIZED_CASES: dict[str, Case | DenseCase] = {
     "ffbp-thesis": EXACT_CASES["bp-thesis"],
-    "ffbp-2k": Case(2000, 15e-3, 120e3, 30e3, (-20.48, 20.46), (40.0, 80.0), 2048, _BEAM),
+    "ffbp-2k": FFBP_2K,
     "ffbp-relief": Case(
         channels=2000,
         spacing_m=15e-3,
@@ -110,6 +114,7 @@ FACTORIZED_CASES = {
     ),
     # The same pixel and channel spacing, with a longer track and larger ranges.
     "ffbp-8k": Case(8192, 15e-3, 120e3, 30e3, (-40.96, 40.94), (40.0, 121.9), 4096, _BEAM),
+    **DENSE_CASES,
 }
 """Cases of factorized imaging."""
 
@@ -122,7 +127,7 @@ def scaled(size: int) -> Case:
 
     Frequencies are scaled, so that pixels and channels keep their spacing in wavelengths.
     """
-    case = FACTORIZED_CASES["ffbp-2k"]
+    case = FFBP_2K
     finer = size / case.pixels
     return replace(
         case,

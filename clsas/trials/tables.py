@@ -24,7 +24,12 @@ from clsas.opencl.device import open_device
 from clsas.products.shadows import dark_level_db
 from clsas.trials import bench, cases, wreck
 
-TOLERANCES_DB = {"ffbp-thesis": (-40.0,), "ffbp-2k": (-50.0, -30.0)}  # -50 dB for others
+TOLERANCES_DB = {
+    "ffbp-thesis": (-40.0,),
+    "ffbp-2k": (-50.0, -30.0),
+    **dict.fromkeys(cases.DENSE_CASES, (-40.0,)),
+}
+"""Tolerances of cases of factorized imaging, dB; -50 for others."""
 FITTED = 3  # exponents are fitted to this many of the largest sizes
 SHADOW_PIXELS = 1024  # along either side of the wreck's scene, 64 m x 56 m
 SHADOW_TOLERANCES_DB = (-20.0, -30.0, -40.0, -50.0, -60.0)

@@ -12,7 +12,7 @@ from clsas.exact.backprojection import backproject
 from clsas.opencl.device import Device
 from clsas.planning.factorize import factorize
 from clsas.planning.planner import plan
-from clsas.trials.cases import FACTORIZED_CASES, Case
+from clsas.trials.cases import FFBP_2K, Case
 from clsas.trials.sensitivity import Constant
 
 COLUMNS = ("constant", "set to", "exact, s", "over usual", "factorized, s", "over usual")
@@ -37,7 +37,7 @@ def constants(device: Device) -> list[Constant]:
     return [Constant(importlib.import_module(f"clsas.{room}"), name) for room, name in names]
 
 
-def changes(device: Device, case: Case = FACTORIZED_CASES["ffbp-2k"]) -> Iterator[list[str]]:
+def changes(device: Device, case: Case = FFBP_2K) -> Iterator[list[str]]:
     """Yield a row for every constant and value: the times of an exact and a factorized image.
 
     The values of a constant take turns. The columns are `COLUMNS`.

@@ -18,8 +18,8 @@ TILE = {"TILE_ROWS": 16, "TILE_COLUMNS": 16}
 BEAMS = [{"BEAM": beam, "NORMALISE": normalise} for beam, normalise in ((0, 0), (64, 0), (64, 1))]
 PIXELS = [beam | {"ALIGNED": aligned} for beam in BEAMS for aligned in (0, 1)]
 STAGES = [
-    {"SHIFTS_GIVEN": given, "RAMP": ramp, "APERTURE_TAPS": 4, "CHUNK": 16}
-    for given, ramp in ((0, 0), (1, 0), (1, 1))
+    {"SHIFTS_GIVEN": given, "RAMP": ramp, "ROWS": rows, "APERTURE_TAPS": 4, "CHUNK": 16}
+    for given, ramp, rows in ((0, 0, 0), (1, 0, 0), (1, 1, 0), (1, 0, 1), (1, 1, 1), (0, 0, 2))
 ]
 OPTIONS = {
     "backproject_tiles": [NUMBERS | TILE | options for options in PIXELS],

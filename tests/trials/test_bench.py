@@ -18,6 +18,8 @@ SMALL = cases.Case(200, 8.25e-3, 1e6, 100e3, (-0.3, 0.3), (40.0, 40.6), 128)
 def test_cases_are_sampled():
     """Channels and pixels are close enough for the beam, the grid and the band."""
     for name, case in cases.FACTORIZED_CASES.items():
+        if name in cases.DENSE_CASES:
+            continue
         wavelength_m = 1500 / case.carrier_hz
         grid = case.grid
         assert grid.shape == (case.pixels, case.pixels)
@@ -27,6 +29,21 @@ def test_cases_are_sampled():
             sine = np.sin(np.radians(case.beam.width_deg / 2))
             assert case.spacing_m < wavelength_m / (4 * sine) * 1.01, name
             assert x_m[1] - x_m[0] == pytest.approx(0.02, rel=1e-3)
+
+
+def test_dense_cases_have_the_channels_that_they_promise():
+    found = cases.DENSE_CASES
+    assert [each.channels for each in found.values()] == [54000, 54000, 16000, 4096]
+    assert found["ffbp-helix"].grid.shape == (150, 150)
+    assert found["ffbp-helix-fine"].grid.shape == (600, 600)
+    assert found["ffbp-volume"].grid.shape == (64, 128, 128)
+    helix_m = found["ffbp-helix"].track()
+    assert np.linalg.norm(helix_m[:, :2], axis=1) == pytest.approx(0.83)
+    assert (helix_m[0, 2], helix_m[-1, 2]) == pytest.approx((0.09, 0.84), abs=1e-4)
+    passes_m = found["ffbp-passes"].track().reshape(20, 800, 3)
+    ahead = passes_m[:, -1] - passes_m[:, 0]
+    assert len(np.unique(np.round(ahead / np.linalg.norm(ahead, axis=1)[:, None], 6), axis=0)) == 3
+    assert len(np.unique(passes_m[:, 0, 2])) == 4
 
 
 def test_scaled_cases_keep_what_they_look_like_in_wavelengths():

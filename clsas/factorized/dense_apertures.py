@@ -1,0 +1,225 @@
+"""Mean tracks of dense apertures: a strip for each pass, or a sheet with all channels.
+
+One curve does not follow many passes, a raster scan, a helix or a planar array. Passes apart from
+each other get a curve each. Channels close to a smooth sheet are interpolated in both of its
+dimensions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import BSpline
+
+from clsas.core.lines import RangeLines, some_channels, wavelength_m
+from clsas.factorized.aperture import mean_track
+from clsas.factorized.tracks import APART, STRIP_SAMPLES, MeanTrack
+
+Shape = Literal["track", "strips", "sheet"]
+"""Mean tracks of one curve, of several, or of a curve that moves sideways."""
+
+DENSE_SHAPES: tuple[Shape, ...] = ("strips", "sheet")
+"""Shapes of the mean tracks of dense apertures."""
+
+_JUMP = 8.0  # median steps from channel to channel, from which on another pass begins
+_LEAST_OF_STRIP = 32  # channels
+_MOST_STRIPS = 128
+_FITTED = 768  # channels to which a sheet is fitted
+_TRIED = (8, 2)  # intervals of a sheet's splines, and coefficients across it
+_REFINED = ((64, 2), (8, 3), (64, 3))  # the same, until all channels lie on the sheet
+_SHEET_CLOSE = 3e-5  # wavelengths rms: then nothing is to be aligned
+_OPEN = np.pi / 6  # of a ring's gap: then its ends are apart
+_OVERLAP = 0.08  # of a closed ring's ends
+_FLAT = 1e-6  # of the length: extents that are none
+_SCREENED = 512  # channels that tell whether one curve may serve
+_FAR_OFF = 2.0  # wavelengths rms, per axis: channels so far from a curve need several
+_CHANNELS_PER_TERM = 4
+_RIDGE = 1e-10  # of the normal equations, where no channel determines a coefficient
+
+
+def mean_track_of(lines: RangeLines, shape: Shape) -> MeanTrack | None:
+    """Return the mean track of some shape, None if channels have none such.
+
+    Equal geometry gives equal tracks: a plan holds the shape only.
+    """
+    if shape == "track":
+        return mean_track(lines)
+    return strips(lines) if shape == "strips" else sheet(lines)
+
+
+def simplest_track(lines: RangeLines) -> tuple[Shape, MeanTrack | None]:
+    """Return a mean track and its shape: one curve, unless channels are far from any."""
+    if not _follows_one_curve(lines):
+        for shape in DENSE_SHAPES:
+            track = mean_track_of(lines, shape)
+            if track is not None:
+                return shape, track
+    return "track", mean_track(lines)
+
+
+def strips(lines: RangeLines) -> MeanTrack | None:
+    """Return a track with a curve for each pass: channels follow each other without a jump.
+
+    None for a single pass, and where passes are short.
+    """
+    bare, centres_m = lines.without_samples(), lines.phase_centres_m
+    steps_m = np.linalg.norm(np.diff(centres_m, axis=0), axis=1)
+    if not steps_m.size:
+        return None
+    jumps = np.flatnonzero(steps_m > _JUMP * np.median(steps_m)) + 1
+    bounds = np.concatenate([[0], jumps, [lines.channels]])
+    if not 1 <= len(jumps) < _MOST_STRIPS or np.diff(bounds).min() < _LEAST_OF_STRIP:
+        return None
+    found = [mean_track(bare.select(slice(int(a), int(b)))) for a, b in pairwise(bounds)]
+    tracks = [track for track in found if track is not None]
+    if len(tracks) < len(found):
+        return None
+    coordinate = [APART * n + track.coordinate for n, track in enumerate(tracks)]
+    others = tuple(track.spline for track in tracks[1:])
+    return MeanTrack(tracks[0].spline, np.concatenate(coordinate), others, sampled=STRIP_SAMPLES)
+
+
+def sheet(lines: RangeLines) -> MeanTrack | None:
+    """Return the smooth sheet nearest to the phase centres, None if they lie on a line.
+
+    A plane, or a ring around the middle, is bent until it follows the channels. Every channel is
+    given the coordinates of the plane or the ring.
+    """
+    centres_m = lines.phase_centres_m
+    some = some_channels(lines.channels, _FITTED)
+    middle_m = centres_m[some].mean(axis=0)
+    some_m = centres_m[some] - middle_m
+    ranked: list[tuple[float, int, _Surface]] = []
+    for surface in _surfaces(some_m):
+        _, rms_m = _fitted(surface.coordinates(some_m), some_m, surface.closed, *_TRIED)
+        ranked.append((rms_m, len(ranked), surface))
+    if not ranked:
+        return None
+    surface = min(ranked)[2]
+    along, across = surface.coordinates(centres_m - middle_m)
+    best, best_m = None, np.inf
+    for intervals, powers in (_TRIED, *_REFINED):
+        if len(some) < _CHANNELS_PER_TERM * (intervals + 3) * powers:
+            continue
+        spline, rms_m = _fitted(
+            (along[some], across[some]), some_m, surface.closed, intervals, powers
+        )
+        if rms_m < 0.5 * best_m:
+            best, best_m = spline, rms_m
+        if best_m <= _SHEET_CLOSE * wavelength_m(lines):
+            break
+    if best is None:
+        return None
+    coefficients = best.c.copy()
+    coefficients[:, 0] += middle_m
+    return MeanTrack(BSpline(best.t, coefficients, best.k), along, across=across)
+
+
+def _follows_one_curve(lines: RangeLines) -> bool:
+    """Return whether one smooth curve may serve: False if channels are far from any.
+
+    A sample of the channels decides, so that no curve is fitted to a hundred thousand in vain.
+    """
+    some = some_channels(lines.channels, _SCREENED)
+    if len(some) == lines.channels:
+        return True
+    track = mean_track(lines.without_samples().select(some))
+    if track is None:
+        return True
+    off_m = track.offsets_m(lines.phase_centres_m[some])
+    return bool(np.sqrt(np.mean(off_m**2)) < _FAR_OFF * wavelength_m(lines))
+
+
+@dataclass(frozen=True, eq=False)
+class _Surface:
+    """A plane, or a ring around an axis, through the origin.
+
+    Attributes
+    ----------
+    axes : float64 [3, 3]
+        Of a plane, the first along it and the second across; of a ring, the last is its axis.
+    centre : (float, float) or None
+        Of the ring, along the first two axes; None for a plane.
+    start : float
+        Angle at which the ring is cut.
+    closed : bool
+        True for a whole ring: its ends meet.
+    """
+
+    axes: NDArray[np.float64]
+    centre: tuple[float, float] | None = None
+    start: float = 0.0
+    closed: bool = False
+
+    def coordinates(
+        self, offset_m: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return coordinates of channels along and across, each from 0 to 1."""
+        first, second, third = self.axes @ offset_m.T
+        if self.centre is None:
+            return _scaled(first), _scaled(second)
+        angle = np.arctan2(second - self.centre[1], first - self.centre[0])
+        turn = (angle - self.start) / (2 * np.pi) % 1.0
+        return turn if self.closed else _scaled(turn), _scaled(third)
+
+
+def _surfaces(offset_m: NDArray[np.float64]) -> Iterator[_Surface]:
+    """Yield the plane nearest to channels, and rings around two axes."""
+    axes = np.linalg.eigh(offset_m.T @ offset_m)[1].T[::-1]
+    length_m = np.ptp(offset_m @ axes.T, axis=0)
+    if length_m[1] <= _FLAT * length_m[0]:
+        return
+    yield _Surface(axes)
+    for order in ((0, 1, 2), (1, 2, 0)):
+        if length_m[order[2]] <= _FLAT * length_m[0]:
+            continue
+        # The circle of least squares: x^2 + y^2 = 2 a x + 2 b y + c.
+        turned = axes[list(order)]
+        one, other, _ = turned @ offset_m.T
+        terms = np.stack([2 * one, 2 * other, np.ones_like(one)], axis=1)
+        a, b, _ = np.linalg.lstsq(terms, one**2 + other**2, rcond=None)[0]
+        angle = np.sort(np.arctan2(other - b, one - a))
+        gaps = np.diff(angle, append=angle[0] + 2 * np.pi)
+        # The ring is cut in its widest gap.
+        widest = int(gaps.argmax())
+        closed = bool(gaps[widest] < _OPEN)
+        yield _Surface(turned, (a, b), float(angle[widest] + gaps[widest] / 2), closed)
+
+
+def _scaled(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return values moved and scaled to run from 0 to 1."""
+    return (values - values.min()) / np.ptp(values)
+
+
+def _fitted(
+    coordinates: tuple[NDArray[np.float64], NDArray[np.float64]],
+    position_m: NDArray[np.float64],
+    closed: bool,
+    intervals: int,
+    powers: int,
+) -> tuple[BSpline, float]:
+    """Return the least-squares sheet of positions [n, 3], and the rms distance from it.
+
+    Positions are cubic splines along it, and polynomials across.
+    """
+    (along, across), low, high = coordinates, 0.0, 1.0
+    if closed:  # on either side of the cut, channels of the other side guide the splines
+        low, high = -_OVERLAP, 1 + _OVERLAP
+        turned = np.concatenate([along - 1, along, along + 1])
+        near = np.flatnonzero((turned > low) & (turned < high))
+        along, across = turned[near], across[near % len(across)]
+        position_m = position_m[near % len(position_m)]
+    knots = np.concatenate([[low] * 3, np.linspace(low, high, intervals + 1), [high] * 3])
+    basis = BSpline.design_matrix(along, knots, 3).toarray()
+    terms = (basis[:, :, None] * across[:, None, None] ** np.arange(powers)).reshape(len(along), -1)
+    normal = terms.T @ terms
+    normal += _RIDGE * np.trace(normal) / len(normal) * np.eye(len(normal))
+    coefficients = np.linalg.solve(normal, terms.T @ position_m)
+    off_m = terms @ coefficients - position_m
+    rms_m = float(np.sqrt(np.mean(np.sum(off_m**2, axis=1))))
+    return BSpline(knots, coefficients.reshape(basis.shape[1], powers, 3), 3), rms_m

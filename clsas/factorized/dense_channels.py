@@ -1,0 +1,275 @@
+"""Virtual channels of dense apertures: in strips, or in the rows and columns of a sheet."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsas.factorized.aperture import SampledLines, cycles_per_extent
+from clsas.factorized.surface import Surface
+from clsas.factorized.tracks import MeanTrack
+from clsas.factorized.tree import (
+    Bands,
+    ChannelRanges,
+    Spacing,
+    VirtualChannels,
+    interpolated_channels,
+)
+from clsas.signal.interpolation import Interpolator
+
+
+def strip_channels(
+    track: MeanTrack,
+    rate: NDArray[np.float64],
+    coordinate: NDArray[np.float64],
+    aperture: Interpolator,
+) -> VirtualChannels:
+    """Return the virtual channels of all strips, one strip after another.
+
+    Parameters are those of `interpolated_channels`; coordinates ascend from strip to strip.
+    """
+    roots, before = len(coordinate), 0
+    samples, channels = (track.strip_of(each) for each in (track.samples, coordinate[0]))
+    orders, found, bounds = [], [], [0]
+    firsts, widths = [], []
+    for number, strip in enumerate(track.alone):
+        start, stop = np.searchsorted(channels, [number, number + 1])
+        apart = track.apart_of(number)
+        some = coordinate[:, start:stop] - apart
+        virtual = interpolated_channels(strip, rate[:, samples == number], some, aperture)
+        own = np.broadcast_to(np.arange(stop - start), some.shape)
+        orders.append(start + (own if virtual.order is None else virtual.order))
+        found.append((virtual.coordinate + apart, virtual.base + before, virtual.between))
+        firsts.append(before)
+        widths.append(virtual.coordinate.shape[1])
+        bounds.append(int(stop))
+        before += widths[-1]
+    place, base, between = (np.concatenate(each, axis=1) for each in zip(*found, strict=True))
+    order = np.concatenate(orders, axis=1)
+    in_order = bool((order == np.arange(order.shape[1])).all())
+    every = np.ones((roots, 1), np.int64)
+    none = 0 * every * np.array(firsts)
+    bands = Bands(every * bounds, every * firsts, every * widths, none, None)
+    positions_m = track.positions_m(place)
+    return VirtualChannels(
+        place, positions_m, None if in_order else order, base, between, aperture, bands
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class SheetChannels:
+    """Virtual channels of a sheet: rows, in each of which all columns follow each other.
+
+    Attributes
+    ----------
+    columns : float64 [roots, columns]
+        Aperture coordinates.
+    rows : float64 [roots, rows]
+        Coordinates across the sheet.
+    """
+
+    columns: NDArray[np.float64]
+    rows: NDArray[np.float64]
+
+    @property
+    def coordinate(self) -> NDArray[np.float64]:
+        """Aperture coordinates of all virtual channels, [roots, n]."""
+        roots, rows = self.rows.shape
+        return np.broadcast_to(self.columns[:, None], (roots, rows, self.columns.shape[1])).reshape(
+            roots, -1
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class SheetRates:
+    """Largest phase rates of subimages, cycles per unit of the coordinate.
+
+    Attributes
+    ----------
+    along : float64 [..., samples]
+        At the samples of a line along the sheet.
+    across : float64 [..., samples]
+        At the samples of a line across it.
+    """
+
+    along: NDArray[np.float64]
+    across: NDArray[np.float64]
+
+    def times(self, extents: NDArray[np.float64]) -> SheetRates:
+        """Return the rates [roots, samples] of subimages of some extents, [roots, axes]."""
+        return SheetRates(
+            *(np.einsum("ra,ars->rs", extents, each) for each in (self.along, self.across))
+        )
+
+
+def sheet_rates(
+    track: MeanTrack,
+    surface: Surface,
+    centres_m: NDArray[np.float64],
+    extents: NDArray[np.float64],
+    cycles_per_m: float,
+    nearest_m: float,
+    every: int = 1,
+) -> SheetRates:
+    """Return the largest phase rates of subimages within boxes, on lines along and across a sheet.
+
+    Rates are [axes, n, samples] as those of `cycles_per_extent`, which has the parameters. They are
+    the largest of some lines each.
+    """
+    lines = track.lines_along + track.lines_across
+    sampled = [[each[::every] for each in line.sampled_m] for line in lines]
+    positions_m, tangents_m = (np.concatenate(each) for each in zip(*sampled, strict=True))
+    rates = cycles_per_extent(
+        SampledLines((positions_m, tangents_m)),
+        surface,
+        centres_m,
+        extents,
+        cycles_per_m,
+        nearest_m,
+    )
+    first = len(track.lines_along) * len(sampled[0][0])
+    shape = rates.shape[:-1]
+    along, across = rates[..., :first], rates[..., first:]
+    return SheetRates(
+        along.reshape(*shape, len(track.lines_along), -1).max(axis=-2),
+        across.reshape(*shape, len(track.lines_across), -1).max(axis=-2),
+    )
+
+
+def first_on_sheet(
+    track: MeanTrack,
+    rates: SheetRates,
+    along: NDArray[np.float64],
+    across: NDArray[np.float64],
+    aperture: Interpolator,
+) -> tuple[VirtualChannels, SheetChannels]:
+    """Return virtual channels of a sheet for raw channels, at coordinates [roots, channels]."""
+    taps = aperture.taps
+    column, row, found = _grid(track, rates, along, across, aperture)
+    above = np.floor(row)
+    first_row = above.astype(np.int64) - (taps // 2 - 1)
+    # Few distinct numbers are sorted fast; channels come sorted along the sheet.
+    order = np.argsort(first_row.astype(np.int16), axis=1, kind="stable")
+    column = np.take_along_axis(column, order, axis=1)
+    first_row = np.take_along_axis(first_row, order, axis=1)
+    if ((np.diff(column) < 0) & (np.diff(first_row) == 0)).any():
+        again = np.lexsort((column, first_row))
+        order = np.take_along_axis(order, again, axis=1)
+        column = np.take_along_axis(column, again, axis=1)
+        first_row = np.take_along_axis(first_row, again, axis=1)
+    lower = np.floor(column)
+    base = lower.astype(np.int64) - (taps // 2 - 1)
+    rows, width = found.rows.shape[1], found.columns.shape[1]
+    # A band for every row that may be the first, also where there is no channel.
+    numbers = np.arange(rows - taps + 1)
+    bounds = np.stack([np.searchsorted(each, np.arange(len(numbers) + 1)) for each in first_row])
+    shape = len(bounds), len(numbers)
+    bands = Bands(
+        bounds,
+        np.broadcast_to(width * numbers, shape),
+        np.full(shape, width),
+        np.broadcast_to(np.where(numbers > 0, taps - 1, 0), shape),
+        np.take_along_axis(row - above - 0.5, order, axis=1),
+    )
+    base += width * first_row
+    return _of_sheet(track, found, order, base, column - lower - 0.5, aperture, bands), found
+
+
+def later_on_sheet(
+    track: MeanTrack, rates: SheetRates, parent: SheetChannels, aperture: Interpolator
+) -> tuple[VirtualChannels, SheetChannels]:
+    """Return virtual channels of a sheet for those of the stage before; every row is a band."""
+    taps = aperture.taps
+    column, row, found = _grid(track, rates, parent.columns, parent.rows, aperture)
+    lower, above = np.floor(column), np.floor(row)
+    base, first_row = (each.astype(np.int64) - (taps // 2 - 1) for each in (lower, above))
+    (roots, bands), channels = row.shape, column.shape[1]
+    width, shape = found.columns.shape[1], (roots, bands, channels)
+    of_bands = Bands(
+        np.broadcast_to(channels * np.arange(bands + 1), (roots, bands + 1)),
+        width * first_row,
+        np.full((roots, bands), width),
+        np.zeros((roots, bands), np.int64),
+        np.broadcast_to((row - above - 0.5)[..., None], shape).reshape(roots, -1),
+    )
+    every = base[:, None] + width * first_row[..., None]
+    between = np.broadcast_to((column - lower - 0.5)[:, None], shape).reshape(roots, -1)
+    return (
+        _of_sheet(track, found, None, every.reshape(roots, -1), between, aperture, of_bands),
+        found,
+    )
+
+
+def _grid(
+    track: MeanTrack,
+    rates: SheetRates,
+    along: NDArray[np.float64],
+    across: NDArray[np.float64],
+    aperture: Interpolator,
+) -> tuple[NDArray[np.float64], NDArray[np.float64], SheetChannels]:
+    """Return positions among columns and rows, and the coordinates of columns and rows."""
+    found = []
+    for line, rate, given in (
+        (track.line_along(0.5), rates.along, along),
+        (track.line_across(0.5), rates.across, across),
+    ):
+        spacing = Spacing.of(line, rate, aperture)
+        position, origin = spacing.positions(given)
+        count = int(position.max()) + aperture.taps // 2 + 1
+        found.append((position, spacing.coordinates(origin + np.arange(count))))
+    (column, columns), (row, rows) = found
+    return column, row, SheetChannels(columns, rows)
+
+
+def _of_sheet(
+    track: MeanTrack,
+    found: SheetChannels,
+    order: NDArray[np.int64] | None,
+    base: NDArray[np.int64],
+    between: NDArray[np.float64],
+    aperture: Interpolator,
+    bands: Bands,
+) -> VirtualChannels:
+    position_m = track.positions_on_grid_m(found.columns, found.rows)
+    position_m = position_m.reshape(len(position_m), -1, 3)
+    return VirtualChannels(found.coordinate, position_m, order, base, between, aperture, bands)
+
+
+def all_channels(
+    virtual: list[VirtualChannels], channels: int, inside: list[NDArray[np.bool_]]
+) -> list[ChannelRanges]:
+    """Return that subimages of each stage that hold a pixel need all channels.
+
+    Parameters
+    ----------
+    virtual : list of VirtualChannels
+    channels : int
+        Number of raw channels.
+    inside : list of bool [roots, subimages]
+    """
+    result = []
+    for each, needed in zip(virtual, inside, strict=True):
+        count = each.coordinate.shape[1]
+        none = np.zeros(needed.shape, np.int64)
+        result.append(ChannelRanges(none, count * needed, none, channels * needed))
+        channels = count
+    return result
+
+
+def band_table(
+    bands: Bands | None, need: ChannelRanges, first_of_parent: NDArray[np.int64]
+) -> NDArray[np.int64]:
+    """Return what the stage kernel is told of every subimage's bands, [roots, subimages, bands, 7].
+
+    See `cl/stage.cl`. `first_of_parent` is the channel of each parent's first line.
+    """
+    if bands is None:
+        none = np.zeros_like(need.first)
+        of_one = [need.begin, need.end, first_of_parent, need.first, need.last - need.first]
+        return np.stack([*of_one, none, none], axis=-1)[:, :, None]
+    begin, end = bands.bounds[:, :-1], bands.bounds[:, 1:]
+    values = [begin, end, 0 * begin, bands.first, bands.width, bands.first, bands.old]
+    needed = need.last > need.first
+    return np.stack(values, axis=-1)[:, None] * needed[..., None, None]
