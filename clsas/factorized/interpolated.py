@@ -226,40 +226,40 @@ class InterpolatedAperture:
         return nodes
 
     def predicted_channels(
-        self, view: VisiblePhases, sides: tuple[tuple[int, int], ...]
+        self, model: VisiblePhases, sides: tuple[tuple[int, int], ...]
     ) -> list[StageChannels]:
         """Predict the virtual channels of subimages, stage by stage."""
         taps, density = self.filter.taps, 2 * self.filter.upsampling
         found: list[StageChannels] = []
-        everywhere_seen, bands = np.ones_like(view.visible(sides[0])), view.strips
-        used = view.lines.channels * view.visible_share(sides[0])
+        everywhere_seen, bands = np.ones_like(model.visible(sides[0])), model.strips
+        used = model.lines.channels * model.visible_share(sides[0])
         for level, (oversampling, side) in enumerate(zip(self.oversampling, sides, strict=True)):
-            seen = view.visible(side)
+            seen = model.visible(side)
             if level:
                 before = self.oversampling[level - 1]
-                turns = before * view.subimage_phase_cycles(sides[level - 1], seen)
-                columns = view.virtual_channels(taps, density, turns)
+                turns = before * model.subimage_phase_cycles(sides[level - 1], seen)
+                columns = model.virtual_channels(taps, density, turns)
                 used = min(
-                    found[-1].count, columns * view.rows(sides[level - 1], taps, density * before)
+                    found[-1].count, columns * model.rows(sides[level - 1], taps, density * before)
                 )
-            turns = oversampling * view.subimage_phase_cycles(side, seen)
-            most_rows = view.rows(side, taps, density * oversampling, most=True)
+            turns = oversampling * model.subimage_phase_cycles(side, seen)
+            most_rows = model.rows(side, taps, density * oversampling, most=True)
             everywhere, most = (
                 most_rows
                 * (
-                    density * oversampling * view.subimage_phase_cycles(side, where, most=True)
-                    + view.strips * (taps + 2)
+                    density * oversampling * model.subimage_phase_cycles(side, where, most=True)
+                    + model.strips * (taps + 2)
                 )
                 for where in (everywhere_seen, seen)
             )
-            if view.beam is not None:
+            if model.beam is not None:
                 if level == len(sides) - 1:
-                    turns += self.beam_cycles * view.visible_phase_cycles(view.beam_rates, seen)
-                    beam_cycles = view.visible_phase_cycles(view.beam_rates, seen, most=True)
+                    turns += self.beam_cycles * model.visible_phase_cycles(model.beam_rates, seen)
+                    beam_cycles = model.visible_phase_cycles(model.beam_rates, seen, most=True)
                     most += density * self.beam_cycles * beam_cycles
                 most *= 1 + BEAM_MARGIN
-            count = view.virtual_channels(taps, density, turns)
-            count *= view.rows(side, taps, density * oversampling)
+            count = model.virtual_channels(taps, density, turns)
+            count *= model.rows(side, taps, density * oversampling)
             summed = taps**self.dimensions * used / count
             if self.dimensions == 2 and level == 0:
                 bands = math.ceil(most_rows) + 2

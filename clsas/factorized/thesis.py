@@ -99,10 +99,10 @@ class NearestBeams:
         return nodes
 
     def predicted_channels(
-        self, view: VisiblePhases, sides: tuple[tuple[int, int], ...]
+        self, model: VisiblePhases, sides: tuple[tuple[int, int], ...]
     ) -> list[StageChannels]:
         """Return the beams of a subimage, stage by stage."""
-        found, channels = [], view.lines.channels
+        found, channels = [], model.lines.channels
         for factor in self.factors:
             used, channels = channels, math.ceil(channels / factor)
             found.append(StageChannels(used, channels, factor, channels, channels))

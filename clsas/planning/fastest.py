@@ -53,14 +53,14 @@ class _Problem:
 
     Attributes
     ----------
-    view : VisibilityModel
+    model : VisibilityModel
         Without the edges of the beam, if there is one.
     conditions : Conditions
     designs : dict
         Filters designed before.
     """
 
-    view: VisibilityModel
+    model: VisibilityModel
     conditions: Conditions
     designs: dict[tuple[FilterRates, int, float], Filters] = field(default_factory=dict)
 
@@ -79,7 +79,7 @@ class _Problem:
     @property
     def beam_edges(self) -> float:
         """Error power of the edges of the beam that are left out."""
-        return 0.0 if self.view.beam is None else _EDGES_SHARE * self.allowed
+        return 0.0 if self.model.beam is None else _EDGES_SHARE * self.allowed
 
     @property
     def reserved(self) -> float:
@@ -89,10 +89,10 @@ class _Problem:
 
     def filters_db(self, reserved: float, root: tuple[int, int]) -> float | None:
         """Return what is left to filters beside roots of a size, None if next to nothing."""
-        spent = reserved + root_error(self.view, root)
+        spent = reserved + root_error(self.model, root)
         if spent >= _MOST_SPENT * self.allowed:
             return None
-        return in_db(self.allowed - spent) - margin_db(self.view)
+        return in_db(self.allowed - spent) - margin_db(self.model)
 
 
 @dataclass(frozen=True)
@@ -126,18 +126,18 @@ class _Trial:
 
 
 def fastest(
-    view: VisibilityModel, conditions: Conditions, seconds: float, choices: Allowed
+    model: VisibilityModel, conditions: Conditions, seconds: float, choices: Allowed
 ) -> tuple[Plan | None, float]:
     """Return the fastest plan within a tolerance, if it takes less than some seconds.
 
     Beside it, where there is none, the least memory of those that did not fit.
     """
-    problem = _Problem(view, conditions)
-    problem = replace(problem, view=trimmed(view, _EDGES_SHARE * problem.allowed))
-    most_root = root_limits(problem.view, _ROOTS_SHARE * problem.allowed)
+    problem = _Problem(model, conditions)
+    problem = replace(problem, model=trimmed(model, _EDGES_SHARE * problem.allowed))
+    most_root = root_limits(problem.model, _ROOTS_SHARE * problem.allowed)
     needed, trial = math.inf, None
     if most_root is not None:
-        beam_cycles = 0.0 if view.beam is None else _LEAST_BEAM_CYCLES
+        beam_cycles = 0.0 if model.beam is None else _LEAST_BEAM_CYCLES
         trial = _Trial(choices, most_root, beam_cycles, problem.reserved)
     while trial is not None:
         tree = trial.tree
@@ -159,15 +159,15 @@ def fastest(
             smaller = (rows // 2, columns) if rows > columns else (rows, columns // 2)
             trial = replace(trial, most_root=smaller, tree=None)
         else:
-            found.kept.update(track=view.track, surface=view.surface)
+            found.kept.update(track=model.track, surface=model.surface)
             return found, needed
     return None, needed
 
 
-def off_track(view: VisibilityModel, conditions: Conditions) -> bool:
+def off_track(model: VisibilityModel, conditions: Conditions) -> bool:
     """Return whether channels lie too far from the mean track for the largest roots."""
-    problem = _Problem(view, conditions)
-    return root_error(problem.view, largest_root(view)) > _ROOTS_SHARE * problem.allowed
+    problem = _Problem(model, conditions)
+    return root_error(problem.model, largest_root(model)) > _ROOTS_SHARE * problem.allowed
 
 
 def _searched(problem: _Problem, trial: _Trial) -> _Trial | None:
@@ -176,7 +176,7 @@ def _searched(problem: _Problem, trial: _Trial) -> _Trial | None:
     if filters_db is None:
         return None
     tree = search(
-        problem.view,
+        problem.model,
         filters_db,
         trial.most_root,
         trial.least_leaf_pixels,
@@ -196,15 +196,15 @@ def _filters(problem: _Problem, trial: _Trial, tree: Tree) -> Filters | None:
     filters_db = problem.filters_db(trial.reserved, tree.sides[0])
     if filters_db is None:
         return None
-    view, stages = problem.view, len(tree.sides)
-    choice = tree.filters(view.spectrum, filters_db)
+    model, stages = problem.model, len(tree.sides)
+    choice = tree.filters(model.spectrum, filters_db)
     if choice is None:
         return None
     key = choice, stages, filters_db
     if key not in problem.designs:
-        cycles_per_m, share = frequencies(view)
-        steering = steering_spectrum(cycles_per_m / view.highest_cycles_per_m, share)
-        problem.designs[key] = choice.design(view.spectrum, steering, stages, filters_db)
+        cycles_per_m, share = frequencies(model)
+        steering = steering_spectrum(cycles_per_m / model.highest_cycles_per_m, share)
+        problem.designs[key] = choice.design(model.spectrum, steering, stages, filters_db)
     return problem.designs[key]
 
 
@@ -212,8 +212,8 @@ def _estimated(
     problem: _Problem, trial: _Trial, tree: Tree, filters: Filters
 ) -> tuple[Errors, Plan]:
     """Return the errors of a candidate that its filters do not account for, and its plan."""
-    sides, roots = tree.sides, root_error(problem.view, tree.sides[0])
-    within = problem.view.within(sides[0])
+    sides, roots = tree.sides, root_error(problem.model, tree.sides[0])
+    within = problem.model.within(sides[0])
     conditions = problem.conditions
     errors = other_errors(
         within,
@@ -271,7 +271,7 @@ def _more_accurate(problem: _Problem, trial: _Trial, errors: Errors, found: Plan
     excess = [max(of_stage - share, 0.0) for of_stage in errors.spacing]
     beam_cycles = trial.beam_cycles
     if excess[-1] and beam_cycles > 0:
-        within = problem.view.within(found.sides[0])
+        within = problem.model.within(found.sides[0])
         without_beam = spacing_error(
             within, last, found.factorization.aperture.filter, trial.oversampling[-1], None
         )
@@ -289,7 +289,7 @@ def _more_accurate(problem: _Problem, trial: _Trial, errors: Errors, found: Plan
         return replace(trial, least_leaf_pixels=2 * math.prod(last), tree=None)
     if any(excess) and max(trial.oversampling) < _MOST_OVERSAMPLING:
         return replace(trial, oversampling=_denser(trial.oversampling, excess, share))
-    too_much = power(-margin_db(problem.view)) * (power(found.predicted_error_db) - allowed)
+    too_much = power(-margin_db(problem.model)) * (power(found.predicted_error_db) - allowed)
     return replace(trial, reserved=trial.reserved + _OVERSHOOT * too_much + _LEAST_STEP * allowed)
 
 

@@ -44,7 +44,7 @@ class BufferSizes:
 
     Attributes
     ----------
-    view : VisibilityModel
+    model : VisibilityModel
     width : int
         Lanes of the device.
     sides, tile
@@ -64,7 +64,7 @@ class BufferSizes:
     half_precision : bool
     """
 
-    view: VisibilityModel
+    model: VisibilityModel
     width: int
     sides: tuple[tuple[int, int], ...]
     tile: tuple[int, int]
@@ -78,17 +78,17 @@ class BufferSizes:
 
     def constant(self) -> Buffers:
         """Return the buffers that do not depend on the number of roots."""
-        lines = self.view.lines
+        lines = self.model.lines
         buffers = {"lines": lines_buffer(lines.channels, self.line_pitch, self.half_precision)}
         if self.filtered:
             buffers = upsampling_buffers(
                 lines.channels, lines.length, self.line_pitch, self.half_precision
             )
-        return buffers | beam_buffers(self.view.beam)
+        return buffers | beam_buffers(self.model.beam)
 
     def tables(self, roots: int) -> Buffers:
         """Return the tables of some roots."""
-        channels, tables = self.view.lines.channels, Buffers()
+        channels, tables = self.model.lines.channels, Buffers()
         for level, side in enumerate(self.sides):
             subimages = self._divided(side)
             tables |= stage_tables(
@@ -98,22 +98,22 @@ class BufferSizes:
                 channels,
                 ramps=True,
                 bands=self.bands[level],
-                rows=self.view.track.is_sheet,
+                rows=self.model.track.is_sheet,
             )
             channels = self.root_channels[level]
         parts, pixels = self._parts()
-        points = None if self.view.surface.is_plane else roots * pixels
-        return tables | leaf_tables(roots * channels, roots * parts, points, self.view.beam)
+        points = None if self.model.surface.is_plane else roots * pixels
+        return tables | leaf_tables(roots * channels, roots * parts, points, self.model.beam)
 
     def work(self, roots: int) -> Buffers:
         """Return the buffers in which some roots are formed together."""
-        buffers, beam = Buffers(), self.view.beam
+        buffers, beam = Buffers(), self.model.beam
         for level, side in enumerate(self.sides):
             subimages, pitch = roots * self._divided(side), self.pitches[level]
             most, half = self.most_channels[level], self.half_precision
             buffers |= stage_lines(level, subimages, most, pitch, half_precision=half)
         parts, pixels = self._parts()
-        if self.view.surface.is_plane:
+        if self.model.surface.is_plane:
             aligned = self.tile == self.sides[-1]
             buffers |= tile_buffers(roots * parts, most, beam, aligned=aligned)
             buffers["tile_centres"] = Buffer((roots * parts, 6), np.float32)
@@ -125,9 +125,9 @@ class BufferSizes:
 
     def _parts(self) -> tuple[int, int]:
         """Return the tiles or groups of a root, and its pixels, at most."""
-        if self.view.surface.is_plane:
+        if self.model.surface.is_plane:
             return self._divided(self.tile), math.prod(self.sides[0])
-        pixels = self.view.most_padded_pixels(self.sides[-1], self.sides[0], self.width)
+        pixels = self.model.most_padded_pixels(self.sides[-1], self.sides[0], self.width)
         return pixels // (STACK * self.width), pixels
 
 

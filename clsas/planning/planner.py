@@ -156,20 +156,20 @@ def plan(
     calibrated, costs = costs is not None, costs or default_costs(device)
     if memory_bytes is not None:
         memory_bytes = validate.count("memory_bytes", memory_bytes)
-    model = Model(lines, grid, beam) if full_model else simplify(lines, grid, beam, tolerance_db)
-    view = VisibilityModel(
-        model.lines, model.grid, model.beam, OUTSIDE * power(tolerance_db or 0.0)
+    scene = Model(lines, grid, beam) if full_model else simplify(lines, grid, beam, tolerance_db)
+    model = VisibilityModel(
+        scene.lines, scene.grid, scene.beam, OUTSIDE * power(tolerance_db or 0.0)
     )
     rest_db = tolerance_db
     if tolerance_db is not None:
-        view.ambiguity.warn("tolerance_db", tolerance_db)
-        rest_db = view.ambiguity.rest_db(tolerance_db, model.error)
-    found = _chosen(view, rest_db, stages, device, costs, memory_bytes, allowed)
+        model.ambiguity.warn("tolerance_db", tolerance_db)
+        rest_db = model.ambiguity.rest_db(tolerance_db, scene.error)
+    found = _chosen(model, rest_db, stages, device, costs, memory_bytes, allowed)
     errors = replace(
         found.errors,
-        line_ends=view.ambiguity.ends,
-        aliasing=view.ambiguity.aliasing,
-        left_out=model.error,
+        line_ends=model.ambiguity.ends,
+        aliasing=model.ambiguity.aliasing,
+        left_out=scene.error,
     )
     prediction = replace(
         found.prediction, error_db=errors.total_db, errors=errors, calibrated=calibrated
@@ -177,16 +177,16 @@ def plan(
     kept = found.kept
     found = replace(found, tolerance_db=tolerance_db, prediction=prediction)
     found.kept.update(kept)
-    if model.left_out:
-        found = with_left_out(found, model, lines, grid, beam)
+    if scene.left_out:
+        found = with_left_out(found, scene, lines, grid, beam)
     found.kept["lines"] = weakref.ref(lines)
     # The image need not warn again.
-    found.kept["warned"] = warn_unreached(lines, grid, beam, view.channels_along)
+    found.kept["warned"] = warn_unreached(lines, grid, beam, model.channels_along)
     return found
 
 
 def _chosen(
-    view: VisibilityModel,
+    model: VisibilityModel,
     tolerance_db: float | None,
     stages: list[tuple[int, int]] | None,
     device: Device,
@@ -195,25 +195,25 @@ def _chosen(
     allowed: Allowed | None,
 ) -> Plan:
     """Return the plan of checked arguments."""
-    beam = view.beam
-    exact = expect(view, ACCURACY_DB if tolerance_db is None else tolerance_db - MARGIN_DB, device)
+    beam = model.beam
+    exact = expect(model, ACCURACY_DB if tolerance_db is None else tolerance_db - MARGIN_DB, device)
     # Exact imaging divides itself to fit a device.
     room = device.info.memory_bytes // 2 if memory_bytes is None else memory_bytes
     exact_fits = memory_bytes is None or exact.memory_bytes <= memory_bytes
     conditions = Conditions(tolerance_db, exact, device, costs, room)
     least: float = exact.memory_bytes
     if stages:
-        if view.track is None:
+        if model.track is None:
             raise ValueError("lines must have channels at more than one place for stages")
         if beam is not None and beam.normalise:
             raise ValueError("beam must not normalise with stages; clsas.backproject does")
-        found = _nearest(view, stages, conditions)
+        found = _nearest(model, stages, conditions)
         if found.memory_bytes <= room:
             return found
         exact_fits, least = False, found.memory_bytes
     elif stages is None and _worth_a_search(exact, costs, exact_fits, allowed):
         to_beat = _WORTH * costs.seconds(exact.work) if exact_fits and allowed is None else math.inf
-        faster, needed = _fastest_of_shapes(view, conditions, to_beat, allowed or Allowed())
+        faster, needed = _fastest_of_shapes(model, conditions, to_beat, allowed or Allowed())
         if faster is not None:
             return faster
         least = min(least, needed)
@@ -222,33 +222,33 @@ def _chosen(
             f"memory_bytes must be at least {math.ceil(10 * least / 2**20) / 10:.1f} MiB for this "
             f"image, got {room / 2**20:.3g} MiB"
         )
-    return exact_plan(view, conditions)
+    return exact_plan(model, conditions)
 
 
 def _fastest_of_shapes(
-    view: VisibilityModel, conditions: Conditions, seconds: float, choices: Allowed
+    model: VisibilityModel, conditions: Conditions, seconds: float, choices: Allowed
 ) -> tuple[Plan | None, float]:
     """Return the fastest plan with a mean track of any shape: see `fastest`.
 
     Strips and sheets are tried where channels lie too far from one curve for roots as large as
     the image.
     """
-    if view.track is None or view.grid.size == 1:
+    if model.track is None or model.grid.size == 1:
         return None, math.inf
     best, least, others = None, math.inf, DENSE_SHAPES
-    if _divisible(view):
-        best, least = fastest(view, conditions, seconds, choices)
-        if view.shape == "track" and not off_track(view, conditions):
+    if _divisible(model):
+        best, least = fastest(model, conditions, seconds, choices)
+        if model.shape == "track" and not off_track(model, conditions):
             others = ()
     for shape in others:
-        if shape == view.shape:
+        if shape == model.shape:
             continue
         # Another search must pay for itself.
         to_beat = seconds if best is None else _WORTH * best.predicted_seconds
-        model = view.with_shape(shape) if to_beat > _SEARCH_S else None
-        if model is None or not _divisible(model):
+        other = model.with_shape(shape) if to_beat > _SEARCH_S else None
+        if other is None or not _divisible(other):
             continue
-        found, needed = fastest(model, conditions, to_beat - _SEARCH_S, choices)
+        found, needed = fastest(other, conditions, to_beat - _SEARCH_S, choices)
         best, least = found or best, min(least, needed)
     return best, least
 
@@ -295,23 +295,23 @@ def _worth_a_search(exact: Exact, costs: Costs, exact_fits: bool, allowed: Allow
     return not exact_fits or allowed is not None or costs.seconds(exact.work) > _SEARCH_S
 
 
-def _divisible(view: VisibilityModel) -> bool:
+def _divisible(model: VisibilityModel) -> bool:
     """Return whether an image can be factorized at all."""
-    if not sweeps_once(view):
+    if not sweeps_once(model):
         return False
-    if view.beam is None:
+    if model.beam is None:
         return True
     # Beams are not interpolated across a sheet, nor normalised over strips.
-    if view.track.is_sheet or (view.track.others and view.beam.normalise):
+    if model.track.is_sheet or (model.track.others and model.beam.normalise):
         return False
     # Normalising divides by a small sum at the beam's edge, and amplifies errors there.
-    if view.beam.normalise and coverage(view, 1).min() < _LEAST_COVERED:
+    if model.beam.normalise and coverage(model, 1).min() < _LEAST_COVERED:
         return False
     # If few pixels see a step of the beam, their error exceeds the prediction for all.
-    if view.beam.jumps and 0 < partly_visible_share(view) < _LEAST_PARTIAL:
+    if model.beam.jumps and 0 < partly_visible_share(model) < _LEAST_PARTIAL:
         return False
     # If hardly any pixel is visible there is little to gain, and errors are not predictable.
-    return float(coverage(view, 2).mean()) >= _LEAST_SHARE_COVERED
+    return float(coverage(model, 2).mean()) >= _LEAST_SHARE_COVERED
 
 
 def decibels(wavelengths: float) -> float:
@@ -325,10 +325,10 @@ def wavelengths(decibels: float) -> float:
 
 
 def _nearest(
-    view: VisibilityModel, stages: Sequence[tuple[int, int]], conditions: Conditions
+    model: VisibilityModel, stages: Sequence[tuple[int, int]], conditions: Conditions
 ) -> Plan:
     """Return the plan of THESIS chapter 4: nearest beams, linear interpolation in range."""
-    rows, columns = view.grid.shape
+    rows, columns = model.grid.shape
     division = math.prod(divisions for _, divisions in stages)
     # Whole work-items: 16 rows by 4 columns.
     leaf = 16 * math.ceil(rows / division / 16), 4 * math.ceil(columns / division / 4)
@@ -336,16 +336,16 @@ def _nearest(
     for _, divisions in reversed(stages):
         sides.append(leaf)
         leaf = leaf[0] * divisions, leaf[1] * divisions
-    linear = interpolation.design(2, NEAREST_UPSAMPLING, view.spectrum)
+    linear = interpolation.design(2, NEAREST_UPSAMPLING, model.spectrum)
     candidate = Candidate(
         sides=tuple(sides[::-1]),
-        tile=_tile(view, sides[0], conditions.device),
+        tile=_tile(model, sides[0], conditions.device),
         align=linear,
         final=linear,
         aperture=NearestBeams(factors=tuple(beams for beams, _ in stages)),
     )
-    error, by_stage = nearest_errors(view, stages)
-    found = predicted_plan(view, candidate, ErrorBudget(nearest_beams=error), conditions)
+    error, by_stage = nearest_errors(model, stages)
+    found = predicted_plan(model, candidate, ErrorBudget(nearest_beams=error), conditions)
     *divided, last = found.stages
     divided = [
         replace(stage, error_db=in_db(power(stage.error_db) + of_beams))
@@ -354,7 +354,7 @@ def _nearest(
     return replace(found, prediction=replace(found.prediction, stages=(*divided, last)))
 
 
-def _tile(view: VisibilityModel, leaf: tuple[int, int], device: Device) -> tuple[int, int]:
+def _tile(model: VisibilityModel, leaf: tuple[int, int], device: Device) -> tuple[int, int]:
     """Return the largest tiles of a leaf that may be expanded about their centres."""
     parts = [
         (rows, columns)
@@ -362,7 +362,7 @@ def _tile(view: VisibilityModel, leaf: tuple[int, int], device: Device) -> tuple
         for columns in range(4, min(leaf[1], 64) + 1, 4)
         if leaf[0] % rows == 0 and leaf[1] % columns == 0
     ]
-    fit = [part for part in parts if leaf_error(view, np.array([part]), device)[0] < 1e-8]
+    fit = [part for part in parts if leaf_error(model, np.array([part]), device)[0] < 1e-8]
     return max(fit or parts[:1], key=math.prod)
 
 

@@ -113,13 +113,13 @@ class _Lines:
 
 
 def predicted_plan(
-    view: VisibilityModel, candidate: Candidate, other_errors: ErrorBudget, conditions: Conditions
+    model: VisibilityModel, candidate: Candidate, other_errors: ErrorBudget, conditions: Conditions
 ) -> Plan:
     """Return the plan of a candidate, with its predicted error, time and memory.
 
     Parameters
     ----------
-    view : VisibilityModel
+    model : VisibilityModel
         That within the candidate's roots, where the aperture is interpolated.
     candidate : Candidate
     other_errors : ErrorBudget
@@ -127,16 +127,16 @@ def predicted_plan(
     conditions : Conditions
     """
     sides, device, costs = candidate.sides, conditions.device, conditions.costs
-    lines = _upsampled(view, candidate, other_errors)
-    if view.track is not None and view.track.is_dense:
-        lines = _trimmed(view, candidate, lines)
-    half_lengths = view.half_lengths(sides, candidate.align, candidate.final, lines.resampling)
-    channels = candidate.aperture.predicted_channels(view, sides)
+    lines = _upsampled(model, candidate, other_errors)
+    if model.track is not None and model.track.is_dense:
+        lines = _trimmed(model, candidate, lines)
+    half_lengths = model.half_lengths(sides, candidate.align, candidate.final, lines.resampling)
+    channels = candidate.aperture.predicted_channels(model, sides)
     levels = [Level.of(half, device.info.width) for half in half_lengths]
-    stages, work = _stages(view, candidate, lines, levels, channels, device, costs)
-    errors, half_precision = _with_arithmetic(view, candidate, lines, channels, conditions)
+    stages, work = _stages(model, candidate, lines, levels, channels, device, costs)
+    errors, half_precision = _with_arithmetic(model, candidate, lines, channels, conditions)
     sizes = BufferSizes(
-        view=view,
+        model=model,
         width=device.info.width,
         sides=sides,
         tile=candidate.tile,
@@ -163,39 +163,39 @@ def predicted_plan(
         half_precision=half_precision,
         half_lengths=half_lengths,
         most_channels=sizes.most_channels,
-        highest_cycles_per_m=view.highest_cycles_per_m,
-        closest_m=view.nearest_m,
-        limits=view.limits,
+        highest_cycles_per_m=model.highest_cycles_per_m,
+        closest_m=model.nearest_m,
+        limits=model.limits,
         roots_at_once=batches.at_once,
         roots_prepared=batches.prepared,
     )
-    return _plan(view, image, conditions, batches.memory_bytes, stages, work, errors)
+    return _plan(model, image, conditions, batches.memory_bytes, stages, work, errors)
 
 
-def exact_plan(view: VisibilityModel, conditions: Conditions) -> Plan:
+def exact_plan(model: VisibilityModel, conditions: Conditions) -> Plan:
     """Return the plan of the exact image."""
     exact = conditions.exact
     image = ExactImage(accuracy_db=exact.accuracy_db)
     errors = ErrorBudget(exact=power(exact.accuracy_db))
-    plan = _plan(view, image, conditions, exact.memory_bytes, [], exact.work, errors)
+    plan = _plan(model, image, conditions, exact.memory_bytes, [], exact.work, errors)
     return replace(plan, prediction=replace(plan.prediction, error_db=exact.accuracy_db))
 
 
-def margin_db(view: VisibilityModel) -> float:
+def margin_db(model: VisibilityModel) -> float:
     """Return the margin of predicted errors, dB, which covers the scatter of measured ones.
 
     Errors scatter more if few channels see a pixel: they depend on the positions of these between
     virtual channels, and relative to a step of the beam. They also scatter more if the lines'
     power lies at few frequencies.
     """
-    channels = view.lines.channels * view.visible_share((16, 16))
-    few = _FEW_CHANNELS[view.beam is not None and view.beam.jumps]
-    return MARGIN_DB + in_db(view.spectrum.scatter * (1 + few / max(channels, 1.0)))
+    channels = model.lines.channels * model.visible_share((16, 16))
+    few = _FEW_CHANNELS[model.beam is not None and model.beam.jumps]
+    return MARGIN_DB + in_db(model.spectrum.scatter * (1 + few / max(channels, 1.0)))
 
 
-def band_of(view: VisibilityModel, outside: float) -> tuple[float, float]:
+def band_of(model: VisibilityModel, outside: float) -> tuple[float, float]:
     """Return the centre and half width of the band that holds all but a share of the power."""
-    spectrum = view.spectrum
+    spectrum = model.spectrum
     bins = np.searchsorted(np.cumsum(spectrum.share), 1 - outside)
     return spectrum.centre, float(min((bins + 1) / (2 * len(spectrum.power)), 0.5))
 
@@ -209,7 +209,7 @@ def half_precision_error(stages: int) -> float:
 
 
 def _plan(
-    view: VisibilityModel,
+    model: VisibilityModel,
     image: Factorization | ExactImage,
     conditions: Conditions,
     memory_bytes: int,
@@ -233,19 +233,19 @@ def _plan(
         tolerance_db=conditions.tolerance_db,
         image=image,
         prediction=prediction,
-        beam=view.beam,
-        lines_digest=view.from_cache("lines", lambda: lines_digest(view.lines)),
-        grid_digest=view.from_cache("grid", lambda: grid_digest(view.grid)),
+        beam=model.beam,
+        lines_digest=model.from_cache("lines", lambda: lines_digest(model.lines)),
+        grid_digest=model.from_cache("grid", lambda: grid_digest(model.grid)),
     )
 
 
-def _upsampled(view: VisibilityModel, candidate: Candidate, other_errors: ErrorBudget) -> _Lines:
+def _upsampled(model: VisibilityModel, candidate: Candidate, other_errors: ErrorBudget) -> _Lines:
     """Return how lines are upsampled, and the errors of all filters.
 
     A gain that makes up for the range filters' attenuation leaves only their scatter.
     """
     align, final, aperture = candidate.align, candidate.final, candidate.aperture
-    stages, samples = len(candidate.sides), view.lines.length
+    stages, samples = len(candidate.sides), model.lines.length
     step = max(int(PHASES / align.upsampling), 1)
     gain = aperture.lines_gain(align, final, PHASES / step)
     align_db = align.error_db if gain is None else align.scatter_db
@@ -257,23 +257,23 @@ def _upsampled(view: VisibilityModel, candidate: Candidate, other_errors: ErrorB
     )
     if gain is not None:
         most_db = in_db(UPSAMPLING_SHARE * errors.total)
-        upsampler = interpolation.upsampler(view.spectrum, step, gain, most_db)
+        upsampler = interpolation.upsampler(model.spectrum, step, gain, most_db)
         if upsampler is not None:
-            resampling = upsampler.resampling(samples, align.taps // 2, view.spectrum)
+            resampling = upsampler.resampling(samples, align.taps // 2, model.spectrum)
             errors = replace(errors, upsampling=power(upsampler.error_db))
             return _Lines(upsampler, resampling, align_db, errors)
-    resampling = interpolation.resampling(samples, align, view.spectrum)
+    resampling = interpolation.resampling(samples, align, model.spectrum)
     return _Lines(None, resampling, align_db, errors)
 
 
-def _trimmed(view: VisibilityModel, candidate: Candidate, lines: _Lines) -> _Lines:
+def _trimmed(model: VisibilityModel, candidate: Candidate, lines: _Lines) -> _Lines:
     """Return upsampled lines without the samples that no pixel needs.
 
     Dense apertures have so many channels that upsampling whole lines takes most of the time.
     """
     resampling = lines.resampling
-    low_m, high_m = range_window_m(view, candidate.sides[0])
-    step_m = view.lines.range_step_m
+    low_m, high_m = range_window_m(model, candidate.sides[0])
+    step_m = model.lines.range_step_m
     spare = len(candidate.sides) * (candidate.align.taps // 2 + 1) + candidate.final.taps + 2
     first, last = (
         math.floor((each_m / step_m + resampling.lead) * resampling.ratio) - resampling.first
@@ -289,7 +289,7 @@ def _trimmed(view: VisibilityModel, candidate: Candidate, lines: _Lines) -> _Lin
 
 
 def _stages(
-    view: VisibilityModel,
+    model: VisibilityModel,
     candidate: Candidate,
     lines: _Lines,
     levels: Sequence[Level],
@@ -312,15 +312,15 @@ def _stages(
         stages.append(Stage(rows, columns, count, samples=samples, seconds=seconds, **figures))
 
     for level, (side, of_stage) in enumerate(zip(candidate.sides, channels, strict=True)):
-        count = view.subimages(side)
+        count = model.subimages(side)
         samples = levels[level].length
         combined = count * of_stage.used
         work = combining(combined, samples, taps, given=level == 0) + Work(subimage=count)
         if dimensions == 2:
             work += adding_in_rows(count * of_stage.count, levels[level].pitch, aperture.taps)
         if level == 0:
-            upsampled = view.lines.channels * lines.resampling.length
-            work += Work(reference=count * references(view))
+            upsampled = model.lines.channels * lines.resampling.length
+            work += Work(reference=count * references(model))
             work += upsampling(upsampled, filtered=lines.upsampler is not None)
         add(
             side,
@@ -331,8 +331,8 @@ def _stages(
             operations=combined * samples,
             error_db=error_db,
         )
-    pixels, backprojected = view.padded_pixels(side, width), count * of_stage.count
-    tiled, weighted = view.surface.is_plane, view.beam is not None
+    pixels, backprojected = model.padded_pixels(side, width), count * of_stage.count
+    tiled, weighted = model.surface.is_plane, model.beam is not None
     taps = candidate.final.taps
     work = backprojecting_leaves(backprojected, pixels, taps, tiled=tiled, weighted=weighted)
     if not tiled:
@@ -350,7 +350,7 @@ def _stages(
 
 
 def _with_arithmetic(
-    view: VisibilityModel,
+    model: VisibilityModel,
     candidate: Candidate,
     lines: _Lines,
     channels: Sequence[StageChannels],
@@ -363,31 +363,31 @@ def _with_arithmetic(
     errors = replace(errors, phases=phases.error(phases.terms_within(tolerance_db)) ** 2)
     if lines.upsampler is None or not conditions.device.info.half_precision:
         return errors, False
-    if _looked_up_singly(view, candidate, lines, conditions.device):
+    if _looked_up_singly(model, candidate, lines, conditions.device):
         return errors, False
     # Each row of a sheet is read and written for about twice as many bands as it has taps.
     bands = 2 * candidate.aperture.filter.taps if candidate.aperture.dimensions == 2 else 0
-    rounding = _half_rounding(view, [stage.summed for stage in channels], bands)
+    rounding = _half_rounding(model, [stage.summed for stage in channels], bands)
     if rounding > _ROUNDING_SHARE * power(tolerance_db):
         return errors, False
     return replace(errors, half_precision=rounding), True
 
 
 def _looked_up_singly(
-    view: VisibilityModel, candidate: Candidate, lines: _Lines, device: Device
+    model: VisibilityModel, candidate: Candidate, lines: _Lines, device: Device
 ) -> bool:
     """Return whether leaves of points are too thick to look samples up in a register.
 
     CPUs convert single samples of half precision ten times slower than whole registers.
     """
-    if view.grid.points_m is None or device.info.width == 1:
+    if model.grid.points_m is None or device.info.width == 1:
         return False
     room = lookup_room(candidate.final.taps, device.info.width)
-    thickness_m = float(view.surface.relief_m(candidate.sides[-1]).max())
-    return thickness_m / 2 * lines.resampling.samples_per_m(view.lines) > room
+    thickness_m = float(model.surface.relief_m(candidate.sides[-1]).max())
+    return thickness_m / 2 * lines.resampling.samples_per_m(model.lines) > room
 
 
-def _half_rounding(view: VisibilityModel, summed: Sequence[float], bands: int) -> float:
+def _half_rounding(model: VisibilityModel, summed: Sequence[float], bands: int) -> float:
     """Return the error power of rounding lines to half precision.
 
     `summed` is the number of channels that a virtual one sums, stage by stage, and `bands` that of
@@ -396,7 +396,7 @@ def _half_rounding(view: VisibilityModel, summed: Sequence[float], bands: int) -
     grows, which counts as half. A sum of very many chunks loses what is added last.
     """
     chunks = np.array(summed) / CHUNK
-    chunks[0] *= peak_density(view)
+    chunks[0] *= peak_density(model)
     if chunks.max() > _MOST_CHUNKS:
         return np.inf
     return HALF_ROUNDING * (1 + float(np.sum(1 + (chunks + bands) / 2)))
