@@ -90,7 +90,7 @@ def _groups(found: Contributions) -> list[NDArray[np.int64]]:
     these apart.
     """
     unknowns = len(found.gradient)
-    power = np.abs(found.values[..., 0]) ** 2
+    power = np.square(np.abs(found.values[..., 0]), dtype=np.float64)
     total = np.maximum(power.sum(axis=0), 1e-300)
     direction = np.einsum("ucp,cp->up", found.gradient, power) / total
     direction -= direction.mean(axis=1, keepdims=True)

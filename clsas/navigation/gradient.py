@@ -34,7 +34,7 @@ def phase_gradient_m(
     width = min(smoothed_m / max(spacing_m, 1e-12) / 2, passage.pings)
     smooth = gaussian_filter1d(values, width, axis=0, mode="constant")
     product = smooth[1:] * smooth[:-1].conj()
-    weights = np.abs(product)
+    weights = np.abs(product).astype(np.float64)  # of which 1e-300 is no zero
     product = (product / np.maximum(weights, 1e-300)).astype(np.complex64)
     turns = (turns[:, 1:] + turns[:, :-1]) / 2
     slope = np.angle(np.sum(weights * product, axis=0))
@@ -103,7 +103,7 @@ def sharpest_m(
                 moved_m[axis, some], turned[some] = best_m, mine
     mean = total / pings
     noise = np.mean(np.abs(turned - mean) ** 2, axis=1)
-    information = 2 * np.einsum("apk,k->ap", turns**2, np.abs(mean) ** 2)
+    information = 2 * np.einsum("apk,k->ap", turns**2, np.abs(mean) ** 2).astype(np.float64)
     variance = np.sum(noise / np.maximum(information, 1e-300), axis=0)
     return np.einsum("pau,ap->up", directions, moved_m), np.sqrt(variance)
 

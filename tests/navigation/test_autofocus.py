@@ -181,6 +181,18 @@ def test_lines_that_hold_their_carrier_still_are_focused_alike():
     assert smooth_residual_m(found, sway_m) <= WAVELENGTH_M / 100
 
 
+@pytest.mark.slow
+def test_pings_that_receive_nothing_are_left_where_they_are():
+    true, told = recorded(points(), smooth_m(2 * WAVELENGTH_M))
+    silent = np.arange(PINGS) < 50
+    samples = np.where(silent[:, None], 0, told.samples)
+    found = autofocus(replace(told, samples=samples), GRID)
+    heard = replace(true, samples=samples)
+    assert found.focused
+    assert abs(peak_db(found.lines, heard)) <= 0.3
+    assert np.isfinite(found.correction_m).all()
+
+
 def test_bad_arguments():
     _, told = recorded(points(), np.zeros(PINGS))
     with pytest.raises(ValueError, match="at least 10 pings"):
