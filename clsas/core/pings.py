@@ -22,7 +22,7 @@ STILL = 0.1
 """Share of the usual advance within which a platform counts as standing still."""
 _LEAST_HALT = 5  # pings; noisy positions bring two or three together without any halt
 _DISORDER = 0.03  # share of pings that turn back, above which steps tell nothing of halts and gaps
-_UNEVEN = 0.25  # of the median step, the median deviation above which steps are uneven
+_UNEVEN = 0.25  # interquartile range of steps over their median, above which they are uneven
 _LOCAL = 11  # steps whose mean is the local course
 _USUAL_QUANTILE = 0.95  # of steps: leaves out up to 5 % of gaps, and holds with 95 % standing still
 
@@ -157,10 +157,10 @@ def _more_even(centres_m: NDArray[np.float64], rx_m: NDArray[np.float64]) -> NDA
 
 
 def _unevenness(places_m: NDArray[np.float64]) -> float:
-    """Return the median deviation of steps from the median one, relative to it."""
+    """Return the interquartile range of steps over their median."""
     steps_m = _steps_m(places_m)
-    usual_m = float(np.median(steps_m)) if steps_m.size else 0.0
-    return float(np.median(np.abs(steps_m - usual_m))) / usual_m if usual_m else math.inf
+    low_m, usual_m, high_m = np.quantile(steps_m, (0.25, 0.5, 0.75)) if steps_m.size else (0, 0, 0)
+    return float(high_m - low_m) / float(usual_m) if usual_m else math.inf
 
 
 def _steps_m(places_m: NDArray[np.float64]) -> NDArray[np.float64]:

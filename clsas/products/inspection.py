@@ -31,6 +31,7 @@ from clsas.sonar.beam import BeamWindow
 from clsas.sonar.sampling import Finding
 
 _FARTHEST_M = 1e12
+_SLOWEST_M_S = 1.0  # of sound in km/s, a slip that is to be shown
 
 
 def inspect(
@@ -122,7 +123,9 @@ def inspect(
 
 def _check_numbers(lines: RangeLines) -> None:
     """Raise ValueError for numbers that no recording has, or that float64 cannot subtract."""
-    validate.number("sound_speed_m_s", lines.sound_speed_m_s, "m/s", most=validate.MOST_M_S)
+    validate.number(
+        "sound_speed_m_s", lines.sound_speed_m_s, "m/s", least=_SLOWEST_M_S, most=validate.MOST_M_S
+    )
     validate.number("carrier_hz", lines.carrier_hz, "Hz", most=validate.MOST_HZ)
     least_m = lines.sound_speed_m_s / (2 * validate.MOST_HZ)
     validate.number("range_step_m", lines.range_step_m, "m", least=least_m)

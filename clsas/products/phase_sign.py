@@ -23,9 +23,9 @@ from clsas.sonar.sampling import Finding
 
 CLEAR = 1.5
 """Ratio of sharpness above which the sign is told: seeds of speckle differ by 1.1."""
-_SHARP = 4.0
+_SHARP = 6.0
 """Sharpness along the track above which a patch is in focus. Speckle has 2. The wrong sign leaves
-at most 2.5, also where the arcs of several targets cross, and the right one up to 80."""
+2.5 at most where the arcs of several targets cross, and 4 on a noisy track; the right one 80."""
 _SPOTS = 5  # judged, and all in focus must agree
 _PRODUCT = 100.0  # length of the aperture over the resolution that it gives; wrong signs blur by it
 _LEAST_PRODUCT = 8.0  # below this both signs look alike
@@ -35,7 +35,7 @@ _MOST_BEND = 0.25
 a circle about the scene ranges do not bend at all, and both signs look alike."""
 _PIXELS = 256  # along a side, at most
 _CELLS = 24.0  # range resolution cells of a patch
-_SEARCHED_CHANNELS = 256  # whose energy is searched for bright places
+_SEARCHED_CHANNELS = 128  # whose energy is searched for bright places
 _GRID_POINTS = 24  # of a grid, along either side, at which the search begins
 _FINER = 4  # times finer is every further step of the search
 _ACCURACY_DB = -40.0
@@ -87,7 +87,7 @@ def phase_sign(
         Why the sign is not told; "" if it is.
     """
     if not lines.samples.any():
-        return None, "the lines are silent"
+        return None, "nothing is left to image: lines are silent, or alike in all pings"
     if not lines.carrier_hz:
         return None, (
             "the lines still have their carrier: conjugate lines give the conjugate image, which "
@@ -95,7 +95,7 @@ def phase_sign(
         )
     spots = _brightest_beside(lines, cell_m) if grid is None else _brightest_of(lines, grid, cell_m)
     if not spots:
-        return None, "no line reaches the grid" if grid is not None else "no range is positive"
+        return None, "no echoes come from the grid" if grid is not None else "no range is positive"
     judged, reason = [], ""
     for spot in spots:
         try:
@@ -151,7 +151,8 @@ def _judged(
             for each in (part, conjugate)
         ]
     x, y, z = spot.place_m.tolist()
-    return PhaseSign(*map(_sharpness_along, images), centre_m=(x, y, z))
+    as_given, of_conjugate = (_sharpness_along(image) for image in images)
+    return PhaseSign(as_given, of_conjugate, centre_m=(x, y, z))
 
 
 def _sharpness_along(image: Image) -> float:
@@ -287,8 +288,7 @@ def _patch(
     near = np.flatnonzero(np.linalg.norm(centres_m - middle_m, axis=1) <= wanted_m / 2)
     if len(near) < _LEAST_CHANNELS:
         raise _NotToldError(
-            f"{len(near)} channels lie within {wanted_m:.3g} m of the track, fewer than "
-            f"{_LEAST_CHANNELS}"
+            f"channels on {wanted_m:.3g} m of the track: {len(near)}, fewer than {_LEAST_CHANNELS}"
         )
     part = lines.select(near[some_channels(len(near), _MOST_CHANNELS)])
     # Sums of very large samples would overflow float32.
@@ -304,7 +304,7 @@ def _patch(
             f"{range_m:.4g} m"
         )
     if not spot.known and _bend_m(part, along) > _MOST_BEND * length_m**2 / (8 * range_m):
-        raise _NotToldError("the track bends, so that a grid is needed")
+        raise _NotToldError("the track is not straight, so that a grid is needed")
     # Two pixels per resolution cell; the patch is as long as a wrong sign blurs a point.
     pitch_m = wavelength_m * range_m / (2 * length_m) / 2
     columns = min(math.ceil(1.2 * length_m / pitch_m), _PIXELS)

@@ -16,8 +16,9 @@ _UNSEEN = 0.01  # share of pixels beyond all lines, above which it is reported
 _POINTS = 16  # of the grid sampled along either side
 _FARTHEST = 1e4
 """First range over the length of a line, above which a unit is wrong; satellites have 100."""
-_LEAST_COVERED = 0.5  # share of the grid inside the lines with which a slip explains the rest
-_MORE_COVERED = 2.0  # times as much of the grid as without the slip
+_SLIPPED = 0.25  # share of the grid beyond the lines, from which a slip is looked for
+_EXPLAINED = 0.5  # of what lies beyond the lines, at least, by a slip
+_LONGEST = 30.0  # lines over the farthest range of a grid; longer ones reach any grid
 _ALIKE = 0.05  # share of the grid by which slips may differ and explain it equally well
 
 
@@ -50,9 +51,9 @@ def check_ranges(lines: RangeLines, grid: Grid | None) -> list[Finding]:
     )
     remedy = "choose another grid, or check the time of the first sample and the sound speed"
     low_m, high_m = grid.bounds_m
-    if near_m < float(np.linalg.norm(high_m - low_m)) / _POINTS:
+    if near_m <= float(np.linalg.norm(high_m - low_m)) / _POINTS:
         remedy = "choose another grid: the track leads through this one"
-    elif slip := _slip(lines, grid, share):
+    elif 1 - share > _SLIPPED and (slip := _slip(lines, grid, share)):
         remedy = f"the grid would lie within the lines if {slip}: check units"
     return [Finding("grid_outside", words, 1 - share, _UNSEEN, remedy)]
 
@@ -109,10 +110,15 @@ def _slip(lines: RangeLines, grid: Grid, share: float) -> str:
     Of those that explain it equally well it is one that leaves the lines shorter, then the
     commonest: long lines reach any grid.
     """
-    slips = _slips(lines.range_step_m, lines.sound_speed_m_s)
+    most_m = _LONGEST * float(_ranges_m(lines, grid).max())
+    slips = [
+        slip
+        for slip in _slips(lines.range_step_m, lines.sound_speed_m_s)
+        if slip.step * lines.range_step_m * lines.length <= most_m
+    ]
     shares = {slip: slip.covered(lines, grid) for slip in slips}
-    most = max(shares.values())
-    if most < max(_LEAST_COVERED, _MORE_COVERED * share):
+    most = max(shares.values(), default=0.0)
+    if most < share + _EXPLAINED * (1 - share):
         return ""
     return min((slip for slip in slips if shares[slip] >= most - _ALIKE), key=_step_of).words
 
