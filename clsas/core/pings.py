@@ -23,7 +23,7 @@ STILL = 0.1
 _LEAST_HALT = 5  # pings; noisy positions bring two or three together without any halt
 _DISORDER = 0.03  # share of pings that turn back, above which steps tell nothing of halts and gaps
 _UNEVEN = 0.25  # interquartile range of steps over their median, above which they are uneven
-_LOCAL = 11  # steps whose mean is the local course
+_LOCAL = 11  # steps averaged for the local course
 _USUAL_QUANTILE = 0.95  # of steps: leaves out up to 5 % of gaps, and holds with 95 % standing still
 
 
@@ -127,7 +127,7 @@ class Transmissions:
 
     @property
     def disordered(self) -> bool:
-        """Whether so many transmissions turn back that steps tell nothing of gaps."""
+        """True if more than 3 % of the transmissions turn back; steps then tell nothing of gaps."""
         return self.turns.size > _DISORDER * self.count
 
     def channels(self, some: NDArray[np.bool_]) -> NDArray[np.int64]:

@@ -74,17 +74,12 @@ def inspect(
 
     Notes
     -----
-    Findings, by name:
+    "Look before you image" in the guide to recordings lists the names of findings, what each means,
+    and its limit.
 
-    - "order", "still_pings", "gaps", "advance", "aperture": of the track.
-    - "dead_channels": 20 dB fainter than the median channel, or without signal.
-    - "clipped_channels": 8 or more equal samples at the largest level, and hardly one below it.
-    - "offset": a constant of the recorder. "background": what all pings have in common.
-    - "ends": lines that do not fade towards their ends.
-    - "oversampling": a band that fills all that is sampled. "band": one beyond its carrier.
-    - "along_track_spacing": see `check_sampling`.
-    - "grid_outside", "range_offset": slips of time or units.
-    - "phase_sign": the conjugate lines give a sharper image.
+    Pings taken standing still are found first and left out: a halt of hundreds of equal pings
+    would hide the rest. Dead and clipped channels are told from what was recorded, ranges from
+    the lines as given; band, offset, background, ends, spacing and phase from the moving pings.
 
     Samples that are NaN or infinite never get here: `RangeLines` and `load` refuse them, and say
     how many there are and where the first one is.

@@ -35,9 +35,9 @@ _MOST_BEND = 0.25
 a circle about the scene ranges do not bend at all, and both signs look alike."""
 _PIXELS = 256  # along a side, at most
 _CELLS = 24.0  # range resolution cells of a patch
-_SEARCHED_CHANNELS = 128  # whose energy is searched for bright places
-_GRID_POINTS = 24  # of a grid, along either side, at which the search begins
-_FINER = 4  # times finer is every further step of the search
+_SEARCHED_CHANNELS = 128  # searched for bright places, spread evenly
+_GRID_POINTS = 24  # along either side of a grid, at which the search begins
+_FINER = 4  # refinement of the search per step
 _ACCURACY_DB = -40.0
 
 
@@ -47,9 +47,9 @@ class _NotToldError(Exception):
 
 @dataclass(frozen=True, eq=False)
 class _Spot:
-    """A place with strong echoes, and the channel in the middle of those that receive them.
+    """A place with strong echoes, and the channel at which half of their energy has arrived.
 
-    It is `known` on a grid. Without one only its range is, and its side is assumed.
+    It is `known` on a grid. Without a grid its range is known, and its direction is assumed.
     """
 
     place_m: NDArray[np.float64]
@@ -248,7 +248,7 @@ class _Energy:
         return found
 
     def spot(self, place_m: NDArray[np.float64], pitch_m: float) -> _Spot:
-        """Return a place with the channel at the middle of what is received from there."""
+        """Return a place with the channel at which half of its energy has arrived."""
         held = np.cumsum(self.around(place_m[None], pitch_m)[0])
         middle = int(np.searchsorted(held, held[-1] / 2))
         return _Spot(place_m, int(self.some[middle]), known=True)

@@ -36,7 +36,7 @@ _LEAST_PINGS = 4 * _BESIDE
 _EQUAL_RANGE = 1e-3  # steps by which first ranges of pings may differ
 ENDS_DB = -20.0
 """Power at an end relative to whole lines above which it is reported."""
-_BLOCK = 1 << 22  # samples looked at together
+_BLOCK = 1 << 22  # samples processed at a time
 
 
 @dataclass(frozen=True, eq=False)

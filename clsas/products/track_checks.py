@@ -16,7 +16,7 @@ from clsas.sonar.sampling import Finding, check_sampling
 GAP = 1.75
 """Advance over that of the pings around it, above which pings are missing: one missing is 2."""
 _SCATTER = 5.0  # standard deviations of steps that a gap exceeds, too: positions are noisy
-_AROUND = 31  # steps whose median is the usual advance about a place
+_AROUND = 31  # steps in the running median, the usual advance near a ping
 _MOST_WAVELENGTHS = 500.0
 """Advance of a channel above which a unit is wrong. A satellite's radar has about 120: its antenna
 is as long. Positions in millimetres make 1000 times the advance."""
@@ -110,7 +110,7 @@ def _check_gaps(pings: Transmissions) -> list[Finding]:
         Finding(
             "gaps",
             f"{gaps.size} gap{several} in the track, after ping{several} {runs(numbers[gaps])}: "
-            f"the widest is {steps_m[widest]:.4g} m, more than {limits_m[widest]:.4g} m",
+            f"the widest is {steps_m[widest]:.4g} m, more than the {limits_m[widest]:.4g} m expected",
             float(steps_m[widest]),
             float(limits_m[widest]),
             "targets beside a gap blur and get grating lobes: image the parts one by one, or "

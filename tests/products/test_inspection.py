@@ -1,7 +1,9 @@
 """Inspections of recordings: a clean one, and one for every defect planted in it."""
 
 import json
+import re
 from dataclasses import replace
+from pathlib import Path
 
 import h5py
 import numpy as np
@@ -513,6 +515,16 @@ def test_arguments_of_another_kind(lines):
     ):
         with pytest.raises((TypeError, ValueError), match=words):
             clsas.inspect(**({"lines": lines} | wrong))
+
+
+def test_the_guide_lists_every_finding():
+    root = Path(__file__).parents[2]
+    files = [*(root / "clsas" / "products").glob("*.py"), root / "clsas/sonar/sampling.py"]
+    made = {name for file in files for name in re.findall(r'Finding\(\s*"(\w+)"', file.read_text())}
+    table = (
+        (root / "docs/how-to/recordings.md").read_text().split("| finding |")[1].split("\n\n")[0]
+    )
+    assert set(re.findall(r"^\| `(\w+)`", table, re.M)) == made - {"ping_rate"}  # of surveys
 
 
 def test_runs_of_indices():
