@@ -23,9 +23,9 @@ from clsas.sonar.sampling import Finding
 
 CLEAR = 1.5
 """Ratio of sharpness above which the sign is told: seeds of speckle differ by 1.1."""
-_SHARP = 6.0
-"""Sharpness along the track above which a patch is in focus. Speckle has 2. The wrong sign leaves
-2.5 at most where the arcs of several targets cross, and 4 on a noisy track; the right one 80."""
+_SHARP = 10.0
+"""Sharpness along the track above which a patch is in focus: 80 for a point, 2 for speckle. Where
+arcs of several targets cross, or on a noisy track, either sign has up to 7."""
 _SPOTS = 5  # judged, and all in focus must agree
 _PRODUCT = 100.0  # length of the aperture over the resolution that it gives; wrong signs blur by it
 _LEAST_PRODUCT = 8.0  # below this both signs look alike

@@ -110,7 +110,7 @@ def _check_gaps(pings: Transmissions) -> list[Finding]:
         Finding(
             "gaps",
             f"{gaps.size} gap{several} in the track, after ping{several} {runs(numbers[gaps])}: "
-            f"the widest is {steps_m[widest]:.4g} m, more than the {limits_m[widest]:.4g} m expected",
+            f"the widest is {steps_m[widest]:.4g} m, over {limits_m[widest]:.4g} m",
             float(steps_m[widest]),
             float(limits_m[widest]),
             "targets beside a gap blur and get grating lobes: image the parts one by one, or "
@@ -162,7 +162,8 @@ def check_spacing(
     """Return a spacing beyond the limits of sampling, on the longest leg between gaps."""
     if grid is None and beam is None and element_length_m is None:
         return []
-    gaps = _gaps(pings.places_m)[0] if pings.count > 2 else np.zeros(0, np.int64)
+    judged = pings.count > 2 and not pings.disordered
+    gaps = _gaps(pings.places_m)[0] if judged else np.zeros(0, np.int64)
     edges = [0, *(gaps + 1).tolist(), pings.count]
     longest = int(np.argmax(np.diff(edges)))
     leg = slice(int(pings.starts[edges[longest]]), int(pings.starts[edges[longest + 1]]))

@@ -238,6 +238,10 @@ def test_pings_out_of_order(lines):
 def test_shuffled_pings_are_out_of_order_and_nothing_else(lines):
     shuffled = lines.select(np.random.default_rng(0).permutation(PINGS))
     assert names(clsas.inspect(shuffled)) == ["order"]
+    assert names(clsas.inspect(shuffled.select(slice(None, None, 2)), beam=BEAM)) == [
+        "order",
+        "along_track_spacing",
+    ]
     assert shuffled.without_still_pings() is shuffled
 
 
