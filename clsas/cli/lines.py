@@ -16,7 +16,7 @@ from clsas.cli.inputs import load, read_levels, read_scene, warn_of_sampling
 from clsas.cli.outputs import progress_bar, report
 from clsas.cli.parameters import HDF5, INPUT, Output
 from clsas.core import validate
-from clsas.core.conditioning import STATISTICS
+from clsas.core.conditioning import STATISTICS, high_passed
 from clsas.files.cphd_writing import SUFFIXES as CPHD
 from clsas.files.formats import SUFFIXES
 from clsas.signal.compression import check_options
@@ -161,7 +161,7 @@ def convert(
     if without_background is not None:
         steps.append(lambda lines: lines.without_background(without_background))
     if high_pass_hz is not None:
-        steps.append(lambda lines: lines.high_passed(high_pass_hz))
+        steps.append(partial(high_passed, cutoff_hz=high_pass_hz, name="--high-pass-hz"))
     if taper_m is not None:
         steps.append(lambda lines: lines.tapered_ends(taper_m))
     if steps or output.suffix.lower() in CPHD:

@@ -19,16 +19,25 @@ _EQUAL_RANGE = 1e-3  # steps by which first ranges of pings may differ: an error
 STATISTICS = ("mean", "median")
 
 
-def high_passed(lines: RangeLines, cutoff_hz: float) -> RangeLines:
-    """Remove frequencies below a cutoff; see `RangeLines.high_passed`."""
+def high_passed(lines: RangeLines, cutoff_hz: float, name: str = "cutoff_hz") -> RangeLines:
+    """Remove frequencies below a cutoff; see `RangeLines.high_passed`.
+
+    Messages call the cutoff by `name`.
+    """
     from clsas.core.fourier import EDGE_PRODUCT, smooth_edge  # imports finufft, which is slow
 
     rate = lines.sound_speed_m_s / (2 * lines.range_step_m)
     lowest = max(0.0, lines.carrier_hz - rate / 2)
-    cutoff = validate.number("cutoff_hz", cutoff_hz, "Hz", above=lowest, below=lowest + rate)
+    cutoff = validate.positive(name, cutoff_hz, "Hz")
+    if cutoff <= lowest:
+        raise ValueError(
+            f"{name} must be finite and > {lowest:g} and < {lowest + rate:g} Hz, got {cutoff:g}: "
+            f"lines on a carrier of {lines.carrier_hz:g} Hz hold nothing below {lowest:g} Hz"
+        )
+    validate.number(name, cutoff, "Hz", above=lowest, below=lowest + rate)
     if cutoff * lines.length < rate:
         raise ValueError(
-            f"cutoff_hz must be at least one cycle per line, {rate / lines.length:g} Hz, "
+            f"{name} must be at least one cycle per line, {rate / lines.length:g} Hz, "
             f"got {cutoff:g} Hz"
         )
     # The edge lies between half the cutoff and the cutoff, and above the band's lowest frequency.

@@ -136,15 +136,16 @@ class RangeLines:
 
     @property
     def ping_starts(self) -> NDArray[np.int64]:
-        """First channel of every ping; consecutive channels with one tx position are a ping."""
+        """First channel of every ping; consecutive channels with one tx position are a ping.
+
+        Pings at one place count as one; `clsas.core.pings.Transmissions` tells them apart.
+        """
         return np.flatnonzero(np.append(True, (np.diff(self.tx_m, axis=0) != 0).any(axis=1)))
 
     @property
     def ping_centres_m(self) -> NDArray[np.float64]:
         """Mean phase centre of every ping, metres, shape [pings, 3]."""
-        starts = self.ping_starts
-        counts = np.diff(np.append(starts, self.channels))
-        return np.add.reduceat(self.phase_centres_m, starts, axis=0) / counts[:, None]
+        return pings.means(self.phase_centres_m, self.ping_starts)
 
     @property
     def wavenumber_rad_m(self) -> float:
@@ -265,7 +266,9 @@ class RangeLines:
         ----------
         least_advance_m : float, optional
             Distance from the last ping that stays, below which a ping is dropped, metres. By
-            default a tenth of the usual advance: the median over the pings that move.
+            default a tenth of the usual advance: the median over the pings that move. Then only
+            halts of five pings or more count, and pings that repeat the place of the one before:
+            noisy positions bring single pings together.
 
         Raises
         ------

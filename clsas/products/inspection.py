@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +14,7 @@ from clsas.core.pings import Transmissions
 from clsas.opencl.device import Device
 from clsas.products.inspection_result import Inspection, PhaseSign
 from clsas.products.phase_sign import check_sign, phase_sign
+from clsas.products.range_checks import check_ranges
 from clsas.products.recording_checks import (
     Levels,
     check_background,
@@ -23,7 +23,7 @@ from clsas.products.recording_checks import (
     check_levels,
     check_offset,
 )
-from clsas.products.track_checks import check_ranges, check_spacing, check_track
+from clsas.products.track_checks import check_spacing, check_track
 from clsas.signal.compression import compress
 from clsas.signal.echoes import Echoes
 from clsas.signal.spectrum import Spectrum, cycles_per_m_at, measure_spectrum
@@ -31,6 +31,7 @@ from clsas.sonar.beam import BeamWindow
 from clsas.sonar.sampling import Finding
 
 _FARTHEST_M = 1e12
+_SLOWEST_M_S = 1.0  # of sound in km/s, a slip that is to be shown
 
 
 def inspect(
@@ -73,17 +74,12 @@ def inspect(
 
     Notes
     -----
-    Findings, by name:
+    "Look before you image" in the guide to recordings lists the names of findings, what each means,
+    and its limit.
 
-    - "dead_channels": 20 dB fainter than the median channel, or without signal.
-    - "clipped_channels": 8 or more samples at the largest level, and hardly one just below it.
-    - "offset": a constant of the recorder. "background": what all pings have in common.
-    - "ends": lines that do not fade towards their ends.
-    - "oversampling": a band that fills all that is sampled. "band": one beyond its carrier.
-    - "still_pings", "gaps", "order", "advance": of the track.
-    - "along_track_spacing": see `check_sampling`.
-    - "grid_outside", "range_offset": slips of time or units.
-    - "phase_sign": the conjugate lines give a sharper image.
+    Pings taken standing still are found first and left out: a halt of hundreds of equal pings
+    would hide the rest. Dead and clipped channels are told from what was recorded, ranges from
+    the lines as given; band, offset, background, ends, spacing and phase from the moving pings.
 
     Samples that are NaN or infinite never get here: `RangeLines` and `load` refuse them, and say
     how many there are and where the first one is.
@@ -95,33 +91,39 @@ def inspect(
         validate.instance("beam", beam, BeamWindow)
     if element_length_m is not None:
         element_length_m = validate.positive("element_length_m", element_length_m, "m")
-    recorded = lines.samples
-    is_echoes = isinstance(lines, Echoes)
-    if isinstance(lines, Echoes):
-        lines = compress(lines)
-    _check_distances(lines)
-    pings = Transmissions.of(lines)
+    # Compression would spread clipped samples over a line: levels are those of what was recorded.
+    recorded, is_echoes = lines.samples, isinstance(lines, Echoes)
+    given = compress(lines) if isinstance(lines, Echoes) else lines
+    _check_numbers(given)
+    # A halt weighs as much as all of a track: everything but levels and ranges is that of the
+    # moving pings.
+    pings = Transmissions.of(given)
+    moving = _Moving.of(given, pings)
     alike = None if np.ptp(pings.receivers) else int(pings.receivers[0])
-    found = check_levels(Levels.of(recorded, magnitudes=not is_echoes), alike)
-    found += check_track(pings, float(lines.last_range_m.max()))
-    moving = lines.without_still_pings() if pings.usual_step_m else lines
-    spectrum = measure_spectrum(moving)
-    band = _Band.of(moving, spectrum)
-    sign = None
-    if moving.samples.any():
-        background = check_background(moving, Transmissions.of(moving))
-        found += check_offset(moving) + background + check_ends(moving)
-        found += check_band(moving, spectrum, band.ends_hz)
-        clean = moving.without_background("median", receivers=alike) if background else moving
-        sign = phase_sign(clean, grid, band.wavelength_m, band.cell_m, device)
-    limits: dict[str, Any] = {"beam": beam, "element_length_m": element_length_m}
-    found += check_spacing(moving, grid, wavelength_m=band.wavelength_m, **limits)
-    found += check_ranges(lines, grid) + check_sign(sign)
-    return _inspection(lines, pings, band, sign, found)
+    found = check_track(pings, moving.wavelength_m, float(given.last_range_m.max()))
+    found += check_levels(Levels.of(recorded, magnitudes=not is_echoes), alike)
+    found += _check_samples(moving)
+    found += check_spacing(
+        moving.lines, moving.pings, grid, beam=beam, element_length_m=element_length_m,
+        wavelength_m=moving.wavelength_m,
+    )  # fmt: skip
+    found += check_ranges(given, grid)
+    # A background is as bright in every ping, and would be taken for the brightest echoes.
+    clean = moving.lines
+    if any(finding.name == "background" for finding in found):
+        clean = clean.without_background("median", receivers=alike)
+    sign, reason = phase_sign(clean, grid, moving.wavelength_m, moving.cell_m, device)
+    return _inspection(given, pings, moving, (sign, reason), found + check_sign(sign, reason))
 
 
-def _check_distances(lines: RangeLines) -> None:
-    """Raise ValueError for positions and ranges whose squares or differences float64 loses."""
+def _check_numbers(lines: RangeLines) -> None:
+    """Raise ValueError for numbers that no recording has, or that float64 cannot subtract."""
+    validate.number(
+        "sound_speed_m_s", lines.sound_speed_m_s, "m/s", least=_SLOWEST_M_S, most=validate.MOST_M_S
+    )
+    validate.number("carrier_hz", lines.carrier_hz, "Hz", most=validate.MOST_HZ)
+    least_m = lines.sound_speed_m_s / (2 * validate.MOST_HZ)
+    validate.number("range_step_m", lines.range_step_m, "m", least=least_m)
     for name in ("first_range_m", "tx_m", "rx_m"):
         farthest_m = float(np.abs(getattr(lines, name)).max())
         validate.number(f"the largest of {name}", farthest_m, "m", most=_FARTHEST_M)
@@ -130,33 +132,52 @@ def _check_distances(lines: RangeLines) -> None:
 
 
 @dataclass(frozen=True)
-class _Band:
-    """The occupied band, as measured."""
+class _Moving:
+    """Lines of the pings that move, and their occupied band."""
 
-    ends_hz: tuple[float, float]
-    oversampling: float
+    lines: RangeLines
+    pings: Transmissions
+    spectrum: Spectrum
+    band_hz: tuple[float, float]
     wavelength_m: float
     cell_m: float
 
     @classmethod
-    def of(cls, lines: RangeLines, spectrum: Spectrum) -> _Band:
+    def of(cls, lines: RangeLines, pings: Transmissions) -> _Moving:
+        """Drop pings taken standing still, unless all were, and measure the band."""
+        advancing = pings.advancing()
+        if pings.usual_step_m and not advancing.all():
+            lines = lines.select(pings.channels(advancing))
+            pings = Transmissions.of(lines)
+        spectrum = measure_spectrum(lines)
         rate_hz = lines.sound_speed_m_s / (2 * lines.range_step_m)
         middle_hz = lines.carrier_hz + spectrum.centre * rate_hz
         oversampling = max(spectrum.oversampling, 1.0)
         half_hz = rate_hz / oversampling / 2
         return cls(
-            ends_hz=(middle_hz - half_hz, middle_hz + half_hz),
-            oversampling=spectrum.oversampling,
+            lines,
+            pings,
+            spectrum,
+            band_hz=(middle_hz - half_hz, middle_hz + half_hz),
             wavelength_m=2 / max(abs(cycles_per_m_at(lines, spectrum.centre)), 1e-30),
             cell_m=lines.range_step_m * oversampling,
         )
 
 
+def _check_samples(moving: _Moving) -> list[Finding]:
+    """Return what is wrong with samples, unless all of them are zero."""
+    lines = moving.lines
+    if not lines.samples.any():
+        return []
+    found = check_offset(lines) + check_background(lines, moving.pings) + check_ends(lines)
+    return found + check_band(lines, moving.spectrum, moving.band_hz)
+
+
 def _inspection(
     lines: RangeLines,
     pings: Transmissions,
-    band: _Band,
-    sign: PhaseSign | None,
+    moving: _Moving,
+    told: tuple[PhaseSign | None, str],
     found: list[Finding],
 ) -> Inspection:
     receivers, depths_m = pings.receivers, lines.phase_centres_m[:, 2]
@@ -178,14 +199,15 @@ def _inspection(
         depths_m=_span(depths_m),
         speed_m_s=speed_m_s,
         carrier_hz=lines.carrier_hz,
-        band_hz=band.ends_hz,
-        oversampling=band.oversampling,
-        wavelength_m=band.wavelength_m,
+        band_hz=moving.band_hz,
+        oversampling=moving.spectrum.oversampling,
+        wavelength_m=moving.wavelength_m,
         length=lines.length,
         range_step_m=lines.range_step_m,
         first_range_m=_span(lines.first_range_m),
         last_range_m=_span(lines.last_range_m),
-        sign=sign,
+        sign=told[0],
+        sign_not_told=told[1],
         findings=tuple(found),
     )
 

@@ -24,7 +24,8 @@ class PhaseSign:
     Attributes
     ----------
     as_given, conjugate : float
-        Mean squared intensity over the squared mean: 2 for speckle, the more the sharper.
+        Mean squared intensity along the track over the squared mean: 2 for speckle and for blurred
+        points, the more the sharper.
     centre_m : tuple of three floats
         Middle of the patch.
     """
@@ -76,7 +77,9 @@ class Inspection:
     first_range_m, last_range_m : tuple of float
         Least and largest range of the first and of the last samples.
     sign : PhaseSign or None
-        Patch imaged both ways; None if the track is too short, or bends and no grid was given.
+        Sharpest patch imaged both ways; None if none could be imaged.
+    sign_not_told : str
+        Why the sign of the phase is not told; "" if it is.
     findings : tuple of Finding
         What is wrong, each with its number and what to do.
     """
@@ -99,6 +102,7 @@ class Inspection:
     first_range_m: tuple[float, float]
     last_range_m: tuple[float, float]
     sign: PhaseSign | None
+    sign_not_told: str
     findings: tuple[Finding, ...]
 
     def __repr__(self) -> str:
@@ -199,11 +203,11 @@ class Inspection:
 
     def _sign(self) -> str:
         if self.sign is None:
-            return "not told: the track is too short, or bends so that a grid is needed"
+            return f"not told: {self.sign_not_told}"
         both = f"sharpness {self.sign.as_given:.3g}, of the conjugate {self.sign.conjugate:.3g}"
-        if "phase_sign" in self:
-            return f"opposite, {both}"
-        return f"as it should be, {both}" if self.sign.ratio < 1 / 1.5 else f"not clear, {both}"
+        if self.sign_not_told:
+            return f"not clear, {both}: {self.sign_not_told}"
+        return f"opposite, {both}" if self.sign.ratio > 1 else f"as it should be, {both}"
 
 
 def runs(indices: Iterable[int]) -> str:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal.windows import hann
 
-from clsas.core.decibels import in_db
+from clsas.core import decibels
 from clsas.core.lines import RangeLines, some_channels
 from clsas.core.pings import Transmissions
 from clsas.products.inspection_result import runs
@@ -20,7 +20,10 @@ from clsas.sonar.sampling import Finding
 DEAD_DB = -20.0
 """Power of a channel relative to the median one below which it counts as dead. At -10 dB channels
 at the ends of a track, where targets leave the beam, would count too."""
-_SAME_LEVEL = 1e-3  # of the largest level: samples within this are equal but for rounding
+_SILENT_DB = -300.0  # stands for no signal
+_SAME_LEVEL = 1e-5
+"""Of the largest level: samples within this are equal but for rounding. Within 1e-3 the beats of
+overlapping chirps have a dozen samples."""
 _LEAST_CLIPPED = 8  # samples at the largest level; echoes have one, or two
 _CLIPPED_OVER_NEXT = 5.0  # times as many samples as at the next lower level: peaks have 1 to 3
 _SPIKE = 2.0  # of power at a constant's frequency over the largest beside it; speckle has 1.2
@@ -33,7 +36,7 @@ _LEAST_PINGS = 4 * _BESIDE
 _EQUAL_RANGE = 1e-3  # steps by which first ranges of pings may differ
 ENDS_DB = -20.0
 """Power at an end relative to whole lines above which it is reported."""
-_BLOCK = 1 << 22  # samples looked at together
+_BLOCK = 1 << 22  # samples processed at a time
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,9 +69,9 @@ class Levels:
             power.append(scaled.var(axis=1, dtype=np.complex128 if scaled.dtype.kind == "c" else
                                     np.float64))  # fmt: skip
             parts = np.maximum(np.abs(scaled.real), np.abs(scaled.imag))
-            found = _at_ceiling(parts)
+            found = _clipped_samples(parts)
             if magnitudes:
-                found = np.maximum(found, _at_ceiling(np.abs(scaled)))
+                found = np.maximum(found, _clipped_samples(np.abs(scaled)))
             clipped.append(found)
         return cls(np.concatenate(power).real, np.concatenate(clipped))
 
@@ -79,7 +82,7 @@ def _blocks(samples: NDArray) -> Iterator[NDArray]:
         yield samples[first : first + rows]
 
 
-def _at_ceiling(level: NDArray[np.float32]) -> NDArray[np.int64]:
+def _clipped_samples(level: NDArray[np.float32]) -> NDArray[np.int64]:
     """Return how many samples of a channel lie at its largest level, 0 if that is no ceiling."""
     largest = level.max(axis=1, keepdims=True)
     at_top = level >= (1 - _SAME_LEVEL) * largest
@@ -99,15 +102,27 @@ def check_levels(levels: Levels, receivers: int | None) -> list[Finding]:
     found = []
     alive = levels.power[levels.power > 0]
     usual = float(np.median(alive)) if alive.size else 0.0
-    dead = levels.power <= usual * 10 ** (DEAD_DB / 10)
-    if dead.any():
-        least_db = in_db(float(levels.power.min()) / usual) if usual else -300.0
-        least = f"{least_db:.0f} dB" if least_db > -290 else "no signal"
+    dead = levels.power <= usual * decibels.power(DEAD_DB)
+    if dead.all():
+        found.append(
+            Finding(
+                "dead_channels",
+                f"all {dead.size} channels hold no signal",
+                _SILENT_DB,
+                DEAD_DB,
+                "check the recorder and how its samples were read",
+                tuple(range(dead.size)),
+            )
+        )
+    elif dead.any():
+        least = float(levels.power.min())
+        least_db = decibels.in_db(least / usual) if least else _SILENT_DB
+        faintest = f"{least_db:.0f} dB" if least else "no signal"
         found.append(
             Finding(
                 "dead_channels",
                 f"{dead.sum()} of {dead.size} channels hold no signal, or {-DEAD_DB:.0f} dB less "
-                f"than the median channel and below (the faintest: {least})"
+                f"than the median channel and below (the faintest: {faintest})"
                 f"{_by_receiver(dead, receivers)}",
                 least_db,
                 DEAD_DB,
@@ -154,7 +169,7 @@ def check_offset(lines: RangeLines) -> list[Finding]:
         places["0 Hz of the recorded signal"] = -lines.carrier_hz / rate_hz
     for name, frequency in places.items():
         share = _constant_share(part.samples.T, frequency)
-        if share > 10 ** (OFFSET_DB / 10):
+        if share > decibels.power(OFFSET_DB):
             recorded = frequency or not lines.carrier_hz
             least_hz = 4 * rate_hz / lines.length
             remedy = (
@@ -163,7 +178,7 @@ def check_offset(lines: RangeLines) -> list[Finding]:
                 else "subtract each channel's mean before compression; where pings have it in "
                 "common, lines.without_background()"
             )
-            found_db = in_db(share)
+            found_db = decibels.in_db(share)
             return [
                 Finding(
                     "offset",
@@ -189,15 +204,15 @@ def check_background(lines: RangeLines, pings: Transmissions) -> list[Finding]:
     samples = lines.samples.reshape(*shape, lines.length)
     some = some_channels(shape[1], 8)
     share = float(np.mean([_constant_share(samples[:, receiver], 0.0) for receiver in some]))
-    if share <= 10 ** (OFFSET_DB / 10):
+    if share <= decibels.power(OFFSET_DB):
         return []
-    found_db = in_db(share)
+    found_db = decibels.in_db(share)
     return [
         Finding(
             "background",
-            f"all pings have {found_db:.1f} dB of their power in common, more than "
-            f"{OFFSET_DB:.0f} dB: direct arrivals, ringing, an offset, or a reflector at constant "
-            "range",
+            f"all pings have {100 * share:.3g} % of their power in common, more than "
+            f"{100 * decibels.power(OFFSET_DB):.2g} %: direct arrivals, ringing, an offset, or a "
+            "reflector at constant range",
             found_db,
             OFFSET_DB,
             'lines.without_background("median")',
@@ -231,7 +246,7 @@ def _constant_share(samples: NDArray, frequency: float) -> float:
 
 def check_ends(lines: RangeLines) -> list[Finding]:
     """Return ends of lines that do not fade."""
-    found_db = in_db(max(end_powers(lines)))
+    found_db = decibels.in_db(max(end_powers(lines)))
     if found_db <= ENDS_DB:
         return []
     extent_m = (lines.length - 1) * lines.range_step_m

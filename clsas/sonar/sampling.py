@@ -93,11 +93,20 @@ def check_sampling(
         come without a wavelength.
     """
     if isinstance(sonar, RangeLines):
+        if track is not None and grid is not None:
+            raise TypeError(
+                "track must be left out with range lines, which have their own: "
+                f"check_sampling(lines, grid); got {type(track).__name__}"
+            )
         grid, track = track if grid is None else grid, None  # type: ignore[assignment]
         if grid is None and beam is None and element_length_m is None:
             raise ValueError("one of grid, beam and element_length_m must be given with lines")
     else:
-        validate.instance("sonar", sonar, Sonar)
+        if not isinstance(sonar, Sonar):
+            raise TypeError(
+                f"sonar must be of type Sonar, got {type(sonar).__name__}; RangeLines may stand in "
+                "its place: check_sampling(lines, grid)"
+            )
         validate.instance("track", track, Track)
         validate.instance("grid", grid, Grid)
     corners = None

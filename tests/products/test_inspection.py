@@ -1,7 +1,9 @@
 """Inspections of recordings: a clean one, and one for every defect planted in it."""
 
 import json
+import re
 from dataclasses import replace
+from pathlib import Path
 
 import h5py
 import numpy as np
@@ -149,6 +151,14 @@ def test_echoes_are_clipped_where_their_parts_are(echoes):
     assert found["clipped_channels"].where == (7,)
 
 
+def test_beats_of_overlapping_chirps_are_not_clipped():
+    """A dozen scattered peaks lie within a thousandth of each other, but are not equal."""
+    level = np.tile(np.linspace(0.1, 0.9, 4000, dtype=np.complex64), (2, 1))
+    level[:, ::300] = 1 - 5e-5 * np.arange(14)
+    level[1, ::300] = 1
+    np.testing.assert_array_equal(Levels.of(level, magnitudes=False).clipped > 0, [False, True])
+
+
 def test_quantised_samples_are_not_clipped():
     rng = np.random.default_rng(0)
     weak = np.rint(1.2 * rng.standard_normal((3, 4000))).astype(np.float32)
@@ -225,6 +235,36 @@ def test_pings_out_of_order(lines):
     assert "sort the pings by time" in found["order"].remedy
 
 
+def test_shuffled_pings_are_out_of_order_and_nothing_else(lines):
+    shuffled = lines.select(np.random.default_rng(0).permutation(PINGS))
+    assert names(clsas.inspect(shuffled)) == ["order"]
+    assert names(clsas.inspect(shuffled.select(slice(None, None, 2)), beam=BEAM)) == [
+        "order",
+        "along_track_spacing",
+    ]
+    assert shuffled.without_still_pings() is shuffled
+
+
+def test_noisy_positions_are_no_halts_and_no_gaps(lines):
+    for jitter_m, wanted in ((0.01, ["order"]), (0.002, [])):
+        noise_m = np.random.default_rng(0).normal(0, jitter_m, (PINGS, 3))
+        noisy = moved(lines, lambda position_m, noise_m=noise_m: position_m + noise_m)
+        assert names(clsas.inspect(noisy)) == wanted
+        assert noisy.without_still_pings() is noisy
+
+
+def test_transmitters_that_alternate_fore_and_aft():
+    """The receivers advance evenly, while phase centres jump to and fro."""
+    platform_m = 0.1 * np.arange(60)
+    tx_x = platform_m + np.where(np.arange(60) % 2, 0.3, -0.3)
+    rx_x = (platform_m[:, None] + 0.05 * np.arange(8)).ravel()
+    tx_m, rx_m = (np.stack([x, 0 * x, 0 * x], axis=1) for x in (np.repeat(tx_x, 8), rx_x))
+    array = clsas.RangeLines(noise(480, 400), 16.0, 0.0125, tx_m, rx_m, 100e3, 1500.0)
+    found = clsas.inspect(array)
+    assert not {"gaps", "order", "still_pings"} & set(names(found))
+    assert found.advance_m == pytest.approx(0.1)
+
+
 def test_positions_that_are_missing(lines):
     found = clsas.inspect(moved(lines, np.zeros_like))
     assert "all 200 pings were taken at one place" in found["still_pings"].message
@@ -274,6 +314,28 @@ def test_slips_of_the_first_range_are_named(lines, words):
     assert words in found["grid_outside"].remedy
 
 
+def test_a_first_range_in_seconds_is_named(lines):
+    in_seconds = replace(lines, first_range_m=lines.first_range_m / 750)
+    remedy = clsas.inspect(in_seconds, GRID)["grid_outside"].remedy
+    assert "a time in seconds, were half the sound speed times it" in remedy
+
+
+def test_a_grid_on_the_track_is_no_slip(lines):
+    on_track = clsas.Grid.plane((1.0, 3.0, 21), (-1.0, 1.0, 21))
+    remedy = clsas.inspect(lines, on_track)["grid_outside"].remedy
+    assert remedy == "choose another grid: the track leads through this one"
+
+
+def test_positions_in_millimetres_by_their_advance(lines):
+    slipped = moved(lines, lambda position_m: 1000 * (position_m + [0.012, 0, 0]))
+    finding = clsas.inspect(slipped)["advance"]
+    assert "500 wavelengths" in finding.message
+    assert "millimetres" in finding.remedy
+    partly = clsas.inspect(slipped, clsas.Grid.plane((-8.0, 2.0, 50), (18.0, 20.5, 50)))
+    assert 0 < partly["grid_outside"].value < 1
+    assert "positions, now in millimetres" in partly["grid_outside"].remedy
+
+
 @pytest.mark.parametrize(
     ("scale", "words"), [(1000, "millimetres were metres"), (1e-3, "kilometres were metres")]
 )
@@ -317,6 +379,70 @@ def test_a_phase_of_the_opposite_sign(lines, grid, platform):
     assert "opposite" in found.describe()
 
 
+@pytest.fixture(scope="module")
+def five_points():
+    """Ten pings of 64 receivers at 1 MHz, and the echoes of five points: the demo's scene."""
+    place_m = np.stack([np.arange(640) * 8.25e-3 - 2.636, np.zeros(640), np.zeros(640)], axis=1)
+    targets = [(0, 42.5, 1), (-1.5, 41, 1), (1.5, 41, 0.5), (1.5, 44, 1), (-1.5, 44, 0.5)]
+    first_m, step_m, range_step = 39.9, 0.006, np.arange(930)
+    samples = np.zeros((640, 930), complex)
+    for x, y, amplitude in targets:
+        range_m = np.linalg.norm(place_m - [x, y, 0], axis=1)[:, None]
+        delay = (first_m + step_m * range_step - range_m) / 0.0075
+        window = np.where(np.abs(delay) < 8, np.cos(np.pi * delay / 16) ** 2, 0)
+        samples += amplitude * np.sinc(delay) * window * np.exp(-4j * np.pi * 1e6 / 1500 * range_m)
+    return clsas.RangeLines(samples, first_m, step_m, place_m, place_m, 1e6, 1500.0)
+
+
+CROSSINGS = [
+    ((-2, 2, 401), (42, 45, 301)),
+    ((-0.5, 1.93, 64), (42.3, 45.44, 64)),
+    ((-2.34, 2.17, 64), (41.75, 44.89, 64)),
+    ((0.1, 1.41, 64), (40.77, 44.63, 64)),
+    ((-1.1, 1.07, 64), (41.38, 45.3, 64)),
+    ((-3.44, 0.6, 64), (41.28, 43.94, 64)),
+]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("sides", CROSSINGS)
+def test_crossing_arcs_of_points_do_not_turn_the_sign(five_points, sides):
+    """Their energy adds up where nothing is, and neither sign is in focus there."""
+    grid = clsas.Grid.plane(*sides)
+    found = clsas.inspect(five_points, grid)
+    assert "phase_sign" not in found
+    assert "as it should be" in found.describe()
+    assert found.sign.as_given > 20
+    conjugate = clsas.inspect(replace(five_points, samples=five_points.samples.conj()), grid)
+    assert "phase_sign" in conjugate
+
+
+def test_the_reason_why_a_sign_is_not_told_is_the_true_one(lines):
+    beyond = clsas.Grid.plane((1.0, 3.0, 50), (100.0, 104.0, 50))
+    angle = np.linspace(0, 2 * np.pi, PINGS)
+    circle = 19.0 * np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
+    for changed, grid, words in (
+        (with_samples(lines, lambda samples: samples.fill(0)), None, "lines are silent"),
+        (lines, beyond, "no echoes come from the grid"),
+        (replace(lines, carrier_hz=0.0), GRID, "the lines still have their carrier"),
+        (lines.select(slice(0, 5)), GRID, "5, fewer than 16"),
+        (moved(lines, lambda _: circle + [2, 19.2, 0]), GRID, "channels on"),
+    ):
+        found = clsas.inspect(changed, grid)
+        assert found.sign is None
+        assert words in found.sign_not_told
+        assert words in found.describe()
+
+
+def test_errors_of_imaging_are_not_hidden(lines, monkeypatch):
+    def broken(*_, **__):
+        raise ValueError("a defect")
+
+    monkeypatch.setattr("clsas.products.phase_sign.backproject", broken)
+    with pytest.raises(ValueError, match="a defect"):
+        clsas.inspect(lines, GRID)
+
+
 def test_speckle_does_not_tell_its_sign(lines):
     rng = np.random.default_rng(0)
     samples = rng.standard_normal((*lines.samples.shape, 2)) @ [1, 1j]
@@ -339,6 +465,9 @@ def test_lines_of_zeros_and_short_recordings(lines):
     silent = clsas.inspect(with_samples(lines, lambda samples: samples.fill(0)))
     assert len(silent["dead_channels"].where) == PINGS
     assert silent.sign is None
+    assert silent["dead_channels"].message == "all 200 channels hold no signal"
+    assert "select" not in silent["dead_channels"].remedy
+    assert "no aperture" in clsas.inspect(lines.select([3]))["aperture"].message
     for some in ([3], [3, 4], [3, 4, 5]):
         assert clsas.inspect(lines.select(some), GRID).pings == len(some)
     single = replace(lines, samples=lines.samples[:, 200:201])
@@ -383,10 +512,23 @@ def test_arguments_of_another_kind(lines):
         ({"lines": replace(lines, first_range_m=1e300)}, "the largest of first_range_m must be"),
         ({"lines": replace(lines, tx_m=[1e200, 0, 0])}, r"the largest of tx_m .* got 1e\+200"),
         ({"lines": replace(lines, range_step_m=1e300)}, "the length of lines must be"),
+        ({"lines": replace(lines, range_step_m=1e-300)}, "range_step_m must be .* >= 7.5e-13 m"),
+        ({"lines": replace(lines, sound_speed_m_s=1e300)}, "sound_speed_m_s must be .* <= 3e"),
+        ({"lines": replace(lines, carrier_hz=1e300)}, "carrier_hz must be .* <= 1e"),
         ({"element_length_m": -1}, "element_length_m must be finite and > 0 m"),
     ):
         with pytest.raises((TypeError, ValueError), match=words):
             clsas.inspect(**({"lines": lines} | wrong))
+
+
+def test_the_guide_lists_every_finding():
+    root = Path(__file__).parents[2]
+    files = [*(root / "clsas" / "products").glob("*.py"), root / "clsas/sonar/sampling.py"]
+    made = {name for file in files for name in re.findall(r'Finding\(\s*"(\w+)"', file.read_text())}
+    table = (
+        (root / "docs/how-to/recordings.md").read_text().split("| finding |")[1].split("\n\n")[0]
+    )
+    assert set(re.findall(r"^\| `(\w+)`", table, re.M)) == made - {"ping_rate"}  # of surveys
 
 
 def test_runs_of_indices():
@@ -414,6 +556,12 @@ def test_the_command(lines, tmp_path):
     assert run.exit_code == 0, run.output
     wanted = moved(lines, halting).without_still_pings().without_background("median")
     np.testing.assert_array_equal(clsas.load(mended).samples, wanted.tapered_ends(0.2).samples)
+    run = CliRunner().invoke(
+        main, ["convert", str(recording), str(mended), "--high-pass-hz", "5e3"]
+    )
+    assert run.exit_code == 1
+    assert "--high-pass-hz must be finite and > 70" in run.stderr
+    assert "hold nothing below 70" in run.stderr
 
 
 def test_a_scene_gives_grid_beam_and_element(lines, tmp_path):

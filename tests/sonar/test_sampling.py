@@ -246,7 +246,13 @@ def test_arguments_beside_lines(arguments, message):
     ("arguments", "message"),
     [
         ((None, track(WIDE, 0.5), GRID), "sonar must be of type Sonar, got NoneType"),
+        (("a", None, GRID), r"must be of type Sonar, got str; RangeLines may stand in its place"),
         ((WIDE, GRID, GRID), "track must be of type Track, got Grid"),
+        (
+            (lines_of(WIDE, track(WIDE, 0.5)), track(WIDE, 0.5), GRID),
+            "track must be left out with range lines.* got Track",
+        ),
+        ((lines_of(WIDE, track(WIDE, 0.5)), 5, GRID), "track must be left out .* got int"),
         ((WIDE, track(WIDE, 0.5), None), "grid must be of type Grid, got NoneType"),
     ],
 )
