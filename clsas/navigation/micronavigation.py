@@ -180,7 +180,8 @@ def micronavigate(
 
     They follow from the phase of a product of two correlated complex Gaussian signals, averaged
     over L samples, and a straight line fitted to K such phases at equal steps. They are scaled by
-    the misfit of that line over all pings, where that is more than expected.
+    the misfit of that line over all pings, where that is more than expected; yaw's also by what
+    neighbouring pairs have in common.
     """
     if isinstance(lines, Echoes):
         lines = compress(lines)
