@@ -143,6 +143,12 @@ class RangeLines:
         return np.flatnonzero(np.append(True, (np.diff(self.tx_m, axis=0) != 0).any(axis=1)))
 
     @property
+    def ping_numbers(self) -> NDArray[np.int64]:
+        """Number of every channel's ping, shape [channels]."""
+        starts = self.ping_starts
+        return np.repeat(np.arange(len(starts)), np.diff(np.append(starts, self.channels)))
+
+    @property
     def ping_centres_m(self) -> NDArray[np.float64]:
         """Mean phase centre of every ping, metres, shape [pings, 3]."""
         return pings.means(self.phase_centres_m, self.ping_starts)

@@ -52,9 +52,8 @@ class Transmissions:
     @classmethod
     def of(cls, lines: RangeLines) -> Transmissions:
         """Return the transmissions of range lines."""
-        runs = lines.ping_starts
-        run = np.repeat(np.arange(len(runs)), np.diff(np.append(runs, lines.channels)))
-        starts = np.flatnonzero((lines.rx_m == lines.rx_m[runs][run]).all(axis=1))
+        first_rx_m = lines.rx_m[lines.ping_starts][lines.ping_numbers]
+        starts = np.flatnonzero((lines.rx_m == first_rx_m).all(axis=1))
         centres_m = means(lines.phase_centres_m, starts)
         places_m = _more_even(centres_m, means(lines.rx_m, starts))
         return cls(np.append(starts, lines.channels), centres_m, places_m)

@@ -286,29 +286,21 @@ class Geometry:
         self, roots: NDArray[np.int64], root_m: NDArray[np.float64]
     ) -> NDArray[np.float64]:
         """Return the largest phase rates of subimages in some roots: see `cycles_per_extent`."""
-        image, surface = self.factorization, self.surface
-        return cycles_per_extent(
-            self.track,
-            surface,
-            root_m,
-            surface.extents_in(image.sides[0], image.sides[0], roots).max(axis=0),
-            image.highest_cycles_per_m,
-            min(surface.radius_m(image.sides[-1]), image.closest_m),
-            image.limits,
-            self.along,
-        )
+        boxes = self._boxes(roots, root_m)
+        return cycles_per_extent(self.track, *boxes, self.factorization.limits, self.along)
 
     def sheet_rates(self, roots: NDArray[np.int64], root_m: NDArray[np.float64]) -> SheetRates:
         """Return the largest phase rates of subimages in some roots, along and across a sheet."""
+        return sheet_rates(self.track, *self._boxes(roots, root_m))
+
+    def _boxes(
+        self, roots: NDArray[np.int64], root_m: NDArray[np.float64]
+    ) -> tuple[Surface, NDArray[np.float64], NDArray[np.float64], float, float]:
+        """Return roots as boxes of `cycles_per_extent`: its surface to its nearest range."""
         image, surface = self.factorization, self.surface
-        return sheet_rates(
-            self.track,
-            surface,
-            root_m,
-            surface.extents_in(image.sides[0], image.sides[0], roots).max(axis=0),
-            image.highest_cycles_per_m,
-            min(surface.radius_m(image.sides[-1]), image.closest_m),
-        )
+        extents = surface.extents_in(image.sides[0], image.sides[0], roots).max(axis=0)
+        nearest_m = min(surface.radius_m(image.sides[-1]), image.closest_m)
+        return surface, root_m, extents, image.highest_cycles_per_m, nearest_m
 
     def references(self, sector: Sector) -> dict[str, NDArray]:
         """Return how roots align the raw channels, in the order of their nodes, [roots, channels].

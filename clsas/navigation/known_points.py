@@ -258,14 +258,13 @@ def _checked_search(model: Model, reader: Reader, search_m: float | None) -> flo
 
 def _axes(lines: RangeLines, names: tuple[str, ...], track: Track | None) -> NDArray[np.float64]:
     """Return unit vectors forward, to port and up of every channel, [3, channels, 3]."""
-    starts = lines.ping_starts
-    ping = np.repeat(np.arange(len(starts)), np.diff(np.append(starts, lines.channels)))
+    ping = lines.ping_numbers
     if track is not None:
         validate.instance("track", track, Track)
-        if track.pings != len(starts):
+        pings = int(ping[-1]) + 1
+        if track.pings != pings:
             raise ValueError(
-                f"track must have a pose for each of the {len(starts)} pings of lines, got "
-                f"{track.pings}"
+                f"track must have a pose for each of the {pings} pings of lines, got {track.pings}"
             )
         return track.rotations.as_matrix()[ping].transpose(2, 0, 1)
     if not set(names) & set(UNKNOWNS[2:]):

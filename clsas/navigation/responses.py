@@ -62,14 +62,10 @@ class Passage:
     @classmethod
     def of(cls, lines: RangeLines, unknowns: tuple[str, ...], wavelength_m: float) -> Passage:
         """Return the passage of lines; `unknowns` are some of "sway", "heave" and "surge"."""
-        starts = lines.ping_starts
-        counts = np.diff(np.append(starts, lines.channels))
         steps_m = np.linalg.norm(np.diff(lines.ping_centres_m, axis=0), axis=1)
         travelled_m = np.concatenate([[0.0], np.cumsum(steps_m)])
         axes = directions(lines, unknowns)
-        return cls(
-            lines, np.repeat(np.arange(len(starts)), counts), travelled_m, axes, wavelength_m
-        )
+        return cls(lines, lines.ping_numbers, travelled_m, axes, wavelength_m)
 
     @property
     def pings(self) -> int:
