@@ -55,6 +55,7 @@
 typedef struct {
     float middle_i;  /* of the blocks' common middle column */
     float4 middle_j; /* of each block's middle row */
+    float4 window_j; /* of the middle row of the blocks that share each window */
     vfloat i;        /* of the lanes */
     vfloat j[STACK];
 } Positions;
@@ -64,6 +65,8 @@ INLINE Positions positions_of(int block_column, int block_row)
     Positions at;
     at.middle_i = block_column + 0.5f * (BLOCK_COLUMNS - TILE_COLUMNS);
     at.middle_j = block_row + 0.5f * (BLOCK_ROWS - TILE_ROWS) + BLOCK_ROWS * (float4)(0.0f, 1.0f, 2.0f, 3.0f);
+    at.window_j = at.middle_j.s0
+        + BLOCK_ROWS * (0.5f * (BLOCKS_PER_WINDOW - 1) + BLOCKS_PER_WINDOW * (float4)(0.0f, 1.0f, 2.0f, 3.0f));
     at.i = at.middle_i + LANE_COLUMNS;
     at.j[0] = at.middle_j.s0 + LANE_ROWS;
     at.j[1] = at.middle_j.s1 + LANE_ROWS;
@@ -147,14 +150,13 @@ INLINE vfloat block_weights(const ItemBeam *item, const Beam *beam, int block, v
 }
 #endif
 
-/* The window for the blocks that share one: about their middle row, in a middle column. */
-INLINE Lookup lookup_for(int window, const Polynomial *position, const Positions *at, __global const sample_t *line,
-                         int line_pitch, int reference)
+/* The windows of the blocks, each about the middle of those that share it. */
+INLINE Windows item_windows(const Polynomial *position, const Positions *at, int reference, int pitch)
 {
-    const float j = at->middle_j.s0 + BLOCK_ROWS * (0.5f * (BLOCKS_PER_WINDOW - 1) + window * BLOCKS_PER_WINDOW);
-    const float t = LANE(position->c0, MIDDLE_COLUMN)
-        + j * (LANE(position->c1, MIDDLE_COLUMN) + j * (LANE(position->c2, MIDDLE_COLUMN) + j * position->c3));
-    return lookup_about(line, line_pitch, reference, t);
+    const float c0 = IN_MIDDLE_COLUMN(position->c0), c1 = IN_MIDDLE_COLUMN(position->c1);
+    const float c2 = IN_MIDDLE_COLUMN(position->c2);
+    const float4 j = at->window_j;
+    return windows_about(c0 + j * (c1 + j * (c2 + j * position->c3)), reference, pitch);
 }
 
 __kernel void backproject_tiles(__global const sample_t *lines, int line_pitch, __global const int *ranges,
@@ -222,9 +224,10 @@ __kernel void backproject_tiles(__global const sample_t *lines, int line_pitch, 
         const float channels = 1.0f;
 #endif
         __global const sample_t *line = LINE(part.lines, entry, line_pitch);
+        const Windows windows = item_windows(&position, &at, reference.sample, line_pitch);
 EACH_WINDOW
         for (int window = 0; window < WINDOWS; window++) {
-            const Lookup lookup = lookup_for(window, &position, &at, line, line_pitch, reference.sample);
+            const Lookup lookup = lookup_in(&windows, window, line, line_pitch);
 EACH_BLOCK
             for (int block = window * BLOCKS_PER_WINDOW; block < (window + 1) * BLOCKS_PER_WINDOW; block++) {
                 FORGET_MEMORY;

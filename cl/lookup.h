@@ -1,13 +1,16 @@
 /* Looking a range line up between its samples, at a position of its own for every lane.
  *
- * Fetching the samples is what limits backprojection, so there are three ways to do it:
+ * Fetching the samples is what limits backprojection, so there are four ways to do it:
  *   - WIDTH 1: a work-item reads its samples, real and imaginary part at once;
  *   - several lanes: every lane reads its samples one by one;
- *   - with HAS_PICK (vectors.h): 2 WIDTH samples of each part are held in registers, a window, and lanes pick theirs.
- *     That is five times as fast with AVX-512, twice with AVX2. The host asks for it where the samples of all lanes of
- *     a block lie within the window.
+ *   - with HAS_PICK (vectors.h), lanes pick their samples from vectors of consecutive ones. 32 registers of AVX-512 hold
+ *     two vectors of each part, with the samples of all taps;
+ *   - 16 registers of AVX2 hold none: for each tap one vector is loaded, or two.
+ * Picking is three to four times as fast as reading one by one. The host asks for it where the positions of all lanes of
+ * a block lie within a window.
  *
  * Build options
+ *   PERMUTE  vectors from which lanes pick, 1 or 2 (2 with AVX-512), or 0.
  *   TAPS     samples per interpolation: 2, 4, 6 or 8.
  *   WINDOWS  windows that the blocks of a work-item take: 1, 2 or 4. Without windows it counts as 1.
  */
@@ -22,35 +25,100 @@
 
 #ifdef HAS_PICK
 
+/* POSITIONS: how many whole samples the positions of lanes can start from, next to each other, within a window of
+ * WINDOW_SAMPLES. */
+#if AVX == 512
+#define POSITIONS (2 * WIDTH - TAPS + 1)
+#define WINDOW_SAMPLES (2 * WIDTH)
+#else
+#define POSITIONS (PERMUTE * WIDTH)
+#define WINDOW_SAMPLES (PERMUTE * WIDTH + TAPS - 1)
+#endif
+
 /* A window of a line. Positions are in samples from a reference sample of the line, less 0.5; `first` leads from a
  * position's integer part to the first of its taps in the window. */
 typedef struct {
+#if AVX == 512
     vfloat re_low, re_high, im_low, im_high;
+#else
+    __global const sample_t *samples;
+    int pitch;
+#endif
     int first;
 } Lookup;
 
-/* The window about position t from sample `reference`; within the line whatever t is. */
+INLINE Lookup lookup_from(__global const sample_t *window, int pitch, int first)
+{
+#if AVX == 512
+    return (Lookup){LOAD_PARTS(window), LOAD_PARTS(window + WIDTH), LOAD_PARTS(window + pitch),
+                    LOAD_PARTS(window + pitch + WIDTH), first};
+#else
+    return (Lookup){window, pitch, first};
+#endif
+}
+
+/* One value for each of up to 4 windows. */
+typedef union {
+    int4 all;
+    int of[4];
+} Numbers;
+
+/* Where windows start in their line, and the `first` of their lookups. */
+typedef struct {
+    Numbers start, first;
+} Windows;
+
+/* The windows about positions t from sample `reference`; within the line whatever t is. */
+INLINE Windows windows_about(float4 t, int reference, int pitch)
+{
+    const int4 lowest = as_int4((t - 0.5f * (POSITIONS - 1)) + ROUNDER) - 0x4B400000;
+    const int4 start = lowest + (reference + 1 - TAPS / 2);
+    Windows windows;
+    windows.start.all = CLAMP(start, (int4)0, (int4)(pitch - WINDOW_SAMPLES));
+    windows.first.all = -lowest;
+    return windows;
+}
+
+INLINE Lookup lookup_in(const Windows *windows, int number, __global const sample_t *line, int pitch)
+{
+    return lookup_from(line + windows->start.of[number], pitch, windows->first.of[number]);
+}
+
 INLINE Lookup lookup_about(__global const sample_t *line, int pitch, int reference, float t)
 {
-    const int whole = ROUNDED_INT(t);
-    __global const sample_t *window = line + CLAMP(reference + whole - (WIDTH - 1), 0, pitch - 2 * WIDTH);
-    return (Lookup){LOAD_PARTS(window), LOAD_PARTS(window + WIDTH), LOAD_PARTS(window + pitch),
-                    LOAD_PARTS(window + pitch + WIDTH), WIDTH - TAPS / 2 - whole};
+    const int lowest = ROUNDED_INT(t - 0.5f * (POSITIONS - 1));
+    const int start = reference + lowest + 1 - TAPS / 2;
+    return lookup_from(line + CLAMP(start, 0, pitch - WINDOW_SAMPLES), pitch, -lowest);
 }
 
 /* The samples under the taps of every lane, for positions rounded by adding ROUNDER. */
 typedef struct {
-    const Lookup *window;
+    const Lookup *lookup;
     vint index;
 } Taps;
 
 INLINE Taps fetch_taps(const Lookup *lookup, vfloat shifted)
 {
-    /* pick() ignores all but an index's lowest bits, so ROUNDER's bits may stay. */
+    /* Picking ignores all but an index's lowest bits, so ROUNDER's bits may stay. */
     return (Taps){lookup, AS_VINT(shifted) + lookup->first};
 }
-#define TAP_RE(taps, k) pick((taps).window->re_low, (taps).window->re_high, (taps).index + (k))
-#define TAP_IM(taps, k) pick((taps).window->im_low, (taps).window->im_high, (taps).index + (k))
+
+#if AVX == 512
+#define TAP_RE(taps, k) pick_of_two((taps).lookup->re_low, (taps).lookup->re_high, (taps).index + (k))
+#define TAP_IM(taps, k) pick_of_two((taps).lookup->im_low, (taps).lookup->im_high, (taps).index + (k))
+#else
+/* Samples from an index on. */
+INLINE vfloat samples_from(__global const sample_t *sample, vint index)
+{
+#if PERMUTE == 1
+    return pick(LOAD_PARTS(sample), index);
+#else
+    return pick_of_two(LOAD_PARTS(sample), LOAD_PARTS(sample + WIDTH), index);
+#endif
+}
+#define TAP_RE(taps, k) samples_from((taps).lookup->samples + (k), (taps).index)
+#define TAP_IM(taps, k) samples_from((taps).lookup->samples + (taps).lookup->pitch + (k), (taps).index)
+#endif
 
 #else
 
@@ -59,6 +127,18 @@ typedef struct {
     int pitch;
     int first;
 } Lookup;
+
+typedef int Windows;
+
+INLINE Windows windows_about(float4 t, int reference, int pitch)
+{
+    return reference;
+}
+
+INLINE Lookup lookup_in(const Windows *windows, int number, __global const sample_t *line, int pitch)
+{
+    return (Lookup){line, pitch, *windows + 1 - TAPS / 2};
+}
 
 INLINE Lookup lookup_about(__global const sample_t *line, int pitch, int reference, float t)
 {

@@ -38,6 +38,7 @@
 
 /* A lane in a block's middle column, and one in its middle. */
 #define MIDDLE_COLUMN ((BLOCK_COLUMNS - 1) / 2)
+#define IN_MIDDLE_COLUMN(vector) (0.5f * (LANE(vector, MIDDLE_COLUMN) + LANE(vector, BLOCK_COLUMNS / 2)))
 #define MIDDLE ((BLOCK_ROWS - 1) / 2 * BLOCK_COLUMNS + MIDDLE_COLUMN)
 
 /* Sums over channels, block by block. */

@@ -111,8 +111,8 @@ INLINE void filter_lanes(const Given *given, __global const float *filter, int b
 #pragma unroll
         for (int t = 0; t < WIDTH && block + t < TAPS; t++) {
             const vfloat weight = LOAD(filter + (block + t) * WIDTH);
-            *re += weight * pick(re_low, re_high, first + t);
-            *im += weight * pick(im_low, im_high, first + t);
+            *re += weight * pick_of_two(re_low, re_high, first + t);
+            *im += weight * pick_of_two(im_low, im_high, first + t);
         }
         re_low = re_high;
         im_low = im_high;

@@ -8,7 +8,7 @@
  *
  * Build options
  *   WIDTH    lanes of a vector: 1, 4, 8 or 16.
- *   PERMUTE  1: define HAS_PICK and pick() where the compiler can permute registers.
+ *   PERMUTE  not 0: define HAS_PICK, pick() and pick_of_two() where the compiler can permute registers.
  */
 
 #ifdef __clang__
@@ -79,20 +79,31 @@ typedef int avx_int __attribute__((vector_size(4 * WIDTH)));
 typedef short avx_half __attribute__((vector_size(2 * WIDTH)));
 #endif
 
-/* pick() gathers lanes from two vectors by index: 0 to WIDTH - 1 number those of `low`, WIDTH to 2 WIDTH - 1 those of
- * `high`. Only an index's lowest bits count, so no index leaves the vectors. */
+/* pick() gathers lanes from a vector by index, or from two: 0 to WIDTH - 1 number those of `low`, WIDTH to 2 WIDTH - 1
+ * those of `high`. Only an index's lowest bits count, so no index leaves the vectors. */
 #if PERMUTE && defined(AVX)
 #define HAS_PICK
-INLINE vfloat pick(vfloat low, vfloat high, vint index)
+INLINE vfloat pick(vfloat from, vint index)
 {
-    const avx_float a = __builtin_astype(low, avx_float), b = __builtin_astype(high, avx_float);
+    const avx_float a = __builtin_astype(from, avx_float);
     const avx_int at = __builtin_astype(index, avx_int);
 #if AVX == 512
-    return __builtin_astype(__builtin_ia32_vpermi2varps512(a, at, b), vfloat);
+    return __builtin_astype(__builtin_ia32_permvarsf512(a, at), vfloat);
 #else
-    /* The blend takes each lane by its sign: bit 3 of the index, moved there, chooses between a and b. */
-    return __builtin_astype(__builtin_ia32_blendvps256(__builtin_ia32_permvarsf256(a, at),
-                                                       __builtin_ia32_permvarsf256(b, at), (avx_float)(at << 28)),
+    return __builtin_astype(__builtin_ia32_permvarsf256(a, at), vfloat);
+#endif
+}
+
+INLINE vfloat pick_of_two(vfloat low, vfloat high, vint index)
+{
+#if AVX == 512
+    const avx_float a = __builtin_astype(low, avx_float), b = __builtin_astype(high, avx_float);
+    return __builtin_astype(__builtin_ia32_vpermi2varps512(a, __builtin_astype(index, avx_int), b), vfloat);
+#else
+    /* The blend takes each lane by its sign: bit 3 of the index, moved there, chooses between both. */
+    return __builtin_astype(__builtin_ia32_blendvps256(__builtin_astype(pick(low, index), avx_float),
+                                                       __builtin_astype(pick(high, index), avx_float),
+                                                       __builtin_astype(index << 28, avx_float)),
                             vfloat);
 #endif
 }

@@ -13,7 +13,7 @@ from clsas.core.lines import RangeLines, fastest, some_channels, wavelength_m
 from clsas.exact.checks import check_distances
 from clsas.exact.groups import Groups, GroupsEstimate
 from clsas.exact.layout import GEOMETRY_ERROR, Conditions, allowed, estimate_layout, lay_out
-from clsas.exact.lookup import most_upsampling
+from clsas.exact.lookup import lookup_cost
 from clsas.exact.tiles import Tiles
 from clsas.opencl import phases
 from clsas.opencl.device import Device
@@ -81,7 +81,7 @@ def decide(
         Error power of effects that the model leaves out.
     estimate : bool
         Estimate groups in place of gathering pixels, which takes longest. The range over which
-        blocks look samples up then does not limit the upsampling.
+        blocks look samples up then plays no part.
     """
     fixed = taps is not None and upsampling is not None
     geometry_error = GEOMETRY_ERROR if fixed else allowed(accuracy_db)
@@ -107,7 +107,7 @@ def decide(
         upsampling=upsampling,
         other_error=math.hypot(geometry_error, phases.error(phase_terms)),
         pixels_per_sample=grid.size / lines.length,
-        most_upsampling=most_upsampling(device, lines, layout.lookup_radius_m),
+        lookup_cost=lookup_cost(device, layout, lines),
     )
     resampling = interpolation.resampling(lines.length, interpolator, spectrum)
     one_cubic = False

@@ -72,11 +72,6 @@ class Groups:
         middle = (rows - 1) // 2 * columns + (columns - 1) // 2  # MIDDLE in cl/pixels.h
         return _longest(blocks - blocks[:, middle, None])
 
-    @property
-    def lookup_radius_m(self) -> float:
-        """Largest distance of a pixel from the point about which its block looks samples up."""
-        return self.block_radius_m
-
     def windows(self, most_m: float) -> int:
         """Return how many windows a group looks samples up in; 0 if even blocks are too large.
 
@@ -143,20 +138,21 @@ class GroupsEstimate:
         Padded pixels of a group.
     radius_m : float
         Largest distance of a pixel from its group's centre.
-    lookup_radius_m : float
-        Unknown, and assumed to be 0.
     """
 
     grid: Grid
     part_pixels: int
     radius_m: float
-    lookup_radius_m: float = 0.0
     across: int = 1
 
     @property
     def parts(self) -> int:
         """Number of groups."""
         return -(-self.grid.size // self.part_pixels)
+
+    def windows(self, most_m: float) -> int:
+        """Return 1: how far apart the pixels of a block lie is not known yet."""
+        return 1
 
 
 def gather(grid: Grid, largest_radius_m: float, width: int) -> Groups:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -143,7 +143,7 @@ def fitting_tiles(grid: Grid, conditions: Conditions) -> Tiles | None:
         most_sine = conditions.allowed_sine_error(most)
         for tiles, (error, sine_error) in zip(candidates, errors, strict=True):
             if error <= most and sine_error <= most_sine:
-                return tiles
+                return replace(tiles, cosines=tiles.cosines_of(conditions.antennas_m))
     return None
 
 

@@ -1,44 +1,67 @@
-"""Lookup of samples: the size of the window of samples that a work-item holds in registers."""
+"""Lookup of samples: how many vectors of them the lanes of a block pick theirs from."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Protocol
 
 from clsas.core.lines import RangeLines, fastest
+from clsas.exact.tiles import HELD
 from clsas.opencl.device import Device
-from clsas.signal import interpolation
 
 _FLOAT32 = 0.05  # samples of room for the rounding of positions
+
+# Relative time of a pixel and channel, measured with PoCL.
+_COSTS = {16: {2: 1.0}, 8: {1: 1.0, 2: 1.4}}  # by lanes, and vectors from which they pick
+_SINGLY = 3.0  # each lane reads its own samples
 
 
 class _Layout(Protocol):
     def windows(self, most_m: float) -> int: ...
 
 
-def most_upsampling(device: Device, lines: RangeLines, lookup_radius_m: float) -> dict[int, float]:
-    """Return, by taps, the upsampling beyond which blocks no longer fit a window; {} if none."""
-    if not device.info.permute:
-        return {}
-    reach_m = lookup_radius_m * (1 + 2 * fastest(lines))
-    samples = {taps: lookup_room(taps, device.info.width) for taps in interpolation.TAPS}
-    return {taps: room * lines.range_step_m / max(reach_m, 1e-30) for taps, room in samples.items()}
-
-
 def lookup_options(
     device: Device, layout: _Layout, lines: RangeLines, samples_per_m: float, taps: int
 ) -> dict[str, int]:
-    """Return the build options of the lookup (cl/lookup.h)."""
-    # Ranges to moving receivers change a little faster than pixel positions.
-    most_m = lookup_room(taps, device.info.width) / samples_per_m / (1 + 2 * fastest(lines))
-    windows = layout.windows(most_m) if device.info.permute else 0
-    return {"PERMUTE": int(windows > 0), "WINDOWS": windows or 1}
+    """Return the build options of the lookup (cl/lookup.h).
 
-
-def lookup_room(taps: int, width: int) -> float:
-    """Return the largest distance, samples, of a pixel's echo from the middle of a window.
-
-    A window holds two vectors of samples. Half the taps of an interpolation reach beyond the echo.
-    Rounding both positions to whole samples costs no room, since the window's middle lies between
-    two samples.
+    They are the fastest with which every pixel finds its samples: in one vector where the
+    positions of a block fit, else in two, else singly.
     """
-    return width - taps / 2 - _FLOAT32
+    # Ranges to moving receivers change a little faster than pixel positions.
+    metres = 1 / samples_per_m / (1 + 2 * fastest(lines))
+    for vectors in _lookups(device):
+        windows = layout.windows(lookup_room(vectors, taps, device.info.width) * metres)
+        if windows:
+            return {"PERMUTE": vectors, "WINDOWS": windows}
+    return {"PERMUTE": 0, "WINDOWS": 1}
+
+
+def lookup_cost(
+    device: Device, layout: _Layout, lines: RangeLines
+) -> Callable[[int, float], float]:
+    """Return the time of a pixel and channel, 1 at best, as a function of taps and upsampling."""
+    if not _lookups(device):
+        return lambda taps, upsampling: 1.0
+    costs = _lookups(device) | {0: _SINGLY}
+
+    def cost(taps: int, upsampling: float) -> float:
+        samples_per_m = upsampling / lines.range_step_m
+        return costs[lookup_options(device, layout, lines, samples_per_m, taps)["PERMUTE"]]
+
+    return cost
+
+
+def lookup_room(vectors: int, taps: int, width: int) -> float:
+    """Return the largest distance, samples, of a pixel's echo from the middle of its window.
+
+    A window of AVX-512 is two vectors with the samples of all taps; one of AVX2 is the samples of
+    one tap. Rounding positions to whole samples takes half a sample.
+    """
+    positions = 2 * width - taps + 1 if width == HELD else vectors * width
+    return (positions - 1) / 2 - _FLOAT32
+
+
+def _lookups(device: Device) -> dict[int, float]:
+    """Return the costs of picking, by vectors; {} where lanes cannot pick."""
+    return _COSTS.get(device.info.width, {}) if device.info.permute else {}

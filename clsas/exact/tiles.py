@@ -6,6 +6,7 @@ from it in float32.
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass
 
@@ -23,6 +24,10 @@ STACK = 4
 BLOCKS = {16: (4, 4), 8: (2, 4), 4: (2, 2), 1: (1, 1)}
 """Rows and columns of a block, by float lanes."""
 
+HELD = 16
+"""Lanes of vectors whose windows registers hold, so that blocks may share them (cl/lookup.h).
+Samples of narrower vectors are loaded tap by tap."""
+
 _LARGEST_ANGLE = 2.0  # of a block at its distance; error bounds of weights saturate beyond it
 
 
@@ -38,11 +43,15 @@ class Tiles:
         Pixels along a tile's side.
     width : int
         Float lanes per work-item.
+    cosines : (float, float)
+        Bounds of the cosines between ways to antennas and the steps from row to row, and from
+        column to column; see `cosines_of`.
     """
 
     grid: Grid
     side: int
     width: int
+    cosines: tuple[float, float] = (1.0, 1.0)
 
     @property
     def down(self) -> int:
@@ -103,24 +112,54 @@ class Tiles:
         angle = min(_radius_m(self.grid, STACK * rows, columns) / nearest_m, _LARGEST_ANGLE)
         return math.hypot(beam.block_error(angle), beam.plane_error(angle, wavelength_m))
 
-    @property
-    def lookup_radius_m(self) -> float:
-        """Largest distance of a pixel from the point about which its block looks samples up."""
-        return self._lookup_radius_m(1)
-
     def windows(self, most_m: float) -> int:
         """Return how many windows a work-item looks samples up in; 0 if even blocks are too large.
 
-        No pixel is farther than `most_m` from the point about which its window lies.
+        No pixel's range differs by more than `most_m` from that of the middle of its blocks.
         """
-        counts = (n for n in (1, 2, STACK) if self._lookup_radius_m(STACK // n) <= most_m)
-        return next(counts, 0)
+        counts = (1, 2, STACK) if self.width == HELD else (STACK,)
+        return next((n for n in counts if self._range_change_m(STACK // n) <= most_m), 0)
 
-    def _lookup_radius_m(self, blocks: int) -> float:
-        """Return `lookup_radius_m` for windows that some blocks of a work-item share."""
-        # A window lies about the column left of the blocks' middle: half a pixel beside it.
+    def _range_change_m(self, blocks: int) -> float:
+        """Return the largest change of a range from the middle of some blocks to their pixels.
+
+        A range changes by the product of the way and a unit vector u towards an antenna, or by the
+        mean of two such products. The farthest pixel lies at c along columns and r along rows: the
+        largest c |u_c| + r |u_r| is sought, with u_c and u_r within their bounds.
+        """
         rows, columns = BLOCKS[self.width]
-        return _radius_m(self.grid, blocks * rows, columns + 1)
+        farthest_m = _radius_m(self.grid, blocks * rows, columns)
+        if min(self.cosines) >= 1:
+            return farthest_m
+        lengths_m = [float(np.linalg.norm(step)) for step in self.grid.vectors_m[1:]]
+        along_m = (blocks * rows - 1) / 2 * lengths_m[0], (columns - 1) / 2 * lengths_m[1]
+        for (one_m, one), (other_m, other) in itertools.permutations(
+            zip(along_m, self.cosines, strict=True)
+        ):
+            if one * farthest_m < one_m:
+                return one * one_m + min(other, math.sqrt(1 - one**2)) * other_m
+        return farthest_m
+
+    def cosines_of(self, antennas_m: NDArray[np.float64]) -> tuple[float, float]:
+        """Return bounds of the cosines between a way to an antenna and the grid's rows, columns.
+
+        The first is for steps from row to row. Where steps are not at right angles it is (1, 1).
+        """
+        origin_m, *steps_m = self.grid.vectors_m
+        lengths_m = [float(np.linalg.norm(step)) for step in steps_m]
+        if abs(steps_m[0] @ steps_m[1]) > 1e-9 * lengths_m[0] * lengths_m[1] or not all(lengths_m):
+            return 1.0, 1.0
+        axes = np.stack([step / length for step, length in zip(steps_m, lengths_m, strict=True)])
+        half_m = np.array([self.down, self.across]) * self.side / 2 * lengths_m
+        middle_m = origin_m + (half_m - np.array(lengths_m) / 2) @ axes
+        away_m = antennas_m - middle_m
+        along_m = np.abs(away_m @ axes.T)  # [antennas, 2]
+        height_m2 = np.maximum(np.sum(away_m**2, axis=1) - np.sum(along_m**2, axis=1), 0.0)
+        nearest_m = np.maximum(along_m - half_m, 0.0)[:, ::-1]
+        farthest_m = along_m + half_m
+        distance_m = np.sqrt(farthest_m**2 + nearest_m**2 + height_m2[:, None])
+        down, across = np.max(farthest_m / np.maximum(distance_m, 1e-150), axis=0)
+        return float(down), float(across)
 
     def nearest_m(self, antennas_m: NDArray[np.float64]) -> float:
         """Return a lower bound of the distance between antennas [n, 3] and tile centres."""

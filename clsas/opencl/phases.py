@@ -13,7 +13,7 @@ PRECISE_TERMS = 7
 """Of a polynomial that errs by no more than single precision, for phases on which images depend
 more than once: those of upsampling and of stages."""
 
-_SHARE = 0.03  # of an image's error, as power
+_SHARE = 0.08  # of an image's error, as power
 _PHASES = (np.arange(2000) + 0.5) / 2000 - 0.5  # cycles
 
 

@@ -382,7 +382,7 @@ def _looked_up_singly(
     """
     if model.grid.points_m is None or device.info.width == 1:
         return False
-    room = lookup_room(candidate.final.taps, device.info.width)
+    room = lookup_room(2, candidate.final.taps, device.info.width)
     thickness_m = float(model.surface.relief_m(candidate.sides[-1]).max())
     return thickness_m / 2 * lines.resampling.samples_per_m(model.lines) > room
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -178,7 +178,7 @@ def choose(
     upsampling: float | None = None,
     other_error: float = 0.0,
     pixels_per_sample: float = np.inf,
-    most_upsampling: Mapping[int, float] | None = None,
+    lookup_cost: Callable[[int, float], float] = lambda taps, upsampling: 1.0,
 ) -> Interpolator:
     """Return the fastest interpolator that keeps the error below `accuracy_db`.
 
@@ -198,8 +198,8 @@ def choose(
         Relative rms error from other causes, which adds in power.
     pixels_per_sample : float
         Pixels over samples of a line. The more pixels, the less the time of upsampling matters.
-    most_upsampling : mapping of float, optional
-        By taps: upsampling up to which the device's fast lookup works; more is avoided.
+    lookup_cost : callable, optional
+        Relative time of a pixel and channel, as a function of taps and upsampling.
 
     Raises
     ------
@@ -229,10 +229,10 @@ def choose(
             f"the best is {found.error_db:.1f} dB"
         )
 
-    def cost(candidate: Interpolator) -> tuple[bool, float]:
-        slow = candidate.upsampling > (most_upsampling or {}).get(candidate.taps, np.inf)
+    def cost(candidate: Interpolator) -> float:
         upsampling_cost = _UPSAMPLING_COST * candidate.upsampling / pixels_per_sample
-        return slow, COST[candidate.taps] + upsampling_cost
+        of_lookup = lookup_cost(candidate.taps, candidate.upsampling)
+        return COST[candidate.taps] * of_lookup + upsampling_cost
 
     return min(candidates, key=cost)
 

@@ -36,7 +36,7 @@ from clsas.exact.groups import Groups
 from clsas.exact.lookup import lookup_options, lookup_room
 from clsas.exact.reference import same_interpolator
 from clsas.exact.run import execute
-from clsas.exact.tiles import BLOCKS, STACK, Tiles
+from clsas.exact.tiles import BLOCKS, HELD, STACK, Tiles
 from clsas.opencl.device import list_devices
 from clsas.simulation.scenes import PointTargets
 from clsas.simulation.simulator import simulate_lines
@@ -99,9 +99,9 @@ def test_the_predicted_error_is_the_measured_one(taps, upsampling):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("mirrored", [False, True])
-@pytest.mark.parametrize("parts", [1, 2, STACK])
+@pytest.mark.parametrize(("vectors", "parts"), [(1, STACK), (2, 1), (2, 2), (2, STACK)])
 @pytest.mark.parametrize("taps", [2, 4, 6, 8])
-def test_samples_are_looked_up_wherever_pixels_lie(device, taps, parts, mirrored):
+def test_samples_are_looked_up_wherever_pixels_lie(device, taps, vectors, parts, mirrored):
     """The furthest pixel of a part of a work-item lies in range, just within a window."""
     track = APERTURE[len(APERTURE) // 2 :][:16]
     upsampling, nowhere = 8.0, patch(1.3, 41)
@@ -110,8 +110,8 @@ def test_samples_are_looked_up_wherever_pixels_lie(device, taps, parts, mirrored
     )
     width = device.info.width if device.info.permute else 16
     block_rows, block_columns = BLOCKS[width]
-    away = np.array([(STACK // parts * block_rows - 1) / 2, block_columns / 2])
-    pitch_m = 0.99 * lookup_room(taps, width) / some.samples_per_m / np.linalg.norm(away)
+    away = np.array([STACK // parts * block_rows - 1, block_columns - 1]) / 2
+    pitch_m = 0.99 * lookup_room(vectors, taps, width) / some.samples_per_m / np.linalg.norm(away)
     down, across = away / np.linalg.norm(away)
     row_m, column_m = pitch_m * np.array([[across, down, 0], [-down, across, 0]])
     if mirrored:
@@ -122,8 +122,9 @@ def test_samples_are_looked_up_wherever_pixels_lie(device, taps, parts, mirrored
     layout = preparation.layout
     assert isinstance(layout, Tiles)
     options = lookup_options(device, layout, lines, preparation.samples_per_m, taps)
-    if device.info.permute:
-        assert (options["PERMUTE"], options["WINDOWS"]) == (1, parts)
+    offered = vectors == 2 if width == HELD else parts == STACK
+    if device.info.permute and offered:
+        assert (options["PERMUTE"], options["WINDOWS"]) == (vectors, parts)
     wanted = same_interpolator(preparation, grid.positions_m())
     assert relative_error_db(execute(preparation), wanted) <= -80
 

@@ -3,6 +3,7 @@ import dataclasses
 import numpy as np
 import pytest
 from cases import along_x, beside, patch
+from scipy.spatial.transform import Rotation
 
 from clsas.core.grid import Grid
 from clsas.exact.groups import Groups
@@ -202,6 +203,34 @@ def test_no_pixel_is_further_than_allowed_from_where_its_samples_are_looked_up(w
         parts = tiles.windows(most_m)
         found.add(parts)
         for part in np.split(place_m, parts) if parts else []:
-            middle_m = part[:, max(columns // 2 - 1, 0)].mean(axis=0)
+            middle_m = part.mean(axis=(0, 1))
             assert np.linalg.norm(part - middle_m, axis=-1).max() <= most_m * (1 + 1e-9)
-    assert found == {0, 1, 2, STACK}
+    assert found == {16: {0, 1, 2, STACK}, 1: {STACK}}.get(width, {0, STACK})
+
+
+@pytest.mark.parametrize("width", [8, 16])
+@pytest.mark.parametrize("seed", range(4))
+def test_ranges_change_within_a_block_by_no_more_than_allowed(width, seed):
+    """Bounds of directions let blocks be larger where no antenna lies along their diagonal."""
+    rng = np.random.default_rng(seed)
+    turn = Rotation.random(random_state=seed).as_matrix()
+    grid = Grid.oriented([0, 40, 0], 0.01 * turn[0], 0.02 * turn[1], (128, 64))
+    bare, (rows, columns) = Tiles(grid, 64, width), BLOCKS[width]
+    away_m = 30 * turn[rng.integers(3)] + rng.normal(0, 5, (50, 3))
+    antennas_m = grid.positions_m()[64, 32] + away_m
+    tiles = dataclasses.replace(bare, cosines=bare.cosines_of(antennas_m))
+    places_m = grid.positions_m().reshape(128 // rows, rows, 64 // columns, columns, 3)
+    blocks_m = places_m.swapaxes(1, 2).reshape(-1, rows * columns, 3)[rng.integers(0, 100, 40)]
+    to_pixels_m = np.linalg.norm(blocks_m[..., None, :] - antennas_m, axis=-1)
+    to_middle_m = np.linalg.norm(blocks_m.mean(axis=1)[:, None] - antennas_m, axis=-1)
+    change_m = np.abs(to_pixels_m - to_middle_m[:, None]).max()
+    least_m = next(most_m for most_m in np.geomspace(1e-3, 1, 500) if tiles.windows(most_m))
+    bound_m = next(most_m for most_m in np.geomspace(1e-3, 1, 500) if bare.windows(most_m))
+    assert change_m <= least_m <= bound_m
+    if least_m < 0.9 * bound_m:
+        assert change_m >= 0.5 * least_m
+
+
+def test_grids_that_are_not_rectangles_have_no_bound_of_directions():
+    grid = Grid.oriented([0, 40, 0], [0.01, 0.002, 0], [0.002, 0.01, 0], (64, 64))
+    assert Tiles(grid, 64, 8).cosines_of(np.array([[0.0, 0.0, 0.0]])) == (1.0, 1.0)

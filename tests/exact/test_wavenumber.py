@@ -281,9 +281,9 @@ def test_aspects_near_end_fire_are_refused():
 
 
 def test_memory_is_refused_before_work_begins(monkeypatch):
-    asked = []
+    asked, lines = [], straight()
     monkeypatch.setattr(validate, "memory", lambda name, size: asked.append((name, size)))
-    wavenumber(straight(), GRID, beam=HANN)
+    wavenumber(lines, GRID, beam=HANN)
     ((name, size),) = asked
     assert name == "lines and grid"
     assert 16 * GRID.size < size < 1e9

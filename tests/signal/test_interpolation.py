@@ -119,16 +119,22 @@ def test_what_is_fixed_is_kept():
     assert (both.taps, both.upsampling) == (2, 1.0)
 
 
-def test_upsampling_stays_within_what_is_preferred():
+def test_slow_lookups_are_avoided():
     spectrum = flat(0.8)
     free = choose(spectrum, -70)
+
+    def slow_beyond(limit: float, *slow_taps: int):
+        return lambda taps, upsampling: 3.0 if taps in slow_taps and upsampling > limit else 1.0
+
     limit = free.upsampling - 0.1
-    bounded = choose(spectrum, -70, most_upsampling=dict.fromkeys(TAPS, limit))
+    bounded = choose(spectrum, -70, lookup_cost=slow_beyond(limit, *TAPS))
     assert bounded.upsampling < free.upsampling
     assert bounded.error_db <= -70
-    of_taps = choose(spectrum, -70, most_upsampling={free.taps: limit})
+    of_taps = choose(spectrum, -70, lookup_cost=slow_beyond(limit, free.taps))
     assert of_taps.taps != free.taps
     assert of_taps.error_db <= -70
+    as_slow = choose(spectrum, -70, lookup_cost=lambda taps, upsampling: 3.0)
+    assert (as_slow.taps, as_slow.upsampling) == (free.taps, free.upsampling)
 
 
 # Resampling
