@@ -29,12 +29,13 @@ def devices(as_json: bool) -> None:
         print_json({"devices": found, "used": used.index, "reason": reason})
         return
     for info in found:
+        in_stages = "" if info.stage_width == info.width else f" ({info.stage_width} in stages)"
         click.echo(
             f"{info.index}  {info.label}\n"
             f"   driver {info.driver}\n"
             f"   {info.kind.upper()}, {info.compute_units} compute units, "
             f"{info.memory_bytes / 2**30:.1f} GiB ({info.max_buffer_bytes / 2**30:.1f} GiB in one "
-            f"buffer), {'fp64' if info.fp64 else 'no fp64'}, vectors of {info.width}"
+            f"buffer), {'fp64' if info.fp64 else 'no fp64'}, vectors of {info.width}{in_stages}"
         )
     click.echo(f"Used: {used.index} ({reason})")
 

@@ -75,7 +75,7 @@ def form(
     largest = check_numbers(lines, chosen.beam)
     pixels, done = aligned(np.empty, grid.shape, np.complex64), 0
     try:
-        run = _Run(lines, grid, chosen, device, pixels, largest)
+        run = _Run(lines, grid, chosen, device.for_stages(), pixels, largest)
         for formed in run.parts():
             done += formed
             if progress is not None:

@@ -200,7 +200,7 @@ def _chosen(
     # Exact imaging divides itself to fit a device.
     room = device.info.memory_bytes // 2 if memory_bytes is None else memory_bytes
     exact_fits = memory_bytes is None or exact.memory_bytes <= memory_bytes
-    conditions = Conditions(tolerance_db, exact, device, costs, room)
+    conditions = Conditions(tolerance_db, exact, device.for_stages(), costs, room)
     least: float = exact.memory_bytes
     if stages:
         if model.track is None:

@@ -151,9 +151,9 @@ def variants(device: Device) -> dict[str, Device]:
 
 def driven(device: Device, width: int, permute: bool) -> Device:
     """Return a device whose kernels are built for vectors of `width` floats, permuted or not."""
-    info = dataclasses.replace(device.info, width=width, permute=permute)
-    if info == device.info:
+    if (width, permute) == (device.info.width, device.info.permute):
         return device
+    info = dataclasses.replace(device.info, width=width, stage_width=width, permute=permute)
     return dataclasses.replace(device, info=info, _kernels={})
 
 

@@ -309,3 +309,21 @@ def test_a_profile_counts_and_times_what_runs_within(platform):
     assert 0 < peak.minimum_s < peak.median_s <= peak.maximum_s
     assert peak.total_s == pytest.approx(peak.minimum_s + peak.median_s + peak.maximum_s)
     assert not times
+
+
+def test_factorized_images_are_driven_with_lanes_of_their_own(platform):
+    """Kernels and profile are those of the device, whatever the lanes of its exact images."""
+    other = dataclasses.replace(
+        platform, info=dataclasses.replace(platform.info, width=1, stage_width=4, permute=False)
+    )
+    driven = other.for_stages()
+    assert driven.info == dataclasses.replace(other.info, width=4)
+    with other.profile() as times:
+        peak = other.for_stages().kernel("peak", WIDTH=4, CHAINS=8)
+        other.for_stages().run(peak, (4,), steps=8, factor=0.5, result=other.buffer(64))
+    assert times["peak"].count == 1
+    assert other.kernel("peak", WIDTH=4, CHAINS=8) is peak
+    alike = dataclasses.replace(
+        platform, info=dataclasses.replace(platform.info, stage_width=platform.info.width)
+    )
+    assert alike.for_stages() is alike
