@@ -10,7 +10,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -155,22 +155,35 @@ class _Line:
         See `VisibilityModel.rates`.
     channels : float64 [channels]
         Aperture coordinates of channels, ascending.
+    along : float64 [samples, 3] or None
+        Unit directions of the beam at `track.samples`.
+    beam_rates : float64 [points, samples]
+        See `VisibilityModel.beam_rates`; 0 across a sheet, where weights change little.
     """
 
     track: MeanTrack
     rates: NDArray[np.float64]
     channels: NDArray[np.float64]
+    along: NDArray[np.float64] | None
+    beam_rates: Any
 
 
 @cached
 def _line(model: VisibilityModel, place: _Place) -> _Line:
     kind, at = place
+    along = model.along
+    beam_rates = None if along is None else model.beam_rates
     if kind == "track":
-        return _Line(model.track, model.rates, np.sort(model.track.coordinate))
+        channels = np.sort(model.track.coordinate)
+        return _Line(model.track, model.rates, channels, along, beam_rates)
     evenly = np.linspace(0, 1, 4 * _SAMPLED_PLACES)
     if kind == "along":
-        return _Line(model.track.line_along(at), model.rates, evenly)
-    return _Line(model.track.line_across(at), model.rates_across, evenly)
+        return _Line(model.track.line_along(at), model.rates, evenly, along, beam_rates)
+    line, rates = model.track.line_across(at), model.rates_across
+    if along is not None:
+        here = interpolated_directions(model.track.samples, along, np.array([at]))
+        along, beam_rates = np.repeat(here, len(line.samples), axis=0), np.zeros(rates.shape[1:])
+    return _Line(line, rates, evenly, along, beam_rates)
 
 
 @cached
@@ -194,10 +207,10 @@ def _interpolated(
         return _Interpolated(1.0, 0.0)
     rates = oversampling * np.tensordot(extents, line.rates[:, samples.points], 1)
     if weighted:
-        rates = rates + beam_cycles * model.beam_rates[samples.points]
+        rates = rates + beam_cycles * line.beam_rates[samples.points]
     interpolated = strip_channels if line.track.others else interpolated_channels
     nodes = interpolated(line.track, rates, samples.coordinate, aperture)
-    of_nodes = _steering(model, line.track, samples.pixels, weighted, nodes.coordinate)
+    of_nodes = _steering(model, line, samples.pixels, weighted, nodes.coordinate)
     # One sparse matrix interpolates at all aperture coordinates of all subimages.
     index = nodes.base[..., None] + np.arange(nodes.taps)
     index += nodes.coordinate.shape[1] * np.arange(len(index))[:, None, None]
@@ -274,9 +287,7 @@ def _samples(
     offsets_m = np.stack([each_m for each_m, _ in found])
     chosen = np.stack([cycles_per_m[(share * SAMPLED_PIXELS).astype(int)] for _, share in found])
     pixels = model.points_m[points], offsets_m, chosen
-    return _Samples(
-        points, count, place, pixels, _steering(model, line.track, pixels, weighted, place)
-    )
+    return _Samples(points, count, place, pixels, _steering(model, line, pixels, weighted, place))
 
 
 def _visible_channels(
@@ -303,7 +314,7 @@ def _visible_channels(
 
 def _steering(
     model: VisibilityModel,
-    track: MeanTrack,
+    line: _Line,
     pixels: _Pixels,
     weighted: bool,
     at: NDArray[np.float64],
@@ -322,7 +333,7 @@ def _steering(
     at : float64 [n, places]
     """
     centres_m, offsets_m, cycles_per_m = pixels
-    sight = centres_m[:, None] - track.positions_m(at)
+    sight = centres_m[:, None] - line.track.positions_m(at)
     offsets_m = offsets_m.swapaxes(1, 2)
     square = np.einsum("nsi,nsi->ns", sight, sight)[..., None] + 2 * sight @ offsets_m
     square += np.einsum("nip,nip->np", offsets_m, offsets_m)[:, None]
@@ -330,8 +341,8 @@ def _steering(
     turns = cycles_per_m[:, None] * (range_m[..., 1:] - range_m[..., :1])
     angle = (2 * np.pi * (turns - np.rint(turns))).astype(np.float32)
     result = np.concatenate([np.cos(angle), np.sin(angle)], axis=-1)
-    if weighted and model.beam is not None:
-        along = interpolated_directions(model.track.samples, model.along, at)
+    if weighted and model.beam is not None and line.along is not None:
+        along = interpolated_directions(line.track.samples, line.along, at)
         sine = np.einsum("nsi,nsi->ns", sight, along)[..., None]
         sine = (sine + along @ offsets_m[..., 1:]) / range_m[..., 1:]
         weights = model.beam.weights(sine, wavelength_m(model.lines)).astype(np.float32)
