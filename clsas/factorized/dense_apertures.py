@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import BSpline
 from scipy.linalg import solveh_banded
-from scipy.sparse import coo_array
+from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
@@ -251,23 +251,28 @@ def _fitted(
         along, across = turned[near], across[near % len(across)]
         position_m = position_m[near % len(position_m)]
     knots = np.concatenate([[low] * 3, np.linspace(low, high, intervals + 1), [high] * 3])
-    basis = BSpline.design_matrix(along, knots, 3).toarray()
-    terms = (basis[:, :, None] * across[:, None, None] ** np.arange(powers)).reshape(len(along), -1)
+    basis = BSpline.design_matrix(along, knots, 3)
+    # Each row has the 4 splines that are not 0 there, times each power.
+    power = np.arange(powers)
+    values = basis.data.reshape(-1, 4, 1) * across[:, None, None] ** power
+    columns = powers * basis.indices.reshape(-1, 4, 1) + power
+    rows = np.arange(len(along) + 1) * (4 * powers)
+    terms = csr_array(
+        (values.ravel(), columns.ravel(), rows), shape=(len(along), powers * basis.shape[1])
+    )
     coefficients = _least_squares(terms, position_m, 4 * powers)
     off_m = terms @ coefficients - position_m
     rms_m = float(np.sqrt(np.mean(np.sum(off_m**2, axis=1))))
     return BSpline(knots, coefficients.reshape(basis.shape[1], powers, 3), 3), rms_m
 
 
-def _least_squares(
-    terms: NDArray[np.float64], values: NDArray[np.float64], band: int
-) -> NDArray[np.float64]:
+def _least_squares(terms: csr_array, values: NDArray[np.float64], band: int) -> NDArray[np.float64]:
     """Return the coefficients of terms [n, m] that fit values [n, 3] best, [m, 3].
 
     Terms as far apart as `band` have nothing in common, so that the normal equations are banded: a
     general solver takes ten times as long, and more where its threads meet other work.
     """
-    normal = terms.T @ terms
+    normal = (terms.T @ terms).toarray()
     m = len(normal)
     lower = np.zeros((band, m))
     for below in range(min(band, m)):
