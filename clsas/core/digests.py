@@ -29,5 +29,5 @@ def grid_digest(grid: Grid) -> str:
 def _digest(*arrays: NDArray) -> str:
     sha = hashlib.sha256()
     for array in arrays:
-        sha.update(np.ascontiguousarray(array).tobytes())
+        sha.update(np.ascontiguousarray(array).reshape(-1).view(np.uint8).data)
     return sha.hexdigest()[:16]

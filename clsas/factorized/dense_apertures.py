@@ -9,12 +9,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import BSpline
+from scipy.linalg import solveh_banded
+from scipy.sparse import coo_array, csr_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import KDTree
 
 from clsas.core.lines import RangeLines, some_channels, wavelength_m
 from clsas.factorized.aperture import mean_track
@@ -63,25 +66,58 @@ def simplest_track(lines: RangeLines) -> tuple[Shape, MeanTrack | None]:
 
 
 def strips(lines: RangeLines) -> MeanTrack | None:
-    """Return a track with a curve for each pass: channels follow each other without a jump.
+    """Return a track with a curve for each pass, whatever the order of the channels.
 
     None for a single pass, and where passes are short.
     """
     bare, centres_m = lines.without_samples(), lines.phase_centres_m
+    passes = _following_each_other(centres_m) or _near_each_other(centres_m)
+    if passes is None:
+        return None
+    tracks, coordinate = [], np.empty(lines.channels)
+    for number, channels in enumerate(passes):
+        track = mean_track(bare.select(channels))
+        if track is None:
+            return None
+        tracks.append(track)
+        coordinate[channels] = APART * number + track.coordinate
+    others = tuple(track.spline for track in tracks[1:])
+    return MeanTrack(tracks[0].spline, coordinate, others, sampled=STRIP_SAMPLES)
+
+
+def _following_each_other(centres_m: NDArray[np.float64]) -> list[NDArray[np.int64]] | None:
+    """Return the channels of passes that follow each other with jumps, None without any."""
     steps_m = np.linalg.norm(np.diff(centres_m, axis=0), axis=1)
     if not steps_m.size:
         return None
     jumps = np.flatnonzero(steps_m > _JUMP * np.median(steps_m)) + 1
-    bounds = np.concatenate([[0], jumps, [lines.channels]])
-    if not 1 <= len(jumps) < _MOST_STRIPS or np.diff(bounds).min() < _LEAST_OF_STRIP:
+    return _passes(np.split(np.arange(len(centres_m)), jumps))
+
+
+def _near_each_other(centres_m: NDArray[np.float64]) -> list[NDArray[np.int64]] | None:
+    """Return the channels of passes that lie apart, in any order of the channels.
+
+    Channels are of one pass if a chain of near neighbours joins them.
+    """
+    count, tree = len(centres_m), KDTree(centres_m)
+    some = centres_m[some_channels(count, _SCREENED)]
+    # A helix or a planar array is no passes: its channels have many neighbours within a jump.
+    step_m = float(np.median(tree.query(some, k=2)[0][:, -1]))
+    neighbours = tree.query_ball_point(some, _JUMP * step_m, return_length=True)
+    if step_m == 0 or np.median(neighbours) > 2 * _JUMP + 1:
         return None
-    found = [mean_track(bare.select(slice(int(a), int(b)))) for a, b in pairwise(bounds)]
-    tracks = [track for track in found if track is not None]
-    if len(tracks) < len(found):
+    pairs = tree.query_pairs(_JUMP * step_m, output_type="ndarray")
+    joined = coo_array((np.ones(len(pairs), np.int8), tuple(pairs.T)), shape=(count, count))
+    number, label = connected_components(joined, directed=False)
+    if number > _MOST_STRIPS:
         return None
-    coordinate = [APART * n + track.coordinate for n, track in enumerate(tracks)]
-    others = tuple(track.spline for track in tracks[1:])
-    return MeanTrack(tracks[0].spline, np.concatenate(coordinate), others, sampled=STRIP_SAMPLES)
+    return _passes([np.flatnonzero(label == each) for each in range(number)])
+
+
+def _passes(found: list[NDArray[np.int64]]) -> list[NDArray[np.int64]] | None:
+    """Return the channels of several passes unless these are too many or too short."""
+    short = min(len(each) for each in found) < _LEAST_OF_STRIP
+    return found if 1 < len(found) <= _MOST_STRIPS and not short else None
 
 
 def sheet(lines: RangeLines) -> MeanTrack | None:
@@ -215,11 +251,31 @@ def _fitted(
         along, across = turned[near], across[near % len(across)]
         position_m = position_m[near % len(position_m)]
     knots = np.concatenate([[low] * 3, np.linspace(low, high, intervals + 1), [high] * 3])
-    basis = BSpline.design_matrix(along, knots, 3).toarray()
-    terms = (basis[:, :, None] * across[:, None, None] ** np.arange(powers)).reshape(len(along), -1)
-    normal = terms.T @ terms
-    normal += _RIDGE * np.trace(normal) / len(normal) * np.eye(len(normal))
-    coefficients = np.linalg.solve(normal, terms.T @ position_m)
+    basis = BSpline.design_matrix(along, knots, 3)
+    # Each row has the 4 splines that are not 0 there, times each power.
+    power = np.arange(powers)
+    values = basis.data.reshape(-1, 4, 1) * across[:, None, None] ** power
+    columns = powers * basis.indices.reshape(-1, 4, 1) + power
+    rows = np.arange(len(along) + 1) * (4 * powers)
+    terms = csr_array(
+        (values.ravel(), columns.ravel(), rows), shape=(len(along), powers * basis.shape[1])
+    )
+    coefficients = _least_squares(terms, position_m, 4 * powers)
     off_m = terms @ coefficients - position_m
     rms_m = float(np.sqrt(np.mean(np.sum(off_m**2, axis=1))))
     return BSpline(knots, coefficients.reshape(basis.shape[1], powers, 3), 3), rms_m
+
+
+def _least_squares(terms: csr_array, values: NDArray[np.float64], band: int) -> NDArray[np.float64]:
+    """Return the coefficients of terms [n, m] that fit values [n, 3] best, [m, 3].
+
+    Terms as far apart as `band` have nothing in common, so that the normal equations are banded: a
+    general solver takes ten times as long, and more where its threads meet other work.
+    """
+    normal = (terms.T @ terms).toarray()
+    m = len(normal)
+    lower = np.zeros((band, m))
+    for below in range(min(band, m)):
+        lower[below, : m - below] = np.diagonal(normal, -below)
+    lower[0] += _RIDGE * np.trace(normal) / m
+    return solveh_banded(lower, terms.T @ values, lower=True)

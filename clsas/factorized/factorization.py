@@ -127,8 +127,6 @@ class Factorization:
         check(self.aperture.stages == levels, "aperture", f"made for {levels} stages")
         for name in ("half_lengths", "most_channels"):
             check(len(getattr(self, name)) == levels, name, f"{levels} numbers, one for each stage")
-        sheet = self.aperture.shape == "sheet"
-        check(not sheet or self.limits is None, "limits", "left out with a sheet")
         ascend = self.limits is None or self.limits[0] < self.limits[1]
         check(ascend, "limits", "two ascending sines")
         together = self.roots_prepared % self.roots_at_once == 0

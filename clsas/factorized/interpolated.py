@@ -197,10 +197,8 @@ class InterpolatedAperture:
         for oversampling, side in zip(self.oversampling, sides, strict=True):
             extents = oversampling * surface.extents_in(side, sides[0], roots)
             rate = np.einsum("ra,ars->rs", extents, rates)
-            last = len(nodes) == len(sides) - 1
-            if last and geometry.beam is not None and geometry.along is not None:
-                beam_rate = visibility.beam_rate(geometry.beam, track, geometry.along, root_m)
-                rate += self.beam_cycles * beam_rate
+            if len(nodes) == len(sides) - 1:
+                rate += self._beam_rate(geometry, root_m)
             nodes.append(interpolated(track, rate, place, self.filter))
             place = nodes[-1].coordinate
         return nodes
@@ -218,12 +216,23 @@ class InterpolatedAperture:
         parent: SheetChannels | None = None
         for oversampling, side in zip(self.oversampling, sides, strict=True):
             own = rates.times(oversampling * surface.extents_in(side, sides[0], roots))
+            if len(nodes) == len(sides) - 1:
+                own.along[:] += self._beam_rate(geometry, root_m)
             if parent is not None:
                 virtual, parent = later_on_sheet(track, own, parent, self.filter)
             else:
                 virtual, parent = first_on_sheet(track, own, *places, self.filter)
             nodes.append(virtual)
         return nodes
+
+    def _beam_rate(
+        self, geometry: Geometry, root_m: NDArray[np.float64]
+    ) -> NDArray[np.float64] | float:
+        """Return the phase rate that the beam's weights count for, [roots, samples]; 0 without."""
+        if geometry.beam is None or geometry.along is None:
+            return 0.0
+        rate = visibility.beam_rate(geometry.beam, geometry.track, geometry.along, root_m)
+        return self.beam_cycles * rate
 
     def predicted_channels(
         self, model: VisiblePhases, sides: tuple[tuple[int, int], ...]

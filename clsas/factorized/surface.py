@@ -205,21 +205,22 @@ def _through_points(grid: Grid) -> Surface:
     across = across - (across @ normal) * normal
     across /= np.linalg.norm(across)
     axes = np.stack([np.cross(normal, across), across])
-    in_plane_m = offset_m @ axes.T
-    # Axis by axis: NumPy reduces long columns slowly.
-    low_m, high_m = (
-        np.array([reduce(axis) for axis in in_plane_m.T.copy()]) for reduce in (np.min, np.max)
-    )
+    # Axis by axis: NumPy multiplies and reduces long, narrow arrays ten times slower.
+    in_plane_m = [offset_m @ axis for axis in axes]
+    low_m, high_m = (np.array([reduce(each) for each in in_plane_m]) for reduce in (np.min, np.max))
     span_m = high_m - low_m
     step_m = max(math.sqrt(math.prod(span_m) / grid.size), span_m.max() / grid.size)
     step_m = max(1.000001 * step_m, _LEAST_CELL_M)
     rows, columns = (int(n) for n in span_m // step_m + 1)
     shape = rows, columns
-    index = np.minimum(((in_plane_m - low_m) // step_m).astype(np.int64), np.array(shape) - 1)
+    row, column = (
+        np.minimum(((each - low) / step_m).astype(np.int64), n - 1)
+        for each, low, n in zip(in_plane_m, low_m, shape, strict=True)
+    )
     steps_m = step_m * axes
     origin_m = middle_m + (low_m + step_m / 2) @ axes
     plane = Grid.oriented(origin_m, steps_m[0], steps_m[1], shape)
-    cell = index[:, 0] * shape[1] + index[:, 1]
+    cell = row * columns + column
     return Surface(grid, plane, np.concatenate([steps_m, [normal]]), cell, offset_m @ normal)
 
 

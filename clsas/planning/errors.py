@@ -22,7 +22,7 @@ from clsas.opencl.device import Device
 from clsas.planning.caching import cached
 from clsas.planning.channels import own_drift, track_error_m
 from clsas.planning.sample_pixels import SPREAD_POINTS, mean_over_relief, pixels_m
-from clsas.planning.spacing_errors import spacing_error
+from clsas.planning.spacing_errors import bias_error, filter_error, spacing_error
 from clsas.planning.visibility_model import Side, VisibilityModel
 from clsas.signal.interpolation import Interpolator
 from clsas.sonar.visibility import sines
@@ -36,10 +36,12 @@ _FARTHEST_CHANNELS = 32  # of those sampled: far from the mean track, where it t
 
 @dataclass(frozen=True)
 class Errors:
-    """Error powers of a tree besides those of its filters.
+    """Error powers of a tree besides those of its range filters.
 
     Attributes
     ----------
+    aperture : float
+        The aperture's filter, in all stages.
     roots : float
         Rounding, and channels that are replaced by places on the mean track.
     spacing : tuple of float
@@ -48,6 +50,7 @@ class Errors:
         Expansion of ranges and weights in the leaves.
     """
 
+    aperture: float
     roots: float
     spacing: tuple[float, ...]
     leaves: float
@@ -64,12 +67,15 @@ def other_errors(
 ) -> Errors:
     """Return the errors of a tree; `model` is that within its roots, whose error is known."""
     last = len(sides) - 1
+    stages = [
+        (side, aperture, denser, beam_cycles if level == last else 0.0)
+        for level, (side, denser) in enumerate(zip(sides, oversampling, strict=True))
+    ]
+    filters = sum(filter_error(model, *stage) for stage in stages)
     return Errors(
+        aperture=filters + bias_error(model, stages),
         roots=roots,
-        spacing=tuple(
-            spacing_error(model, side, aperture, denser, beam_cycles if level == last else 0.0)
-            for level, (side, denser) in enumerate(zip(sides, oversampling, strict=True))
-        ),
+        spacing=tuple(spacing_error(model, *stage) for stage in stages),
         leaves=float(leaf_error(model, np.array([sides[-1]]), device)[0]),
     )
 

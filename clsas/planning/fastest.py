@@ -211,7 +211,7 @@ def _filters(problem: _Problem, trial: _Trial, tree: Tree) -> Filters | None:
 def _estimated(
     problem: _Problem, trial: _Trial, tree: Tree, filters: Filters
 ) -> tuple[Errors, Plan]:
-    """Return the errors of a candidate that its filters do not account for, and its plan."""
+    """Return the errors of a candidate besides those of its range filters, and its plan."""
     sides, roots = tree.sides, root_error(problem.model, tree.sides[0])
     within = problem.model.within(sides[0])
     conditions = problem.conditions
@@ -225,6 +225,7 @@ def _estimated(
         conditions.device,
     )
     budget = ErrorBudget(
+        aperture_filters=errors.aperture,
         roots=errors.roots,
         spacing=sum(errors.spacing),
         leaves=errors.leaves,

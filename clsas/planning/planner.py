@@ -301,8 +301,8 @@ def _divisible(model: VisibilityModel) -> bool:
         return False
     if model.beam is None:
         return True
-    # Beams are not interpolated across a sheet, nor normalised over strips.
-    if model.track.is_sheet or (model.track.others and model.beam.normalise):
+    # Sums of weights, to normalise by, are interpolated along a single curve only.
+    if model.track.is_dense and model.beam.normalise:
         return False
     # Normalising divides by a small sum at the beam's edge, and amplifies errors there.
     if model.beam.normalise and coverage(model, 1).min() < _LEAST_COVERED:

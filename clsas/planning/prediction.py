@@ -23,7 +23,7 @@ from clsas.factorized.estimates import (
     upsampling,
 )
 from clsas.factorized.factorization import ExactImage, Factorization
-from clsas.factorized.filters import UPSAMPLING_SHARE, interpolations
+from clsas.factorized.filters import UPSAMPLING_SHARE
 from clsas.factorized.interpolated import InterpolatedAperture
 from clsas.factorized.plan import Plan, Prediction, Stage
 from clsas.factorized.thesis import NearestBeams
@@ -123,7 +123,7 @@ def predicted_plan(
         That within the candidate's roots, where the aperture is interpolated.
     candidate : Candidate
     other_errors : ErrorBudget
-        Contributions that the filters do not account for.
+        Contributions of all but the range filters.
     conditions : Conditions
     """
     sides, device, costs = candidate.sides, conditions.device, conditions.costs
@@ -252,8 +252,6 @@ def _upsampled(model: VisibilityModel, candidate: Candidate, other_errors: Error
     errors = replace(
         other_errors,
         range_filters=stages * power(align_db) + power(final.scatter_db),
-        aperture_filters=interpolations(stages, aperture.dimensions)
-        * power(aperture.filter.error_db),
     )
     if gain is not None:
         most_db = in_db(UPSAMPLING_SHARE * errors.total)

@@ -8,8 +8,9 @@ and compared with the exact ones.
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,22 +58,72 @@ def spacing_error(
         weighted by the beam.
     """
 
-    def error(places: tuple[_Place, ...]) -> float:
-        found = [
-            mean_over_relief(
-                model,
-                side,
-                functools.partial(
-                    _interpolation_error, model, place, side, aperture, oversampling, beam_cycles
-                ),
-            )
-            for place in places
-        ]
+    def excess(error: float) -> float:
+        return max(error - power(aperture.error_db), 0.0)
+
+    return _over_places(model, side, aperture, oversampling, beam_cycles, excess)
+
+
+def filter_error(
+    model: VisibilityModel,
+    side: Side,
+    aperture: Interpolator,
+    oversampling: float,
+    beam_cycles: float | None,
+) -> float:
+    """Error power of the aperture's filter itself, for one stage: see `spacing_error`.
+
+    On a sheet virtual channels are as dense everywhere as the largest phase rate of any line along
+    it and across it asks for. Elsewhere the filter errs by less than at its worst.
+    """
+    worst = power(aperture.error_db)
+    if not model.track.is_sheet:
+        return worst
+
+    def least(error: float) -> float:
+        return min(error, worst)
+
+    return _over_places(model, side, aperture, oversampling, beam_cycles, least)
+
+
+def bias_error(model: VisibilityModel, stages: Sequence[Stage]) -> float:
+    """Error power by which biases of interpolations on a sheet add up beyond their own powers.
+
+    Filters of few taps attenuate steering functions by a mean that all interpolations, along and
+    across and in every stage, have in common. Their amplitudes add, not their powers.
+    """
+    if not model.track.is_sheet:
+        return 0.0
+    biases = np.array([_bias(model, places, stage) for stage in stages for places in _DIMENSIONS])
+    return float(max(biases.sum() ** 2 - biases @ biases, 0.0))
+
+
+def _bias(model: VisibilityModel, places: tuple[_Place, ...], stage: Stage) -> float:
+    extents = tuple(model.surface.extents(stage[0]))
+    return float(np.mean([_interpolated(model, each, *stage, extents).bias for each in places]))
+
+
+def _over_places(
+    model: VisibilityModel,
+    side: Side,
+    aperture: Interpolator,
+    oversampling: float,
+    beam_cycles: float | None,
+    part: Callable[[float], float],
+) -> float:
+    """Return a part of the error of interpolating along the track, or along and across a sheet."""
+
+    def error(place: _Place, extents: NDArray[np.float64]) -> float:
+        given = place, side, aperture, oversampling, beam_cycles, tuple(extents)
+        return part(_interpolated(model, *given).error)
+
+    def mean(places: tuple[_Place, ...]) -> float:
+        found = [mean_over_relief(model, side, functools.partial(error, each)) for each in places]
         return sum(found) / len(found)
 
     if not model.track.is_sheet:
-        return error((_TRACK,))
-    return error(_LINES_ALONG) + error(_LINES_ACROSS)
+        return mean((_TRACK,))
+    return sum(mean(places) for places in _DIMENSIONS)
 
 
 _Place = tuple[Literal["track", "along", "across"], float]
@@ -80,6 +131,17 @@ _Place = tuple[Literal["track", "along", "across"], float]
 _TRACK: _Place = ("track", 0.0)
 _LINES_ALONG: tuple[_Place, ...] = (("along", 0.25),)
 _LINES_ACROSS: tuple[_Place, ...] = (("across", 0.2), ("across", 0.7))
+_DIMENSIONS = (_LINES_ALONG, _LINES_ACROSS)
+
+Stage = tuple[Side, Interpolator, float, float | None]
+"""What `spacing_error` takes of a stage, beside the model."""
+
+
+class _Interpolated(NamedTuple):
+    """Steering functions between virtual channels: their error power, and their mean error."""
+
+    error: float
+    bias: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,48 +155,62 @@ class _Line:
         See `VisibilityModel.rates`.
     channels : float64 [channels]
         Aperture coordinates of channels, ascending.
+    along : float64 [samples, 3] or None
+        Unit directions of the beam at `track.samples`.
+    beam_rates : float64 [points, samples]
+        See `VisibilityModel.beam_rates`; 0 across a sheet, where weights change little.
     """
 
     track: MeanTrack
     rates: NDArray[np.float64]
     channels: NDArray[np.float64]
+    along: NDArray[np.float64] | None
+    beam_rates: Any
 
 
 @cached
 def _line(model: VisibilityModel, place: _Place) -> _Line:
     kind, at = place
+    along = model.along
+    beam_rates = None if along is None else model.beam_rates
     if kind == "track":
-        return _Line(model.track, model.rates, np.sort(model.track.coordinate))
+        channels = np.sort(model.track.coordinate)
+        return _Line(model.track, model.rates, channels, along, beam_rates)
     evenly = np.linspace(0, 1, 4 * _SAMPLED_PLACES)
     if kind == "along":
-        return _Line(model.track.line_along(at), model.rates, evenly)
-    return _Line(model.track.line_across(at), model.rates_across, evenly)
+        return _Line(model.track.line_along(at), model.rates, evenly, along, beam_rates)
+    line, rates = model.track.line_across(at), model.rates_across
+    if along is not None:
+        here = interpolated_directions(model.track.samples, along, np.array([at]))
+        along, beam_rates = np.repeat(here, len(line.samples), axis=0), np.zeros(rates.shape[1:])
+    return _Line(line, rates, evenly, along, beam_rates)
 
 
-def _interpolation_error(
+@cached
+def _interpolated(
     model: VisibilityModel,
     line_at: _Place,
     side: Side,
     aperture: Interpolator,
     oversampling: float,
     beam_cycles: float | None,
-    extents: NDArray[np.float64],
-) -> float:
-    """Error power of interpolated steering functions, less that of the filter.
+    extents: tuple[float, ...],
+) -> _Interpolated:
+    """Errors of interpolated steering functions of subimages of some extents.
 
     The error is 1, as large as the image, if no beam touches a subimage.
     """
     weighted = model.beam is not None and beam_cycles is not None
     line = _line(model, line_at)
-    samples = _samples(model, line_at, side, weighted, tuple(extents))
+    samples = _samples(model, line_at, side, weighted, extents)
     if samples is None:
-        return 1.0
+        return _Interpolated(1.0, 0.0)
     rates = oversampling * np.tensordot(extents, line.rates[:, samples.points], 1)
     if weighted:
-        rates = rates + beam_cycles * model.beam_rates[samples.points]
+        rates = rates + beam_cycles * line.beam_rates[samples.points]
     interpolated = strip_channels if line.track.others else interpolated_channels
     nodes = interpolated(line.track, rates, samples.coordinate, aperture)
-    of_nodes = _steering(model, line.track, samples.pixels, weighted, nodes.coordinate)
+    of_nodes = _steering(model, line, samples.pixels, weighted, nodes.coordinate)
     # One sparse matrix interpolates at all aperture coordinates of all subimages.
     index = nodes.base[..., None] + np.arange(nodes.taps)
     index += nodes.coordinate.shape[1] * np.arange(len(index))[:, None, None]
@@ -143,11 +219,12 @@ def _interpolation_error(
     of_nodes = of_nodes.reshape(-1, of_nodes.shape[-1])
     interpolate = csr_array((weights, index.ravel(), rows), shape=(len(rows) - 1, len(of_nodes)))
     wrong = (interpolate @ of_nodes).reshape(samples.exact.shape) - samples.exact
-    error, total = (
-        samples.count @ np.einsum("nsp,nsp->n", each, each, dtype=np.float64)
-        for each in (wrong, samples.exact)
+    error, bias, total = (
+        samples.count @ np.einsum("nsp,nsp->n", *each, dtype=np.float64)
+        for each in ((wrong, wrong), (wrong, samples.exact), (samples.exact, samples.exact))
     )
-    return float(max(error / max(total, 1e-30) - power(aperture.error_db), 0.0))
+    total = max(total, 1e-30)
+    return _Interpolated(float(error / total), float(bias / total))
 
 
 @dataclass(frozen=True, eq=False)
@@ -210,9 +287,7 @@ def _samples(
     offsets_m = np.stack([each_m for each_m, _ in found])
     chosen = np.stack([cycles_per_m[(share * SAMPLED_PIXELS).astype(int)] for _, share in found])
     pixels = model.points_m[points], offsets_m, chosen
-    return _Samples(
-        points, count, place, pixels, _steering(model, line.track, pixels, weighted, place)
-    )
+    return _Samples(points, count, place, pixels, _steering(model, line, pixels, weighted, place))
 
 
 def _visible_channels(
@@ -239,7 +314,7 @@ def _visible_channels(
 
 def _steering(
     model: VisibilityModel,
-    track: MeanTrack,
+    line: _Line,
     pixels: _Pixels,
     weighted: bool,
     at: NDArray[np.float64],
@@ -258,7 +333,7 @@ def _steering(
     at : float64 [n, places]
     """
     centres_m, offsets_m, cycles_per_m = pixels
-    sight = centres_m[:, None] - track.positions_m(at)
+    sight = centres_m[:, None] - line.track.positions_m(at)
     offsets_m = offsets_m.swapaxes(1, 2)
     square = np.einsum("nsi,nsi->ns", sight, sight)[..., None] + 2 * sight @ offsets_m
     square += np.einsum("nip,nip->np", offsets_m, offsets_m)[:, None]
@@ -266,8 +341,8 @@ def _steering(
     turns = cycles_per_m[:, None] * (range_m[..., 1:] - range_m[..., :1])
     angle = (2 * np.pi * (turns - np.rint(turns))).astype(np.float32)
     result = np.concatenate([np.cos(angle), np.sin(angle)], axis=-1)
-    if weighted and model.beam is not None:
-        along = interpolated_directions(model.track.samples, model.along, at)
+    if weighted and model.beam is not None and line.along is not None:
+        along = interpolated_directions(line.track.samples, line.along, at)
         sine = np.einsum("nsi,nsi->ns", sight, along)[..., None]
         sine = (sine + along @ offsets_m[..., 1:]) / range_m[..., 1:]
         weights = model.beam.weights(sine, wavelength_m(model.lines)).astype(np.float32)

@@ -15,7 +15,6 @@ from clsas.simulation.scenes import PointTargets
 from clsas.simulation.simulator import simulate_lines
 from clsas.sonar.beam import BeamWindow
 
-_POINTS = 1000
 _AIR_M_S, _WATER_M_S = 343.0, 1500.0
 
 
@@ -37,6 +36,8 @@ class DenseCase:
         Pixels along either side.
     slices : int
         Number of images on top of each other, from the target's lowest point to its highest.
+    points : int
+        Number of points; simulation takes as long as they are many.
     """
 
     track: Callable[[], NDArray[np.float64]]
@@ -47,6 +48,7 @@ class DenseCase:
     image_m: float
     pixels: int
     slices: int = 1
+    points: int = 1000
 
     beam: ClassVar[BeamWindow | None] = None
     """Every channel counts for every pixel."""
@@ -70,8 +72,8 @@ class DenseCase:
     def lines(self, seed: int = 1) -> RangeLines:
         """Return range lines of random points, with complex amplitudes."""
         random = np.random.default_rng(seed)
-        positions_m = random.uniform(-0.5, 0.5, (_POINTS, 3)) * self.target_m
-        amplitudes = random.standard_normal(_POINTS) + 1j * random.standard_normal(_POINTS)
+        positions_m = random.uniform(-0.5, 0.5, (self.points, 3)) * self.target_m
+        amplitudes = random.standard_normal(self.points) + 1j * random.standard_normal(self.points)
         track_m = self.track()
         return simulate_lines(
             track_m,
@@ -138,7 +140,9 @@ DENSE_CASES = {
     # 150 turns of 360 pings in air, about a target of 0.24 m.
     "ffbp-helix": _in_air(150),
     "ffbp-helix-fine": _in_air(600),
-    "ffbp-passes": DenseCase(_passes, 120e3, 30e3, _WATER_M_S, (10.0, 10.0, 0.0), 10.0, 1024),
+    "ffbp-passes": DenseCase(
+        _passes, 120e3, 30e3, _WATER_M_S, (10.0, 10.0, 0.0), 10.0, 1024, points=100
+    ),
     "ffbp-volume": DenseCase(
         _circle, 120e3, 30e3, _WATER_M_S, (1.28, 1.28, 0.64), 1.27, 128, slices=64
     ),

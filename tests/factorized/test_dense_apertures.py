@@ -62,6 +62,29 @@ def test_each_pass_has_a_strip():
     assert -0.1 < local.min() < local.max() < 1.1
 
 
+@pytest.mark.parametrize("order", ["two platforms in turn", "random", "backwards"])
+def test_passes_are_found_in_any_order_of_their_channels(order):
+    tx_m = TRACKS["passes"]()
+    given = {
+        "two platforms in turn": np.arange(1600).reshape(2, 800).T.ravel(),
+        "random": np.random.default_rng(2).permutation(1600),
+        "backwards": np.arange(1600)[::-1],
+    }[order]
+    found = strips(lines_at(tx_m[given]))
+    assert found.strips == 8
+    in_passes = found.strip_of(found.coordinate)[np.argsort(given)].reshape(8, 200)
+    assert (in_passes == in_passes[:, :1]).all()
+    assert len(np.unique(in_passes)) == 8
+    assert np.abs(found.offsets_m(tx_m[given])).max() < 1e-9
+
+
+@pytest.mark.parametrize("name", ["helix", "raster", "spiral", "planar"])
+def test_channels_beside_each_other_are_no_passes(name):
+    tx_m = np.random.default_rng(2).permutation(TRACKS[name]())
+    assert strips(lines_at(tx_m)) is None
+    assert sheet(lines_at(tx_m)).is_sheet
+
+
 def test_short_passes_have_none():
     tx_m = TRACKS["passes"]().reshape(8, 200, 3)[:, :20].reshape(-1, 3)
     assert strips(lines_at(tx_m)) is None
