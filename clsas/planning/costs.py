@@ -28,26 +28,26 @@ class Costs:
     those for a device.
     """
 
-    call_ns: float = 1.3e7
+    call_ns: float = 1.35e7
     upsampled_sample_ns: float = 18.0
-    filtered_sample_ns: float = 1.7
-    reference_ns: float = 120.0
+    filtered_sample_ns: float = 1.9
+    reference_ns: float = 125.0
     batch_ns: float = 1.0e5
     subimage_ns: float = 300.0
-    line_ns: float = 30.0
+    line_ns: float = 32.0
     sample_ns: float = 0.1
     sample_tap_ns: float = 0.02
-    single_sample_ns: float = 1.1
+    single_sample_ns: float = 1.15
     given_sample_ns: float = 0.05
-    leaf_channel_ns: float = 10.0
-    leaf_ns: float = 0.52
+    leaf_channel_ns: float = 11.0
+    leaf_ns: float = 0.53
     leaf_point_ns: float = 1.2
     leaf_gathered_ns: float = 1.25
-    group_ns: float = 240.0
-    part_ns: float = 20.0
+    group_ns: float = 243.0
+    part_ns: float = 16.0
     pixel_ns: float = 0.66
     point_ns: float = 0.85
-    beam_ns: float = 0.11
+    beam_ns: float = 0.12
 
     def __post_init__(self) -> None:
         """Check every cost."""
@@ -68,22 +68,26 @@ class Costs:
 
 
 _AVX2 = Costs(
-    call_ns=1.4e7,
-    filtered_sample_ns=2.5,
-    reference_ns=60.0,
-    batch_ns=1.3e5,
-    subimage_ns=600.0,
-    line_ns=45.0,
-    sample_ns=0.04,
-    sample_tap_ns=0.067,
-    given_sample_ns=0.2,
-    leaf_channel_ns=9.5,
-    leaf_ns=0.85,
-    leaf_point_ns=1.1,
-    leaf_gathered_ns=0.6,
-    pixel_ns=1.07,
-    point_ns=1.35,
-    beam_ns=0.46,
+    call_ns=1.6e7,
+    upsampled_sample_ns=19.0,
+    filtered_sample_ns=4.4,
+    reference_ns=100.0,
+    batch_ns=1.0e5,
+    subimage_ns=700.0,
+    line_ns=26.0,
+    sample_ns=0.045,
+    sample_tap_ns=0.08,
+    single_sample_ns=0.15,
+    given_sample_ns=0.02,
+    leaf_channel_ns=16.0,
+    leaf_ns=1.45,
+    leaf_point_ns=1.95,
+    leaf_gathered_ns=0.5,
+    group_ns=280.0,
+    part_ns=12.0,
+    pixel_ns=1.44,
+    point_ns=1.9,
+    beam_ns=0.4,
 )
 
 
@@ -180,10 +184,10 @@ def _tables() -> dict[str, Any]:
     """Return the stored tables by key; raises OSError or ValueError if the file has none."""
     try:
         stored = reading.parse_json(reading.read_bytes(path()))
-    except FileNotFoundError:
+    except (FileNotFoundError, NotADirectoryError):
         return {}
-    if not isinstance(stored, dict):
-        raise ValueError(f"it must hold an object, got {validate.shown(stored)}")
+    if not isinstance(stored, dict) or not all(isinstance(each, dict) for each in stored.values()):
+        raise ValueError(f"it must hold tables by device, got {validate.shown(stored)}")
     return stored
 
 

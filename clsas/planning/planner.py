@@ -170,7 +170,7 @@ def plan(
     exact_fits = memory_bytes is None or exact.memory_bytes <= memory_bytes
     searched = stages is None and _worth_a_search(exact, known.costs, exact_fits, allowed)
     if searched and known.source == "default":
-        known = scaling.measured(device)
+        known = scaling.scaled(device)
     room = device.info.memory_bytes // 2 if memory_bytes is None else memory_bytes
     conditions = Conditions(rest_db, exact, device, known.costs, room)
     found = _chosen(model, stages, conditions, exact_fits, allowed)

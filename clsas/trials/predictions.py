@@ -11,7 +11,7 @@ from functools import partial
 from clsas.exact.backprojection import form_exactly
 from clsas.factorized.report import costs_in_words
 from clsas.opencl.device import Device
-from clsas.planning import scaling
+from clsas.planning import costs, scaling
 from clsas.planning.costs import KnownCosts
 from clsas.planning.exact_image import expect
 from clsas.planning.factorize import factorize
@@ -32,10 +32,17 @@ def requests(names: Sequence[str] | None = None) -> list[tuple[str, float]]:
     return [(case, asked_db) for case in names or known for asked_db in known[case]]
 
 
-def title(device: Device, known: KnownCosts) -> str:
+def known_costs(device: Device) -> KnownCosts:
+    """Return the costs that a plan would use: those stored, or else scaled ones."""
+    known = costs.load(device)
+    return scaling.scaled(device) if known.source == "default" else known
+
+
+def title(device: Device) -> str:
     """Return the device and the origin of its costs."""
+    known, info = known_costs(device), device.info
     origin = costs_in_words(known.source, known.measured)
-    return f"{device.info.label}, {device.info.driver}: {origin}"
+    return f"{info.label}, {info.driver}, {info.compute_units} compute units: {origin}"
 
 
 def rows(
@@ -43,9 +50,9 @@ def rows(
 ) -> Iterator[list[str]]:
     """Yield a row of the table for every request.
 
-    Costs are those that a plan would use; measured where none are stored.
+    Costs are those of `known_costs`.
     """
-    known = scaling.measured(device)
+    known = known_costs(device)
     for case, asked_db in requests(names):
         sides, predicted_s, form = _prepared(case, asked_db, device, known)
         form()  # builds the kernels
