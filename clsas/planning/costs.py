@@ -68,26 +68,26 @@ class Costs:
 
 
 _AVX2 = Costs(
-    call_ns=1.6e7,
+    call_ns=1.2e7,
     upsampled_sample_ns=19.0,
-    filtered_sample_ns=4.4,
+    filtered_sample_ns=4.0,
     reference_ns=100.0,
     batch_ns=1.0e5,
     subimage_ns=700.0,
-    line_ns=26.0,
+    line_ns=36.0,
     sample_ns=0.045,
-    sample_tap_ns=0.08,
+    sample_tap_ns=0.062,
     single_sample_ns=0.15,
     given_sample_ns=0.02,
-    leaf_channel_ns=16.0,
-    leaf_ns=1.45,
-    leaf_point_ns=1.95,
+    leaf_channel_ns=17.0,
+    leaf_ns=1.35,
+    leaf_point_ns=2.0,
     leaf_gathered_ns=0.5,
     group_ns=280.0,
     part_ns=12.0,
-    pixel_ns=1.44,
+    pixel_ns=1.45,
     point_ns=1.9,
-    beam_ns=0.4,
+    beam_ns=0.2,
 )
 
 

@@ -13,9 +13,9 @@ import numpy as np
 from clsas.core.grid import Grid
 from clsas.core.lines import RangeLines
 from clsas.exact.backprojection import form_exactly
+from clsas.factorized import run
 from clsas.factorized.estimates import Work
 from clsas.factorized.plan import Plan
-from clsas.factorized.run import form
 from clsas.opencl.device import Device
 from clsas.planning.costs import Costs
 from clsas.planning.exact_image import Exact, expect
@@ -155,12 +155,12 @@ def exact_image(
 ) -> TimedImage:
     """Return an exact image, to be timed."""
     expected = expect(VisibilityModel(lines, grid, beam), EXACT_DB, device)
-    request = {"device": device, "accuracy_db": EXACT_DB, "beam": beam}
-    return TimedImage(partial(form_exactly, lines, grid, **request), expected, expected.tiled)
+    form = partial(form_exactly, lines, grid, device=device, accuracy_db=EXACT_DB, beam=beam)
+    return TimedImage(form, expected, expected.tiled)
 
 
 def planned_image(device: Device, lines: RangeLines, grid: Grid, chosen: Plan) -> TimedImage:
     """Return an image by a plan, to be timed as its first: nothing is kept from run to run."""
     return TimedImage(
-        lambda: form(lines, grid, replace(chosen), device, None), chosen, grid.is_planar
+        lambda: run.form(lines, grid, replace(chosen), device, None), chosen, grid.is_planar
     )

@@ -27,7 +27,7 @@ ACCURACIES_DB = (-50.0, -80.0)
 
 def requests(names: Sequence[str] | None = None) -> list[tuple[str, float]]:
     """Return cases, all or some, with the accuracies or tolerances that the benchmarks use, dB."""
-    known = {case: ACCURACIES_DB for case in cases.EXACT_CASES}
+    known: dict[str, tuple[float, ...]] = dict.fromkeys(cases.EXACT_CASES, ACCURACIES_DB)
     known |= {case: TOLERANCES_DB.get(case, (-50.0,)) for case in cases.FACTORIZED_CASES}
     return [(case, asked_db) for case in names or known for asked_db in known[case]]
 
@@ -76,8 +76,8 @@ def _prepared(
     lines, grid, beam = described.lines(), described.grid, described.beam
     if case in cases.EXACT_CASES:
         work = expect(VisibilityModel(lines, grid, beam), asked_db, device).work
-        request = {"beam": beam, "accuracy_db": asked_db, "device": device}
-        return "", float(known.costs.seconds(work)), partial(form_exactly, lines, grid, **request)
+        form = partial(form_exactly, lines, grid, beam=beam, accuracy_db=asked_db, device=device)
+        return "", float(known.costs.seconds(work)), form
     chosen = plan(lines, grid, tolerance_db=asked_db, beam=beam, device=device, costs=known.costs)
     sides = ", ".join(f"{rows} x {columns}" for rows, columns in chosen.sides)
     # A copy has no geometry of an earlier image.

@@ -58,13 +58,13 @@ def test_what_is_measured_is_stored(cache, small, monkeypatch):
 @pytest.mark.slow
 def test_first_images_of_plans_are_measured(cache, small, monkeypatch):
     """Others find the geometry that the first has left."""
-    form, kept = timed_images.form, []
+    form, kept = timed_images.run.form, []
 
     def looked_at(lines, grid, chosen, *others):
         kept.append(dict(chosen.kept))
         return form(lines, grid, chosen, *others)
 
-    monkeypatch.setattr(timed_images, "form", looked_at)
+    monkeypatch.setattr(timed_images.run, "form", looked_at)
     monkeypatch.setattr(module.validate, "warn", lambda _: None)  # whatever this machine does
     calibrate()
     assert len(kept) > 10
