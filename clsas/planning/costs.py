@@ -24,8 +24,8 @@ from clsas.opencl.device import Device, DeviceInfo
 class Costs:
     """Time of each kind of work, nanoseconds per unit of the field of that name in `Work`.
 
-    The defaults were measured with PoCL on 2 AVX-512 cores (`clsas calibrate`); `defaults` returns
-    those for a device.
+    The defaults are fitted to kernels' and hosts' times of `scripts/bench predictions` with PoCL on
+    2 AVX-512 cores; `defaults` returns those for a device.
     """
 
     call_ns: float = 1.35e7

@@ -63,7 +63,7 @@ _KERNEL_S = 0.01  # of the exact image's kernel; half of it is too short for a d
 _LEAST_KERNEL_S = 0.003  # and with less than this images are made larger
 _LARGER = 3  # the factorized image's sides: its kernels take as long as the exact one's
 _ROOTS = 2  # of a batch of it
-_LEAST_S = 1e-6  # of what is timed, so that factors are positive
+_LEAST_S = 1e-6  # shortest time of anything, so that factors are positive
 _CHANNELS = 192
 _LEAST_PIXELS, _MOST_PIXELS = 192, 1024  # along either side of the exact images
 _TOLERANCE_DB = -45.0
@@ -111,7 +111,7 @@ class Scale:
 
 _SMALL = {
     16: Scale(0.78, 0.78, 0.8, 0.93, 0.95, 0.75, 0.85),
-    8: Scale(0.9, 0.9, 1.5, 1.35, 1.15, 0.89, 1.31),
+    8: Scale(0.75, 0.75, 1.28, 1.0, 1.0, 0.84, 1.2),
     1: Scale(1.0, 1.0, 0.67, 0.65, 0.58, 0.54, 2.15),
 }
 """Times of these images relative to those of large ones, by lanes of a CPU: lines fit a cache, but
