@@ -3,9 +3,26 @@
 import pytest
 from variants import DEFAULT, EVERY_VARIANT, OTHERS, OWN, is_repeated, variant
 
-from clsas.opencl.device import Device
+from clsas.opencl.device import Device, list_devices
+from clsas.planning import costs
 
 _ALL = OWN | OTHERS
+
+
+@pytest.fixture(autouse=True, scope="session")
+def stored_costs(tmp_path_factory):
+    """A cache folder of the tests' own, with default costs stored for every device.
+
+    So plans depend neither on measured times nor on the user's calibration, also in the processes
+    that tests start.
+    """
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("CLSAS_CACHE", str(tmp_path_factory.mktemp("cache")))
+        if list_devices():
+            for way in _ALL.values():
+                device = variant(*way)
+                costs.save(device, costs.defaults(device))
+        yield
 
 
 @pytest.fixture(params=OWN.values(), ids=OWN.keys(), scope="session")

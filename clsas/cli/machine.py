@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import fields
+from datetime import UTC, datetime
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
@@ -14,6 +16,9 @@ from clsas.cli.parameters import File, need_matplotlib
 from clsas.opencl.device import choose, open_device
 from clsas.trials import demo as demonstration
 
+if TYPE_CHECKING:
+    from clsas.planning.costs import KnownCosts
+
 
 @click.command()
 @options.as_json
@@ -23,10 +28,19 @@ def devices(as_json: bool) -> None:
     \b
     Example:  CLSAS_DEVICE=0 clsas devices
     """
+    from clsas.planning import costs
+
     used, reason = choose()
     found = clsas.list_devices()
+    known = {info.index: costs.load(info) for info in found}
     if as_json:
-        print_json({"devices": found, "used": used.index, "reason": reason})
+        origins = {
+            index: {"source": k.source, "measured": k.measured} for index, k in known.items()
+        }
+        print_json(
+            {"devices": found, "used": used.index, "reason": reason,
+             "costs": origins, "costs_file": costs.path()}
+        )  # fmt: skip
         return
     for info in found:
         in_stages = "" if info.stage_width == info.width else f" ({info.stage_width} in stages)"
@@ -35,9 +49,20 @@ def devices(as_json: bool) -> None:
             f"   driver {info.driver}\n"
             f"   {info.kind.upper()}, {info.compute_units} compute units, "
             f"{info.memory_bytes / 2**30:.1f} GiB ({info.max_buffer_bytes / 2**30:.1f} GiB in one "
-            f"buffer), {'fp64' if info.fp64 else 'no fp64'}, vectors of {info.width}{in_stages}"
+            f"buffer), {'fp64' if info.fp64 else 'no fp64'}, vectors of {info.width}{in_stages}\n"
+            f"   costs: {_origin(known[info.index])}"
         )
-    click.echo(f"Used: {used.index} ({reason})")
+    click.echo(f"Used: {used.index} ({reason})\nCosts are stored in {costs.path()}")
+
+
+def _origin(known: KnownCosts) -> str:
+    """Return where costs come from, and how old they are."""
+    if known.source == "default":
+        return "defaults, until the first plan with a tolerance measures the device in 0.3 s"
+    how = {"scaled": "defaults, scaled by a short measurement", "calibrated": "calibrated"}
+    days = (datetime.now(UTC) - datetime.fromisoformat(known.measured)).days
+    age = "today" if days < 1 else f"{days} day{'s' * (days > 1)} ago"
+    return f"{how[known.source]}, on {known.measured[:10]} ({age})"
 
 
 @click.command()
@@ -55,7 +80,7 @@ def calibrate(device: str | None, as_json: bool) -> None:
     opened = open_device(device)
     with progress_bar("calibrating") as progress:
         found = measure(opened, progress=progress)
-    stored = costs.load(opened) == found
+    stored = costs.load(opened).costs == found
     parts = "".join(f"\n{getattr(found, part.name):>12.4g}  {part.name}" for part in fields(found))
     report(
         as_json,

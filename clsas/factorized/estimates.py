@@ -34,14 +34,20 @@ class Work:
         Stages of batches of roots: launches, tables, transfers.
     subimage
         Subimages, stage by stage.
+    line
+        Lines aligned and combined in stages: their shifts, phases and weights.
     sample, sample_tap
         Samples aligned and combined in stages; the same times the taps of both filters.
+    single_sample
+        Those of lines in single precision.
     given_sample
         Samples aligned in the first stage, whose lines come from main memory.
     leaf_channel
         Virtual channels of the leaves.
     leaf, leaf_point
         Pixels times virtual channels of leaves, with 4 taps, on a plane and off it.
+    leaf_gathered
+        Those of leaves so thick that samples are not looked up in registers.
     group
         Pixels off a plane that the host puts into groups.
     part
@@ -58,12 +64,15 @@ class Work:
     reference: Amount = 0.0
     batch: Amount = 0.0
     subimage: Amount = 0.0
+    line: Amount = 0.0
     sample: Amount = 0.0
     sample_tap: Amount = 0.0
+    single_sample: Amount = 0.0
     given_sample: Amount = 0.0
     leaf_channel: Amount = 0.0
     leaf: Amount = 0.0
     leaf_point: Amount = 0.0
+    leaf_gathered: Amount = 0.0
     group: Amount = 0.0
     part: Amount = 0.0
     pixel: Amount = 0.0
@@ -80,13 +89,21 @@ def upsampling(samples: Amount, *, filtered: bool) -> Work:
     return Work(filtered_sample=samples) if filtered else Work(upsampled_sample=samples)
 
 
-def combining(lines: Amount, samples: Amount, taps: int, *, given: bool) -> Work:
+def combining(
+    lines: Amount, samples: Amount, taps: int, *, given: bool, half_precision: bool = True
+) -> Work:
     """Return the work of aligning and combining lines of so many samples in a stage.
 
     `taps` are those of both filters; `given` is whether it is the first stage.
     """
     aligned = lines * samples
-    return Work(sample=aligned, sample_tap=aligned * taps, given_sample=aligned * given)
+    return Work(
+        line=lines,
+        sample=aligned,
+        sample_tap=aligned * taps,
+        single_sample=aligned * (not half_precision),
+        given_sample=aligned * given,
+    )
 
 
 def adding_in_rows(lines: Amount, samples: Amount, taps: Amount) -> Work:
@@ -95,14 +112,29 @@ def adding_in_rows(lines: Amount, samples: Amount, taps: Amount) -> Work:
 
 
 def backprojecting_leaves(
-    lines: Amount, pixels: Amount, taps: int, *, tiled: bool, weighted: bool
+    lines: Amount,
+    pixels: Amount,
+    taps: int,
+    *,
+    tiled: bool,
+    weighted: bool,
+    gathered: bool = False,
 ) -> Work:
-    """Return the work of backprojecting the lines of leaves of so many pixels."""
+    """Return the work of backprojecting the lines of leaves of so many pixels.
+
+    `gathered` is whether samples are not looked up in registers.
+    """
     pairs = lines * pixels
     weighted_pairs = pairs * weighted
     if tiled:
         return Work(leaf_channel=lines, leaf=pairs * COST[taps], beam=weighted_pairs)
-    return Work(leaf_channel=lines, leaf_point=pairs * COST[taps], beam=weighted_pairs)
+    of_taps = pairs * COST[taps]
+    return Work(
+        leaf_channel=lines,
+        leaf_point=of_taps,
+        leaf_gathered=of_taps * gathered,
+        beam=weighted_pairs,
+    )
 
 
 def backprojecting(

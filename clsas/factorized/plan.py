@@ -7,7 +7,7 @@ import hashlib
 import json
 import weakref
 from dataclasses import replace
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal, TypeAlias
 
 from pydantic import Field, TypeAdapter, ValidationError
 from pydantic.dataclasses import dataclass
@@ -31,9 +31,13 @@ from clsas.factorized.fields import (
 from clsas.opencl import phases
 from clsas.sonar.simplify import EFFECTS
 
-VERSION = 3
+VERSION = 4
 """Version of a plan's JSON. Version 1, of clsas before 0.1.0, had no number; version 2 had one mean
-track."""
+track; version 3 did not tell the origin of costs."""
+
+
+CostSource: TypeAlias = Literal["given", "calibrated", "scaled", "default"]
+"""Origin of the costs that make a prediction: see `clsas.planning.costs.KnownCosts`."""
 
 
 @dataclass(frozen=True, config=CONFIG)
@@ -83,9 +87,11 @@ class Prediction:
         Largest amount of device memory needed.
     device : str
         Device whose times these are.
-    calibrated : bool
-        True if times follow from costs that were measured on this device or given, not from
-        defaults.
+    cost_source : str
+        Origin of the costs that make the times: "given", "calibrated" on the device, "scaled" to it
+        by a short measurement, or "default".
+    costs_measured : str
+        Time of that measurement, UTC, in ISO 8601; "" without one.
     stages : tuple of Stage
         Every stage, and the backprojection at the end. Empty for an exact image.
     work : Work
@@ -102,7 +108,8 @@ class Prediction:
     stages: tuple[Stage, ...]
     work: StoredWork
     errors: StoredErrors
-    calibrated: bool = True
+    cost_source: CostSource = "given"
+    costs_measured: str = ""
 
     __repr__ = reprs.of_fields
 

@@ -14,10 +14,17 @@ if TYPE_CHECKING:
 _HEADINGS = (
     "stage", "subimages", "rows x columns", "channels", "samples", "operations", "error", "time",
 )  # fmt: skip
-_DEFAULT_COSTS = (
-    "Times follow from default costs, not from any measured on this device: "
-    "`clsas calibrate` measures them."
-)
+_COSTS = {
+    "given": "costs that were given.",
+    "calibrated": "costs that `clsas calibrate` measured on this device{when}.",
+    "scaled": (
+        "default costs, scaled to this device by a short measurement{when}: `clsas calibrate` "
+        "measures each."
+    ),
+    "default": (
+        "default costs, not from any measured on this device: `clsas calibrate` measures them."
+    ),
+}
 
 
 def summary(plan: Plan) -> str:
@@ -47,9 +54,14 @@ def report(plan: Plan) -> Report:
     else:
         parts += [_filters(plan.factorization), _stages(plan.stages)]
     parts += ["Error by cause, with its margin; powers add up:", *plan.prediction.errors.describe()]
-    if not plan.prediction.calibrated:
-        parts.append(_DEFAULT_COSTS)
+    said = plan.prediction
+    parts.append(f"Times follow from {costs_in_words(said.cost_source, said.costs_measured)}")
     return Report(parts)
+
+
+def costs_in_words(source: str, measured: str) -> str:
+    """Return the origin of costs, and the day they were measured, as the end of a sentence."""
+    return _COSTS[source].format(when=f" on {measured[:10]}" if measured else "")
 
 
 def _headline(plan: Plan) -> str:

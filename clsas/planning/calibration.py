@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import math
-import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable
 from functools import partial
 from itertools import product
 
@@ -14,19 +12,20 @@ from scipy.optimize import nnls
 
 from clsas.core import validate
 from clsas.core.grid import Grid
-from clsas.core.image import Image
 from clsas.core.lines import RangeLines
-from clsas.exact.backprojection import backproject
 from clsas.factorized.plan import Plan
 from clsas.opencl.device import Device, open_device
 from clsas.planning import costs as stored
 from clsas.planning.costs import Costs
-from clsas.planning.exact_image import Exact, expect
-from clsas.planning.factorize import factorize
+from clsas.planning.exact_image import Exact
 from clsas.planning.planner import plan
-from clsas.planning.visibility_model import VisibilityModel
-from clsas.simulation.scenes import PointTargets
-from clsas.simulation.simulator import simulate_lines
+from clsas.planning.timed_images import (
+    TimedImage,
+    exact_image,
+    planned_image,
+    scene,
+    with_relief,
+)
 from clsas.sonar.beam import BeamWindow
 
 _SIZES = ((500, 768), (1500, 512))
@@ -37,9 +36,7 @@ _TOLERANCES_DB = (-25.0, -45.0, -60.0)
 # With these costs the planner chooses shallow trees, and deep ones: their times differ enough to
 # tell the costs apart.
 _PLANNED_WITH = (Costs(pixel_ns=1e3, point_ns=1e3), Costs(pixel_ns=1e3, leaf_ns=10.0))
-_EXACT_DB = -50.0
 _WIDE = BeamWindow(120.0, "hann")  # touches every pixel from every channel
-_PIXEL_M = 0.02
 
 _ROUNDS = 4
 """Timed runs of every image; the fastest counts."""
@@ -47,53 +44,6 @@ _PRIOR = 0.3
 """Weight of a cost's relative deviation from the default, against relative misfits of times."""
 _MOST_SCATTER = 0.2  # rms log ratio of the best times of even and odd runs; else not stored
 _MOST_MISFIT = 0.35  # rms log ratio of predicted and measured times; else not stored
-
-
-@dataclass(frozen=True, eq=False)
-class _Image:
-    """An image that is timed: how to form it, its predicted work, and its times."""
-
-    form: Callable[[], object]
-    channels: int
-    expected: Plan | Exact
-    tiled: bool
-    seconds: list[float] = field(default_factory=list)
-    kernels: list[dict[str, float]] = field(default_factory=list)
-
-    def run(self, device: Device) -> None:
-        """Form the image once more; time the whole and every kernel."""
-        with device.profile() as times:
-            start = time.perf_counter()
-            self.form()
-            self.seconds.append(time.perf_counter() - start)
-        self.kernels.append({name: each.total_s for name, each in times.items()})
-
-    @property
-    def in_stages(self) -> float:
-        """Least time of the stages' kernels, seconds."""
-        return min(each.get("stage", 0.0) for each in self.kernels)
-
-    @property
-    def in_pixels(self) -> float:
-        """Least time of the backprojecting kernels, seconds."""
-        names = ("backproject_tiles", "backproject_points")
-        return min(sum(each.get(name, 0.0) for name in names) for each in self.kernels)
-
-    @property
-    def scatter(self) -> float:
-        """Repeatability: log ratio of the best times of even and odd runs."""
-        return math.log(min(self.seconds[::2]) / min(self.seconds[1::2]))
-
-    def work(self, names: Sequence[str]) -> list[float]:
-        """Return the amounts of work that some costs are for."""
-        work = self.expected.work
-        return [float(getattr(work, name.removesuffix("_ns"))) for name in names]
-
-    @property
-    def pixel_work(self) -> float:
-        """Pixels times channels, in units of the time with 4 taps."""
-        return sum(self.work(_PIXELS))
-
 
 _HOST = (
     "call_ns",
@@ -104,8 +54,15 @@ _HOST = (
     "group_ns",
     "part_ns",
 )
-_STAGES = ("subimage_ns", "sample_ns", "sample_tap_ns", "given_sample_ns")
-_PIXELS = ("leaf_ns", "leaf_point_ns", "pixel_ns", "point_ns")
+_STAGES = (
+    "subimage_ns",
+    "line_ns",
+    "sample_ns",
+    "sample_tap_ns",
+    "single_sample_ns",
+    "given_sample_ns",
+)
+_PIXELS = ("pixel_ns", "point_ns")
 
 
 def calibrate(
@@ -174,111 +131,75 @@ def calibrate(
     return costs
 
 
-def _images(device: Device) -> list[_Image]:
+def _images(device: Device) -> list[TimedImage]:
     """Return the images that are timed."""
     images = []
 
-    def backprojected(lines: RangeLines, grid: Grid, beam: BeamWindow | None = None) -> None:
-        expected = expect(VisibilityModel(lines, grid, beam), _EXACT_DB, device)
-        form = partial(backproject, lines, grid, device=device, accuracy_db=_EXACT_DB, beam=beam)
-        images.append(_Image(form, lines.channels, expected, expected.tiled))
-
     def factorized(lines: RangeLines, grid: Grid, tolerance_db: float, planned_with: Costs) -> None:
         chosen = plan(lines, grid, tolerance_db=tolerance_db, device=device, costs=planned_with)
-        if chosen.is_exact:
-            return
-
-        def form() -> Image:
-            """Form the image with an empty cache, as the first image of a plan."""
-            return factorize(lines, grid, replace(chosen), device=device)
-
-        images.append(_Image(form, lines.channels, chosen, grid.is_planar))
+        if not chosen.is_exact:
+            images.append(planned_image(device, lines, grid, chosen))
 
     for channels, pixels in _SIZES:
-        lines, grid = _scene(channels, pixels)
-        backprojected(lines, grid)
-        backprojected(lines, grid, _WIDE)
+        lines, grid = scene(channels, pixels)
+        images += [exact_image(device, lines, grid), exact_image(device, lines, grid, _WIDE)]
         for tolerance_db, planned_with in product(_TOLERANCES_DB, _PLANNED_WITH):
             factorized(lines, grid, tolerance_db, planned_with)
             if planned_with is _PLANNED_WITH[0]:
-                factorized(
-                    lines, grid.with_height(np.zeros(grid.shape)), tolerance_db, planned_with
-                )
+                factorized(lines, with_relief(grid), tolerance_db, planned_with)
     for channels, pixels in _SMALL_SIZES:
-        lines, grid = _scene(channels, pixels)
-        backprojected(lines, grid)
-        backprojected(lines, grid.with_height(np.zeros(grid.shape)))
+        lines, grid = scene(channels, pixels)
+        images += [exact_image(device, lines, each) for each in (grid, with_relief(grid))]
     return images
 
 
-def _scene(channels: int, pixels: int) -> tuple[RangeLines, Grid]:
-    """Return lines of random points at 120 kHz and a grid over them, from 40 m."""
-    random = np.random.default_rng(0)
-    half_m = _PIXEL_M * pixels / 2
-    grid = Grid.plane((-half_m, half_m, pixels), (40.0, 40 + 2 * half_m, pixels))
-    along = (np.arange(channels) - (channels - 1) / 2) * (20.0 / channels)
-    tx_m = np.stack([along, 0 * along, 0 * along], axis=1)
-    positions_m = random.uniform([-half_m, 40, 0], [half_m, 40 + 2 * half_m, 0], (100, 3))
-    lines = simulate_lines(
-        tx_m,
-        tx_m,
-        PointTargets(positions_m, random.standard_normal(100)),
-        carrier_hz=120e3,
-        bandwidth_hz=30e3,
-        oversampling=1.25,
-    )
-    return lines, grid
-
-
-def _fitted(images: list[_Image], usual: Costs) -> Costs:
+def _fitted(images: list[TimedImage], usual: Costs) -> Costs:
     """Fit costs to the best times of some images, close to `usual` proportions."""
     plans = [image for image in images if isinstance(image.expected, Plan)]
     exact = [image for image in images if isinstance(image.expected, Exact)]
     tiled = [image for image in plans if image.tiled]
 
-    def per_pixel(some: list[_Image]) -> float:
-        return float(np.median([1e9 * image.in_pixels / image.pixel_work for image in some]))
+    def per_pixel(some: list[TimedImage]) -> float:
+        return float(np.median([1e9 * image.in_pixels / _pixel_work(image) for image in some]))
 
-    of_host = [
-        max(min(image.seconds) - image.in_stages - image.in_pixels, 1e-6) for image in images
-    ]
     least_squares = partial(_least_squares, usual)
     leaves = least_squares(
         ("leaf_channel_ns", "leaf_ns"),
         [image.work(("leaf_channel_ns", "leaf_ns")) for image in tiled],
         [image.in_pixels for image in tiled],
     )
-    of_points = [
-        (
-            1e9 * image.in_pixels
-            - leaves["leaf_channel_ns"] * float(image.expected.work.leaf_channel)
-        )
-        / image.pixel_work
-        for image in plans
-        if not image.tiled
-    ]
-    pixel_ns = per_pixel([image for image in exact if image.tiled and not _is_weighted(image)])
-    weighted = [image for image in exact if _is_weighted(image)]
-    of_beam = [1e9 * image.in_pixels - pixel_ns * image.pixel_work for image in weighted]
+    # Lines of points take as long as those of tiles.
+    of_points = [image for image in plans if not image.tiled]
+    channel_s = 1e-9 * leaves["leaf_channel_ns"]
+    points = least_squares(
+        ("leaf_point_ns", "leaf_gathered_ns"),
+        [image.work(("leaf_point_ns", "leaf_gathered_ns")) for image in of_points],
+        [i.in_pixels - channel_s * sum(i.work(("leaf_channel_ns",))) for i in of_points],
+    )
+    pixel_ns = per_pixel([image for image in exact if image.tiled and not image.is_weighted])
+    weighted = [image for image in exact if image.is_weighted]
+    of_beam = [1e9 * image.in_pixels - pixel_ns * _pixel_work(image) for image in weighted]
     pairs = [float(image.expected.work.beam) for image in weighted]
     return Costs(
-        **least_squares(_HOST, [image.work(_HOST) for image in images], of_host),
+        **least_squares(
+            _HOST, [image.work(_HOST) for image in images], [image.elsewhere for image in images]
+        ),
         **least_squares(
             _STAGES,
             [image.work(_STAGES) for image in plans],
             [image.in_stages for image in plans],
         ),
         **leaves,
-        leaf_point_ns=max(float(np.median(of_points)), 0.0),
+        **points,
         pixel_ns=pixel_ns,
         point_ns=per_pixel([i for i in exact if not i.tiled]),
         beam_ns=max(float(np.median(np.divide(of_beam, pairs))), 0.0),
     )
 
 
-def _is_weighted(image: _Image) -> bool:
-    """Return whether a beam weighs an exact image."""
-    return isinstance(image.expected, Exact) and image.expected.weighted
+def _pixel_work(image: TimedImage) -> float:
+    """Return pixels times channels of an exact image, in units of the time with 4 taps."""
+    return sum(image.work(_PIXELS))
 
 
 def _least_squares(

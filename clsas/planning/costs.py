@@ -1,51 +1,62 @@
-"""Costs of each kind of work on a device: measured once, stored in the user's cache."""
+"""Costs of each kind of work on a device: measured once, stored in the user's cache folder."""
 
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, dataclass, fields
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields, replace
+from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 
 from clsas.core import reading, validate
-from clsas.core.atomic import replacing
+from clsas.core.atomic import make_folders, replacing
 from clsas.core.cache import cache_folder
+from clsas.core.version import __version__
 from clsas.factorized.estimates import Work
-from clsas.opencl.device import Device
+from clsas.factorized.plan import CostSource
+from clsas.opencl.device import Device, DeviceInfo
 
 
 @dataclass(frozen=True)
 class Costs:
     """Time of each kind of work, nanoseconds per unit of the field of that name in `Work`.
 
-    The defaults were measured with PoCL on 2 AVX-512 cores (`clsas calibrate`); `defaults` returns
-    those for a device.
+    The defaults are fitted to kernels' and hosts' times of `scripts/bench predictions` with PoCL on
+    2 AVX-512 cores; `defaults` returns those for a device.
     """
 
-    call_ns: float = 1.2e7
-    upsampled_sample_ns: float = 8.0
-    filtered_sample_ns: float = 1.3
-    reference_ns: float = 100.0
+    call_ns: float = 1.35e7
+    upsampled_sample_ns: float = 18.0
+    filtered_sample_ns: float = 1.9
+    reference_ns: float = 125.0
     batch_ns: float = 1.0e5
     subimage_ns: float = 300.0
-    sample_ns: float = 0.02
-    sample_tap_ns: float = 0.034
-    given_sample_ns: float = 0.25
+    line_ns: float = 32.0
+    sample_ns: float = 0.1
+    sample_tap_ns: float = 0.02
+    single_sample_ns: float = 1.15
+    given_sample_ns: float = 0.05
     leaf_channel_ns: float = 11.0
-    leaf_ns: float = 0.55
-    leaf_point_ns: float = 0.9
-    group_ns: float = 150.0
-    part_ns: float = 30.0
-    pixel_ns: float = 0.5
-    point_ns: float = 0.78
-    beam_ns: float = 0.13
+    leaf_ns: float = 0.53
+    leaf_point_ns: float = 1.2
+    leaf_gathered_ns: float = 1.25
+    group_ns: float = 243.0
+    part_ns: float = 16.0
+    pixel_ns: float = 0.66
+    point_ns: float = 0.85
+    beam_ns: float = 0.12
 
     def __post_init__(self) -> None:
         """Check every cost."""
         for field in fields(self):
             validate.number(field.name, getattr(self, field.name), "ns", least=0.0)
+
+    def times(self, factors: Mapping[str, float]) -> Costs:
+        """Return these costs with some of them multiplied by factors, by name."""
+        return replace(self, **{name: each * getattr(self, name) for name, each in factors.items()})
 
     def seconds(self, work: Work) -> Any:
         """Return the time of some work, the sum of amounts times costs: an array if these are."""
@@ -57,29 +68,61 @@ class Costs:
 
 
 _AVX2 = Costs(
-    call_ns=1.4e7,
-    filtered_sample_ns=2.5,
-    reference_ns=60.0,
-    batch_ns=1.3e5,
-    subimage_ns=600.0,
-    sample_ns=0.04,
-    sample_tap_ns=0.067,
-    given_sample_ns=0.2,
-    leaf_channel_ns=9.5,
-    leaf_ns=0.85,
-    leaf_point_ns=1.1,
-    pixel_ns=1.07,
-    point_ns=1.35,
-    beam_ns=0.46,
+    call_ns=1.2e7,
+    upsampled_sample_ns=19.0,
+    filtered_sample_ns=4.0,
+    reference_ns=100.0,
+    batch_ns=1.0e5,
+    subimage_ns=700.0,
+    line_ns=36.0,
+    sample_ns=0.045,
+    sample_tap_ns=0.062,
+    single_sample_ns=0.15,
+    given_sample_ns=0.02,
+    leaf_channel_ns=17.0,
+    leaf_ns=1.35,
+    leaf_point_ns=2.0,
+    leaf_gathered_ns=0.5,
+    group_ns=280.0,
+    part_ns=12.0,
+    pixel_ns=1.45,
+    point_ns=1.9,
+    beam_ns=0.2,
 )
 
 
-def defaults(device: Device) -> Costs:
+@dataclass(frozen=True)
+class KnownCosts:
+    """Costs of a device, with their origin.
+
+    Attributes
+    ----------
+    costs : Costs
+    source : str
+        "given" by the caller; "calibrated" by `clsas.calibrate`; "scaled" from the defaults by a
+        short measurement; or "default".
+    measured : str
+        Time of the measurement, UTC, in ISO 8601; "" without one.
+    """
+
+    costs: Costs
+    source: CostSource
+    measured: str = ""
+
+    def __post_init__(self) -> None:
+        """Check the source and the time."""
+        validate.one_of("source", self.source, get_args(CostSource))
+        if self.measured and datetime.fromisoformat(self.measured).tzinfo is None:
+            raise ValueError(f"measured must have a time zone, got {self.measured}")
+
+
+def defaults(device: Device | DeviceInfo) -> Costs:
     """Return the costs of a device without a measurement of its own.
 
     For 8 lanes these are the costs of 2 AVX2 cores with PoCL.
     """
-    return _AVX2 if device.info.width == 8 else Costs()
+    info = device.info if isinstance(device, Device) else device
+    return _AVX2 if info.width == 8 else Costs()
 
 
 def path() -> Path:
@@ -87,36 +130,72 @@ def path() -> Path:
     return cache_folder() / "costs.json"
 
 
-def load(device: Device) -> Costs:
-    """Return the measured costs of a device and its driver, or else `defaults`."""
-    return measured(device) or defaults(device)
+def load(device: Device | DeviceInfo) -> KnownCosts:
+    """Return the stored costs of a device and its driver, or else `defaults`.
 
-
-def measured(device: Device) -> Costs | None:
-    """Return the measured costs of a device and its driver, None without any."""
-    names = {field.name for field in fields(Costs)}
+    Warns
+    -----
+    ClsasWarning
+        If the file of costs cannot be read, or holds something else.
+    """
+    info = device.info if isinstance(device, Device) else device
+    default = KnownCosts(defaults(info), "default")
     try:
-        stored = reading.parse_json(reading.read_bytes(path()))[_key(device)]
-        return Costs(**{name: float(stored[name]) for name in names})
-    except (OSError, ValueError, KeyError, TypeError):
-        return None
+        table = _tables().get(key(info))
+        return default if table is None else _known(table)
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        validate.warn(f"costs stored in {path()} are ignored: {_reason(error)}")
+        return default
 
 
-def save(device: Device, costs: Costs) -> Path:
-    """Store the measured costs of a device; return the file."""
+def save(device: Device, costs: Costs, source: CostSource = "calibrated") -> Path:
+    """Store the measured costs of a device; return the file.
+
+    The file is replaced as a whole, so that another process reads the old one or the new one.
+
+    Raises
+    ------
+    OSError
+        If the user's cache folder cannot be written.
+    """
     file = path()
     try:
-        stored = dict(reading.parse_json(reading.read_bytes(file)))
-    except (OSError, ValueError, TypeError):
-        stored = {}  # no file yet, or not one of clsas
-    stored[_key(device)] = asdict(costs)
-    file.parent.mkdir(parents=True, exist_ok=True)
+        stored = _tables()
+    except (OSError, ValueError):
+        stored = {}  # whoever reads the file is warned
+    measured = datetime.now(UTC).isoformat(timespec="seconds")
+    stored[key(device.info)] = {"source": source, "measured": measured, "costs": asdict(costs)}
+    make_folders(file.parent)
     with replacing(file) as temporary:
         temporary.write_text(json.dumps(stored, indent=1))
     return file
 
 
-def _key(device: Device) -> str:
-    info = device.info
+def key(info: DeviceInfo) -> str:
+    """Return what costs depend on: device, driver, cores, how kernels are built, and version."""
     lookup = ", permuting" if info.permute else ""
-    return f"{info.label}, {info.driver}, {info.width} lanes{lookup}"
+    return (
+        f"{info.label}, {info.driver}, {info.compute_units} compute units, {info.width} lanes"
+        f"{lookup}, clsas {__version__}"
+    )
+
+
+def _tables() -> dict[str, Any]:
+    """Return the stored tables by key; raises OSError or ValueError if the file has none."""
+    try:
+        stored = reading.parse_json(reading.read_bytes(path()))
+    except (FileNotFoundError, NotADirectoryError):
+        return {}
+    if not isinstance(stored, dict) or not all(isinstance(each, dict) for each in stored.values()):
+        raise ValueError(f"it must hold tables by device, got {validate.shown(stored)}")
+    return stored
+
+
+def _known(table: dict[str, Any]) -> KnownCosts:
+    """Return costs from their stored table; raises an error if it is not one of `save`."""
+    costs = {field.name: float(table["costs"][field.name]) for field in fields(Costs)}
+    return KnownCosts(Costs(**costs), table["source"], table["measured"])
+
+
+def _reason(error: Exception) -> str:
+    return f"{error} is missing" if isinstance(error, KeyError) else str(error)

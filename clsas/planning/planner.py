@@ -21,10 +21,10 @@ from clsas.factorized.left_out import with_left_out
 from clsas.factorized.plan import Plan
 from clsas.factorized.thesis import NearestBeams
 from clsas.opencl.device import Device, open_device
+from clsas.planning import costs as stored_costs
+from clsas.planning import scaling
 from clsas.planning.beam_coverage import coverage, partly_visible_share, sweeps_once
-from clsas.planning.costs import Costs
-from clsas.planning.costs import defaults as default_costs
-from clsas.planning.costs import measured as measured_costs
+from clsas.planning.costs import Costs, KnownCosts
 from clsas.planning.errors import leaf_error, nearest_errors
 from clsas.planning.exact_image import Exact, expect
 from clsas.planning.fastest import fastest, off_track
@@ -103,7 +103,8 @@ def plan(
         Device memory that may be used. By default half of the device's, or as much as plain
         backprojection takes.
     costs : Costs, optional
-        Costs in place of those stored for the device.
+        Costs in place of those stored for the device. Where none are stored, a measurement of 0.3 s
+        scales the defaults, and is stored, before the first search for a factorization.
     taps : (range, aperture), optional
         For study, with a tolerance: numbers of taps, 4, 6 or 8, in place of the fastest.
     depth : int, optional
@@ -130,7 +131,8 @@ def plan(
     ClsasWarning
         If the tolerance may be missed because lines do not fade towards ends that the grid
         reaches, or because the lines' band fills all that is sampled; or if no pixel lies within
-        any line's range, or the beam, so that the image will be zero.
+        any line's range, or the beam, so that the image will be zero; or if costs stored for the
+        device cannot be read, or those measured cannot be stored.
     """
     validate.instance("lines", lines, RangeLines)
     validate.instance("grid", grid, Grid)
@@ -152,8 +154,7 @@ def plan(
     if costs is not None:
         validate.instance("costs", costs, Costs)
     device = open_device(device)
-    costs = costs or measured_costs(device)
-    calibrated, costs = costs is not None, costs or default_costs(device)
+    known = stored_costs.load(device) if costs is None else KnownCosts(costs, "given")
     if memory_bytes is not None:
         memory_bytes = validate.count("memory_bytes", memory_bytes)
     scene = Model(lines, grid, beam) if full_model else simplify(lines, grid, beam, tolerance_db)
@@ -164,7 +165,15 @@ def plan(
     if tolerance_db is not None:
         model.ambiguity.warn("tolerance_db", tolerance_db)
         rest_db = model.ambiguity.rest_db(tolerance_db, scene.error)
-    found = _chosen(model, rest_db, stages, device, costs, memory_bytes, allowed)
+    exact = expect(model, ACCURACY_DB if rest_db is None else rest_db - MARGIN_DB, device)
+    # Exact imaging divides itself to fit a device.
+    exact_fits = memory_bytes is None or exact.memory_bytes <= memory_bytes
+    searched = stages is None and _worth_a_search(exact, known.costs, exact_fits, allowed)
+    if searched and known.source == "default":
+        known = scaling.scaled(device)
+    room = device.info.memory_bytes // 2 if memory_bytes is None else memory_bytes
+    conditions = Conditions(rest_db, exact, device.for_stages(), known.costs, room)
+    found = _chosen(model, stages, conditions, exact_fits, allowed)
     errors = replace(
         found.errors,
         line_ends=model.ambiguity.ends,
@@ -172,7 +181,11 @@ def plan(
         left_out=scene.error,
     )
     prediction = replace(
-        found.prediction, error_db=errors.total_db, errors=errors, calibrated=calibrated
+        found.prediction,
+        error_db=errors.total_db,
+        errors=errors,
+        cost_source=known.source,
+        costs_measured=known.measured,
     )
     kept = found.kept
     found = replace(found, tolerance_db=tolerance_db, prediction=prediction)
@@ -187,20 +200,13 @@ def plan(
 
 def _chosen(
     model: VisibilityModel,
-    tolerance_db: float | None,
     stages: list[tuple[int, int]] | None,
-    device: Device,
-    costs: Costs,
-    memory_bytes: int | None,
+    conditions: Conditions,
+    exact_fits: bool,
     allowed: Allowed | None,
 ) -> Plan:
     """Return the plan of checked arguments."""
-    beam = model.beam
-    exact = expect(model, ACCURACY_DB if tolerance_db is None else tolerance_db - MARGIN_DB, device)
-    # Exact imaging divides itself to fit a device.
-    room = device.info.memory_bytes // 2 if memory_bytes is None else memory_bytes
-    exact_fits = memory_bytes is None or exact.memory_bytes <= memory_bytes
-    conditions = Conditions(tolerance_db, exact, device.for_stages(), costs, room)
+    beam, exact, room = model.beam, conditions.exact, conditions.memory_bytes
     least: float = exact.memory_bytes
     if stages:
         if model.track is None:
@@ -211,8 +217,9 @@ def _chosen(
         if found.memory_bytes <= room:
             return found
         exact_fits, least = False, found.memory_bytes
-    elif stages is None and _worth_a_search(exact, costs, exact_fits, allowed):
-        to_beat = _WORTH * costs.seconds(exact.work) if exact_fits and allowed is None else math.inf
+    elif stages is None and _worth_a_search(exact, conditions.costs, exact_fits, allowed):
+        is_free = exact_fits and allowed is None
+        to_beat = _WORTH * conditions.costs.seconds(exact.work) if is_free else math.inf
         faster, needed = _fastest_of_shapes(model, conditions, to_beat, allowed or Allowed())
         if faster is not None:
             return faster

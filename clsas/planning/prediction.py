@@ -126,15 +126,17 @@ def predicted_plan(
         Contributions of all but the range filters.
     conditions : Conditions
     """
-    sides, device, costs = candidate.sides, conditions.device, conditions.costs
+    sides, device = candidate.sides, conditions.device
     lines = _upsampled(model, candidate, other_errors)
     if model.track is not None and model.track.is_dense:
         lines = _trimmed(model, candidate, lines)
     half_lengths = model.half_lengths(sides, candidate.align, candidate.final, lines.resampling)
     channels = candidate.aperture.predicted_channels(model, sides)
     levels = [Level.of(half, device.info.width) for half in half_lengths]
-    stages, work = _stages(model, candidate, lines, levels, channels, device, costs)
     errors, half_precision = _with_arithmetic(model, candidate, lines, channels, conditions)
+    stages, work = _stages(
+        model, candidate, lines, levels, channels, conditions, half_precision=half_precision
+    )
     sizes = BufferSizes(
         model=model,
         width=device.info.width,
@@ -292,10 +294,12 @@ def _stages(
     lines: _Lines,
     levels: Sequence[Level],
     channels: Sequence[StageChannels],
-    device: Device,
-    costs: Costs,
+    conditions: Conditions,
+    *,
+    half_precision: bool,
 ) -> tuple[list[Stage], Work]:
     """Return the prediction of every stage and of the leaves, and the work of all."""
+    device, costs = conditions.device, conditions.costs
     width, aperture = device.info.width, candidate.aperture.filter
     dimensions = candidate.aperture.dimensions
     taps = candidate.align.taps + aperture.taps**dimensions
@@ -313,7 +317,9 @@ def _stages(
         count = model.subimages(side)
         samples = levels[level].length
         combined = count * of_stage.used
-        work = combining(combined, samples, taps, given=level == 0) + Work(subimage=count)
+        work = combining(
+            combined, samples, taps, given=level == 0, half_precision=half_precision
+        ) + Work(subimage=count)
         if dimensions == 2:
             work += adding_in_rows(count * of_stage.count, levels[level].pitch, aperture.taps)
         if level == 0:
@@ -332,7 +338,10 @@ def _stages(
     pixels, backprojected = model.padded_pixels(side, width), count * of_stage.count
     tiled, weighted = model.surface.is_plane, model.beam is not None
     taps = candidate.final.taps
-    work = backprojecting_leaves(backprojected, pixels, taps, tiled=tiled, weighted=weighted)
+    gathered = not tiled and _looked_up_singly(model, candidate, lines, device)
+    work = backprojecting_leaves(
+        backprojected, pixels, taps, tiled=tiled, weighted=weighted, gathered=gathered
+    )
     if not tiled:
         work += Work(group=count * pixels)
     add(

@@ -303,7 +303,7 @@ def test_calibrate(monkeypatch):
     monkeypatch.setattr("clsas.planning.calibration.calibrate", lambda device, progress: measured)
     assert not run_json("calibrate", "--device", 0)["stored"]
     assert ", not stored in " in run("calibrate", "--device", 0)[0]
-    monkeypatch.setattr(costs, "load", lambda device: measured)
+    monkeypatch.setattr(costs, "load", lambda device: costs.KnownCosts(measured, "calibrated"))
     result = run_json("calibrate", "--device", 0)
     assert result["stored"]
     assert result["costs"]["pixel_ns"] == 0.7
@@ -335,7 +335,11 @@ def test_devices(monkeypatch):
     infos = clsas.list_devices()
     result = run_json("devices")
     assert [device["name"] for device in result["devices"]] == [info.name for info in infos]
+    assert {each["source"] for each in result["costs"].values()} == {"calibrated"}
+    assert result["costs_file"] == str(costs.path())
     text, _ = run("devices")
+    assert re.search(r"^   costs: calibrated, on \d{4}-\d\d-\d\d \(today\)$", text, re.MULTILINE)
+    assert f"Costs are stored in {costs.path()}" in text
     assert all(info.label in text and info.driver in text for info in infos)
     assert f"Used: {result['used']} ({result['reason']})" in text
     last = infos[-1].index

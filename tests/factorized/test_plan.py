@@ -406,17 +406,26 @@ def test_a_frequency_that_lines_cannot_hold_is_refused(chosen):
 def test_it_says_whether_times_are_of_this_device(chosen, monkeypatch, tmp_path):
     lines, grid = made(straight)
     monkeypatch.setenv("CLSAS_CACHE", str(tmp_path))
-    usual = plan(lines, grid, tolerance_db=-50)
-    assert not usual.prediction.calibrated
+    usual = plan(lines, grid, stages=[])
+    assert usual.prediction.cost_source == "default"
     words = "Times follow from default costs, not from any measured on this device: `clsas calib"
     assert words in usual.describe()
-    assert words in plan(lines, grid, stages=[]).describe()
     device = open_device()
+    costs.save(device, costs.defaults(device), "scaled")
+    scaled = plan(lines, grid, tolerance_db=-50)
+    day = scaled.prediction.costs_measured[:10]
+    words = (
+        f"Times follow from default costs, scaled to this device by a short measurement on {day}"
+    )
+    assert words in scaled.describe()
     costs.save(device, costs.defaults(device))
     measured = plan(lines, grid, tolerance_db=-50)
-    assert measured.prediction.calibrated
+    assert measured.prediction.cost_source == "calibrated"
+    assert f"costs that `clsas calibrate` measured on this device on {day}" in measured.describe()
     assert "default costs" not in measured.describe()
-    assert Plan.from_json(usual.to_json()).prediction.calibrated is False
+    given = plan(lines, grid, tolerance_db=-50, costs=costs.Costs())
+    assert "Times follow from costs that were given." in given.describe()
+    assert Plan.from_json(scaled.to_json()).prediction.cost_source == "scaled"
 
 
 def test_json_may_leave_out_filters(chosen):

@@ -4,7 +4,7 @@ import pytest
 
 from clsas.core.validate import ClsasWarning
 from clsas.opencl.device import open_device
-from clsas.planning import costs
+from clsas.planning import costs, timed_images
 from clsas.planning.calibration import calibrate
 from clsas.planning.costs import Costs
 
@@ -30,13 +30,13 @@ def disturbed(monkeypatch):
     """A function that changes the times of images."""
 
     def disturb(change):
-        run = module._Image.run
+        run = module.TimedImage.run
 
         def changed(image, device):
             run(image, device)
             image.seconds[-1] = change(image, image.seconds[-1])
 
-        monkeypatch.setattr(module._Image, "run", changed)
+        monkeypatch.setattr(module.TimedImage, "run", changed)
 
     return disturb
 
@@ -48,7 +48,7 @@ def test_what_is_measured_is_stored(cache, small, monkeypatch):
     monkeypatch.setattr(module, "_MOST_MISFIT", 100.0)
     seen = []
     found = calibrate(progress=lambda *n: seen.append(n))
-    assert costs.load(open_device()) == found != Costs()
+    assert costs.load(open_device()).costs == found != Costs()
     assert seen == [(done, seen[0][1]) for done in range(1, len(seen) + 1)]
     assert found.pixel_ns > 0
     assert found.leaf_ns > 0
@@ -58,13 +58,13 @@ def test_what_is_measured_is_stored(cache, small, monkeypatch):
 @pytest.mark.slow
 def test_first_images_of_plans_are_measured(cache, small, monkeypatch):
     """Others find the geometry that the first has left."""
-    form, kept = module.factorize, []
+    form, kept = timed_images.run.form, []
 
-    def looked_at(lines, grid, chosen, **others):
+    def looked_at(lines, grid, chosen, *others):
         kept.append(dict(chosen.kept))
-        return form(lines, grid, chosen, **others)
+        return form(lines, grid, chosen, *others)
 
-    monkeypatch.setattr(module, "factorize", looked_at)
+    monkeypatch.setattr(timed_images.run, "form", looked_at)
     monkeypatch.setattr(module.validate, "warn", lambda _: None)  # whatever this machine does
     calibrate()
     assert len(kept) > 10
@@ -79,13 +79,14 @@ def test_measurements_of_a_busy_machine_are_not_stored(cache, small, disturbed):
     costs.save(open_device(), before)
     with pytest.warns(ClsasWarning, match=r"not stored: times of the same image differ by \d+"):
         found = calibrate()
-    assert costs.load(open_device()) == before != found
+    assert costs.load(open_device()).costs == before != found
 
 
 @pytest.mark.slow
 def test_times_that_no_costs_explain_are_not_stored(cache, small, disturbed):
     """Small images take a thousand times as long as large ones."""
-    disturbed(lambda image, seconds: 1e6 / image.pixel_work)
+    names = ("leaf_ns", "leaf_point_ns", "pixel_ns", "point_ns")
+    disturbed(lambda image, seconds: 1e6 / sum(image.work(names)))
     with pytest.warns(ClsasWarning, match=r"the costs miss the times measured by \d+"):
         calibrate()
     assert not cache.exists()

@@ -1,0 +1,259 @@
+"""Costs of a device that nobody calibrated: defaults, scaled by a measurement of 0.3 s.
+
+Devices differ mostly in how fast they run each of the kernels, and hosts in how fast they are.
+Costs of one kernel keep the proportions that they have by default. So three small images, formed
+exactly on a plane, exactly off it, and factorized, tell a factor for each group of costs.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
+from itertools import cycle
+from pathlib import Path
+
+from clsas.core import validate
+from clsas.core.decibels import power
+from clsas.core.lines import RangeLines
+from clsas.opencl.buffers import padded_length, upsampled_lines
+from clsas.opencl.device import Device
+from clsas.planning import costs as stored
+from clsas.planning.costs import Costs, KnownCosts
+from clsas.planning.exact_image import expect
+from clsas.planning.fastest import fastest
+from clsas.planning.prediction import OUTSIDE, Conditions
+from clsas.planning.search import Allowed
+from clsas.planning.timed_images import (
+    TimedImage,
+    exact_image,
+    planned_image,
+    scene,
+    square,
+    with_relief,
+)
+from clsas.planning.visibility_model import VisibilityModel
+from clsas.signal import interpolation
+from clsas.signal.interpolation import Resampling
+
+GROUPS = {
+    "host": ("call_ns", "reference_ns", "batch_ns", "group_ns", "part_ns"),
+    "transforms": ("upsampled_sample_ns",),
+    "filters": ("filtered_sample_ns",),
+    "stages": (
+        "subimage_ns",
+        "line_ns",
+        "sample_ns",
+        "sample_tap_ns",
+        "single_sample_ns",
+        "given_sample_ns",
+    ),
+    "leaves": ("leaf_channel_ns", "leaf_ns"),
+    "pixels": ("pixel_ns", "beam_ns"),
+    "points": ("point_ns", "leaf_point_ns", "leaf_gathered_ns"),
+}
+"""Costs that are scaled by the same factor, by the field of `Scale`."""
+
+_BUDGET_S = 0.3
+"""Time of the measurement, without building kernels."""
+_KERNEL_S = 0.01  # of the exact image's kernel; half of it is too short for a device to settle,
+_LEAST_KERNEL_S = 0.003  # and with less than this images are made larger
+_LARGER = 3  # the factorized image's sides: its kernels take as long as the exact one's
+_ROOTS = 2  # of a batch of it
+_LEAST_S = 1e-6  # shortest time of anything, so that factors are positive
+_CHANNELS = 192
+_LEAST_PIXELS, _MOST_PIXELS = 192, 1024  # along either side of the exact images
+_TOLERANCE_DB = -45.0
+_PLANNED_WITH = Costs(pixel_ns=1e3, point_ns=1e3)  # so that an image is factorized
+_ALLOWED = Allowed(align_taps=(4,), aperture_taps=(6,), stages=(2,))
+_measuring = threading.Lock()
+
+
+@dataclass(frozen=True)
+class Scale:
+    """Factors by which a device and its host are slower than the default costs have it.
+
+    Attributes
+    ----------
+    host, transforms : float
+        Work of the host: everything but FFTs, and these.
+    filters, stages, leaves, pixels, points : float
+        Kernels that upsample lines, combine them in stages, backproject leaves on a plane, and
+        backproject exact images on a plane, and any image off it.
+    """
+
+    host: float
+    transforms: float
+    filters: float
+    stages: float
+    leaves: float
+    pixels: float
+    points: float
+
+    def __post_init__(self) -> None:
+        """Check every factor."""
+        for each in fields(self):
+            validate.positive(each.name, getattr(self, each.name))
+
+    def over(self, other: Scale) -> Scale:
+        """Return these factors divided by others."""
+        return Scale(*(mine / vars(other)[name] for name, mine in vars(self).items()))
+
+    def of(self, usual: Costs) -> Costs:
+        """Return default costs scaled to the device."""
+        return usual.times(
+            {name: getattr(self, group) for group, names in GROUPS.items() for name in names}
+        )
+
+
+_SMALL = {
+    16: Scale(0.78, 0.78, 0.8, 0.93, 0.95, 0.75, 0.85),
+    8: Scale(0.75, 0.75, 1.28, 1.0, 1.0, 0.84, 1.2),
+    1: Scale(1.0, 1.0, 0.8, 0.93, 0.95, 0.54, 2.15),
+}
+"""Times of these images relative to those of large ones, by lanes of a CPU: lines fit a cache, but
+buffers are touched for the first time. Geometric means over the cases of `scripts/bench
+predictions` on PoCL with AVX-512, on PoCL with AVX2 and on Intel's runtime with AVX-512."""
+
+
+def scaled(device: Device) -> KnownCosts:
+    """Scale the default costs to a device, and store them.
+
+    A process measures a device once, even if the costs cannot be stored. Threads wait for it.
+
+    Warns
+    -----
+    ClsasWarning
+        If the costs cannot be stored.
+    """
+    with _measuring:
+        return _scaled_once(device, stored.path())
+
+
+@functools.cache
+def _scaled_once(device: Device, path: Path) -> KnownCosts:
+    """Scale the default costs to a device, and store them in the file `path`."""
+    costs = measure(device).of(stored.defaults(device))
+    try:
+        stored.save(device, costs, "scaled")
+    except OSError as error:
+        validate.warn(
+            f"costs measured on {device.info.label} cannot be stored, so that every process "
+            f"measures them anew, for {_BUDGET_S:g} s: {error}"
+        )
+        return KnownCosts(costs, "scaled")
+    return stored.load(device)
+
+
+def measure(device: Device) -> Scale:
+    """Measure how fast a device and its host are, in 0.3 s and the time to build kernels.
+
+    Images are larger on fast devices. They take turns, and the fastest run of each counts. Once all
+    have run, none begins that would not end in time.
+    """
+    # Events of its own: whoever profiles the device sees nothing of the measurement.
+    device = replace(device, _events=None)
+    start = time.perf_counter()
+    side = _LEAST_PIXELS
+    images, building_s = _built(device, side)
+    images.exact.run(device)
+    if images.exact.in_pixels < _LEAST_KERNEL_S:
+        larger = side * math.sqrt(_KERNEL_S / max(images.exact.in_pixels, _LEAST_S))
+        images, again_s = _built(device, 64 * round(min(larger, _MOST_PIXELS) / 64))
+        building_s += again_s
+    end = start + building_s + _BUDGET_S
+    for image in cycle(images.timed):
+        everyone = all(each.seconds for each in images.timed)
+        if everyone and time.perf_counter() + image.seconds[-1] > end:
+            break
+        image.run(device)
+    info = device.info
+    found = images.scale(stored.defaults(device), images.transform_s(info.width))
+    small = _SMALL.get(info.width) if info.kind == "cpu" else None
+    return found if small is None else found.over(small)
+
+
+@dataclass(frozen=True, eq=False)
+class _Images:
+    """Images that are timed.
+
+    Attributes
+    ----------
+    exact, points, factorized : TimedImage
+        On a plane, off it, and on a plane of three times the sides.
+    lines : RangeLines
+    resampling : Resampling
+        How the exact images upsample the lines.
+    """
+
+    exact: TimedImage
+    points: TimedImage
+    factorized: TimedImage
+    lines: RangeLines
+    resampling: Resampling
+
+    @property
+    def timed(self) -> tuple[TimedImage, ...]:
+        """All images, the one whose kernels scatter most first."""
+        return self.factorized, self.exact, self.points
+
+    def transform_s(self, width: int) -> float:
+        """Return the time in which the host upsamples the lines, seconds per sample."""
+        samples, pitch = self.lines.samples, padded_length(self.resampling)
+        seconds = min(
+            _seconds(lambda: upsampled_lines(samples, self.resampling, width, 0, pitch))
+            for _ in range(2)
+        )
+        return seconds / (len(samples) * self.resampling.length)
+
+    def scale(self, usual: Costs, sample_s: float) -> Scale:
+        """Return the factors by which times differ from those of the usual costs.
+
+        `sample_s` is the time of a sample that the host upsamples.
+        """
+        factorized, exact, points = self.timed
+        transformed = sum(sum(image.work(GROUPS["transforms"])) for image in self.timed)
+        host_s = sum(image.in_host for image in self.timed) - transformed * sample_s
+
+        def slower(seconds: float, group: str, *images: TimedImage) -> float:
+            usual_s = sum(image.predicted_s(usual, GROUPS[group]) for image in images)
+            return max(seconds, _LEAST_S) / usual_s
+
+        return Scale(
+            host=slower(host_s, "host", *self.timed),
+            transforms=1e9 * sample_s / usual.upsampled_sample_ns,
+            filters=slower(factorized.in_kernels("upsample_lines"), "filters", factorized),
+            stages=slower(factorized.in_stages, "stages", factorized),
+            leaves=slower(factorized.in_pixels, "leaves", factorized),
+            pixels=slower(exact.in_pixels, "pixels", exact),
+            points=slower(points.in_pixels, "points", points),
+        )
+
+
+def _built(device: Device, side: int) -> tuple[_Images, float]:
+    """Return images of some pixels along a side, formed once, and the time that this took."""
+    lines, grid = scene(_CHANNELS, _LARGER * side)
+    exact = exact_image(device, lines, square(side))
+    points = exact_image(device, lines, with_relief(square(3 * side // 4)))
+    model = VisibilityModel(lines, grid, None, OUTSIDE * power(_TOLERANCE_DB))
+    room = device.info.memory_bytes // 2
+    competing = expect(model, _TOLERANCE_DB, device)
+    conditions = Conditions(_TOLERANCE_DB, competing, device, _PLANNED_WITH, room)
+    found, _ = fastest(model, conditions, math.inf, _ALLOWED)
+    assert found is not None  # the scene is made so
+    # Kernels that touch a buffer first take twice as long. Large images have many batches.
+    found = found.changed(roots_at_once=_ROOTS, roots_prepared=8 * _ROOTS)
+    factorized = planned_image(device, lines, grid, found)
+    resampling = interpolation.resampling(lines.length, found.factorization.final, model.spectrum)
+    images = _Images(exact, points, factorized, lines, resampling)
+    return images, sum(_seconds(image.form) for image in images.timed)
+
+
+def _seconds(act: Callable[[], object]) -> float:
+    """Return the time that something takes."""
+    start = time.perf_counter()
+    act()
+    return time.perf_counter() - start

@@ -1,0 +1,166 @@
+"""Images that are timed to learn what work costs on a device."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+
+import numpy as np
+
+from clsas.core.grid import Grid
+from clsas.core.lines import RangeLines
+from clsas.exact.backprojection import form_exactly
+from clsas.factorized import run
+from clsas.factorized.estimates import Work
+from clsas.factorized.plan import Plan
+from clsas.opencl.device import Device
+from clsas.planning.costs import Costs
+from clsas.planning.exact_image import Exact, expect
+from clsas.planning.visibility_model import VisibilityModel
+from clsas.sonar.beam import BeamWindow
+
+_SOUND_M_S = 1500.0
+_CARRIER_HZ, _SAMPLE_RATE_HZ, _BAND = 120e3, 37.5e3, 0.8
+"""Carrier, sample rate, and the share of it that the lines' band fills."""
+_NEAREST_M, _TRACK_M, _PIXEL_M = 40.0, 20.0, 0.02
+_MARGIN_M = 1.0  # of ranges, to either side
+_RELIEF_M = 0.5  # of dunes as long as a quarter of the grid: no accuracy lets it be left out
+EXACT_DB = -50.0
+"""Accuracy of the exact images."""
+
+
+@dataclass(frozen=True, eq=False)
+class TimedImage:
+    """An image that is timed: how to form it, its predicted work, and its times.
+
+    Attributes
+    ----------
+    form : callable
+        Forms the image.
+    expected : Plan or Exact
+        The image as it is predicted.
+    tiled : bool
+        True if pixels lie in tiles of a plane.
+    seconds : list of float
+        Time of every run.
+    kernels : list of dict
+        Time of every kernel, run by run.
+    """
+
+    form: Callable[[], object]
+    expected: Plan | Exact
+    tiled: bool
+    seconds: list[float] = field(default_factory=list)
+    kernels: list[dict[str, float]] = field(default_factory=list)
+
+    def run(self, device: Device) -> None:
+        """Form the image once more; time the whole and every kernel."""
+        with device.profile() as times:
+            start = time.perf_counter()
+            self.form()
+            self.seconds.append(time.perf_counter() - start)
+        self.kernels.append({name: each.total_s for name, each in times.items()})
+
+    @property
+    def in_stages(self) -> float:
+        """Least time of the stages' kernels, seconds."""
+        return self.in_kernels("stage")
+
+    @property
+    def in_pixels(self) -> float:
+        """Least time of the backprojecting kernels, seconds."""
+        return self.in_kernels("backproject_tiles", "backproject_points")
+
+    def in_kernels(self, *names: str) -> float:
+        """Return the least time of some kernels in a run, seconds."""
+        return min(sum(each.get(name, 0.0) for name in names) for each in self.kernels)
+
+    @property
+    def elsewhere(self) -> float:
+        """Least time without the kernels of stages and pixels, seconds: mostly the host's."""
+        return max(min(self.seconds) - self.in_stages - self.in_pixels, 1e-6)
+
+    @property
+    def in_host(self) -> float:
+        """Least time of a run without its kernels, seconds."""
+        runs = zip(self.seconds, self.kernels, strict=True)
+        return min(seconds - sum(kernels.values()) for seconds, kernels in runs)
+
+    @property
+    def scatter(self) -> float:
+        """Repeatability: log ratio of the best times of even and odd runs."""
+        return math.log(min(self.seconds[::2]) / min(self.seconds[1::2]))
+
+    @property
+    def is_weighted(self) -> bool:
+        """True for an exact image that a beam weighs."""
+        return isinstance(self.expected, Exact) and self.expected.weighted
+
+    def work(self, names: Sequence[str]) -> list[float]:
+        """Return the amounts of work that some costs are for."""
+        work: Work = self.expected.work
+        return [float(getattr(work, name.removesuffix("_ns"))) for name in names]
+
+    def predicted_s(self, costs: Costs, names: Sequence[str]) -> float:
+        """Return the time that some costs predict for their work, seconds."""
+        amounts = zip(names, self.work(names), strict=True)
+        return 1e-9 * sum(getattr(costs, name) * amount for name, amount in amounts)
+
+
+def square(pixels: int) -> Grid:
+    """Return a square grid beside the track of `scene`."""
+    half_m = _PIXEL_M * pixels / 2
+    return Grid.plane((-half_m, half_m, pixels), (_NEAREST_M, _NEAREST_M + 2 * half_m, pixels))
+
+
+def scene(channels: int, pixels: int) -> tuple[RangeLines, Grid]:
+    """Return lines of noise from a straight track, and a square grid beside it.
+
+    Times do not depend on samples, and noise takes a hundredth of the time of a simulation. It
+    fades towards the ends of the lines.
+    """
+    random = np.random.default_rng(0)
+    half_m = _PIXEL_M * pixels / 2
+    tx_m = np.zeros((channels, 3))
+    tx_m[:, 0] = (np.arange(channels) - (channels - 1) / 2) * (_TRACK_M / channels)
+    farthest_m = math.hypot(_NEAREST_M + 2 * half_m, half_m + _TRACK_M / 2)
+    step_m = _SOUND_M_S / (2 * _SAMPLE_RATE_HZ)
+    length = math.ceil((farthest_m - _NEAREST_M + 2 * _MARGIN_M) / step_m)
+    spectrum = random.standard_normal((channels, length, 2)) @ [1, 1j]
+    spectrum[:, np.abs(np.fft.fftfreq(length)) > _BAND / 2] = 0
+    samples = np.fft.ifft(spectrum) * np.hanning(length)
+    lines = RangeLines(
+        samples,
+        first_range_m=_NEAREST_M - _MARGIN_M,
+        range_step_m=step_m,
+        tx_m=tx_m,
+        rx_m=tx_m,
+        carrier_hz=_CARRIER_HZ,
+        sound_speed_m_s=_SOUND_M_S,
+    )
+    return lines, square(pixels)
+
+
+def with_relief(grid: Grid) -> Grid:
+    """Return a plane raised by dunes: its pixels are grouped, and not laid out in tiles."""
+    rows, columns = (np.sin(np.linspace(0, 8 * np.pi, count)) for count in grid.shape)
+    return grid.with_height(_RELIEF_M / 2 * rows[:, None] * columns)
+
+
+def exact_image(
+    device: Device, lines: RangeLines, grid: Grid, beam: BeamWindow | None = None
+) -> TimedImage:
+    """Return an exact image, to be timed."""
+    expected = expect(VisibilityModel(lines, grid, beam), EXACT_DB, device)
+    form = partial(form_exactly, lines, grid, device=device, accuracy_db=EXACT_DB, beam=beam)
+    return TimedImage(form, expected, expected.tiled)
+
+
+def planned_image(device: Device, lines: RangeLines, grid: Grid, chosen: Plan) -> TimedImage:
+    """Return an image by a plan, to be timed as its first: nothing is kept from run to run."""
+    return TimedImage(
+        lambda: run.form(lines, grid, replace(chosen), device, None), chosen, grid.is_planar
+    )

@@ -1,0 +1,95 @@
+"""Predicted against measured times of the benchmarks' cases."""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from functools import partial
+
+from clsas.exact.backprojection import form_exactly
+from clsas.factorized.report import costs_in_words
+from clsas.opencl.device import Device
+from clsas.planning import costs, scaling
+from clsas.planning.costs import KnownCosts
+from clsas.planning.exact_image import expect
+from clsas.planning.factorize import factorize
+from clsas.planning.planner import plan
+from clsas.planning.visibility_model import VisibilityModel
+from clsas.trials import cases
+from clsas.trials.tables import TOLERANCES_DB
+
+COLUMNS = ("case", "dB", "subimages", "predicted s", "measured s: median (min to max)", "ratio")
+ACCURACIES_DB = (-50.0, -80.0)
+"""Accuracies of cases of exact imaging."""
+
+
+def requests(names: Sequence[str] | None = None) -> list[tuple[str, float]]:
+    """Return cases, all or some, with the accuracies or tolerances that the benchmarks use, dB."""
+    known: dict[str, tuple[float, ...]] = dict.fromkeys(cases.EXACT_CASES, ACCURACIES_DB)
+    known |= {case: TOLERANCES_DB.get(case, (-50.0,)) for case in cases.FACTORIZED_CASES}
+    return [(case, asked_db) for case in names or known for asked_db in known[case]]
+
+
+def known_costs(device: Device) -> KnownCosts:
+    """Return the costs that a plan would use: those stored, or else scaled ones."""
+    known = costs.load(device)
+    return scaling.scaled(device) if known.source == "default" else known
+
+
+def title(device: Device) -> str:
+    """Return the device and the origin of its costs."""
+    known, info = known_costs(device), device.info
+    origin = costs_in_words(known.source, known.measured)
+    return f"{info.label}, {info.driver}, {info.compute_units} compute units: {origin}"
+
+
+def rows(
+    device: Device, names: Sequence[str] | None = None, repeats: int = 5
+) -> Iterator[list[str]]:
+    """Yield a row of the table for every request.
+
+    Costs are those of `known_costs`.
+    """
+    known = known_costs(device)
+    for case, asked_db in requests(names):
+        sides, predicted_s, form = _prepared(case, asked_db, device, known)
+        form()  # builds the kernels
+        measured_s = [_seconds(form) for _ in range(repeats)]
+        median_s = statistics.median(measured_s)
+        yield [
+            case,
+            f"{asked_db:g}",
+            sides,
+            f"{predicted_s:.3f}",
+            f"{median_s:.3f} ({min(measured_s):.3f} to {max(measured_s):.3f})",
+            f"{predicted_s / median_s:.2f}",
+        ]
+
+
+def _prepared(
+    case: str, asked_db: float, device: Device, known: KnownCosts
+) -> tuple[str, float, Callable[[], object]]:
+    """Return the sides of the subimages, the predicted time, and what forms the image."""
+    described = (cases.EXACT_CASES | cases.FACTORIZED_CASES)[case]
+    lines, grid, beam = described.lines(), described.grid, described.beam
+    if case in cases.EXACT_CASES:
+        work = expect(VisibilityModel(lines, grid, beam), asked_db, device).work
+        form = partial(form_exactly, lines, grid, beam=beam, accuracy_db=asked_db, device=device)
+        return "", float(known.costs.seconds(work)), form
+    chosen = plan(lines, grid, tolerance_db=asked_db, beam=beam, device=device, costs=known.costs)
+    sides = ", ".join(f"{rows} x {columns}" for rows, columns in chosen.sides)
+    # A copy has no geometry of an earlier image.
+    return (
+        sides or "exact",
+        chosen.predicted_seconds,
+        lambda: factorize(lines, grid, replace(chosen), device=device),
+    )
+
+
+def _seconds(act: Callable[[], object]) -> float:
+    """Return the time that something takes."""
+    start = time.perf_counter()
+    act()
+    return time.perf_counter() - start

@@ -1,0 +1,177 @@
+import dataclasses
+import errno
+import json
+
+import numpy as np
+import pytest
+from factorizing import EXACT_IS_SLOW, made, straight
+
+from clsas.core.validate import ClsasWarning
+from clsas.opencl.device import open_device
+from clsas.planning import costs, scaling
+from clsas.planning.calibration import calibrate
+from clsas.planning.costs import Costs
+from clsas.planning.planner import plan
+from clsas.planning.scaling import GROUPS, Scale
+
+SAME = Scale(*(1.0 for _ in dataclasses.fields(Scale)))
+TWICE = Scale(*(2.0 for _ in dataclasses.fields(Scale)))
+WISH = {"tolerance_db": -30}
+
+
+@pytest.fixture
+def cache(tmp_path, monkeypatch):
+    """An empty cache of the user's."""
+    monkeypatch.setenv("CLSAS_CACHE", str(tmp_path / "cache"))
+    return costs.path()
+
+
+@pytest.fixture
+def measured(monkeypatch):
+    """What measurements return from now on, and the devices that were measured."""
+
+    class Measured(list):
+        scale = SAME
+
+    found = Measured()
+    monkeypatch.setattr(scaling, "measure", lambda device: found.append(device) or found.scale)
+    # However small the image is.
+    monkeypatch.setattr("clsas.planning.planner._SEARCH_S", 0.0)
+    return found
+
+
+def scene():
+    return made(straight)
+
+
+def test_the_first_plan_measures_and_later_ones_read_what_it_stored(cache, measured):
+    first = plan(*scene(), **WISH)
+    assert len(measured) == 1
+    assert first.prediction.cost_source == "scaled"
+    stored = costs.load(open_device())
+    assert stored.source == "scaled"
+    assert stored.costs == costs.defaults(open_device())
+    assert plan(*scene(), **WISH).to_json() == first.to_json()
+    costs.save(open_device(), EXACT_IS_SLOW, "scaled")
+    assert plan(*scene(), **WISH).exact_seconds > 10 * first.exact_seconds
+    assert len(measured) == 1
+
+
+def test_a_device_twice_as_slow_takes_twice_the_time(tmp_path, monkeypatch, measured):
+    times = []
+    for number, measured.scale in enumerate((SAME, TWICE)):
+        monkeypatch.setenv("CLSAS_CACHE", str(tmp_path / str(number)))
+        found = plan(*scene(), **WISH)
+        times.append((found.predicted_seconds, found.exact_seconds))
+    assert np.divide(times[1], times[0]) == pytest.approx([2, 2])
+
+
+def test_every_cost_is_scaled_once():
+    assert sorted(name for names in GROUPS.values() for name in names) == sorted(
+        field.name for field in dataclasses.fields(Costs)
+    )
+    assert list(GROUPS) == [field.name for field in dataclasses.fields(Scale)]
+    assert SAME.of(EXACT_IS_SLOW) == EXACT_IS_SLOW
+    slow_stages = dataclasses.replace(SAME, stages=3.0).of(Costs())
+    assert slow_stages.sample_ns == 3 * Costs().sample_ns
+    assert slow_stages.leaf_ns == Costs().leaf_ns
+
+
+@pytest.mark.parametrize("value", [0.0, -1.0, float("nan"), float("inf")])
+def test_factors_are_positive(value):
+    with pytest.raises(ValueError, match="stages must be"):
+        dataclasses.replace(SAME, stages=value)
+
+
+@pytest.mark.parametrize("wish", [{"stages": []}, {"stages": [(2, 2)]}], ids=["exact", "stages"])
+def test_plans_without_a_search_measure_nothing(cache, measured, wish):
+    assert plan(*scene(), **wish).prediction.cost_source == "default"
+    assert not measured
+    assert not cache.exists()
+
+
+def test_nor_do_plans_of_small_images_or_with_given_costs(cache, measured, monkeypatch):
+    assert plan(*scene(), **WISH, costs=EXACT_IS_SLOW).prediction.cost_source == "given"
+    monkeypatch.setattr("clsas.planning.planner._SEARCH_S", 1e6)
+    assert plan(*scene(), **WISH).prediction.cost_source == "default"
+    assert not measured
+
+
+def test_another_driver_is_measured_anew(cache, measured):
+    device = open_device()
+    other = dataclasses.replace(
+        device, info=dataclasses.replace(device.info, driver="another"), _kernels={}
+    )
+    for each in (device, other, device, other):
+        plan(*scene(), **WISH, device=each)
+    assert measured == [device, other]
+    keys = {
+        costs.key(dataclasses.replace(device.info, **change))
+        for change in ({}, {"driver": "x"}, {"name": "x"}, {"compute_units": 99}, {"width": 4})
+    }
+    assert len(keys) == 5
+
+
+def test_another_version_of_clsas_measures_anew(cache, measured, monkeypatch):
+    plan(*scene(), **WISH)
+    monkeypatch.setattr(costs, "__version__", "99.0")
+    assert costs.load(open_device()).source == "default"
+
+
+def test_a_calibration_replaces_scaled_costs(cache, measured, monkeypatch):
+    plan(*scene(), **WISH)
+    module = "clsas.planning.calibration."
+    monkeypatch.setattr(module + "_SIZES", ((200, 128), (400, 96)))
+    monkeypatch.setattr(module + "_SMALL_SIZES", ((50, 32), (100, 64)))
+    monkeypatch.setattr(module + "_ROUNDS", 2)
+    for name in ("_MOST_SCATTER", "_MOST_MISFIT"):  # whatever else this machine does
+        monkeypatch.setattr(module + name, 100.0)
+    found = calibrate()
+    assert costs.load(open_device()).costs == found
+    assert plan(*scene(), **WISH).prediction.cost_source == "calibrated"
+    assert len(measured) == 1
+
+
+@pytest.mark.parametrize("content", ["", "[]", '{"KEY": {"pixel_ns": 0.5}}', '{"KEY": 5}'])
+def test_a_broken_or_foreign_file_is_told_and_measured_anew(cache, measured, content):
+    cache.parent.mkdir()
+    cache.write_text(content.replace("KEY", costs.key(open_device().info)))
+    with pytest.warns(ClsasWarning, match=r"costs stored in .*costs\.json are ignored"):
+        found = plan(*scene(), **WISH)
+    assert found.prediction.cost_source == "scaled"
+    assert len(measured) == 1
+    assert plan(*scene(), **WISH).prediction.cost_source == "scaled"
+    assert json.loads(cache.read_text())
+
+
+def test_costs_of_other_devices_stay(cache, measured):
+    cache.parent.mkdir()
+    cache.write_text('{"another device": {"of": "a later version"}}')
+    plan(*scene(), **WISH)
+    stored = json.loads(cache.read_text())
+    assert stored["another device"] == {"of": "a later version"}
+    assert len(stored) == 2
+
+
+def test_costs_that_cannot_be_stored_serve_this_process(cache, measured, monkeypatch):
+    measured.scale = TWICE
+
+    def read_only(*args):
+        raise PermissionError(errno.EACCES, "Permission denied", str(cache))
+
+    monkeypatch.setattr(costs, "replacing", read_only)
+    with pytest.warns(ClsasWarning, match="cannot be stored, so that every process") as heard:
+        found = plan(*scene(), **WISH)
+    assert len(heard) == 1
+    assert found.prediction.cost_source == "scaled"
+    again = plan(*scene(), **WISH)  # without a warning
+    assert again.predicted_seconds == found.predicted_seconds
+    assert len(measured) == 1
+
+
+def test_a_device_is_measured(platform):
+    """Whatever the machine does meanwhile: factors are within the reach of known devices."""
+    with platform.profile() as times:
+        found = scaling.measure(platform)
+    assert not times  # of the measurement's own kernels
+    assert all(1e-3 < factor < 1e3 for factor in vars(found).values())
