@@ -163,7 +163,9 @@ class _Passes:
                 found[ping] = 0.0, here.spacing_m  # too few channels overlap to tell
                 continue
             at, behind, ahead = (
-                self.correlator.correlate(corrected, here, each, self.lines.range_step_m)
+                self.correlator.correlate(
+                    corrected, here, each, self.lines.range_step_m, align=False
+                )
                 for each in pairs
             )
             found[ping] = surge(at, behind, ahead, here.spacing_m)
