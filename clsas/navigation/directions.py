@@ -9,7 +9,7 @@ with the phase that it would have with the mean of both geometries. This holds f
 itself, however strong its echoes are.
 
 Uniform arrays cannot tell directions apart whose sines differ by half a wavelength over the spacing
-of the phase centres. The filters let only the middle of the beam pass, whose partners are weak.
+of the phase centres. Filters may let only the middle of the beam pass, whose partners are weak.
 """
 
 from __future__ import annotations
@@ -27,9 +27,15 @@ from clsas.navigation.overlap import Array, Overlap
 from clsas.navigation.swath import Swath
 from clsas.sonar.system import element_pattern
 
+ALL, MIDDLE = 1.0, 0.25
+"""Half width of what passes, in periods of ambiguous directions: all of them, or the middle of the
+beam. The middle has the least error where there is little noise; noise wants all echoes."""
+
 _BANDS = 6  # of the spectrum, with filters of their own
-_PASSED = 0.25  # of the period of ambiguous directions: sine at which half the amplitude passes
 _EDGE = 0.03  # of that period: how gradually
+# Exponent of the even beam's power, by which filters weigh directions. With 1 strong echoes at the
+# edge of the beam pass too: 1.7 times the error in a scene of few scatterers, beside 0.25.
+_PRIOR = 0.25
 _NOISE = 0.01  # power over the echoes', against which filters are regularised
 _TURN = 0.1  # cycles by which a direction's phase may change from one node in range to the next
 _MOST_NODES = 16
@@ -77,7 +83,7 @@ class Alignment:
         Filters of either ping: rows give channels of the common geometry.
     sensitivity : float64 [nodes, pairs]
         Decrease in range per metre of sway, a mean over the directions that pass.
-    echoes, noise : float64 [pairs, pairs]
+    echoes, noise : complex128 [pairs, pairs]
         Correlation that filtered channels have of an even seabed, and of white noise.
     """
 
@@ -86,8 +92,8 @@ class Alignment:
     first: NDArray[np.complex128]
     second: NDArray[np.complex128]
     sensitivity: NDArray[np.float64]
-    echoes: NDArray[np.float64]
-    noise: NDArray[np.float64]
+    echoes: NDArray[np.complex128]
+    noise: NDArray[np.complex128]
 
     def apply(
         self,
@@ -118,6 +124,17 @@ class Alignment:
             found.append(total)
         return found[0], found[1]
 
+    def shared(self, coherence: float) -> NDArray[np.float64]:
+        """Return how pairs' phase errors correlate, [pairs, pairs].
+
+        A phase errs by products of one channel's echoes with the other's noise, and of both noises.
+        Neighbours share some of both, once filtered.
+        """
+        echoes, noise = coherence, 1 - coherence
+        products = 2 * echoes * (self.echoes.conj() * self.noise).real
+        products += noise * np.abs(self.noise) ** 2
+        return products / (2 * echoes + noise)
+
     def shares(self, range_m: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the weights of nodes at ranges, [nodes, ranges]."""
         nodes = np.arange(len(self.range_m), dtype=np.float64)
@@ -147,15 +164,17 @@ def alignment(
     frame: Frame,
     swath: Swath,
     band: NDArray[np.float64],
+    half_width: float,
 ) -> Alignment:
     """Return the filters that bring the channels of two pings to one geometry.
 
     A filter is the linear estimate with the least mean square error, over an even seabed under the
     beam, of the channels that the mean geometry would have. `band` is the phase per metre of range
-    at frequencies that stand for equal shares of the power, ascending.
+    at frequencies that stand for equal shares of the power, ascending; `half_width` is `ALL` or
+    `MIDDLE`.
     """
     cycles_per_m = band.reshape(_BANDS, -1).mean(axis=1)
-    beam = _Beam(lines, array, pairs, frame, swath, cycles_per_m)
+    beam = _Beam(lines, array, pairs, frame, swath, cycles_per_m, half_width)
     near_m, far_m = swath.edges_m[[0, -1]]
     range_m = 1 / np.linspace(1 / near_m, 1 / far_m, beam.nodes(near_m, far_m))
     made = [beam.filters(each) for each in range_m]
@@ -171,10 +190,10 @@ def alignment(
     )
 
 
-def _normalised(covariance: NDArray[np.complex128]) -> NDArray[np.float64]:
-    """Return the magnitudes of correlations."""
+def _normalised(covariance: NDArray[np.complex128]) -> NDArray[np.complex128]:
+    """Return the correlations of a covariance."""
     size = np.sqrt(np.diag(covariance).real)
-    return np.abs(covariance) / np.outer(size, size)
+    return covariance / np.outer(size, size)
 
 
 class _Beam:
@@ -188,10 +207,12 @@ class _Beam:
         frame: Frame,
         swath: Swath,
         cycles_per_m: NDArray[np.float64],
+        half_width: float,
     ) -> None:
         assert swath.element_length_m is not None
         self.lines, self.pairs, self.frame, self.swath = lines, pairs, frame, swath
         self.cycles_per_m, self.lengths_m = cycles_per_m, swath.element_length_m
+        self.half_width = half_width
         self.headings = [
             array.forward[int(np.searchsorted(array.starts, each[0], "right")) - 1]
             for each in (pairs.first, pairs.second)
@@ -227,9 +248,9 @@ class _Beam:
             arrived = []
             for ping, late_m in enumerate((first_m, second_m)):
                 steering = np.exp(-2j * np.pi * cycles_per_m * late_m)
-                weighted = (power * steering).conj().T
+                weighted = (power**_PRIOR * steering).conj().T
                 covariance = steering @ weighted
-                covariance += _NOISE * power.sum() * np.eye(count)
+                covariance += _NOISE * np.sum(power**_PRIOR) * np.eye(count)
                 # The covariance is Hermitian: solving from the left gives the filter's transpose.
                 matrix = np.linalg.solve(covariance.conj(), (target @ weighted).T).T
                 filters[ping, band] = matrix
@@ -266,7 +287,7 @@ class _Beam:
         steps_m = np.diff(np.sort(self.pairs.along_m))
         spacing_m = float(np.median(steps_m)) if len(steps_m) else 0.0
         periods = np.abs(self.sine) * abs(cycles_per_m) * spacing_m
-        return 1 / (1 + np.exp((periods - _PASSED) / _EDGE))
+        return 1 / (1 + np.exp((periods - self.half_width) / _EDGE))
 
     def _power(self, rays: NDArray[np.float64], cycles_per_m: float) -> NDArray[np.float64]:
         """Return the power that an even seabed returns from directions."""

@@ -127,11 +127,13 @@ class Correlator:
         pairs: Overlap,
         most_m: float,
         *,
-        align: bool = True,
+        directions: float | None = None,
     ) -> Correlation:
         """Return the correlation of some pairs at lags of up to `most_m`.
 
         `lines` has the samples that the correlator was made for, and the positions to test.
+        `directions`, the half width of `alignment`, aligns echoes from all over the beam; without
+        it only those from broadside are. A narrow beam needs no more.
         """
         swath, most = self.swath, max(math.ceil(most_m / self.step_m), 1)
         frame = self._frame(lines, array, pairs)
@@ -145,8 +147,8 @@ class Correlator:
             self._along_rays(lines, each, frame, range_m) for each in (pairs.first, pairs.second)
         )
         aligned = None
-        if align and swath.element_length_m is not None:
-            aligned = alignment(lines, array, pairs, frame, swath, self._band())
+        if directions is not None and swath.element_length_m is not None:
+            aligned = alignment(lines, array, pairs, frame, swath, self._band(), directions)
             first, second = aligned.apply((first, second), range_m, self.cycles_per_m)
         values, coherence, start = [], [], 0
         for n in self.samples:
@@ -249,16 +251,21 @@ def displacement(found: Correlation, *, first: bool, yaw: bool) -> Displacement:
     coherence = np.sqrt(np.mean(found.coherence[:, :, lag] ** 2, axis=0))
     variance = phase_variance(coherence, found.independent)
     design = np.stack([-turns, -steer] if yaw else [-turns], axis=-1)
-    weights = np.broadcast_to(1 / variance, phase.shape)
-    normal = np.einsum("kw,kwa,kwb->ab", weights, design, design)
+    normal = np.einsum("w,kwa,kwb->ab", 1 / variance, design, design)
+    inverse = np.linalg.inv(normal)
+    solution = np.zeros(2)
     unknowns = len(normal)
-    covariance, solution = np.zeros((2, 2)), np.zeros(2)
-    covariance[:unknowns, :unknowns] = np.linalg.inv(normal)
-    right = np.einsum("kw,kwa,kw->a", weights, design, phase)
-    solution[:unknowns] = covariance[:unknowns, :unknowns] @ right
+    solution[:unknowns] = inverse @ np.einsum("w,kwa,kw->a", 1 / variance, design, phase)
     residual = phase - design @ solution[:unknowns]
-    misfit = float(np.sum(weights * residual**2) / max(phase.size - unknowns, 1))
-    # Errors that neighbours share look like a yaw, which residuals do not show.
+    covariance = np.zeros((2, 2))
+    spread = np.zeros_like(normal)
+    for window, each in enumerate(coherence):
+        shared = np.eye(len(phase)) if found.aligned is None else found.aligned.shared(each)
+        at = design[:, window]
+        spread += at.T @ shared @ at / variance[window]
+    covariance[:unknowns, :unknowns] = inverse @ spread @ inverse
+    expected = phase.size - float(np.trace(inverse @ spread))
+    misfit = float(np.sum(residual**2 / variance) / max(expected, 1.0))
     covariance *= np.outer([1.0, _SHARED], [1.0, _SHARED])
     return Displacement(
         sway_m + float(solution[0]), slope + float(solution[1]), covariance, coherence, misfit

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsas.core.lines import RangeLines
+from clsas.navigation.directions import ALL, MIDDLE
 from clsas.navigation.displacement import Correlator, Displacement, displacement, surge
 from clsas.navigation.overlap import Array, Overlap, moved, overlap
 from clsas.navigation.smoother import Step, integrated
@@ -76,6 +77,7 @@ def measured(
     """
     passes = _Passes(lines, array, correlator, unknowns, progress)
     passes.settle(most_step_m)
+    passes.narrow()
     deviation_m = np.zeros(array.pings - 1)
     if "surge" in unknowns:
         for _ in range(_SURGES):
@@ -131,27 +133,49 @@ class _Passes:
         self.moved, self.surge_m = np.zeros((count, 2)), np.zeros(count)
         self.coherent = np.ones(count, bool)
         self.steps: list[Displacement] = []
+        self.directions = ALL
         self.overlaps = self._paired(lines, array)
 
     def settle(self, most_m: float) -> None:
         """Measure sway and yaw until they change no more; look for steps of up to `most_m`."""
         first = not self.steps
         for _ in range(_PASSES):
-            corrected, here = self._corrected()
-            self.steps, changes = [], np.zeros_like(self.moved)
-            for ping, each in enumerate(self.overlaps):
-                correlation = self.correlator.correlate(corrected, here, each, most_m)
-                step = displacement(correlation, first=first, yaw=self.yaw)
-                self.steps.append(step)
-                changes[ping] = step.sway_m, step.yaw_rad
-                self.progress.done(ping + 1, len(self.overlaps))
+            self.steps = self._steps(most_m, self.directions, first=first)
             self.coherent = np.array([self._is_coherent(step) for step in self.steps])
+            changes = np.array([(step.sway_m, step.yaw_rad) for step in self.steps])
             changes[~self.coherent] = self.moved[~self.coherent] = 0.0
             self.moved = self.moved + changes
             deviations = np.stack([np.sqrt(np.diag(step.covariance)) for step in self.steps])
             first, most_m = False, _LATER_LAGS * self.lines.range_step_m
             if np.all(np.abs(changes) <= _SETTLED * deviations):
                 return
+
+    def narrow(self) -> None:
+        """Use the middle of the beam alone, if that makes the displacements more certain."""
+        if self.correlator.swath.element_length_m is None or not self.coherent.any():
+            return
+        most_m = _LATER_LAGS * self.lines.range_step_m
+        steps = self._steps(most_m, MIDDLE, first=False)
+        if self._variance(steps) < self._variance(self.steps):
+            self.directions = MIDDLE
+            self.settle(most_m)
+
+    def _steps(self, most_m: float, directions: float, *, first: bool) -> list[Displacement]:
+        """Return what is left of the displacements between all pings."""
+        corrected, here = self._corrected()
+        steps = []
+        for ping, each in enumerate(self.overlaps):
+            found = self.correlator.correlate(corrected, here, each, most_m, directions=directions)
+            steps.append(displacement(found, first=first, yaw=self.yaw))
+            self.progress.done(ping + 1, len(self.overlaps))
+        return steps
+
+    def _variance(self, steps: list[Displacement]) -> float:
+        """Return the mean variance of the yaws between pings, or of the sways without yaw."""
+        number = 1 if self.yaw else 0
+        some = [step for step, kept in zip(steps, self.coherent, strict=True) if kept]
+        variance = np.mean([step.covariance[number, number] for step in some])
+        return float(variance * max(np.mean([step.misfit for step in some]), 1.0))
 
     def surges_m(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the rest of every advance, and its standard deviation; 0 without coherence."""
@@ -163,9 +187,7 @@ class _Passes:
                 found[ping] = 0.0, here.spacing_m  # too few channels overlap to tell
                 continue
             at, behind, ahead = (
-                self.correlator.correlate(
-                    corrected, here, each, self.lines.range_step_m, align=False
-                )
+                self.correlator.correlate(corrected, here, each, self.lines.range_step_m)
                 for each in pairs
             )
             found[ping] = surge(at, behind, ahead, here.spacing_m)
