@@ -29,12 +29,14 @@ _SLOPES = np.linspace(-0.2, 0.2, 81)  # yaw between pings that is tried first, r
 _FINE = 16  # points per sample at which the envelope's peak is looked for
 _FREQUENCIES = 9  # of the band, over which the expected phase is averaged
 _HIGHLIGHT = 3.0  # times the median power, from which on echoes are weakened
-_LEAST_SQUARE = 1e-4  # of a coherence whose logarithm is taken
 _SMOOTHED = 9  # samples over which that power is a mean
 # Standard deviation of yaw over that of independent pairs, by `scripts/bench navigation`: 1 covers
 # 0.89 to 0.94 of errors by 95 % intervals.
 _SHARED = 1.1
 _SPECKLE_LAGS = 64  # samples over which speckle may be correlated in range
+
+Window = tuple[NDArray[np.complex128], NDArray[np.complex128]]
+"""Samples of both channels of all pairs in a window of range, [pairs, n] each."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,8 +45,6 @@ class Correlation:
 
     Attributes
     ----------
-    apart_m : float
-        Mean distance forward from the phase centre of a pair's first channel to the second one's.
     values : complex128 [pairs, windows, lags]
         Cross-correlation, without the phase that is expected of arrays where they are said to lie.
     coherence : float64 [pairs, windows, lags]
@@ -62,7 +62,6 @@ class Correlation:
         Filters that channels went through; None as they were received.
     """
 
-    apart_m: float
     values: NDArray[np.complex128]
     coherence: NDArray[np.float64]
     lags_m: NDArray[np.float64]
@@ -126,36 +125,13 @@ class Correlator:
         array: Array,
         pairs: Overlap,
         most_m: float,
-        *,
-        directions: float | None = None,
+        directions: float,
     ) -> Correlation:
-        """Return the correlation of some pairs at lags of up to `most_m`.
-
-        `lines` has the samples that the correlator was made for, and the positions to test.
-        `directions`, the half width of `alignment`, aligns echoes from all over the beam; without
-        it only those from broadside are. A narrow beam needs no more.
-        """
-        swath, most = self.swath, max(math.ceil(most_m / self.step_m), 1)
-        frame = self._frame(lines, array, pairs)
-        range_m = np.concatenate(
-            [
-                low + self.step_m * np.arange(n)
-                for low, n in zip(swath.edges_m[:-1], self.samples, strict=True)
-            ]
-        )
-        first, second = (
-            self._along_rays(lines, each, frame, range_m) for each in (pairs.first, pairs.second)
-        )
-        aligned = None
-        if directions is not None and swath.element_length_m is not None:
-            aligned = alignment(lines, array, pairs, frame, swath, self._band(), directions)
-            first, second = aligned.apply((first, second), range_m, self.cycles_per_m)
-        values, coherence, start = [], [], 0
-        for n in self.samples:
-            part = slice(start, start + n)
-            one, other = first[:, part], second[:, part]
-            if swath.element_length_m is not None:
-                one, other = _without_highlights(one, other)
+        """Return the correlation of pairs at lags of up to `most_m`. See `windows`."""
+        most = max(math.ceil(most_m / self.step_m), 1)
+        windows, frame, aligned = self.windows(lines, array, pairs, directions)
+        values, coherence = [], []
+        for (one, other), n in zip(windows, self.samples, strict=True):
             length = scipy.fft.next_fast_len(int(n) + most)
             spectra = (scipy.fft.fft(each, length, axis=1) for each in (one, other))
             of_one, of_other = spectra
@@ -166,10 +142,7 @@ class Correlator:
             ]
             values.append(lagged)
             coherence.append(np.abs(lagged) / np.maximum(energy, 1e-300))
-            start += n
-        between_m = lines.phase_centres_m[pairs.second] - lines.phase_centres_m[pairs.first]
         return Correlation(
-            float(np.mean(between_m @ frame.forward)),
             np.stack(values, axis=1),
             np.stack(coherence, axis=1),
             self.step_m * np.arange(-most, most + 1, dtype=np.float64),
@@ -179,6 +152,33 @@ class Correlator:
             self.independent,
             aligned,
         )
+
+    def windows(
+        self, lines: RangeLines, array: Array, pairs: Overlap, directions: float
+    ) -> tuple[list[Window], Frame, Alignment | None]:
+        """Return both channels of all pairs by window of range, and how they were aligned.
+
+        `lines` has the samples that the correlator was made for, and the positions to test.
+        `directions` is the half width of `alignment`. Where the beam is narrow, all echoes are
+        aligned as those from broadside.
+        """
+        swath, frame = self.swath, self._frame(lines, array, pairs)
+        range_m = np.concatenate(
+            [
+                low + self.step_m * np.arange(n)
+                for low, n in zip(swath.edges_m[:-1], self.samples, strict=True)
+            ]
+        )
+        first, second = (
+            self._along_rays(lines, each, frame, range_m) for each in (pairs.first, pairs.second)
+        )
+        ends = np.cumsum(self.samples)[:-1]
+        if swath.element_length_m is None:
+            return _split(first, second, ends), frame, None
+        aligned = alignment(lines, array, pairs, frame, swath, self._band(), directions)
+        first, second = aligned.apply((first, second), range_m, self.cycles_per_m)
+        windows = [_without_highlights(*each) for each in _split(first, second, ends)]
+        return windows, frame, aligned
 
     def _frame(self, lines: RangeLines, array: Array, pairs: Overlap) -> Frame:
         centre_m = (lines.phase_centres_m[pairs.first] + lines.phase_centres_m[pairs.second]) / 2
@@ -282,30 +282,12 @@ def _unambiguous_slope(found: Correlation) -> float:
     return 0.5 / max(abs(found.cycles_per_m) * apart_m, 1e-9)
 
 
-def surge(
-    at: Correlation, behind: Correlation, ahead: Correlation, spacing_m: float
-) -> tuple[float, float]:
-    """Return how far an array advanced beyond what its navigation says, and its deviation, metres.
-
-    `at` correlates pairs that share a phase centre, `behind` and `ahead` pairs whose second channel
-    lies one spacing off. A parabola through the logarithms of their coherence has its peak where
-    the second channel really is: near the peak the coherence of a beam is much like a Gaussian.
-    """
-    logs, deviations = [], []
-    for found in (behind, at, ahead):
-        samples = found.independent
-        square = np.mean(found.coherence.max(axis=-1) ** 2, axis=0) - 1 / samples
-        mean = float(np.clip(np.average(square, weights=samples), _LEAST_SQUARE, 1.0))
-        logs.append(0.5 * math.log(mean))
-        count = float(np.sum(samples)) * len(found.along_m)
-        deviations.append((1 - mean) / math.sqrt(2 * count * mean))
-    before, here, after = logs
-    bend = before - 2 * here + after
-    if bend >= 0 or here < max(before, after):
-        return math.copysign(spacing_m, before - after) - at.apart_m, spacing_m
-    shift = 0.5 * (before - after) / bend
-    deviation = spacing_m * 0.5 * math.hypot(deviations[0], deviations[2]) / -bend
-    return -spacing_m * shift - at.apart_m, deviation
+def _split(
+    first: NDArray[np.complex128], second: NDArray[np.complex128], ends: NDArray[np.int64]
+) -> list[Window]:
+    """Return both channels by window."""
+    parts = np.split(first, ends, axis=1), np.split(second, ends, axis=1)
+    return list(zip(*parts, strict=True))
 
 
 def _without_highlights(

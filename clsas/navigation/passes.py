@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsas.core.lines import RangeLines
+from clsas.navigation.advance import surge
 from clsas.navigation.directions import ALL, MIDDLE
-from clsas.navigation.displacement import Correlator, Displacement, displacement, surge
+from clsas.navigation.displacement import Correlator, Displacement, displacement
 from clsas.navigation.overlap import Array, Overlap, moved, overlap
 from clsas.navigation.smoother import Step, integrated
 
@@ -165,7 +166,7 @@ class _Passes:
         corrected, here = self._corrected()
         steps = []
         for ping, each in enumerate(self.overlaps):
-            found = self.correlator.correlate(corrected, here, each, most_m, directions=directions)
+            found = self.correlator.correlate(corrected, here, each, most_m, directions)
             steps.append(displacement(found, first=first, yaw=self.yaw))
             self.progress.done(ping + 1, len(self.overlaps))
         return steps
@@ -182,16 +183,9 @@ class _Passes:
         corrected, here = self._corrected()
         found = np.zeros((len(self.overlaps), 2))
         for ping in np.flatnonzero(self.coherent).tolist():
-            pairs = [overlap(corrected, here, ping, lag) for lag in (0, -1, 1)]
-            if not all(each.pairs for each in pairs):
-                found[ping] = 0.0, here.spacing_m  # too few channels overlap to tell
-                continue
-            at, behind, ahead = (
-                self.correlator.correlate(corrected, here, each, self.lines.range_step_m)
-                for each in pairs
-            )
-            found[ping] = surge(at, behind, ahead, here.spacing_m)
-            self.progress.done(ping + 1, self.array.pings - 1, passes=3)
+            pairs = overlap(corrected, here, ping)
+            found[ping] = surge(self.correlator, corrected, here, pairs, self.directions)
+            self.progress.done(ping + 1, self.array.pings - 1)
         return found[:, 0], found[:, 1]
 
     def result(self, surge_sd_m: NDArray[np.float64]) -> Displacements:
