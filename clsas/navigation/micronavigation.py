@@ -199,7 +199,7 @@ def micronavigate(
     longest_m = float(np.diff(swath.edges_m).max())
     most_step_m = validate.number("most_step_m", most_step_m, "m", above=0.0, most=longest_m)
     correlator = Correlator(lines, swath)
-    found = measured(lines, array, correlator, names, most_step_m, progress)
+    found = measured(lines, array, correlator, names, fixes[:, :2], most_step_m, progress)
     return _result(lines, array, swath, found, fixes)
 
 

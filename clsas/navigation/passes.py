@@ -67,16 +67,19 @@ def measured(
     array: Array,
     correlator: Correlator,
     unknowns: tuple[str, ...],
+    fixes: NDArray[np.float64],
     most_step_m: float,
     progress: Callable[[int, int], None] | None,
 ) -> Displacements:
-    """Return the displacements between all pings.
+    """Return the displacements between all pings; `fixes` are those of sway and yaw for `smooth`.
 
     Every pass aligns the channels by all that was found before it: what is left is small, and
     linear in the displacement. Where the advance differs from the navigation's, channels are then
     paired anew.
     """
-    passes = _Passes(lines, array, correlator, unknowns, progress)
+    yaw = "yaw" in unknowns
+    # Without yaw the track does not turn as a whole either.
+    passes = _Passes(lines, array, correlator, fixes if yaw else fixes * [1.0, 0.0], progress)
     passes.settle(most_step_m)
     passes.narrow()
     deviation_m = np.zeros(array.pings - 1)
@@ -125,11 +128,12 @@ class _Passes:
         lines: RangeLines,
         array: Array,
         correlator: Correlator,
-        unknowns: tuple[str, ...],
+        fixes: NDArray[np.float64],
         progress: Callable[[int, int], None] | None,
     ) -> None:
         self.lines, self.array, self.correlator = lines, array, correlator
-        self.yaw, self.progress = "yaw" in unknowns, _Progress(progress)
+        self.fixes, self.yaw = fixes, bool(np.any(fixes[:, 1] > 0))
+        self.progress = _Progress(progress)
         count = array.pings - 1
         self.moved, self.surge_m = np.zeros((count, 2)), np.zeros(count)
         self.coherent = np.ones(count, bool)
@@ -214,7 +218,8 @@ class _Passes:
             [
                 Step.over(each, np.zeros((2, 2)), levers_m)
                 for each, levers_m in zip(self.moved, self._levers_m(there), strict=True)
-            ]
+            ],
+            self.fixes,
         )
         corrected = moved(advanced, there, states[:, 0], states[:, 1], none)
         return corrected, Array.of(corrected)

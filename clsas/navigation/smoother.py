@@ -70,12 +70,23 @@ class Step:
         return cls(np.eye(1), np.array([moved]), np.array([[deviation**2]]))
 
 
-def integrated(steps: Sequence[Step]) -> NDArray[np.float64]:
-    """Return the states of all pings, [pings, n], with zeros at the first."""
-    states = [np.zeros(len(steps[0].drift))]
+def integrated(steps: Sequence[Step], fixes: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the states of all pings, [pings, n], by steps taken as exact.
+
+    The first state is the one that keeps the track nearest to its navigation: a common shift and
+    turn. `fixes` are as those of `smooth`; a number whose fixes are 0 begins at 0.
+    """
+    size = len(steps[0].drift)
+    states, from_first = [np.zeros(size)], [np.eye(size)]
     for step in steps:
         states.append(step.transition @ states[-1] + step.drift)
-    return np.stack(states)
+        from_first.append(step.transition @ from_first[-1])
+    found, changes = np.stack(states), np.stack(from_first)
+    free = np.all(fixes > 0, axis=0)
+    weights = np.where(free, 1 / np.where(free, fixes, 1.0), 0.0)
+    design = (weights[..., None] * changes)[..., free].reshape(-1, int(free.sum()))
+    first = np.linalg.lstsq(design, -(weights * found).ravel(), rcond=None)[0]
+    return found + changes[..., free] @ first
 
 
 def smooth(
