@@ -44,6 +44,7 @@ class Displacements:
         See `Step.over`.
     coherence : float64 [pings - 1, windows]
     misfit : float64 [pings - 1]
+    scatter : float64 [pings - 1, windows]
         See `Displacement`.
     pairs : int64 [pings - 1]
         Pairs of channels that share a phase centre.
@@ -58,6 +59,7 @@ class Displacements:
     levers_m: list[tuple[float, float]]
     coherence: NDArray[np.float64]
     misfit: NDArray[np.float64]
+    scatter: NDArray[np.float64]
     pairs: NDArray[np.int64]
     coherent: NDArray[np.bool_]
 
@@ -203,6 +205,7 @@ class _Passes:
             levers_m=self._levers_m(here),
             coherence=np.stack([step.coherence for step in self.steps]),
             misfit=np.array([step.misfit for step in self.steps]),
+            scatter=np.stack([step.scatter for step in self.steps]),
             pairs=np.array([each.pairs for each in self.overlaps]),
             coherent=self.coherent,
         )
