@@ -141,8 +141,8 @@ def micronavigate(
         are taken as horizontal.
     element_length_m : float or (transmitter, receiver), optional
         Lengths of the elements. Give them where the beam is wide: echoes far from broadside change
-        their range less, and the expected phase of separate transmitters and receivers is a mean
-        over the beam.
+        their range less, and with separate transmitters and receivers they shift phases. Both pings
+        are then aligned for every direction of the beam.
     sway_sd_m, yaw_sd_rad, surge_sd_m : float or array_like [pings]
         Standard deviation of the navigation's sway, yaw and surge.
     correlation_pings : float, optional
@@ -186,7 +186,8 @@ def micronavigate(
     They follow from the phase of a product of two correlated complex Gaussian signals, averaged
     over L samples, and a straight line fitted to K such phases at equal steps. They are scaled by
     the misfit of that line over all pings, where that is more than expected; yaw's also by what
-    neighbouring pairs have in common.
+    neighbouring pairs have in common. Those of positions and of the track's shape are scaled by
+    `Micronavigation.persistence` too.
     """
     if isinstance(lines, Echoes):
         lines = compress(lines)
