@@ -17,27 +17,29 @@ import scipy.fft
 from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
 
-from clsas.core.geometry import bistatic_range_m
 from clsas.core.lines import RangeLines
+from clsas.navigation.directions import Alignment, Frame, alignment, ranges_m
 from clsas.navigation.overlap import Array, Overlap
 from clsas.navigation.swath import Swath
 from clsas.signal.readout import Readout
 from clsas.signal.spectrum import cycles_per_m_at
-from clsas.sonar.system import element_pattern
 
 _CANCELLED = 1e-6  # length of the sum of two unit vectors, up to which they are opposite
-_ANGLES = 65  # of the beam, over which the expected phase is averaged
-_WIDEST = math.radians(75)  # half of the beam that is averaged
 _SLOPES = np.linspace(-0.2, 0.2, 81)  # yaw between pings that is tried first, rad
 _FINE = 16  # points per sample at which the envelope's peak is looked for
 _FREQUENCIES = 9  # of the band, over which the expected phase is averaged
 _HIGHLIGHT = 3.0  # times the median power, from which on echoes are weakened
-_LEAST_SQUARE = 1e-4  # of a coherence whose logarithm is taken
 _SMOOTHED = 9  # samples over which that power is a mean
 # Standard deviation of yaw over that of independent pairs, by `scripts/bench navigation`: 1 covers
 # 0.89 to 0.94 of errors by 95 % intervals.
 _SHARED = 1.1
+# Error of a pair's phase by filters and interpolation: yaw of coarse arrays over even speckle
+# without noise has a bias as of 3e-3.
+_EXACT_RAD = 2e-3
 _SPECKLE_LAGS = 64  # samples over which speckle may be correlated in range
+
+Window = tuple[NDArray[np.complex128], NDArray[np.complex128]]
+"""Samples of both channels of all pairs in a window of range, [pairs, n] each."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,10 +48,8 @@ class Correlation:
 
     Attributes
     ----------
-    apart_m : float
-        Mean distance forward from the phase centre of a pair's first channel to the second one's.
     values : complex128 [pairs, windows, lags]
-        Cross-correlation, without the phase that is expected of arrays where they are said to lie.
+        Cross-correlation; its phase is 0 for arrays that lie where they are said to.
     coherence : float64 [pairs, windows, lags]
         Its magnitude over the geometric mean of both energies.
     lags_m : float64 [lags]
@@ -61,9 +61,10 @@ class Correlation:
         See `Overlap`.
     independent : float64 [windows]
         Number of independent samples of speckle in a window.
+    aligned : Alignment or None
+        Filters that channels went through; None as they were received.
     """
 
-    apart_m: float
     values: NDArray[np.complex128]
     coherence: NDArray[np.float64]
     lags_m: NDArray[np.float64]
@@ -71,6 +72,7 @@ class Correlation:
     sensitivity: NDArray[np.float64]
     along_m: NDArray[np.float64]
     independent: NDArray[np.float64]
+    aligned: Alignment | None = None
 
 
 @dataclass(frozen=True)
@@ -87,6 +89,8 @@ class Displacement:
         Mean over the pairs.
     misfit : float
         Mean square of the residual phases over what their coherence explains; 1 is expected.
+    scatter : float64 [windows]
+        What every window by itself says beyond this: of yaw, or of sway where there is no yaw.
     """
 
     sway_m: float
@@ -94,6 +98,7 @@ class Displacement:
     covariance: NDArray[np.float64]
     coherence: NDArray[np.float64]
     misfit: float
+    scatter: NDArray[np.float64]
 
 
 class Correlator:
@@ -121,36 +126,18 @@ class Correlator:
         )
 
     def correlate(
-        self, lines: RangeLines, array: Array, pairs: Overlap, most_m: float
+        self,
+        lines: RangeLines,
+        array: Array,
+        pairs: Overlap,
+        most_m: float,
+        directions: float,
     ) -> Correlation:
-        """Return the correlation of some pairs at lags of up to `most_m`.
-
-        `lines` has the samples that the correlator was made for, and the positions to test.
-        """
-        swath, most = self.swath, max(math.ceil(most_m / self.step_m), 1)
-        centre_m = (lines.phase_centres_m[pairs.first] + lines.phase_centres_m[pairs.second]) / 2
-        ping = int(np.searchsorted(array.starts, pairs.first[0], "right")) - 1
-        forward = array.forward[ping] + array.forward[ping + 1]
-        both = float(np.linalg.norm(forward))
-        # They cancel where the track turns back from one ping to the next.
-        forward = forward / both if both > _CANCELLED else array.forward[ping]
-        outward = swath.side * np.array([-forward[1], forward[0], 0.0])
-        range_m = np.concatenate(
-            [
-                low + self.step_m * np.arange(n)
-                for low, n in zip(swath.edges_m[:-1], self.samples, strict=True)
-            ]
-        )
-        first, second = (
-            self._along_rays(lines, each, centre_m, outward, range_m)
-            for each in (pairs.first, pairs.second)
-        )
-        values, coherence, start = [], [], 0
-        for n in self.samples:
-            part = slice(start, start + n)
-            one, other = first[:, part], second[:, part]
-            if swath.element_length_m is not None:
-                one, other = _without_highlights(one, other)
+        """Return the correlation of pairs at lags of up to `most_m`. See `windows`."""
+        most = max(math.ceil(most_m / self.step_m), 1)
+        windows, frame, aligned = self.windows(lines, array, pairs, directions)
+        values, coherence = [], []
+        for (one, other), n in zip(windows, self.samples, strict=True):
             length = scipy.fft.next_fast_len(int(n) + most)
             spectra = (scipy.fft.fft(each, length, axis=1) for each in (one, other))
             of_one, of_other = spectra
@@ -161,99 +148,76 @@ class Correlator:
             ]
             values.append(lagged)
             coherence.append(np.abs(lagged) / np.maximum(energy, 1e-300))
-            start += n
-        expected, sensitivity = self._expected(lines, array, pairs, centre_m, forward, outward)
-        between_m = lines.phase_centres_m[pairs.second] - lines.phase_centres_m[pairs.first]
         return Correlation(
-            float(np.mean(between_m @ forward)),
-            np.stack(values, axis=1) * np.exp(-1j * expected)[..., None],
+            np.stack(values, axis=1),
             np.stack(coherence, axis=1),
             self.step_m * np.arange(-most, most + 1, dtype=np.float64),
             self.cycles_per_m,
-            sensitivity,
+            self._sensitivity(frame, aligned),
             pairs.along_m,
             self.independent,
+            aligned,
         )
+
+    def windows(
+        self, lines: RangeLines, array: Array, pairs: Overlap, directions: float
+    ) -> tuple[list[Window], Frame, Alignment | None]:
+        """Return both channels of all pairs by window of range, and how they were aligned.
+
+        `lines` has the samples that the correlator was made for, and the positions to test.
+        `directions` is the half width of `alignment`. Where the beam is narrow, all echoes are
+        aligned as those from broadside.
+        """
+        swath, frame = self.swath, self._frame(lines, array, pairs)
+        range_m = np.concatenate(
+            [
+                low + self.step_m * np.arange(n)
+                for low, n in zip(swath.edges_m[:-1], self.samples, strict=True)
+            ]
+        )
+        first, second = (
+            self._along_rays(lines, each, frame, range_m) for each in (pairs.first, pairs.second)
+        )
+        ends = np.cumsum(self.samples)[:-1]
+        if swath.element_length_m is None:
+            return _split(first, second, ends), frame, None
+        aligned = alignment(lines, array, pairs, frame, swath, self._band(), directions)
+        first, second = aligned.apply((first, second), range_m, self.cycles_per_m)
+        windows = [_without_highlights(*each) for each in _split(first, second, ends)]
+        return windows, frame, aligned
+
+    def _frame(self, lines: RangeLines, array: Array, pairs: Overlap) -> Frame:
+        centre_m = (lines.phase_centres_m[pairs.first] + lines.phase_centres_m[pairs.second]) / 2
+        ping = int(np.searchsorted(array.starts, pairs.first[0], "right")) - 1
+        forward = array.forward[ping] + array.forward[ping + 1]
+        both = float(np.linalg.norm(forward))
+        # They cancel where the track turns back from one ping to the next.
+        forward = forward / both if both > _CANCELLED else array.forward[ping]
+        outward = self.swath.side * np.array([-forward[1], forward[0], 0.0])
+        return Frame(centre_m, forward, outward)
+
+    def _sensitivity(self, frame: Frame, aligned: Alignment | None) -> NDArray[np.float64]:
+        middles_m = self.swath.middles_m
+        if aligned is not None:
+            return aligned.sensitivity.T @ aligned.shares(middles_m)
+        return self.swath.side * frame.rays(self.swath, middles_m) @ frame.outward
 
     def _along_rays(
         self,
         lines: RangeLines,
         channels: NDArray[np.int64],
-        centre_m: NDArray[np.float64],
-        outward: NDArray[np.float64],
+        frame: Frame,
         range_m: NDArray[np.float64],
     ) -> NDArray[np.complex128]:
         """Return channels at the points of rays from their phase centres, [channels, ranges].
 
         The phase of an echo is that of its distance along the ray.
         """
-        across, up = self.swath.slopes(centre_m[:, 2:], range_m)
-        points_m = centre_m[:, None] + (range_m * across)[..., None] * outward
-        points_m[..., 2] += range_m * up
-        path_m = self._range_m(lines, channels, points_m)
+        points_m = frame.centre_m[:, None] + range_m[:, None] * frame.rays(self.swath, range_m)
+        path_m = ranges_m(lines, channels, points_m)
         turns = lines.carrier_cycles_per_m * path_m - self.cycles_per_m * range_m
         values = self.readout.read(channels, path_m).astype(np.complex128)
         return values * np.exp(2j * np.pi * (turns - np.rint(turns)))
-
-    def _range_m(
-        self, lines: RangeLines, channels: NDArray[np.int64], points_m: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
-        """Return ranges of points [channels, n, 3] in channels, [channels, n]."""
-        velocity = lines.rx_velocity_m_s
-        return bistatic_range_m(
-            points_m,
-            lines.tx_m[channels, None],
-            lines.rx_m[channels, None],
-            None if velocity is None else velocity[channels, None],
-            lines.sound_speed_m_s,
-        )
-
-    def _expected(
-        self,
-        lines: RangeLines,
-        array: Array,
-        pairs: Overlap,
-        centre_m: NDArray[np.float64],
-        forward: NDArray[np.float64],
-        outward: NDArray[np.float64],
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the phase of a pair's correlation, and its sensitivity, over the whole beam.
-
-        Pairs are aligned for the ray in the middle of the beam. Echoes from other directions come
-        with slightly other differences in range, whose mean phase is the expected one.
-        """
-        swath = self.swath
-        angle = np.zeros(1)
-        if swath.element_length_m is not None:
-            wavelength_m = 2 / abs(self.cycles_per_m)
-            shortest = wavelength_m / max(swath.element_length_m)
-            half = min(math.asin(min(shortest, 1.0)), _WIDEST)
-            angle = np.linspace(-half, half, _ANGLES)
-        across, up = swath.slopes(centre_m[:, 2:], swath.middles_m)
-        shape = pairs.pairs, swath.windows
-        ray = np.broadcast_to(across, shape)[..., None] * outward
-        ray[..., 2] += up
-        # [pairs, windows, angles, 3]
-        rays = np.cos(angle)[:, None] * ray[..., None, :] + np.sin(angle)[:, None] * forward
-        points_m = swath.middles_m[:, None, None] * rays + centre_m[:, None, None]
-        middle_m = swath.middles_m[:, None] * ray + centre_m[:, None]
-        apart_m = np.zeros(rays.shape[:-1])
-        for channels, sign in ((pairs.first, -1), (pairs.second, 1)):
-            flat_m = points_m.reshape(len(channels), -1, 3)
-            path_m = self._range_m(lines, channels, flat_m).reshape(rays.shape[:-1])
-            path_m -= self._range_m(lines, channels, middle_m)[..., None]
-            apart_m = apart_m + sign * path_m
-        # Channels of unlike separation migrate by different amounts: that is not delay.
-        total = np.zeros(rays.shape[:-2], np.complex128)
-        seen = np.zeros(rays.shape[:-1])
-        for cycles_per_m in self._band():
-            weights = self._beam(rays, array, pairs, cycles_per_m)
-            seen = seen + weights
-            turned = np.exp(2j * np.pi * cycles_per_m * apart_m)
-            total = total + np.sum(weights * turned, axis=-1)
-        port = swath.side * outward
-        sensitivity = np.sum(seen * (rays @ port), axis=-1) / np.sum(seen, axis=-1)
-        return np.angle(total), sensitivity
 
     def _band(self) -> NDArray[np.float64]:
         """Return phases per metre at frequencies that stand for equal shares of the power."""
@@ -262,22 +226,7 @@ class Correlator:
         at = (np.arange(_FREQUENCIES) + 0.5) / _FREQUENCIES
         share = np.cumsum(self.spectrum.share)
         away = np.interp(at, share / share[-1], self.spectrum.frequency) / self.step_m
-        return np.concatenate([self.cycles_per_m - away, self.cycles_per_m + away])
-
-    def _beam(
-        self, rays: NDArray[np.float64], array: Array, pairs: Overlap, cycles_per_m: float
-    ) -> NDArray[np.float64]:
-        """Return the product of both channels' two-way amplitudes in directions."""
-        weights = np.ones(rays.shape[:-1])
-        if self.swath.element_length_m is None:
-            return weights
-        wavelength_m = 2 / abs(cycles_per_m)
-        for channel in (pairs.first[0], pairs.second[0]):
-            ping = int(np.searchsorted(array.starts, channel, "right")) - 1
-            sine = rays @ array.forward[ping]
-            for length_m in self.swath.element_length_m:
-                weights = weights * element_pattern(length_m, sine, 1.0, wavelength_m)
-        return weights
+        return np.concatenate([self.cycles_per_m - away[::-1], self.cycles_per_m + away])
 
 
 def displacement(found: Correlation, *, first: bool, yaw: bool) -> Displacement:
@@ -308,19 +257,36 @@ def displacement(found: Correlation, *, first: bool, yaw: bool) -> Displacement:
     coherence = np.sqrt(np.mean(found.coherence[:, :, lag] ** 2, axis=0))
     variance = phase_variance(coherence, found.independent)
     design = np.stack([-turns, -steer] if yaw else [-turns], axis=-1)
-    weights = np.broadcast_to(1 / variance, phase.shape)
-    normal = np.einsum("kw,kwa,kwb->ab", weights, design, design)
+    normal = np.einsum("w,kwa,kwb->ab", 1 / variance, design, design)
+    inverse = np.linalg.inv(normal)
+    solution = np.zeros(2)
     unknowns = len(normal)
-    covariance, solution = np.zeros((2, 2)), np.zeros(2)
-    covariance[:unknowns, :unknowns] = np.linalg.inv(normal)
-    right = np.einsum("kw,kwa,kw->a", weights, design, phase)
-    solution[:unknowns] = covariance[:unknowns, :unknowns] @ right
+    solution[:unknowns] = inverse @ np.einsum("w,kwa,kw->a", 1 / variance, design, phase)
     residual = phase - design @ solution[:unknowns]
-    misfit = float(np.sum(weights * residual**2) / max(phase.size - unknowns, 1))
-    # Errors that neighbours share look like a yaw, which residuals do not show.
+    covariance = np.zeros((2, 2))
+    spread = np.zeros_like(normal)
+    for window, each in enumerate(coherence):
+        shared = np.eye(len(phase)) if found.aligned is None else found.aligned.shared(each)
+        at = design[:, window]
+        spread += at.T @ shared @ at / variance[window]
+    covariance[:unknowns, :unknowns] = inverse @ spread @ inverse
+    expected = phase.size - float(np.trace(inverse @ spread))
+    misfit = float(np.sum(residual**2 / variance) / max(expected, 1.0))
     covariance *= np.outer([1.0, _SHARED], [1.0, _SHARED])
+    # More windows do not make the model of the array more exact.
+    level = design.mean(axis=1)
+    covariance[:unknowns, :unknowns] += _EXACT_RAD**2 * np.linalg.inv(level.T @ level)
+    alone = np.linalg.solve(
+        np.einsum("kwa,kwb->wab", design, design),
+        np.einsum("kwa,kw->wa", design, residual)[..., None],
+    )
     return Displacement(
-        sway_m + float(solution[0]), slope + float(solution[1]), covariance, coherence, misfit
+        sway_m + float(solution[0]),
+        slope + float(solution[1]),
+        covariance,
+        coherence,
+        misfit,
+        alone[:, -1, 0],
     )
 
 
@@ -334,30 +300,12 @@ def _unambiguous_slope(found: Correlation) -> float:
     return 0.5 / max(abs(found.cycles_per_m) * apart_m, 1e-9)
 
 
-def surge(
-    at: Correlation, behind: Correlation, ahead: Correlation, spacing_m: float
-) -> tuple[float, float]:
-    """Return how far an array advanced beyond what its navigation says, and its deviation, metres.
-
-    `at` correlates pairs that share a phase centre, `behind` and `ahead` pairs whose second channel
-    lies one spacing off. A parabola through the logarithms of their coherence has its peak where
-    the second channel really is: near the peak the coherence of a beam is much like a Gaussian.
-    """
-    logs, deviations = [], []
-    for found in (behind, at, ahead):
-        samples = found.independent
-        square = np.mean(found.coherence.max(axis=-1) ** 2, axis=0) - 1 / samples
-        mean = float(np.clip(np.average(square, weights=samples), _LEAST_SQUARE, 1.0))
-        logs.append(0.5 * math.log(mean))
-        count = float(np.sum(samples)) * len(found.along_m)
-        deviations.append((1 - mean) / math.sqrt(2 * count * mean))
-    before, here, after = logs
-    bend = before - 2 * here + after
-    if bend >= 0 or here < max(before, after):
-        return math.copysign(spacing_m, before - after) - at.apart_m, spacing_m
-    shift = 0.5 * (before - after) / bend
-    deviation = spacing_m * 0.5 * math.hypot(deviations[0], deviations[2]) / -bend
-    return -spacing_m * shift - at.apart_m, deviation
+def _split(
+    first: NDArray[np.complex128], second: NDArray[np.complex128], ends: NDArray[np.int64]
+) -> list[Window]:
+    """Return both channels by window."""
+    parts = np.split(first, ends, axis=1), np.split(second, ends, axis=1)
+    return list(zip(*parts, strict=True))
 
 
 def _without_highlights(

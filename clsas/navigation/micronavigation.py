@@ -16,7 +16,7 @@ from clsas.navigation.checks import check_navigation
 from clsas.navigation.displacement import Correlator
 from clsas.navigation.overlap import Array, moved
 from clsas.navigation.passes import Displacements, measured
-from clsas.navigation.smoother import Step, shape_deviation_m, smooth
+from clsas.navigation.smoother import Step, persistence, shape_deviation_m, smooth
 from clsas.navigation.swath import Swath
 from clsas.signal.compression import compress
 from clsas.signal.echoes import Echoes
@@ -59,6 +59,9 @@ class Micronavigation:
         Middles of the windows.
     overlap : int64 [pings - 1]
         Number of pairs of channels that share a phase centre.
+    persistence : float
+        Variance that errors of many steps add up to, over that of independent ones: echoes stay in
+        the beam for many pings. Standard deviations of positions and of the shape hold it.
     """
 
     lines: RangeLines
@@ -76,6 +79,7 @@ class Micronavigation:
     coherence: NDArray[np.float64]
     range_m: NDArray[np.float64]
     overlap: NDArray[np.int64]
+    persistence: float = 1.0
 
     @cached_property
     def shape_sd_m(self) -> NDArray[np.float64]:
@@ -88,7 +92,8 @@ class Micronavigation:
         if not all(np.isfinite(each).all() for each in deviations):
             return np.full(len(self.sway_m), np.nan)
         advance_m = np.linalg.norm(np.diff(self.lines.ping_centres_m, axis=0), axis=1)
-        return shape_deviation_m(*deviations, advance_m)
+        sway_m, yaw_rad = (np.sqrt(self.persistence) * each for each in deviations)
+        return shape_deviation_m(sway_m, yaw_rad, advance_m)
 
     def __repr__(self) -> str:
         """Return the size of what was found, and how coherent the echoes are."""
@@ -136,8 +141,8 @@ def micronavigate(
         are taken as horizontal.
     element_length_m : float or (transmitter, receiver), optional
         Lengths of the elements. Give them where the beam is wide: echoes far from broadside change
-        their range less, and the expected phase of separate transmitters and receivers is a mean
-        over the beam.
+        their range less, and with separate transmitters and receivers they shift phases. Both pings
+        are then aligned for every direction of the beam.
     sway_sd_m, yaw_sd_rad, surge_sd_m : float or array_like [pings]
         Standard deviation of the navigation's sway, yaw and surge.
     correlation_pings : float, optional
@@ -181,7 +186,8 @@ def micronavigate(
     They follow from the phase of a product of two correlated complex Gaussian signals, averaged
     over L samples, and a straight line fitted to K such phases at equal steps. They are scaled by
     the misfit of that line over all pings, where that is more than expected; yaw's also by what
-    neighbouring pairs have in common.
+    neighbouring pairs have in common. Those of positions and of the track's shape are scaled by
+    `Micronavigation.persistence` too.
     """
     if isinstance(lines, Echoes):
         lines = compress(lines)
@@ -199,7 +205,7 @@ def micronavigate(
     longest_m = float(np.diff(swath.edges_m).max())
     most_step_m = validate.number("most_step_m", most_step_m, "m", above=0.0, most=longest_m)
     correlator = Correlator(lines, swath)
-    found = measured(lines, array, correlator, names, most_step_m, progress)
+    found = measured(lines, array, correlator, names, fixes[:, :2], most_step_m, progress)
     return _result(lines, array, swath, found, fixes)
 
 
@@ -221,11 +227,12 @@ def _result(
     _check_coherence(found)
     count = len(found.moved)
     misfit = max(float(found.misfit[found.coherent].mean()), 1.0)
+    persist = persistence(found.scatter[found.coherent])
     # Errors of a navigation between two pings are no larger than those of both.
     bridged = 2 * fixes[:-1] ** 2
     steps, along = [], []
     for ping in range(count):
-        covariance, deviation_m = misfit * found.covariance[ping], found.surge_sd_m[ping]
+        covariance, deviation_m = persist * misfit * found.covariance[ping], found.surge_sd_m[ping]
         if not found.coherent[ping]:
             covariance, deviation_m = np.diag(bridged[ping, :2]), math.sqrt(bridged[ping, 2])
         steps.append(Step.over(found.moved[ping], covariance, found.levers_m[ping]))
@@ -253,6 +260,7 @@ def _result(
         coherence=found.coherence,
         range_m=swath.middles_m,
         overlap=found.pairs,
+        persistence=persist,
     )
 
 

@@ -9,7 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsas.core.lines import RangeLines
-from clsas.navigation.displacement import Correlator, Displacement, displacement, surge
+from clsas.navigation.advance import surge
+from clsas.navigation.directions import ALL, MIDDLE
+from clsas.navigation.displacement import Correlator, Displacement, displacement
 from clsas.navigation.overlap import Array, Overlap, moved, overlap
 from clsas.navigation.smoother import Step, integrated
 
@@ -42,6 +44,7 @@ class Displacements:
         See `Step.over`.
     coherence : float64 [pings - 1, windows]
     misfit : float64 [pings - 1]
+    scatter : float64 [pings - 1, windows]
         See `Displacement`.
     pairs : int64 [pings - 1]
         Pairs of channels that share a phase centre.
@@ -56,6 +59,7 @@ class Displacements:
     levers_m: list[tuple[float, float]]
     coherence: NDArray[np.float64]
     misfit: NDArray[np.float64]
+    scatter: NDArray[np.float64]
     pairs: NDArray[np.int64]
     coherent: NDArray[np.bool_]
 
@@ -65,17 +69,21 @@ def measured(
     array: Array,
     correlator: Correlator,
     unknowns: tuple[str, ...],
+    fixes: NDArray[np.float64],
     most_step_m: float,
     progress: Callable[[int, int], None] | None,
 ) -> Displacements:
-    """Return the displacements between all pings.
+    """Return the displacements between all pings; `fixes` are those of sway and yaw for `smooth`.
 
     Every pass aligns the channels by all that was found before it: what is left is small, and
     linear in the displacement. Where the advance differs from the navigation's, channels are then
     paired anew.
     """
-    passes = _Passes(lines, array, correlator, unknowns, progress)
+    yaw = "yaw" in unknowns
+    # Without yaw the track does not turn as a whole either.
+    passes = _Passes(lines, array, correlator, fixes if yaw else fixes * [1.0, 0.0], progress)
     passes.settle(most_step_m)
+    passes.narrow()
     deviation_m = np.zeros(array.pings - 1)
     if "surge" in unknowns:
         for _ in range(_SURGES):
@@ -122,30 +130,26 @@ class _Passes:
         lines: RangeLines,
         array: Array,
         correlator: Correlator,
-        unknowns: tuple[str, ...],
+        fixes: NDArray[np.float64],
         progress: Callable[[int, int], None] | None,
     ) -> None:
         self.lines, self.array, self.correlator = lines, array, correlator
-        self.yaw, self.progress = "yaw" in unknowns, _Progress(progress)
+        self.fixes, self.yaw = fixes, bool(np.any(fixes[:, 1] > 0))
+        self.progress = _Progress(progress)
         count = array.pings - 1
         self.moved, self.surge_m = np.zeros((count, 2)), np.zeros(count)
         self.coherent = np.ones(count, bool)
         self.steps: list[Displacement] = []
+        self.directions = ALL
         self.overlaps = self._paired(lines, array)
 
     def settle(self, most_m: float) -> None:
         """Measure sway and yaw until they change no more; look for steps of up to `most_m`."""
         first = not self.steps
         for _ in range(_PASSES):
-            corrected, here = self._corrected()
-            self.steps, changes = [], np.zeros_like(self.moved)
-            for ping, each in enumerate(self.overlaps):
-                correlation = self.correlator.correlate(corrected, here, each, most_m)
-                step = displacement(correlation, first=first, yaw=self.yaw)
-                self.steps.append(step)
-                changes[ping] = step.sway_m, step.yaw_rad
-                self.progress.done(ping + 1, len(self.overlaps))
+            self.steps = self._steps(most_m, self.directions, first=first)
             self.coherent = np.array([self._is_coherent(step) for step in self.steps])
+            changes = np.array([(step.sway_m, step.yaw_rad) for step in self.steps])
             changes[~self.coherent] = self.moved[~self.coherent] = 0.0
             self.moved = self.moved + changes
             deviations = np.stack([np.sqrt(np.diag(step.covariance)) for step in self.steps])
@@ -153,21 +157,41 @@ class _Passes:
             if np.all(np.abs(changes) <= _SETTLED * deviations):
                 return
 
+    def narrow(self) -> None:
+        """Use the middle of the beam alone, if that makes the displacements more certain."""
+        if self.correlator.swath.element_length_m is None or not self.coherent.any():
+            return
+        most_m = _LATER_LAGS * self.lines.range_step_m
+        steps = self._steps(most_m, MIDDLE, first=False)
+        if self._variance(steps) < self._variance(self.steps):
+            self.directions = MIDDLE
+            self.settle(most_m)
+
+    def _steps(self, most_m: float, directions: float, *, first: bool) -> list[Displacement]:
+        """Return what is left of the displacements between all pings."""
+        corrected, here = self._corrected()
+        steps = []
+        for ping, each in enumerate(self.overlaps):
+            found = self.correlator.correlate(corrected, here, each, most_m, directions)
+            steps.append(displacement(found, first=first, yaw=self.yaw))
+            self.progress.done(ping + 1, len(self.overlaps))
+        return steps
+
+    def _variance(self, steps: list[Displacement]) -> float:
+        """Return the mean variance of the yaws between pings, or of the sways without yaw."""
+        number = 1 if self.yaw else 0
+        some = [step for step, kept in zip(steps, self.coherent, strict=True) if kept]
+        variance = np.mean([step.covariance[number, number] for step in some])
+        return float(variance * max(np.mean([step.misfit for step in some]), 1.0))
+
     def surges_m(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the rest of every advance, and its standard deviation; 0 without coherence."""
         corrected, here = self._corrected()
         found = np.zeros((len(self.overlaps), 2))
         for ping in np.flatnonzero(self.coherent).tolist():
-            pairs = [overlap(corrected, here, ping, lag) for lag in (0, -1, 1)]
-            if not all(each.pairs for each in pairs):
-                found[ping] = 0.0, here.spacing_m  # too few channels overlap to tell
-                continue
-            at, behind, ahead = (
-                self.correlator.correlate(corrected, here, each, self.lines.range_step_m)
-                for each in pairs
-            )
-            found[ping] = surge(at, behind, ahead, here.spacing_m)
-            self.progress.done(ping + 1, self.array.pings - 1, passes=3)
+            pairs = overlap(corrected, here, ping)
+            found[ping] = surge(self.correlator, corrected, here, pairs, self.directions)
+            self.progress.done(ping + 1, self.array.pings - 1)
         return found[:, 0], found[:, 1]
 
     def result(self, surge_sd_m: NDArray[np.float64]) -> Displacements:
@@ -181,6 +205,7 @@ class _Passes:
             levers_m=self._levers_m(here),
             coherence=np.stack([step.coherence for step in self.steps]),
             misfit=np.array([step.misfit for step in self.steps]),
+            scatter=np.stack([step.scatter for step in self.steps]),
             pairs=np.array([each.pairs for each in self.overlaps]),
             coherent=self.coherent,
         )
@@ -196,7 +221,8 @@ class _Passes:
             [
                 Step.over(each, np.zeros((2, 2)), levers_m)
                 for each, levers_m in zip(self.moved, self._levers_m(there), strict=True)
-            ]
+            ],
+            self.fixes,
         )
         corrected = moved(advanced, there, states[:, 0], states[:, 1], none)
         return corrected, Array.of(corrected)

@@ -21,6 +21,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+_LAGS = 10  # pings over which errors may persist
+_PINGS_PER_LAG = 4
 _DRAWS = 400  # of errors: the deviation is certain to 4 %
 
 
@@ -70,12 +72,23 @@ class Step:
         return cls(np.eye(1), np.array([moved]), np.array([[deviation**2]]))
 
 
-def integrated(steps: Sequence[Step]) -> NDArray[np.float64]:
-    """Return the states of all pings, [pings, n], with zeros at the first."""
-    states = [np.zeros(len(steps[0].drift))]
+def integrated(steps: Sequence[Step], fixes: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the states of all pings, [pings, n], by steps taken as exact.
+
+    The first state is the one that keeps the track nearest to its navigation: a common shift and
+    turn. `fixes` are as those of `smooth`; a number whose fixes are 0 begins at 0.
+    """
+    size = len(steps[0].drift)
+    states, from_first = [np.zeros(size)], [np.eye(size)]
     for step in steps:
         states.append(step.transition @ states[-1] + step.drift)
-    return np.stack(states)
+        from_first.append(step.transition @ from_first[-1])
+    found, changes = np.stack(states), np.stack(from_first)
+    free = np.all(fixes > 0, axis=0)
+    weights = np.where(free, 1 / np.where(free, fixes, 1.0), 0.0)
+    design = (weights[..., None] * changes)[..., free].reshape(-1, int(free.sum()))
+    first = np.linalg.lstsq(design, -(weights * found).ravel(), rcond=None)[0]
+    return found + changes[..., free] @ first
 
 
 def smooth(
@@ -124,3 +137,21 @@ def shape_deviation_m(
     at_m = np.concatenate([[0.0], np.cumsum(advance_m)])
     line, _ = np.linalg.qr(np.stack([np.ones_like(at_m), at_m], axis=1))
     return np.sqrt(np.mean((sway_m - sway_m @ line @ line.T) ** 2, axis=0))
+
+
+def persistence(scatter: NDArray[np.float64]) -> float:
+    """Return the variance of a sum of errors over that of independent ones, at least 1.
+
+    Echoes stay in the beam for many pings, and so do the errors that they make. They differ between
+    windows of range: `scatter`, [pings - 1, windows], is how far every window is off the joint
+    displacement. Its covariance from ping to ping tells, weighted by a triangle (Newey and West
+    1987). One window or few pings do not tell: 1.
+    """
+    count, windows = scatter.shape
+    lags = min(_LAGS, count // _PINGS_PER_LAG)
+    square = float(np.sum(scatter**2))
+    if windows < 2 or lags < 1 or square <= 0:
+        return 1.0
+    shared = [float(np.sum(scatter[each:] * scatter[:-each])) for each in range(1, lags + 1)]
+    weights = 1 - np.arange(1, lags + 1) / (lags + 1)
+    return max(1.0, 1 + 2 * float(weights @ shared) / square)

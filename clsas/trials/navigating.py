@@ -225,11 +225,12 @@ def voyage(
     return Voyage(told, said_to_be_on(lines, sonar, true), range_m, target_m)
 
 
-def navigated(voyage: Voyage) -> Micronavigation:
-    """Return what micronavigation finds of a voyage."""
+def navigated(voyage: Voyage, window_m: float | None = None) -> Micronavigation:
+    """Return what micronavigation finds of a voyage, in windows of a length in range."""
     return micronavigate(
         voyage.told,
         range_m=voyage.range_m,
+        window_m=window_m,
         element_length_m=_ANTENNA_M,
         sway_sd_m=0.2,
         yaw_sd_rad=0.02,

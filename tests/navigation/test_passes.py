@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import clsas
-from clsas.navigation.smoother import shape_deviation_m
+from clsas.navigation.smoother import persistence, shape_deviation_m
 
 SPACING_M = 0.1  # of phase centres: yaw of 30 mrad turns neighbours by half a cycle
 PINGS = 12
@@ -64,3 +64,13 @@ def test_deviation_of_shape_is_that_of_walks():
     told = shape_deviation_m(np.full(count - 1, 1e-4), np.full(count - 1, 1e-3), advance_m)
     np.testing.assert_allclose(told, np.std(walks_m, axis=0), rtol=0.25)
     assert shape_deviation_m(np.zeros(4), np.zeros(4), np.ones(4)) == pytest.approx(np.zeros(5))
+
+
+def test_errors_that_persist_count_more():
+    """Errors that stay for several pings add up to more than independent ones do."""
+    random = np.random.default_rng(2)
+    white = random.standard_normal((400, 3))
+    kept = np.stack([np.convolve(each, np.ones(5), "valid") for each in white.T], axis=1)
+    assert persistence(white) == pytest.approx(1, abs=0.3)
+    assert 2.5 < persistence(kept) < 5
+    assert persistence(white[:, :1]) == persistence(white[:3]) == 1
