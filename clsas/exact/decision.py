@@ -85,7 +85,9 @@ def decide(
     """
     fixed = taps is not None and upsampling is not None
     geometry_error = GEOMETRY_ERROR if fixed else allowed(accuracy_db)
-    phase_terms = phases.TERMS[-1] if fixed else phases.terms_within(accuracy_db)
+    phase_terms = phases.TERMS[-1]
+    if not fixed:
+        phase_terms = phases.terms_within(accuracy_db, phases.EXACT_SHARE)
     conditions = Conditions(
         antennas_of(lines, beam),
         cycles_per_m_of(lines, spectrum),

@@ -220,9 +220,8 @@ class Plan:
     @property
     def phase_terms(self) -> int:
         """Terms of the polynomials for sine and cosine of pixels' phases."""
-        return phases.terms_within(
-            self.predicted_error_db if self.tolerance_db is None else self.tolerance_db
-        )
+        error_db = self.predicted_error_db if self.tolerance_db is None else self.tolerance_db
+        return phases.terms_within(error_db, phases.FACTORIZED_SHARE)
 
     def __repr__(self) -> str:
         """Return the request, the prediction and the sides of the subimages."""

@@ -312,7 +312,7 @@ def _describe(index: int, device: cl.Device) -> DeviceInfo:
     width, permute, stage_width = 1, False, 1
     if is_cpu and platform.startswith("Intel"):
         # Its compiler vectorises exact images across work-items, faster than through explicit
-        # vectors. In stages it fails to, and is ten times as slow as with them.
+        # vectors. In stages it fails to, and is twelve times as slow as with them.
         lanes = device.native_vector_width_float
         stage_width = lanes if lanes in (8, 16) else 4
     elif is_cpu:

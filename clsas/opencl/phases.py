@@ -13,7 +13,9 @@ PRECISE_TERMS = 7
 """Of a polynomial that errs by no more than single precision, for phases on which images depend
 more than once: those of upsampling and of stages."""
 
-_SHARE = 0.08  # of an image's error, as power
+FACTORIZED_SHARE, EXACT_SHARE = 0.03, 0.08
+"""Of an image's error, as power. Errors of the many channels of exact images average out."""
+
 _PHASES = (np.arange(2000) + 0.5) / 2000 - 0.5  # cycles
 
 
@@ -38,9 +40,12 @@ def error(terms: int) -> float:
     return float(np.sqrt(np.mean(np.abs(found - np.exp(2j * np.pi * _PHASES)) ** 2)))
 
 
-def terms_within(error_db: float) -> int:
-    """Return how many terms an image of some relative rms error, dB, needs."""
-    most = np.sqrt(_SHARE) * 10 ** (error_db / 20)
+def terms_within(error_db: float, share: float) -> int:
+    """Return how many terms an image of some relative rms error, dB, needs.
+
+    `share` is that of the error's power.
+    """
+    most = np.sqrt(share) * 10 ** (error_db / 20)
     return next((terms for terms in TERMS if error(terms) <= most), TERMS[-1])
 
 

@@ -84,7 +84,8 @@ class _Problem:
     @property
     def reserved(self) -> float:
         """Error power that is kept for what neither filters nor roots add, at least."""
-        of_phases = phases.error(phases.terms_within(self.tolerance_db)) ** 2
+        terms = phases.terms_within(self.tolerance_db, phases.FACTORIZED_SHARE)
+        of_phases = phases.error(terms) ** 2
         return self.beam_edges + _RESERVED_SHARE * self.allowed + of_phases
 
     def filters_db(self, reserved: float, root: tuple[int, int]) -> float | None:

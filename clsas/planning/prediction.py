@@ -367,7 +367,8 @@ def _with_arithmetic(
     tolerance_db, errors = conditions.tolerance_db, lines.errors
     if tolerance_db is None:
         return errors, False
-    errors = replace(errors, phases=phases.error(phases.terms_within(tolerance_db)) ** 2)
+    terms = phases.terms_within(tolerance_db, phases.FACTORIZED_SHARE)
+    errors = replace(errors, phases=phases.error(terms) ** 2)
     if lines.upsampler is None or not conditions.device.info.half_precision:
         return errors, False
     if _looked_up_singly(model, candidate, lines, conditions.device):

@@ -79,12 +79,9 @@ def test_micronavigation_refuses_by_name(case):
 
 def test_micronavigation_says_that_pings_are_out_of_order():
     lines = array_lines(6).select(of_pings(ORDER))
-    with (
-        pytest.warns(ClsasWarning, match=r"turns back \d times \(first after ping 5\).* order"),
-        pytest.warns(ClsasWarning, match="pairs of pings are not coherent"),
-    ):
+    with pytest.warns(ClsasWarning, match=r"turns back \d times \(first after ping 5\).* order"):
         found = clsas.micronavigate(lines, unknowns=("sway",))
-    assert np.isfinite(found.sway_m).all()
+    assert np.abs(found.sway_m).max() <= 3e-3
     lines = array_lines().select(of_pings(np.r_[0:4, 8, 5:8, 4, 9:12]))
     with (
         pytest.warns(ClsasWarning, match="the track turns back"),
