@@ -6,7 +6,7 @@
  *   - with HAS_PICK (vectors.h), lanes pick their samples from vectors of consecutive ones. 32 registers of AVX-512 hold
  *     two vectors of each part, with the samples of all taps;
  *   - 16 registers of AVX2 hold none: for each tap one vector is loaded, or two.
- * Picking is three to four times as fast as reading one by one. The host asks for it where the positions of all lanes of
+ * Picking is two to four times as fast as reading one by one. The host asks for it where the positions of all lanes of
  * a block lie within a window.
  *
  * Build options

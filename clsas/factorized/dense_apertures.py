@@ -32,6 +32,7 @@ DENSE_SHAPES: tuple[Shape, ...] = ("strips", "sheet")
 _JUMP = 8.0  # median steps from channel to channel, from which on another pass begins
 _LEAST_OF_STRIP = 32  # channels
 _MOST_STRIPS = 128
+_MOST_PAIRS = 64.0  # neighbours of a channel within a jump, on average
 _FITTED = 768  # channels to which a sheet is fitted
 _TRIED = (8, 2)  # intervals of a sheet's splines, and coefficients across it
 _REFINED = ((64, 2), (8, 3), (64, 3))  # the same, until all channels lie on the sheet
@@ -104,7 +105,8 @@ def _near_each_other(centres_m: NDArray[np.float64]) -> list[NDArray[np.int64]] 
     # A helix or a planar array is no passes: its channels have many neighbours within a jump.
     step_m = float(np.median(tree.query(some, k=2)[0][:, -1]))
     neighbours = tree.query_ball_point(some, _JUMP * step_m, return_length=True)
-    if step_m == 0 or np.median(neighbours) > 2 * _JUMP + 1:
+    # The mean bounds the memory of pairs: channels of a platform at rest are all neighbours.
+    if step_m == 0 or np.median(neighbours) > 2 * _JUMP + 1 or np.mean(neighbours) > _MOST_PAIRS:
         return None
     pairs = tree.query_pairs(_JUMP * step_m, output_type="ndarray")
     joined = coo_array((np.ones(len(pairs), np.int8), tuple(pairs.T)), shape=(count, count))

@@ -11,7 +11,8 @@ from clsas.core.lines import RangeLines
 from clsas.navigation.displacement import Correlator, Window
 from clsas.navigation.overlap import Array, Overlap
 
-_LEAST_SQUARE = 1e-4  # of a coherence whose logarithm is taken
+_LEAST_SQUARE = 1e-4  # of a coherence
+_LEAST_SHARE = 0.05  # of it that neighbours must have: with less, side lobes decide
 
 
 def surge(
@@ -44,10 +45,12 @@ def surge(
             for first, second in ((there, here), (order, order), (here, there))
         ]
     )
+    if squares[1] < max(squares[0], squares[2]):
+        return math.copysign(spacing_m, squares[0] - squares[2]) - apart_m, spacing_m
     before, at, after = 0.5 * np.log(squares)
     bend = before - 2 * at + after
-    if bend >= 0 or at < max(before, after):
-        return math.copysign(spacing_m, before - after) - apart_m, spacing_m
+    if bend >= 0 or min(squares[0], squares[2]) < _LEAST_SHARE * squares[1]:
+        return 0.0, spacing_m  # neighbours of sparse arrays share no speckle
     count = float(samples.sum()) * len(beside)
     if aligned is not None:
         count /= float(np.mean(np.sum(aligned.shared(math.sqrt(squares[1])), axis=0)))

@@ -46,7 +46,7 @@ _PADDING = 16  # samples of zeros beyond the lines: filters delay by less
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """Where an overlap looks: pairs of phase centres, and the directions of rays.
+    """Geometry of an overlap: the pairs' phase centres, and the rays to the seabed.
 
     Attributes
     ----------

@@ -16,6 +16,7 @@ from clsas.core.lines import RangeLines
 from clsas.factorized.plan import Plan
 from clsas.opencl.device import Device, open_device
 from clsas.planning import costs as stored
+from clsas.planning import scaling
 from clsas.planning.costs import Costs
 from clsas.planning.exact_image import Exact
 from clsas.planning.planner import plan
@@ -54,14 +55,7 @@ _HOST = (
     "group_ns",
     "part_ns",
 )
-_STAGES = (
-    "subimage_ns",
-    "line_ns",
-    "sample_ns",
-    "sample_tap_ns",
-    "single_sample_ns",
-    "given_sample_ns",
-)
+_STAGES = scaling.GROUPS["stages"]
 _PIXELS = ("pixel_ns", "point_ns")
 
 

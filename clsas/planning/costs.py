@@ -186,7 +186,7 @@ def _tables() -> dict[str, Any]:
         stored = reading.parse_json(reading.read_bytes(path()))
     except (FileNotFoundError, NotADirectoryError):
         return {}
-    if not isinstance(stored, dict) or not all(isinstance(each, dict) for each in stored.values()):
+    if not isinstance(stored, dict):
         raise ValueError(f"it must hold tables by device, got {validate.shown(stored)}")
     return stored
 
@@ -194,6 +194,8 @@ def _tables() -> dict[str, Any]:
 def _known(table: dict[str, Any]) -> KnownCosts:
     """Return costs from their stored table; raises an error if it is not one of `save`."""
     costs = {field.name: float(table["costs"][field.name]) for field in fields(Costs)}
+    if table["source"] not in ("scaled", "calibrated") or not table["measured"]:
+        raise ValueError("costs must be scaled or calibrated, at a time")
     return KnownCosts(Costs(**costs), table["source"], table["measured"])
 
 

@@ -241,7 +241,7 @@ def _built(device: Device, side: int) -> tuple[_Images, float]:
     model = VisibilityModel(lines, grid, None, OUTSIDE * power(_TOLERANCE_DB))
     room = device.info.memory_bytes // 2
     competing = expect(model, _TOLERANCE_DB, device)
-    conditions = Conditions(_TOLERANCE_DB, competing, device, _PLANNED_WITH, room)
+    conditions = Conditions(_TOLERANCE_DB, competing, device.for_stages(), _PLANNED_WITH, room)
     found, _ = fastest(model, conditions, math.inf, _ALLOWED)
     assert found is not None  # the scene is made so
     # Kernels that touch a buffer first take twice as long. Large images have many batches.

@@ -35,10 +35,12 @@ ROOMS = ("planning", "factorized", "exact")
 MODULES = ("clsas.signal.spectrum", "clsas.signal.ambiguity", "clsas.signal.interpolation")
 FIXED = {
     "clsas.planning.calibration": "it measures costs, which the cases are given",
+    "clsas.planning.scaling": "as calibration",
+    "clsas.planning.timed_images": "as calibration",
     "clsas.exact.checks": "limits of input",
     "clsas.exact.reference": "the float64 reference",
     "clsas.exact.wavenumber": "another imager, with a tool of its own",
-    "STACK CHUNK GUARD PHASES _GROUP _FINE VECTOR_ROOM": "layouts that kernels share",
+    "STACK HELD CHUNK GUARD PHASES _GROUP _FINE VECTOR_ROOM": "layouts that kernels share",
     "_FAR _LARGEST_HALF _LEAST_HALF _MOST_EXPONENT _SINGULAR": "limits of number formats",
     "BEST_TOLERANCE_DB WORST_TOLERANCE_DB BEST_ACCURACY_DB": "limits of input",
     "ACCURACY_DB TOLERANCE_DB NEAREST_UPSAMPLING": "defaults of the interface",

@@ -249,6 +249,26 @@ def test_an_advance_that_differs_is_found():
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("every", [2, 5])
+def test_sparse_arrays_do_not_take_side_lobes_for_an_advance(every):
+    """Elements shorter than their spacing: neighbours share no speckle that tells the advance."""
+    sonar, advance_m = overlapping_array(48, 16)
+    pings = np.arange(16)
+    course = ((0, 0, 0), (advance_m, 0, 0), 16, 1.0)
+    yaw_rad = 3e-3 * np.cos(pings)
+    true = clsas.Track.straight(*course, sway_m=4e-3 * np.sin(pings), yaw_rad=yaw_rad)
+    lines = recorded(
+        sonar, true, clsas.Track.straight(*course), seabed(true, 12, 18, 8000, seed=5), 12, 18
+    )
+    receivers = np.r_[0:16:every, 16:32:every]
+    lines = lines.select((32 * pings[:, None] + receivers).ravel())
+    found = micronavigate(lines, range_m=(12, 18), element_length_m=WAVELENGTH_M)
+    assert np.abs(np.diff(found.surge_m)).max() <= 1e-4
+    error = found.yaw_steps_rad - np.diff(yaw_rad)
+    assert np.sqrt(np.mean(error**2)) <= 1.5 * np.sqrt(np.mean(found.yaw_steps_sd_rad**2))
+
+
+@pytest.mark.slow
 def test_the_command(straight, tmp_path):
     clsas.save(tmp_path / "lines.h5", straight)
     arguments = ["navigate", str(tmp_path / "lines.h5"), "-o", str(tmp_path / "corrected.h5")]
