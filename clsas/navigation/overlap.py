@@ -118,11 +118,8 @@ class Overlap:
         return len(self.first)
 
 
-def overlap(lines: RangeLines, array: Array, ping: int, lag: int = 0) -> Overlap:
-    """Return the overlap of a ping with the next.
-
-    `lag` pairs every channel with one that lies so many receivers further ahead in the next ping.
-    """
+def overlap(lines: RangeLines, array: Array, ping: int) -> Overlap:
+    """Return the overlap of a ping with the next."""
     centres_m, forward = lines.phase_centres_m, array.forward[ping]
     here, there = array.channels(ping), array.channels(ping + 1)
     origin_m = array.reference_m[ping]
@@ -137,9 +134,7 @@ def overlap(lines: RangeLines, array: Array, ping: int, lag: int = 0) -> Overlap
     paired = paired[np.argsort(apart_m[paired], kind="stable")]
     _, unique = np.unique(nearest[paired], return_index=True)
     paired = np.sort(paired[unique])
-    chosen = nearest[paired] + lag
-    kept = (chosen >= 0) & (chosen < len(order))
-    first, second = here[paired[kept]], there[order[chosen[kept]]]
+    first, second = here[paired], there[order[nearest[paired]]]
     middle_m = (centres_m[first] + centres_m[second]) / 2
     pivot_m = middle_m.mean(axis=0) if len(first) else origin_m
     return Overlap(first, second, (middle_m - pivot_m) @ forward, pivot_m)

@@ -105,9 +105,9 @@ class _Progress:
     def __init__(self, tell: Callable[[int, int], None] | None) -> None:
         self.tell, self.left, self.told = tell, 1.0, 0
 
-    def done(self, number: int, count: int, passes: int = 1) -> None:
-        """Tell that `number` of `count` pairs of pings are done, in work of so many passes."""
-        left = self.left * _LEFT ** (passes * number / count)
+    def done(self, number: int, count: int) -> None:
+        """Tell that `number` of `count` pairs of pings are done."""
+        left = self.left * _LEFT ** (number / count)
         if number == count:
             self.left = left
         self._tell(int(_PROGRESS * (1 - left)))
