@@ -23,7 +23,7 @@ _PASSES = 6  # at most, and again after a surge
 _SETTLED = 0.1  # changes of the last pass, over their standard deviations
 _LATER_LAGS = 4  # samples to either side that later passes look at
 _SURGES = 3  # times that the advance is corrected and channels are paired anew
-_LEFT = 0.75  # of the progress, after a pass: of usually 8, or 3 without surge
+_LEFT = 0.75  # of the progress that a pass leaves open; most runs take 3 to 8 passes
 _PROGRESS = 1000  # steps that are told
 _LEAST_SURGE = 0.02  # spacings of the array, for which that is worth it
 
