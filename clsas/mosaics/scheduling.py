@@ -178,7 +178,8 @@ def form_patches(run: Run, finished: dict[PatchIndex, Record]) -> Generator[Form
             if not running and not todo and survey.has_ended:
                 return
             timeout_s = None if survey.has_ended and running else POLL_S
-            for future in wait(running or [Future()], timeout_s):
+            done = wait(running or [Future()], timeout_s)
+            for future in [future for future in running if future in done]:
                 with uninterrupted():
                     index = running.pop(future)
                     record, image = future.result()

@@ -11,6 +11,7 @@ import sys
 import textwrap
 import threading
 import time
+from concurrent.futures import wait
 from types import MappingProxyType, SimpleNamespace
 
 import h5py
@@ -22,6 +23,7 @@ import clsas
 from clsas.core.grid import Grid
 from clsas.core.image_error import relative_error_db
 from clsas.core.validate import ClsasWarning
+from clsas.mosaics import scheduling
 from clsas.mosaics.devices import claim_device
 from clsas.mosaics.documents import read_document
 from clsas.mosaics.forming import open_visibility, stamped_files
@@ -65,6 +67,14 @@ def test_every_patch_has_its_own_pixels(exact):
         assert 0 < patch.record.channels < 160  # the beam's
         assert not patch.record.flags
     assert sorted(seen) == list(np.ndindex(2, 4))
+
+
+def test_patches_of_one_device_come_in_order(monkeypatch):
+    """Also when several are finished before anybody looks."""
+    monkeypatch.setattr(scheduling, "wait", lambda futures, timeout: set(wait(futures).done))
+    wish = REQUEST | {"patches": (6, 8)}
+    patches = [(patch.row, patch.column) for patch in clsas.mosaic(LINES, GRID, **wish)]
+    assert patches == list(np.ndindex(6, 8))
 
 
 def test_a_store_holds_pixels_and_records(file, tmp_path, exact):
