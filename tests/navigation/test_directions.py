@@ -56,9 +56,9 @@ def responses(sine, directions):
 
 def test_echoes_off_broadside_arrive_with_one_phase():
     """As received their phases differ along the overlap, which looks like a yaw."""
-    received, filtered = responses(np.array([-0.6, -0.5, -0.4, 0.4, 0.5, 0.6]), ALL)
+    received, filtered = responses(np.array([-0.5, 0.5]), ALL)
     error_rad, left_rad = (np.abs(np.angle(a * b.conj())).max() for a, b in (received, filtered))
-    assert error_rad > 0.15
+    assert error_rad > 0.1
     assert left_rad < 0.3 * error_rad
 
 
