@@ -73,6 +73,17 @@ def main_loop(library: Path) -> Loop:
     return max(bodies, key=lambda loop: loop.multiply_adds)
 
 
+def counts(loop: Loop) -> dict[str, int]:
+    """Return how many instructions a loop has, and how many of each kind."""
+    return {
+        "instructions": len(loop.lines),
+        "multiply-adds": loop.multiply_adds,
+        "permutes": loop.count(r"^vperm|^vblendv|^vshuf|^vunpck"),
+        "memory operands": loop.count(r"^v.*\("),
+        "on the stack": loop.count(r"^v.*\(%r[sb]p"),
+    }
+
+
 def scheduled(loop: Loop, processor: str) -> tuple[str, str]:
     """Return a loop's cycles per iteration on a processor, and its busiest port with its cycles.
 
@@ -120,22 +131,14 @@ def table(device: str | None) -> None:
                         row = [case, f"{accuracy_db:g}", library.stem]
                         rows.append(row + _row(main_loop(library), times[library.stem]))
     print(f"{info.name}, {info.driver}, vectors of {info.width}; cycles by llvm-mca\n")
-    header = ["case", "dB", "kernel", "ms", "instructions", "multiply-adds", "permutes"]
-    header += ["memory operands", "on the stack"]
+    header = ["case", "dB", "kernel", "ms", *counts(Loop(()))]
     for processor in PROCESSORS:
         header += [f"{processor}: cycles", "busiest port"]
     tables.table(header, rows)
 
 
 def _row(loop: Loop, milliseconds: float) -> list[str]:
-    counts = [
-        len(loop.lines),
-        loop.multiply_adds,
-        loop.count(r"^vperm|^vblendv|^vshuf|^vunpck"),
-        loop.count(r"^v.*\("),
-        loop.count(r"^v.*\(%r[sb]p"),
-    ]
-    row = [f"{milliseconds:.1f}", *map(str, counts)]
+    row = [f"{milliseconds:.1f}", *map(str, counts(loop).values())]
     for processor in PROCESSORS:
         row += scheduled(loop, processor)
     return row
