@@ -147,7 +147,8 @@ def navigated(job: Job) -> Outcome:
     _write_track(job.folder / "navigate.csv", found)
     files = ["navigate.csv"]
     files += job.draw("navigate-track.png", lambda: plot.corrections(found))
-    files += job.draw("navigate-coherence.png", lambda: plot.coherence(found))
+    range_m = job.options("navigate").get("range_m")
+    files += job.draw("navigate-coherence.png", lambda: plot.coherence(found, range_m=range_m))
     return Outcome(numbers.of_navigation(found), files, found.lines)
 
 
