@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from clsas.core import reprs, validate
+from clsas.core.conditioning import DEAD_DB
 from clsas.core.lines import RangeLines
-from clsas.navigation.checks import check_navigation
+from clsas.navigation.checks import check_navigation, mean_wavelength_m
 from clsas.navigation.displacement import Correlator
 from clsas.navigation.overlap import Array, moved
 from clsas.navigation.passes import Displacements, measured
@@ -28,7 +29,11 @@ YAW_SD_RAD = math.radians(1.0)
 """Standard deviation of a navigation's yaw, unless given."""
 
 _LEAST_SHARE = 0.25  # of the pairs of pings, that must be coherent
-_LEAST_DEVIATION, _MOST_DEVIATION = 1e-9, 1e6  # of a navigation, metres and radians
+_LEAST_DEVIATION = 1e-9  # of a navigation, metres or radians
+_MOST_DEVIATION_M = 1e3
+_IMPLAUSIBLE = 3.0  # standard deviations of the navigation, rms over the pings
+_LONGEST_ARRAY = 4.0  # farthest ranges
+_SHORTEST_ARRAY, _SHORTEST_ELEMENT = 0.5, 0.05  # wavelengths
 _LEAST_WINDOW = 16  # samples
 _WINDOW_CELLS = 150.0  # range resolution cells of a window, unless given
 
@@ -171,8 +176,9 @@ def micronavigate(
     Warns
     -----
     ClsasWarning
-        If some pairs of pings are not coherent: the navigation bridges them. If the track turns
-        back, so that pings may be out of order.
+        If some pairs of pings are not coherent: the navigation bridges them. If channels are dead:
+        they are left out. If what is found is far beyond the accuracy of the navigation. If the
+        track turns back, so that pings may be out of order.
 
     Notes
     -----
@@ -197,16 +203,42 @@ def micronavigate(
     check_navigation(lines, 2, "micronavigation", may_stand=False)
     array = Array.of(lines)
     swath = _swath(lines, range_m, window_m, side, seabed_z_m, element_length_m)
-    fixes = _fixes(
-        array.pings,
-        {"sway_sd_m": sway_sd_m, "yaw_sd_rad": yaw_sd_rad, "surge_sd_m": surge_sd_m},
-        correlation_pings,
-    )
+    accuracy = _Accuracy.of(array.pings, sway_sd_m, yaw_sd_rad, surge_sd_m, correlation_pings)
     longest_m = float(np.diff(swath.edges_m).max())
     most_step_m = validate.number("most_step_m", most_step_m, "m", above=0.0, most=longest_m)
     correlator = Correlator(lines, swath)
-    found = measured(lines, array, correlator, names, fixes[:, :2], most_step_m, progress)
-    return _result(lines, array, swath, found, fixes)
+    _check_sizes(lines, array, swath, mean_wavelength_m(correlator.readout))
+    dead = int((~correlator.heard).sum())
+    if dead:
+        validate.warn(
+            f"{dead} of {lines.channels} channels hold no signal, or {-DEAD_DB:.0f} dB less than "
+            f"others of their ping (the first is channel {int(np.argmin(correlator.heard))}): they "
+            "are left out of what is correlated"
+        )
+    found = measured(
+        lines, array, correlator, names, accuracy.deviations[:, :2], most_step_m, progress
+    )
+    return _result(lines, array, swath, found, accuracy)
+
+
+def _check_sizes(lines: RangeLines, array: Array, swath: Swath, wave_m: float) -> None:
+    """Refuse arrays and elements of a size that no sonar has: lengths in other units."""
+    centres_m = lines.phase_centres_m[array.channels(0)]
+    length_m, farthest_m = float(np.ptp(centres_m @ array.forward[0])), float(swath.edges_m[-1])
+    least_m, most_m = _SHORTEST_ARRAY * wave_m, _LONGEST_ARRAY * farthest_m
+    if not least_m <= length_m <= most_m:
+        raise ValueError(
+            f"the phase centres of a ping must extend over {least_m:.3g} to {most_m:.3g} m (half a "
+            f"wavelength to {_LONGEST_ARRAY:g} times the farthest range), got {length_m:.3g} m: "
+            "are the positions of lines in metres?"
+        )
+    least_m, most_m = _SHORTEST_ELEMENT * wave_m, 2 * length_m
+    for each_m in swath.element_length_m or ():
+        if not least_m <= each_m <= most_m:
+            raise ValueError(
+                f"element_length_m must be from {least_m:.3g} m (a twentieth of a wavelength) to "
+                f"{most_m:.3g} m (the array of receivers), got {each_m:.3g} m"
+            )
 
 
 def _checked_unknowns(unknowns: Sequence[str]) -> tuple[str, ...]:
@@ -221,24 +253,22 @@ def _result(
     array: Array,
     swath: Swath,
     found: Displacements,
-    fixes: NDArray[np.float64],
+    accuracy: _Accuracy,
 ) -> Micronavigation:
-    """Fuse displacements with the navigation; `fixes` are [pings, 3]: sway, yaw and surge."""
+    """Fuse displacements with the navigation."""
     _check_coherence(found)
     count = len(found.moved)
     misfit = max(float(found.misfit[found.coherent].mean()), 1.0)
     persist = persistence(found.scatter[found.coherent])
-    # Errors of a navigation between two pings are no larger than those of both.
-    bridged = 2 * fixes[:-1] ** 2
-    steps, along = [], []
-    for ping in range(count):
-        covariance, deviation_m = persist * misfit * found.covariance[ping], found.surge_sd_m[ping]
-        if not found.coherent[ping]:
-            covariance, deviation_m = np.diag(bridged[ping, :2]), math.sqrt(bridged[ping, 2])
-        steps.append(Step.over(found.moved[ping], covariance, found.levers_m[ping]))
-        along.append(Step.along(found.surge_m[ping], deviation_m))
-    states, covariances = smooth(steps, fixes[:, :2])
-    surges, spreads = smooth(along, fixes[:, 2:])
+    steps: list[Step | None] = [None] * count
+    along: list[Step | None] = [None] * count
+    for ping in np.flatnonzero(found.coherent).tolist():
+        covariance = persist * misfit * found.covariance[ping]
+        steps[ping] = Step.over(found.moved[ping], covariance, found.levers_m[ping])
+        along[ping] = Step.along(found.surge_m[ping], found.surge_sd_m[ping])
+    states, covariances = smooth(steps, accuracy.deviations[:, :2], accuracy.correlation_pings)
+    surges, spreads = smooth(along, accuracy.deviations[:, 2:], accuracy.correlation_pings)
+    _check_plausible(np.concatenate([states, surges], axis=1), accuracy)
     corrected = moved(lines, array, states[:, 0], states[:, 1], surges[:, 0])
     at = Array.of(corrected)
     heading = np.arctan2(at.forward[:, 1], at.forward[:, 0])
@@ -271,7 +301,8 @@ def _check_coherence(found: Displacements) -> None:
         raise ValueError(
             f"lines must be coherent from ping to ping; {without} of {len(found.coherent)} pairs "
             f"of pings are not: their coherence is at most {found.coherence.max():.2f} in any "
-            f"window. Check range_m, and the navigation's advance from ping to ping"
+            f"window, and {found.least_coherence.min():.2f} at least is needed to tell echoes from "
+            f"noise. Check range_m, and the navigation's advance from ping to ping"
         )
     if without:
         validate.warn(
@@ -300,7 +331,12 @@ def _swath(
     if not nearest <= near < far <= farthest:
         raise ValueError(
             f"range_m must lie within what every channel has, {nearest:.6g} to {farthest:.6g} m, "
-            f"got ({near:.6g}, {far:.6g})"
+            f"the nearer first, got ({near:.6g}, {far:.6g})"
+        )
+    if far - near < _LEAST_WINDOW * lines.range_step_m:
+        raise ValueError(
+            f"range_m must be at least {_LEAST_WINDOW} samples long, "
+            f"{_LEAST_WINDOW * lines.range_step_m:.4g} m, got {far - near:.4g} m"
         )
     if window_m is None:
         cell_m = lines.range_step_m * max(measure_spectrum(lines).oversampling, 1.0)
@@ -335,23 +371,61 @@ def _swath(
     return Swath(edges, 1 if side == "port" else -1, seabed_z_m, lengths)
 
 
-def _fixes(
-    pings: int, deviations: dict[str, ArrayLike], correlation_pings: float | None
-) -> NDArray[np.float64]:
-    """Return the navigation's standard deviations as independent measurements, [pings, n].
+@dataclass(frozen=True, eq=False)
+class _Accuracy:
+    """Accuracy of a navigation.
 
-    Errors that persist over n pings average out like white ones that are sqrt(2 n) times as large.
+    Attributes
+    ----------
+    deviations : float64 [pings, 3]
+        Standard deviations of sway (m), yaw (rad) and surge (m).
+    correlation_pings : float
+        Pings over which errors persist.
     """
-    persist = float(pings)
-    if correlation_pings is not None:
+
+    deviations: NDArray[np.float64]
+    correlation_pings: float
+
+    @classmethod
+    def of(
+        cls,
+        pings: int,
+        sway_sd_m: ArrayLike,
+        yaw_sd_rad: ArrayLike,
+        surge_sd_m: ArrayLike,
+        correlation_pings: float | None,
+    ) -> _Accuracy:
+        """Return checked deviations; errors persist over the whole recording unless given."""
+        if correlation_pings is None:
+            correlation_pings = pings
         persist = validate.number("correlation_pings", correlation_pings, "pings", least=0.5)
-    found = []
-    for name, value in deviations.items():
-        checked = validate.array(name, value, np.float64, (pings,), broadcast=True)
-        if checked.min() < _LEAST_DEVIATION or checked.max() > _MOST_DEVIATION:
-            wrong = checked.min() if checked.min() < _LEAST_DEVIATION else checked.max()
-            raise ValueError(
-                f"{name} must be from {_LEAST_DEVIATION:g} to {_MOST_DEVIATION:g}, got {wrong:g}"
-            )
-        found.append(checked * math.sqrt(2 * persist))
-    return np.stack(found, axis=1)
+        found = []
+        for name, value, unit, most in (
+            ("sway_sd_m", sway_sd_m, "m", _MOST_DEVIATION_M),
+            ("yaw_sd_rad", yaw_sd_rad, "rad", math.pi),
+            ("surge_sd_m", surge_sd_m, "m", _MOST_DEVIATION_M),
+        ):
+            checked = validate.array(name, value, np.float64, (pings,), broadcast=True)
+            if checked.min() < _LEAST_DEVIATION or checked.max() > most:
+                wrong = checked.min() if checked.min() < _LEAST_DEVIATION else checked.max()
+                raise ValueError(
+                    f"{name} must be from {_LEAST_DEVIATION:g} to {most:.4g} {unit}, "
+                    f"got {wrong:g} {unit}"
+                )
+            found.append(checked)
+        return cls(np.stack(found, axis=1), persist)
+
+
+def _check_plausible(states: NDArray[np.float64], accuracy: _Accuracy) -> None:
+    """Warn of corrections far beyond the accuracy of the navigation; `states` are [pings, 3]."""
+    beyond = np.sqrt(np.mean((states / accuracy.deviations) ** 2, axis=0))
+    worst = int(np.argmax(beyond))
+    if beyond[worst] > _IMPLAUSIBLE:
+        name, option = (("sway", "sway_sd_m"), ("yaw", "yaw_sd_rad"), ("surge", "surge_sd_m"))[
+            worst
+        ]
+        validate.warn(
+            f"the {name} found is {beyond[worst]:.3g} times the accuracy given for the navigation "
+            f"({option}), rms over the pings. Check that accuracy, side, element_length_m, and the "
+            "sign of phase: `clsas inspect` tells conjugated samples"
+        )
