@@ -13,15 +13,15 @@ from numpy.typing import ArrayLike, NDArray
 from clsas.core import reprs, validate
 from clsas.core.conditioning import DEAD_DB
 from clsas.core.lines import RangeLines
+from clsas.navigation.accuracy import Accuracy, check_plausible
 from clsas.navigation.checks import check_navigation, mean_wavelength_m
 from clsas.navigation.displacement import Correlator
 from clsas.navigation.overlap import Array, moved
 from clsas.navigation.passes import Displacements, measured
 from clsas.navigation.smoother import Step, persistence, shape_deviation_m, smooth
-from clsas.navigation.swath import Swath
+from clsas.navigation.swath import Swath, check_sizes, checked_swath
 from clsas.signal.compression import compress
 from clsas.signal.echoes import Echoes
-from clsas.signal.spectrum import measure_spectrum
 from clsas.sonar.track import Track
 
 UNKNOWNS = ("sway", "yaw", "surge")
@@ -29,13 +29,6 @@ YAW_SD_RAD = math.radians(1.0)
 """Standard deviation of a navigation's yaw, unless given."""
 
 _LEAST_SHARE = 0.25  # of the pairs of pings, that must be coherent
-_LEAST_DEVIATION = 1e-9  # of a navigation, metres or radians
-_MOST_DEVIATION_M = 1e3
-_IMPLAUSIBLE = 3.0  # standard deviations of the navigation, rms over the pings
-_LONGEST_ARRAY = 4.0  # farthest ranges
-_SHORTEST_ARRAY, _SHORTEST_ELEMENT = 0.5, 0.05  # wavelengths
-_LEAST_WINDOW = 16  # samples
-_WINDOW_CELLS = 150.0  # range resolution cells of a window, unless given
 
 
 @dataclass(frozen=True, eq=False)
@@ -202,12 +195,12 @@ def micronavigate(
     names = _checked_unknowns(unknowns)
     check_navigation(lines, 2, "micronavigation", may_stand=False)
     array = Array.of(lines)
-    swath = _swath(lines, range_m, window_m, side, seabed_z_m, element_length_m)
-    accuracy = _Accuracy.of(array.pings, sway_sd_m, yaw_sd_rad, surge_sd_m, correlation_pings)
+    swath = checked_swath(lines, range_m, window_m, side, seabed_z_m, element_length_m)
+    accuracy = Accuracy.of(array.pings, sway_sd_m, yaw_sd_rad, surge_sd_m, correlation_pings)
     longest_m = float(np.diff(swath.edges_m).max())
     most_step_m = validate.number("most_step_m", most_step_m, "m", above=0.0, most=longest_m)
     correlator = Correlator(lines, swath)
-    _check_sizes(lines, array, swath, mean_wavelength_m(correlator.readout))
+    check_sizes(lines, array, swath, mean_wavelength_m(correlator.readout))
     dead = int((~correlator.heard).sum())
     if dead:
         validate.warn(
@@ -219,26 +212,6 @@ def micronavigate(
         lines, array, correlator, names, accuracy.deviations[:, :2], most_step_m, progress
     )
     return _result(lines, array, swath, found, accuracy)
-
-
-def _check_sizes(lines: RangeLines, array: Array, swath: Swath, wave_m: float) -> None:
-    """Refuse arrays and elements of a size that no sonar has: lengths in other units."""
-    centres_m = lines.phase_centres_m[array.channels(0)]
-    length_m, farthest_m = float(np.ptp(centres_m @ array.forward[0])), float(swath.edges_m[-1])
-    least_m, most_m = _SHORTEST_ARRAY * wave_m, _LONGEST_ARRAY * farthest_m
-    if not least_m <= length_m <= most_m:
-        raise ValueError(
-            f"the phase centres of a ping must extend over {least_m:.3g} to {most_m:.3g} m (half a "
-            f"wavelength to {_LONGEST_ARRAY:g} times the farthest range), got {length_m:.3g} m: "
-            "are the positions of lines in metres?"
-        )
-    least_m, most_m = _SHORTEST_ELEMENT * wave_m, 2 * length_m
-    for each_m in swath.element_length_m or ():
-        if not least_m <= each_m <= most_m:
-            raise ValueError(
-                f"element_length_m must be from {least_m:.3g} m (a twentieth of a wavelength) to "
-                f"{most_m:.3g} m (the array of receivers), got {each_m:.3g} m"
-            )
 
 
 def _checked_unknowns(unknowns: Sequence[str]) -> tuple[str, ...]:
@@ -253,7 +226,7 @@ def _result(
     array: Array,
     swath: Swath,
     found: Displacements,
-    accuracy: _Accuracy,
+    accuracy: Accuracy,
 ) -> Micronavigation:
     """Fuse displacements with the navigation."""
     _check_coherence(found)
@@ -268,7 +241,7 @@ def _result(
         along[ping] = Step.along(found.surge_m[ping], found.surge_sd_m[ping])
     states, covariances = smooth(steps, accuracy.deviations[:, :2], accuracy.correlation_pings)
     surges, spreads = smooth(along, accuracy.deviations[:, 2:], accuracy.correlation_pings)
-    _check_plausible(np.concatenate([states, surges], axis=1), accuracy)
+    check_plausible(np.concatenate([states, surges], axis=1), accuracy)
     corrected = moved(lines, array, states[:, 0], states[:, 1], surges[:, 0])
     at = Array.of(corrected)
     heading = np.arctan2(at.forward[:, 1], at.forward[:, 0])
@@ -308,124 +281,4 @@ def _check_coherence(found: Displacements) -> None:
         validate.warn(
             f"{without} of {len(found.coherent)} pairs of pings are not coherent (the first after "
             f"ping {int(np.argmin(found.coherent))}): the navigation's accuracy bridges them"
-        )
-
-
-def _swath(
-    lines: RangeLines,
-    range_m: tuple[float, float] | None,
-    window_m: float | None,
-    side: str,
-    seabed_z_m: float | None,
-    element_length_m: float | tuple[float, float] | None,
-) -> Swath:
-    """Return the swath of checked arguments."""
-    validate.one_of("side", side, ("port", "starboard"))
-    nearest, farthest = float(lines.first_range_m.max()), float(lines.last_range_m.min())
-    if range_m is None:
-        # Rays are read where every channel has samples, whatever it is displaced.
-        spare = 0.02 * (farthest - nearest)
-        near, far = nearest + spare, farthest - spare
-    else:
-        near, far = map(float, validate.array("range_m", range_m, np.float64, (2,)))
-    if not nearest <= near < far <= farthest:
-        raise ValueError(
-            f"range_m must lie within what every channel has, {nearest:.6g} to {farthest:.6g} m, "
-            f"the nearer first, got ({near:.6g}, {far:.6g})"
-        )
-    if far - near < _LEAST_WINDOW * lines.range_step_m:
-        raise ValueError(
-            f"range_m must be at least {_LEAST_WINDOW} samples long, "
-            f"{_LEAST_WINDOW * lines.range_step_m:.4g} m, got {far - near:.4g} m"
-        )
-    if window_m is None:
-        cell_m = lines.range_step_m * max(measure_spectrum(lines).oversampling, 1.0)
-        window_m = min(_WINDOW_CELLS * cell_m, far - near)
-    window_m = validate.number(
-        "window_m",
-        window_m,
-        "m",
-        least=_LEAST_WINDOW * lines.range_step_m,
-        most=(far - near) * (1 + 1e-9),
-    )
-    if seabed_z_m is not None:
-        seabed_z_m = validate.number("seabed_z_m", seabed_z_m, "m")
-        height_m = float(np.abs(lines.phase_centres_m[:, 2] - seabed_z_m).max())
-        if height_m >= near:
-            raise ValueError(
-                f"seabed_z_m must lie less than the nearest range of {near:.4g} m from the sonar's "
-                f"height, got {height_m:.4g} m: rays must reach the seabed beside it"
-            )
-    lengths = None
-    if element_length_m is not None:
-        given = np.atleast_1d(validate.array(
-            "element_length_m", np.ravel(element_length_m), np.float64, (None,)))  # fmt: skip
-        if given.size > 2 or given.min() <= 0:
-            raise ValueError(
-                "element_length_m must be one or two lengths above 0 m, got "
-                f"{validate.shown(element_length_m)}"
-            )
-        lengths = float(given[0]), float(given[-1])
-    windows = max(int((far - near) / window_m + 1e-9), 1)
-    edges = np.linspace(near, far, windows + 1)
-    return Swath(edges, 1 if side == "port" else -1, seabed_z_m, lengths)
-
-
-@dataclass(frozen=True, eq=False)
-class _Accuracy:
-    """Accuracy of a navigation.
-
-    Attributes
-    ----------
-    deviations : float64 [pings, 3]
-        Standard deviations of sway (m), yaw (rad) and surge (m).
-    correlation_pings : float
-        Pings over which errors persist.
-    """
-
-    deviations: NDArray[np.float64]
-    correlation_pings: float
-
-    @classmethod
-    def of(
-        cls,
-        pings: int,
-        sway_sd_m: ArrayLike,
-        yaw_sd_rad: ArrayLike,
-        surge_sd_m: ArrayLike,
-        correlation_pings: float | None,
-    ) -> _Accuracy:
-        """Return checked deviations; errors persist over the whole recording unless given."""
-        if correlation_pings is None:
-            correlation_pings = pings
-        persist = validate.number("correlation_pings", correlation_pings, "pings", least=0.5)
-        found = []
-        for name, value, unit, most in (
-            ("sway_sd_m", sway_sd_m, "m", _MOST_DEVIATION_M),
-            ("yaw_sd_rad", yaw_sd_rad, "rad", math.pi),
-            ("surge_sd_m", surge_sd_m, "m", _MOST_DEVIATION_M),
-        ):
-            checked = validate.array(name, value, np.float64, (pings,), broadcast=True)
-            if checked.min() < _LEAST_DEVIATION or checked.max() > most:
-                wrong = checked.min() if checked.min() < _LEAST_DEVIATION else checked.max()
-                raise ValueError(
-                    f"{name} must be from {_LEAST_DEVIATION:g} to {most:.4g} {unit}, "
-                    f"got {wrong:g} {unit}"
-                )
-            found.append(checked)
-        return cls(np.stack(found, axis=1), persist)
-
-
-def _check_plausible(states: NDArray[np.float64], accuracy: _Accuracy) -> None:
-    """Warn of corrections far beyond the accuracy of the navigation; `states` are [pings, 3]."""
-    beyond = np.sqrt(np.mean((states / accuracy.deviations) ** 2, axis=0))
-    worst = int(np.argmax(beyond))
-    if beyond[worst] > _IMPLAUSIBLE:
-        name, option = (("sway", "sway_sd_m"), ("yaw", "yaw_sd_rad"), ("surge", "surge_sd_m"))[
-            worst
-        ]
-        validate.warn(
-            f"the {name} found is {beyond[worst]:.3g} times the accuracy given for the navigation "
-            f"({option}), rms over the pings. Check that accuracy, side, element_length_m, and the "
-            "sign of phase: `clsas inspect` tells conjugated samples"
         )

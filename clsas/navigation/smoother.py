@@ -140,7 +140,7 @@ def _extended(
     change: NDArray[np.float64],
     fresh: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return mean and covariance of a state and of the next, which is `change` of it and `fresh`."""
+    """Return mean and covariance of a state and the next: `change` of it, and `fresh` noise."""
     across = change @ covariance
     return (
         np.concatenate([state, change @ state]),

@@ -370,7 +370,7 @@ def test_lengths_in_other_units_are_refused(swaying, options, message):
 @pytest.mark.slow
 def test_positions_in_other_units_are_refused(swaying, factor):
     scaled = replace(swaying, tx_m=factor * swaying.tx_m, rx_m=factor * swaying.rx_m)
-    with pytest.raises(ValueError, match="phase centres of a ping must extend .* in metres"):
+    with pytest.raises(ValueError, match=r"phase centres of a ping must extend .* in metres"):
         micronavigate(scaled, range_m=(12, 15), element_length_m=WAVELENGTH_M)
 
 
