@@ -129,21 +129,22 @@ def _shifts(
     """
     size = [scipy.fft.next_fast_len(2 * images[0].shape[axis]) for axis in (1, 2)]
     spectra: dict[int, NDArray[np.complex64]] = {}
-    shifts = np.zeros((len(pairs), len(groups)))
-    for number, (first, second) in enumerate(pairs):
+    products = []
+    for first, second in pairs:
         for each in (first, second):
             if each not in spectra:
                 spectra[each] = scipy.fft.rfftn(images[each], s=size, axes=(1, 2))
                 spectra.pop(each - max(_LAGS) - 1, None)
         both = spectra[first].conj() * spectra[second]
-        for of, group in enumerate(groups):
-            power = scipy.fft.irfftn(both[group].sum(axis=0), s=size)
-            row, column = np.unravel_index(int(np.argmax(power)), power.shape)
-            before, at, after = (power[(row + n) % size[0], column] for n in (-1, 0, 1))
-            bend = before - 2 * at + after
-            shifts[number, of] = (row + size[0] // 2) % size[0] - size[0] // 2
-            shifts[number, of] += 0.5 * (before - after) / bend if bend < 0 else 0.0
-    return shifts
+        products.append([both[group].sum(axis=0) for group in groups])
+    power = scipy.fft.irfftn(np.array(products), s=size, axes=(2, 3))
+    peaks = np.argmax(power.reshape(*power.shape[:2], -1), axis=2)
+    row, column = np.unravel_index(peaks, size)
+    pair, group = np.ogrid[: len(pairs), : len(groups)]
+    before, at, after = (power[pair, group, (row + n) % size[0], column] for n in (-1, 0, 1))
+    bend = before - 2 * at + after
+    fraction = np.where(bend < 0, 0.5 * (before - after) / np.where(bend < 0, bend, 1.0), 0.0)
+    return (row + size[0] // 2) % size[0] - size[0] // 2 + fraction
 
 
 def _slopes(

@@ -6,16 +6,21 @@ position per ping is solved for, which gives every response the phase of its own
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
+from clsas.core.phasors import phasors
 from clsas.navigation.responses import Contributions, Passage
 
 _PASSES = 3  # of alternating least squares: steps of the track, and the responses' own slopes
 _TRIED = 9  # displacements within half a wavelength: 4 per cycle of the sharpness
 _NEWTON = 3  # steps from the best of them
 _SWEEPS = 2  # over all pings
+_PART = 8.0  # Fresnel lengths, over which a response stays in the beam
+_LEAST_PART = 64  # pings: the mean of fewer holds noise
 _BLOCKS = 16  # of pings that are moved together: few enough to leave the sum over the others
 
 
@@ -55,7 +60,7 @@ def phase_gradient_m(
 
 
 def _phase(product: NDArray[np.complex64], expected: NDArray[np.float64]) -> NDArray[np.float32]:
-    return np.angle(product * np.exp(-1j * expected.astype(np.float32)))
+    return np.angle(product * phasors(-expected.astype(np.float32)))
 
 
 def _turns(passage: Passage, found: Contributions) -> NDArray[np.float64]:
@@ -95,17 +100,42 @@ def sharpest_m(
         for some in np.array_split(order, min(_BLOCKS, pings)):
             for axis, turn in enumerate(turns[:, some]):
                 others = total - turned[some]
-                mine = turned[some] * np.exp(-1j * turn * moved_m[axis, some, None])
+                mine = turned[some] * phasors(-turn * moved_m[axis, some, None])
                 level = np.abs(others) ** 2 + np.abs(mine) ** 2
                 best_m = _sharpest(level, others.conj() * mine, turn, furthest_m)
-                mine *= np.exp(1j * turn * best_m[:, None])
+                mine *= phasors(turn * best_m[:, None])
                 total = total + np.sum(mine - turned[some], axis=0)
                 moved_m[axis, some], turned[some] = best_m, mine
-    mean = total / pings
-    noise = np.mean(np.abs(turned - mean) ** 2, axis=1)
+    mean, noise = _mean_and_noise(turned)
     information = 2 * np.einsum("apk,k->ap", turns**2, np.abs(mean) ** 2).astype(np.float64)
     variance = np.sum(noise / np.maximum(information, 1e-300), axis=0)
     return np.einsum("pau,ap->up", directions, moved_m), np.sqrt(variance)
+
+
+def range_deviation_m(passage: Passage, found: Contributions) -> float:
+    """Return the standard deviation of the range of single pings that responses tell, metres.
+
+    It is the median over the pings, each by the scatter of its contributions around those of its
+    part of the track. Responses of a scene agree about the one track. Brightest pixels of speckle
+    can be made brighter, but every one in its own way.
+    """
+    values = passage.by_ping(found.values[..., 0])
+    length_m = _PART * passage.fresnel_length_m(found)
+    parts = int(min(passage.along_m[-1] / length_m, passage.pings / _LEAST_PART))
+    variances = []
+    for part in np.array_split(values, max(parts, 1)):
+        mean, noise = _mean_and_noise(part)
+        variances.append(noise / (2 * max(float(np.sum(np.abs(mean) ** 2)), 1e-300)))
+    phase = math.sqrt(float(np.median(np.concatenate(variances))))
+    return passage.wavelength_m / (4 * np.pi) * phase
+
+
+def _mean_and_noise(
+    values: NDArray[np.complex64],
+) -> tuple[NDArray[np.complex64], NDArray[np.float32]]:
+    """Return the mean of contributions over the pings, and every ping's mean power beside it."""
+    mean = values.mean(axis=0)
+    return mean, np.mean(np.abs(values - mean) ** 2, axis=1)
 
 
 def _directions(turns: NDArray[np.float64], weights: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -129,8 +159,8 @@ def _sharpest(
     and `turn` are [pings, points].
     """
     step_m = 2 * furthest_m / (_TRIED - 1)
-    rotation = np.exp(1j * turn * step_m)
-    tried = cross * np.exp(-1j * turn * furthest_m)
+    rotation = phasors(turn * np.float32(step_m))
+    tried = cross * phasors(-turn * np.float32(furthest_m))
     sharpness = np.empty((_TRIED, len(cross)), np.float32)
     for number in range(_TRIED):
         sharpness[number] = np.sum((level + 2 * tried.real) ** 2, axis=1)
@@ -138,7 +168,7 @@ def _sharpest(
     first_m = np.float32(step_m) * np.argmax(sharpness, axis=0).astype(np.float32) - furthest_m
     moved_m = first_m.copy()
     for _ in range(_NEWTON):
-        at = cross * np.exp(1j * turn * moved_m[:, None])
+        at = cross * phasors(turn * moved_m[:, None])
         intensity = level + 2 * at.real
         slope = -2 * turn * at.imag
         bend = np.sum(slope**2 - 2 * intensity * turn**2 * at.real, axis=1)
