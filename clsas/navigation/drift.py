@@ -14,8 +14,10 @@ from collections.abc import Sequence
 
 import numpy as np
 import scipy.fft
+import scipy.linalg
 from numpy.typing import NDArray
 
+from clsas.core.phasors import phasors
 from clsas.navigation.responses import Contributions, Passage
 
 _LENGTH = 1.5
@@ -60,7 +62,8 @@ def drift_m(passage: Passage, found: Contributions) -> NDArray[np.float64] | Non
         some = channels[each]
         at_m = channel_m[some] - starts_m[each]
         taper = np.sin(np.pi * at_m / length_m) ** 2
-        turn = (taper * np.exp(-2j * np.pi * frequency[:, None] * at_m)).astype(np.complex64)
+        cycles = frequency[:, None] * at_m
+        turn = taper.astype(np.float32) * phasors((-2 * np.pi * cycles).astype(np.float32))
         values = found.values[some]
         # Products of small matrices keep to one thread: waiting for others takes longer.
         image = turn @ values.transpose(1, 0, 2)
@@ -186,7 +189,8 @@ def _slopes(
     level = np.kron(np.eye(unknowns), np.full(count, 1 / count))
     design = np.concatenate([design.reshape(-1, unknowns * count), level])
     right = np.concatenate([right.ravel(), np.zeros(unknowns)])
-    return np.linalg.lstsq(design, right, rcond=None)[0].reshape(unknowns, count)
+    found = scipy.linalg.lstsq(design, right, lapack_driver="gelsy", check_finite=False)[0]
+    return found.reshape(unknowns, count)
 
 
 def _integrated(

@@ -108,10 +108,23 @@ def peak_db(
     return float(20 * np.log10(image / ideal))
 
 
+def residual_m(found: Autofocus, sway_m: NDArray[np.float64], smoothed: float = 0) -> float:
+    """Return the rms of what is left of a sway, the largest of any 400 pings, or its smooth part.
+
+    Over so many pings a response stays in the beam. A trend of theirs is left out. `smoothed` is
+    the number of pings of a mean.
+    """
+    error_m, worst_m = found.correction_m[:, 1] - sway_m, 0.0
+    for first in range(0, max(len(error_m) - PINGS, 0) + 1, PINGS // 4):
+        left_m = detrended(error_m[first : first + PINGS])
+        left_m = gaussian_filter1d(left_m, smoothed) if smoothed else left_m
+        worst_m = max(worst_m, float(np.std(left_m)))
+    return worst_m
+
+
 def smooth_residual_m(found: Autofocus, sway_m: NDArray[np.float64]) -> float:
     """Return the rms of what is left of the smooth part of a sway."""
-    left_m = detrended(found.correction_m[:, 1] - sway_m)
-    return float(np.std(gaussian_filter1d(left_m, _SMOOTHED)))
+    return residual_m(found, sway_m, _SMOOTHED)
 
 
 @dataclass(frozen=True)
@@ -181,7 +194,7 @@ def rows(devices: Iterable[str]) -> Iterator[list[str]]:
             sway_m = scene.sway_m
             true, told = recorded(scene.targets, sway_m)
             found, images = _timed(told, scene.grid, device)
-            left = np.std(detrended(found.correction_m[:, 1] - sway_m)) / WAVELENGTH_M
+            left = residual_m(found, sway_m) / WAVELENGTH_M
             yield [
                 f"{name}, {device}",
                 f"{scene.smooth:g} smooth, {scene.white:g} white",
