@@ -24,7 +24,7 @@ from clsas.core.image import Image
 from clsas.core.lines import RangeLines
 from clsas.navigation.checks import check_navigation
 from clsas.navigation.drift import drift_m
-from clsas.navigation.gradient import phase_gradient_m, range_deviation_m, sharpest_m
+from clsas.navigation.gradient import disagreement_m, phase_gradient_m, sharpest_m
 from clsas.navigation.responses import (
     READ_DB,
     Contributions,
@@ -43,16 +43,16 @@ UNKNOWNS = ("sway", "heave", "surge")
 
 IMAGE_TOLERANCE_DB = -30.0
 """Tolerance of the images in between: errors far below responses."""
-MOST_UNCERTAIN = 1 / 90
-"""Wavelengths to which responses must tell the range of single pings. Those of speckle, made as
-bright as they get, tell it to 0.016 to 0.03, bright ones to 0.004 to 0.008."""
+MOST_DISAGREEMENT = 1 / 40
+"""Wavelengths of range that halves of the responses may disagree about single pings. Responses of
+speckle disagree by 0.046 and more, bright ones by 0.01."""
 
 _DRIFTS = 3  # times that drift is measured at most
 _NEIGHBOURHOODS = (2.0, 1.0)  # Fresnel lengths around responses, along the track
 _SWEEPS = 2  # times that single pings are moved at most
 _RESPONSES, _RESPONSES_FOR_DRIFT = 200, 40
 _OFFSETS = np.arange(-4.0, 5.0)  # samples in range, of which drift sees images
-_LEAST_RESPONSES = 8
+_LEAST_RESPONSES = 8  # halves of which can agree
 _LEAST_GRADIENT = 0.05  # of range per displacement, rms
 _APART = 4.0  # range resolution cells between responses
 _GAIN = 1.02  # of sharpness, for which a step is repeated
@@ -245,11 +245,11 @@ class _Focus:
                 dropped = name
             if self.progress is not None:
                 self.progress(number, len(stages))
-        uncertain = range_deviation_m(self.passage, self._responses) / self.passage.wavelength_m
-        if uncertain > MOST_UNCERTAIN:
+        apart = disagreement_m(self.passage, self._responses) / self.passage.wavelength_m
+        if apart > MOST_DISAGREEMENT:
             return self._unfocused(
-                f"responses tell the range of single pings to {uncertain:.2g} wavelengths, "
-                f"{MOST_UNCERTAIN:.2g} are needed"
+                f"one half of the responses and the other want the pings moved by displacements "
+                f"that differ by {apart:.2g} wavelengths rms, at most {MOST_DISAGREEMENT:g}"
             )
         return self._outcome(focused=True)
 

@@ -6,8 +6,6 @@ position per ping is solved for, which gives every response the phase of its own
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
@@ -19,8 +17,7 @@ _PASSES = 3  # of alternating least squares: steps of the track, and the respons
 _TRIED = 9  # displacements within half a wavelength: 4 per cycle of the sharpness
 _NEWTON = 3  # steps from the best of them
 _SWEEPS = 2  # over all pings
-_PART = 8.0  # Fresnel lengths, over which a response stays in the beam
-_LEAST_PART = 64  # pings: the mean of fewer holds noise
+_DEVIATION_PER_MEDIAN = 1.4826  # of the magnitude of normal errors
 _BLOCKS = 16  # of pings that are moved together: few enough to leave the sum over the others
 
 
@@ -106,36 +103,31 @@ def sharpest_m(
                 mine *= phasors(turn * best_m[:, None])
                 total = total + np.sum(mine - turned[some], axis=0)
                 moved_m[axis, some], turned[some] = best_m, mine
-    mean, noise = _mean_and_noise(turned)
+    mean = total / pings
+    noise = np.mean(np.abs(turned - mean) ** 2, axis=1)
     information = 2 * np.einsum("apk,k->ap", turns**2, np.abs(mean) ** 2).astype(np.float64)
     variance = np.sum(noise / np.maximum(information, 1e-300), axis=0)
     return np.einsum("pau,ap->up", directions, moved_m), np.sqrt(variance)
 
 
-def range_deviation_m(passage: Passage, found: Contributions) -> float:
-    """Return the standard deviation of the range of single pings that responses tell, metres.
+def disagreement_m(passage: Passage, found: Contributions) -> float:
+    """Return how far apart in range two halves of the responses want single pings, metres.
 
-    It is the median over the pings, each by the scatter of its contributions around those of its
-    part of the track. Responses of a scene agree about the one track. Brightest pixels of speckle
-    can be made brighter, but every one in its own way.
+    Responses of a scene agree, as they all see the one track. Brightest pixels of speckle can be
+    made brighter, but every one in its own way. It is a median over ways to halve them: a single
+    one may put most of the bright ones into one half.
     """
-    values = passage.by_ping(found.values[..., 0])
-    length_m = _PART * passage.fresnel_length_m(found)
-    parts = int(min(passage.along_m[-1] / length_m, passage.pings / _LEAST_PART))
-    variances = []
-    for part in np.array_split(values, max(parts, 1)):
-        mean, noise = _mean_and_noise(part)
-        variances.append(noise / (2 * max(float(np.sum(np.abs(mean) ** 2)), 1e-300)))
-    phase = math.sqrt(float(np.median(np.concatenate(variances))))
-    return passage.wavelength_m / (4 * np.pi) * phase
-
-
-def _mean_and_noise(
-    values: NDArray[np.complex64],
-) -> tuple[NDArray[np.complex64], NDArray[np.float32]]:
-    """Return the mean of contributions over the pings, and every ping's mean power beside it."""
-    mean = values.mean(axis=0)
-    return mean, np.mean(np.abs(values - mean) ** 2, axis=1)
+    quarter = np.arange(found.points) % 4
+    gradient = found.gradient[:, passage.lines.ping_starts]
+    apart_m = []
+    for other in (1, 2, 3):
+        first = (quarter == 0) | (quarter == other)
+        moved_m = [sharpest_m(passage, found.of(some))[0] for some in (first, ~first)]
+        apart = moved_m[0] - moved_m[1]
+        apart -= np.median(apart, axis=1, keepdims=True)
+        # This median passes over single pings that one half puts half a wavelength of path off.
+        apart_m.append(np.median(np.abs(np.einsum("up,upk->pk", apart, gradient))))
+    return float(np.median(apart_m)) * _DEVIATION_PER_MEDIAN / 2
 
 
 def _directions(turns: NDArray[np.float64], weights: NDArray[np.float64]) -> NDArray[np.float64]:

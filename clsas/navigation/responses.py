@@ -134,6 +134,12 @@ class Contributions:
         """Number of points."""
         return self.values.shape[1]
 
+    def of(self, points: NDArray[np.bool_]) -> Contributions:
+        """Return the contributions to some of the points."""
+        return Contributions(
+            self.values[:, points], self.gradient[:, :, points], self.range_m[:, points]
+        )
+
 
 def contributions(
     passage: Passage,
