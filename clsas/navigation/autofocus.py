@@ -22,7 +22,7 @@ from clsas.core.contrast import contrast
 from clsas.core.grid import Grid
 from clsas.core.image import Image
 from clsas.core.lines import RangeLines
-from clsas.navigation.checks import check_navigation
+from clsas.navigation.checks import check_navigation, mean_wavelength_m
 from clsas.navigation.drift import drift_m
 from clsas.navigation.gradient import disagreement_m, phase_gradient_m, sharpest_m
 from clsas.navigation.responses import (
@@ -36,7 +36,6 @@ from clsas.opencl.device import Device, open_device
 from clsas.planning.factorize import factorize
 from clsas.planning.planner import plan
 from clsas.signal.readout import Readout
-from clsas.signal.spectrum import cycles_per_m_at
 from clsas.sonar.beam import BeamWindow
 
 UNKNOWNS = ("sway", "heave", "surge")
@@ -59,7 +58,6 @@ _GAIN = 1.02  # of sharpness, for which a step is repeated
 _LARGE_CHANGE = 1 / 8  # wavelengths rms, likewise: finer steps find what smaller ones leave
 # Wavelengths rms, for which an image is formed. Less changes the sharpness by 0.2 % at most.
 _LEAST_CHANGE = 1 / 400
-_LEAST_CYCLES = 0.02  # per sample, from lines about 0 Hz to those with a carrier
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,11 +153,22 @@ def autofocus(
     validate.progress(progress)
     names = _checked_unknowns(unknowns)
     check_navigation(lines, 10, "autofocus", may_stand=True)
-    readout = Readout.of(lines, READ_DB)
-    passage = Passage.of(lines, names, _mean_wavelength_m(readout))
+    readout = Readout.of(_of_unit_level(lines), READ_DB)
+    passage = Passage.of(lines, names, mean_wavelength_m(readout))
     focus = _Focus(readout, grid, passage, beam, open_device(device), progress)
     focus.check_geometry(names)
-    return focus.result()
+    found = focus.result()
+    return replace(found, lines=replace(found.lines, samples=lines.samples))
+
+
+def _of_unit_level(lines: RangeLines) -> RangeLines:
+    """Return lines whose largest sample is about 1: single precision holds squared intensities."""
+    largest = float(np.abs(lines.samples).max())
+    if not largest:
+        return lines
+    # A power of two changes no sample's digits.
+    scale = np.float32(2.0 ** -np.clip(math.frexp(largest)[1], -126, 126))
+    return replace(lines, samples=lines.samples * scale)
 
 
 def _checked_unknowns(unknowns: Sequence[str]) -> tuple[str, ...]:
@@ -167,17 +176,6 @@ def _checked_unknowns(unknowns: Sequence[str]) -> tuple[str, ...]:
     if not names or len(set(names)) < len(names):
         raise ValueError(f"unknowns must be one or several of {UNKNOWNS}, got {names}")
     return names
-
-
-def _mean_wavelength_m(readout: Readout) -> float:
-    """Return the wavelength at the centre of the lines' band, which may hold the carrier still."""
-    cycles_per_m = abs(cycles_per_m_at(readout.lines, readout.spectrum.centre))
-    if not cycles_per_m * readout.lines.range_step_m > _LEAST_CYCLES:
-        raise ValueError(
-            "carrier_hz must be that of the lines, or their samples must hold the carrier still; "
-            f"got {readout.lines.carrier_hz:g} Hz, and samples about 0 Hz"
-        )
-    return 2 / cycles_per_m
 
 
 class _Focus:
