@@ -14,6 +14,7 @@ from clsas.core.geometry import pairwise_range_m
 from clsas.core.grid import Grid
 from clsas.core.image import Image
 from clsas.core.lines import RangeLines, wavelength_m
+from clsas.core.phasors import phasors
 from clsas.signal.readout import Readout
 from clsas.sonar.beam import BeamWindow
 from clsas.sonar.directions import track_directions
@@ -133,7 +134,7 @@ class Contributions:
         """Number of points."""
         return self.values.shape[1]
 
-    def of(self, points: slice) -> Contributions:
+    def of(self, points: NDArray[np.bool_]) -> Contributions:
         """Return the contributions to some of the points."""
         return Contributions(
             self.values[:, points], self.gradient[:, :, points], self.range_m[:, points]
@@ -169,7 +170,7 @@ def contributions(
         at_m = (path_m[..., None] + offsets_m).reshape(len(some), -1)
         turns = lines.carrier_cycles_per_m * at_m
         phase = (2 * np.pi * (turns - np.rint(turns))).astype(np.float32)
-        read = readout.read(some, at_m) * np.exp(1j * phase)
+        read = readout.read(some, at_m) * phasors(phase)
         values[some] = read.reshape(len(some), len(points_m), -1)
         if beam is not None and along is not None:
             sine = sines(points_m, part.phase_centres_m, along[some])
