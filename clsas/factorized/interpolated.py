@@ -16,7 +16,7 @@ from pydantic.dataclasses import dataclass
 
 from clsas.core import reprs
 from clsas.core.lines import RangeLines
-from clsas.factorized import tree, visibility
+from clsas.factorized import tree
 from clsas.factorized.dense_apertures import Shape
 from clsas.factorized.dense_channels import (
     SheetChannels,
@@ -51,9 +51,8 @@ class VisiblePhases(Protocol):
     def beam(self) -> BeamWindow | None:
         """The beam."""
 
-    @property
-    def beam_rates(self) -> NDArray[np.float64]:
-        """Cycles of the beam's weights per unit of the aperture coordinate."""
+    def beam_phase_cycles(self, visible: NDArray[np.bool_], *, most: bool = False) -> float:
+        """Return the cycles that a beam's weights count for, their mean or maximum; 0 without."""
 
     def visible(self, side: tuple[int, int]) -> NDArray[np.bool_]:
         """Return which track samples touch a subimage with their beam."""
@@ -66,16 +65,17 @@ class VisiblePhases(Protocol):
     ) -> float:
         """Return the visible phase cycles of subimages of a size, their mean or maximum."""
 
-    def visible_phase_cycles(
-        self, rates: NDArray[np.float64], visible: NDArray[np.bool_], *, most: bool = False
-    ) -> float:
-        """Return the phase accumulated along the visible aperture, its mean or maximum."""
-
     def virtual_channels(self, taps: Any, density: float, phase_cycles: Any) -> Any:
         """Return the number of virtual channels for some phase cycles."""
 
     def rows(
-        self, side: tuple[int, int], taps: int, density: float, *, most: bool = False
+        self,
+        side: tuple[int, int],
+        taps: int,
+        density: float,
+        beam_density: float = 0.0,
+        *,
+        most: bool = False,
     ) -> float:
         """Return the number of rows of virtual channels across a sheet; 1 without one."""
 
@@ -197,8 +197,8 @@ class InterpolatedAperture:
         for oversampling, side in zip(self.oversampling, sides, strict=True):
             extents = oversampling * surface.extents_in(side, sides[0], roots)
             rate = np.einsum("ra,ars->rs", extents, rates)
-            if len(nodes) == len(sides) - 1:
-                rate += self._beam_rate(geometry, root_m)
+            if len(nodes) == len(sides) - 1 and geometry.beam is not None:
+                rate += self.beam_cycles * geometry.beam_rates(roots, root_m)
             nodes.append(interpolated(track, rate, place, self.filter))
             place = nodes[-1].coordinate
         return nodes
@@ -216,23 +216,14 @@ class InterpolatedAperture:
         parent: SheetChannels | None = None
         for oversampling, side in zip(self.oversampling, sides, strict=True):
             own = rates.times(oversampling * surface.extents_in(side, sides[0], roots))
-            if len(nodes) == len(sides) - 1:
-                own.along[:] += self._beam_rate(geometry, root_m)
+            if len(nodes) == len(sides) - 1 and geometry.beam is not None:
+                own = own.plus(self.beam_cycles, geometry.sheet_beam_rates(roots, root_m))
             if parent is not None:
                 virtual, parent = later_on_sheet(track, own, parent, self.filter)
             else:
                 virtual, parent = first_on_sheet(track, own, *places, self.filter)
             nodes.append(virtual)
         return nodes
-
-    def _beam_rate(
-        self, geometry: Geometry, root_m: NDArray[np.float64]
-    ) -> NDArray[np.float64] | float:
-        """Return the phase rate that the beam's weights count for, [roots, samples]; 0 without."""
-        if geometry.beam is None or geometry.along is None:
-            return 0.0
-        rate = visibility.beam_rate(geometry.beam, geometry.track, geometry.along, root_m)
-        return self.beam_cycles * rate
 
     def predicted_channels(
         self, model: VisiblePhases, sides: tuple[tuple[int, int], ...]
@@ -252,23 +243,26 @@ class InterpolatedAperture:
                     found[-1].count, columns * model.rows(sides[level - 1], taps, density * before)
                 )
             turns = oversampling * model.subimage_phase_cycles(side, seen)
-            most_rows = model.rows(side, taps, density * oversampling, most=True)
+            beam_cycles = self.beam_cycles if level == len(sides) - 1 else 0.0
+            rows, most_rows = (
+                model.rows(
+                    side, taps, density * oversampling, density * beam_cycles, most=most_of_any
+                )
+                for most_of_any in (False, True)
+            )
             everywhere, most = (
                 most_rows
                 * (
                     density * oversampling * model.subimage_phase_cycles(side, where, most=True)
+                    + density * beam_cycles * model.beam_phase_cycles(where, most=True)
                     + model.strips * (taps + 2)
                 )
                 for where in (everywhere_seen, seen)
             )
             if model.beam is not None:
-                if level == len(sides) - 1:
-                    turns += self.beam_cycles * model.visible_phase_cycles(model.beam_rates, seen)
-                    beam_cycles = model.visible_phase_cycles(model.beam_rates, seen, most=True)
-                    most += density * self.beam_cycles * beam_cycles
+                turns += beam_cycles * model.beam_phase_cycles(seen)
                 most *= 1 + BEAM_MARGIN
-            count = model.virtual_channels(taps, density, turns)
-            count *= model.rows(side, taps, density * oversampling)
+            count = rows * model.virtual_channels(taps, density, turns)
             summed = taps**self.dimensions * used / count
             if self.dimensions == 2 and level == 0:
                 bands = math.ceil(most_rows) + 2

@@ -174,10 +174,10 @@ def predicted_plan(
     return _plan(model, image, conditions, batches.memory_bytes, stages, work, errors)
 
 
-def exact_plan(model: VisibilityModel, conditions: Conditions) -> Plan:
-    """Return the plan of the exact image."""
+def exact_plan(model: VisibilityModel, conditions: Conditions, reason: str) -> Plan:
+    """Return the plan of the exact image; see `ExactImage` for the reason."""
     exact = conditions.exact
-    image = ExactImage(accuracy_db=exact.accuracy_db)
+    image = ExactImage(accuracy_db=exact.accuracy_db, reason=reason)
     errors = ErrorBudget(exact=power(exact.accuracy_db))
     plan = _plan(model, image, conditions, exact.memory_bytes, [], exact.work, errors)
     return replace(plan, prediction=replace(plan.prediction, error_db=exact.accuracy_db))

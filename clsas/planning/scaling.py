@@ -242,7 +242,7 @@ def _built(device: Device, side: int) -> tuple[_Images, float]:
     room = device.info.memory_bytes // 2
     competing = expect(model, _TOLERANCE_DB, device)
     conditions = Conditions(_TOLERANCE_DB, competing, device.for_stages(), _PLANNED_WITH, room)
-    found, _ = fastest(model, conditions, math.inf, _ALLOWED)
+    found = fastest(model, conditions, math.inf, _ALLOWED).plan
     assert found is not None  # the scene is made so
     # Kernels that touch a buffer first take twice as long. Large images have many batches.
     found = found.changed(roots_at_once=_ROOTS, roots_prepared=8 * _ROOTS)
