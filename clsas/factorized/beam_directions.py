@@ -12,10 +12,15 @@ from clsas.factorized.dense_apertures import smooth_over_sheet
 from clsas.factorized.tracks import MeanTrack
 from clsas.sonar.beam import BeamWindow
 
+_END = 0.03  # of a curve: over so much, turning at an end is measured
+
 
 @dataclass(frozen=True, eq=False)
 class BeamDirections:
     """Unit directions of the beam at any place of a mean track.
+
+    Past its ends, where positions go on straight ahead, directions keep turning as at the ends. So
+    weights of a beam that stays on a target change there as little as before.
 
     Attributes
     ----------
@@ -40,21 +45,38 @@ class BeamDirections:
             smooth = smooth_over_sheet(track, channels_along, either_sign=beam.squint_deg == 0)
             return cls(np.zeros(0), np.zeros((0, 3)), smooth)
         order = np.argsort(track.coordinate, kind="stable")
-        places, along = track.coordinate[order], channels_along[order]
-        return cls(track.samples, interpolated_directions(places, along, track.samples))
+        sampled = interpolated_directions(
+            track.coordinate[order], channels_along[order], track.samples
+        )
+        return cls(track.samples, _turning_on(track, sampled))
 
     def at(
         self, coordinate: NDArray[np.float64], across: NDArray[np.float64] | None = None
     ) -> NDArray[np.float64]:
-        """Return unit directions at aperture coordinates, [..., 3]; in the middle of a sheet.
-
-        Past the ends of a sheet, where positions go on straight ahead, directions keep turning: so
-        weights change there as evenly as within.
-        """
+        """Return unit directions at aperture coordinates, [..., 3]; in the middle of a sheet."""
         if self.sheet is None:
             return interpolated_directions(self.coordinate, self.along, coordinate)
-        found = self.sheet.positions_m(coordinate, across)
-        return found / np.maximum(np.linalg.norm(found, axis=-1, keepdims=True), 1e-9)
+        return _unit(self.sheet.positions_m(coordinate, across))
+
+
+def _turning_on(track: MeanTrack, sampled: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return directions at `track.samples` that turn past the curves' ends as before them."""
+    strip, result = track.strip_of(track.samples), sampled.copy()
+    steps = max(round(_END * track.sampled), 1)
+    for number in range(track.strips):
+        inside = np.flatnonzero(track.on_track & (strip == number))
+        for end, inner in ((inside[0], inside[steps]), (inside[-1], inside[-1 - steps])):
+            # An end is the outermost sample on its curve: those beyond it are on the same side.
+            beyond = (strip == number) & ~track.on_track
+            beyond &= np.sign(track.samples - track.samples[end]) == np.sign(end - inner)
+            slope = (sampled[end] - sampled[inner]) / (track.samples[end] - track.samples[inner])
+            past = track.samples[beyond] - track.samples[end]
+            result[beyond] = sampled[end] + past[:, None] * slope
+    return _unit(result)
+
+
+def _unit(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-9)
 
 
 def interpolated_directions(
@@ -62,7 +84,7 @@ def interpolated_directions(
 ) -> NDArray[np.float64]:
     """Return unit directions at aperture coordinates, [..., 3], from those at ascending `given`."""
     between = np.stack([np.interp(coordinate, given, axis) for axis in along.T], axis=-1)
-    return between / np.maximum(np.linalg.norm(between, axis=-1, keepdims=True), 1e-9)
+    return _unit(between)
 
 
 def beam_rate(

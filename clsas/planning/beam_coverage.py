@@ -15,6 +15,8 @@ _BINS = 512  # of power by aspect angle; half or twice as many change nothing
 # Largest change of direction from one channel to the next, over the beam's width. At a kink a beam
 # swings past pixels between two channels, which no virtual channel can follow.
 _MOST_TURNED = 1 / 16
+_CELLS = 8, 3  # along and across a sheet: smooth directions are cubic across it at most
+_LEAST_HELD = 0.9  # of these cells that hold channels, where directions differ
 _EVERY_DIRECTION = (-2.0, 2.0)  # sines of the aspect angle, beyond any
 # Of the best pixel's sum of weights: normalising amplifies errors by its inverse.
 _LEAST_COVERED = 0.25
@@ -56,6 +58,8 @@ def obstacle(model: VisibilityModel) -> str:
     beam = model.beam
     if beam is None:
         return ""
+    if model.track.is_sheet and _directions_unknown(model):
+        return "the heading turns, and large parts of the smooth aperture hold no channel"
     if not model.track.is_sheet and _turns_between_channels(model):
         return "the heading changes from channel to channel by more than 1/16 of the beam's width"
     # Normalising divides by a small sum at the beam's edge, and amplifies errors there.
@@ -70,19 +74,41 @@ def obstacle(model: VisibilityModel) -> str:
     return ""
 
 
+def _directions_unknown(model: VisibilityModel) -> bool:
+    """Return whether directions differ over a sheet, but parts of it hold no channel.
+
+    The smooth directions are then those of no channel, and may be anything.
+    """
+    assert model.directions is not None
+    track, (columns, rows) = model.track, _CELLS
+    at = model.directions.at(track.coordinate, track.across)
+    if np.linalg.norm(at - at.mean(axis=0), axis=1).max() <= _MOST_TURNED * _width(model):
+        return False
+    cell = [
+        np.clip((each * count).astype(np.int64), 0, count - 1)
+        for each, count in ((track.coordinate, columns), (track.across, rows))
+    ]
+    held = len(np.unique(cell[0] * rows + cell[1]))
+    return held < _LEAST_HELD * columns * rows
+
+
+def _width(model: VisibilityModel) -> float:
+    """Return the width of the beam, in sine of the aspect angle."""
+    assert model.beam is not None
+    return float(np.ptp(np.clip(model.beam.limits, -1, 1)))
+
+
 def _turns_between_channels(model: VisibilityModel) -> bool:
     """Return whether neighbours on the track look in different directions.
 
     At a kink the beam may swing past a point within a few channels, and a track may lead back
     beside itself.
     """
-    assert model.beam is not None
     order = np.argsort(model.track.coordinate, kind="stable")
     strip = model.track.strip_of(model.track.coordinate[order])
     turned = np.linalg.norm(np.diff(model.channels_along[order], axis=0), axis=1)
     turned = turned[np.diff(strip) == 0]
-    most = _MOST_TURNED * np.ptp(np.clip(model.beam.limits, -1, 1))
-    return bool(turned.max(initial=0.0) > most)
+    return bool(turned.max(initial=0.0) > _MOST_TURNED * _width(model))
 
 
 def sweeps_once(model: VisibilityModel) -> bool:

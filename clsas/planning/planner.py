@@ -261,7 +261,7 @@ def _fastest_of_shapes(
             best = replace(
                 found,
                 least_bytes=min(best.least_bytes, found.least_bytes),
-                obstacle=best.obstacle and found.obstacle,
+                obstacle=best.obstacle if found.obstacle else "",
             )
     return best
 
