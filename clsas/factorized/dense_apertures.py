@@ -57,6 +57,15 @@ def mean_track_of(lines: RangeLines, shape: Shape) -> MeanTrack | None:
     return strips(lines) if shape == "strips" else sheet(lines)
 
 
+def shapes_after(shape: Shape) -> tuple[Shape, ...]:
+    """Return the shapes that channels may have besides one: see `simplest_track`.
+
+    It has tried those before, so that these are none.
+    """
+    order = ("track", *DENSE_SHAPES)
+    return order[order.index(shape) + 1 :]
+
+
 def simplest_track(lines: RangeLines) -> tuple[Shape, MeanTrack | None]:
     """Return a mean track and its shape: one curve, unless channels are far from any."""
     if not _follows_one_curve(lines):
@@ -101,7 +110,8 @@ def _near_each_other(centres_m: NDArray[np.float64]) -> list[NDArray[np.int64]] 
 
     Channels are of one pass if a chain of near neighbours joins them.
     """
-    count, tree = len(centres_m), KDTree(centres_m)
+    # Such a tree takes half the time of a balanced one to make, and more to search, but for few.
+    count, tree = len(centres_m), KDTree(centres_m, balanced_tree=False, compact_nodes=False)
     some = centres_m[some_channels(count, _SCREENED)]
     # A helix or a planar array is no passes: its channels have many neighbours within a jump.
     step_m = float(np.median(tree.query(some, k=2)[0][:, -1]))

@@ -155,7 +155,7 @@ def _mean_track_error(model: VisibilityModel, side: Side, extents: NDArray[np.fl
     # Lines are stretched by turning their phase; their envelope stays.
     wrong += (2 * np.pi * model.rms_cycles_per_m * stretched_m) ** 2
     weights = np.ones_like(wrong)
-    if model.beam is not None:
+    if model.beam is not None and model.directions is not None:
         directions = model.directions.at(part.coordinate, part.across)
         virtual = [sines(*each, directions) for each in zip(points_m, virtual_m, strict=True)]
         channels = [sines(each, middle_m, model.channels_along[index]) for each in points_m]

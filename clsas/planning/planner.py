@@ -14,7 +14,7 @@ from clsas.core.decibels import in_db, power
 from clsas.core.grid import Grid
 from clsas.core.lines import RangeLines
 from clsas.exact.backprojection import ACCURACY_DB
-from clsas.factorized.dense_apertures import DENSE_SHAPES
+from clsas.factorized.dense_apertures import shapes_after
 from clsas.factorized.estimates import ErrorBudget
 from clsas.factorized.filters import ALIGN_TAPS
 from clsas.factorized.left_out import with_left_out
@@ -242,13 +242,11 @@ def _fastest_of_shapes(
     """
     if model.track is None or model.grid.size == 1:
         return Outcome(obstacle=_NO_EXTENT)
-    others = DENSE_SHAPES
+    others = shapes_after(model.shape)
     best = _fastest_unless(obstacle(model), model, conditions, seconds, choices)
     if model.shape == "track" and not best.obstacle and not off_track(model, conditions):
         others = ()
     for shape in others:
-        if shape == model.shape:
-            continue
         # Another search must pay for itself.
         to_beat = seconds if best.plan is None else _WORTH * best.plan.predicted_seconds
         other = model.with_shape(shape) if to_beat > _SEARCH_S else None

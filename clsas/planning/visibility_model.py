@@ -386,6 +386,8 @@ class VisibilityModel:
     @property
     @cached
     def _sheet_beam_rates(self) -> SheetRates:
+        assert self.beam is not None
+        assert self.directions is not None
         sides_m = self._root_extents[:, None] * self.surface.steps_m
         return sheet_beam_rates(self.beam, self.track, self.directions, self.points_m, sides_m)
 
