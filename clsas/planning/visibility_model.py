@@ -538,7 +538,7 @@ def _over_points(values: NDArray[np.float64], most: bool) -> float:
 
 
 def _mean_and_max(values: NDArray[np.float64]) -> tuple[float, float]:
-    return float(values.mean()), float(values.max())
+    return float(values.sum()) / values.size, float(values.max())
 
 
 def _spacing(samples: NDArray[np.float64]) -> NDArray[np.float64]:
