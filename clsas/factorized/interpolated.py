@@ -7,7 +7,7 @@ interpolated from those of fewer, virtual channels; their lines are weighted sum
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Protocol
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -71,7 +71,7 @@ class VisiblePhases(Protocol):
     def rows(
         self,
         side: tuple[int, int],
-        taps: int,
+        taps: float,
         density: float,
         beam_density: float = 0.0,
         *,
@@ -82,6 +82,41 @@ class VisiblePhases(Protocol):
     @property
     def strips(self) -> int:
         """Number of curves that make the mean track."""
+
+
+class _Overhang(NamedTuple):
+    """Virtual channels past the aperture's ends, where filters extend beyond the last channel.
+
+    Each stage interpolates the virtual channels that the one before has there, and has more past
+    these. So they become more from stage to stage, as if filters had more taps.
+
+    Attributes
+    ----------
+    columns, rows : float
+        Virtual channels along the aperture, and across a sheet, without those past the ends.
+    taps_along, taps_across : float
+        Taps of filters that would extend as far.
+    """
+
+    columns: float
+    rows: float
+    taps_along: float
+    taps_across: float
+
+    @classmethod
+    def after(cls, before: _Overhang | None, columns: float, rows: float, taps: int) -> _Overhang:
+        """Return that of the next stage; `before` is None for the first."""
+        if before is None:
+            return cls(columns, rows, taps, taps)
+        # Those of the stage before count as fewer: virtual channels lie farther apart now.
+        along, across = (
+            taps + of_taps * min(now / max(then, 1e-9), 1.0)
+            for of_taps, now, then in (
+                (before.taps_along, columns, before.columns),
+                (before.taps_across, rows, before.rows),
+            )
+        )
+        return cls(columns, rows, along, across)
 
 
 @dataclass(frozen=True, eq=False, config=CONFIG)
@@ -233,39 +268,39 @@ class InterpolatedAperture:
         found: list[StageChannels] = []
         everywhere_seen, bands = np.ones_like(model.visible(sides[0])), model.strips
         used = model.lines.channels * model.visible_share(sides[0])
+        before: _Overhang | None = None
         for level, (oversampling, side) in enumerate(zip(self.oversampling, sides, strict=True)):
             seen = model.visible(side)
-            if level:
-                before = self.oversampling[level - 1]
-                turns = before * model.subimage_phase_cycles(sides[level - 1], seen)
-                columns = model.virtual_channels(taps, density, turns)
-                used = min(
-                    found[-1].count, columns * model.rows(sides[level - 1], taps, density * before)
-                )
-            turns = oversampling * model.subimage_phase_cycles(side, seen)
             beam_cycles = self.beam_cycles if level == len(sides) - 1 else 0.0
+            dense = density * oversampling, density * beam_cycles
+            turns = oversampling * model.subimage_phase_cycles(side, seen)
+            turns += beam_cycles * model.beam_phase_cycles(seen)
+            past = _Overhang.after(before, density * turns, model.rows(side, 0, *dense), taps)
+            if before is not None:
+                parent, above = sides[level - 1], self.oversampling[level - 1]
+                seen_turns = above * model.subimage_phase_cycles(parent, seen)
+                columns = model.virtual_channels(before.taps_along, density, seen_turns)
+                rows = model.rows(parent, before.taps_across, density * above)
+                used = min(found[-1].count, columns * rows)
             rows, most_rows = (
-                model.rows(
-                    side, taps, density * oversampling, density * beam_cycles, most=most_of_any
-                )
-                for most_of_any in (False, True)
+                model.rows(side, past.taps_across, *dense, most=most) for most in (False, True)
             )
             everywhere, most = (
                 most_rows
                 * (
-                    density * oversampling * model.subimage_phase_cycles(side, where, most=True)
-                    + density * beam_cycles * model.beam_phase_cycles(where, most=True)
-                    + model.strips * (taps + 2)
+                    dense[0] * model.subimage_phase_cycles(side, where, most=True)
+                    + dense[1] * model.beam_phase_cycles(where, most=True)
+                    + model.strips * (past.taps_along + 2)
                 )
                 for where in (everywhere_seen, seen)
             )
             if model.beam is not None:
-                turns += beam_cycles * model.beam_phase_cycles(seen)
                 most *= 1 + BEAM_MARGIN
-            count = rows * model.virtual_channels(taps, density, turns)
+            count = rows * model.virtual_channels(past.taps_along, density, turns)
             summed = taps**self.dimensions * used / count
             if self.dimensions == 2 and level == 0:
                 bands = math.ceil(most_rows) + 2
+            before = past
             found.append(StageChannels(used, count, summed, everywhere, most, bands))
             if self.dimensions == 2:
                 bands = math.ceil(most_rows) + 3  # the rows, for the next stage

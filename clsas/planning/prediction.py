@@ -152,7 +152,8 @@ def predicted_plan(
     )
     roots = stages[0].subimages
     batches = batches_within(sizes, roots, device, conditions.memory_bytes)
-    work += Work(batch=float(-(-roots // batches.at_once) * len(sides)))
+    # The host lays out the virtual channels of each strip by itself, which takes as long.
+    work += Work(batch=float(-(-roots // batches.at_once) * len(sides) * model.strips))
     errors = errors.times(candidate.margin)
     image = Factorization(
         sides=sides,

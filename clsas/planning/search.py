@@ -49,6 +49,7 @@ MOST_STAGES = 5
 # without a leaf, so that they are imaged exactly; twice gains 3 % of time.
 _LEAF_SHARE = 0.25
 _MOST_OVERHANG = 1.1  # of roots that fit an image, over its rows or columns
+_OVERHANG = 1.5  # of taps: those of the stage before count half where subimages are half as long
 _SPARE_SAMPLES = 16  # of a line, for filters and padding; twice moves times by 3 % at most
 
 
@@ -354,7 +355,9 @@ def all_options(
     leaf = sizes.leaf_error <= _LEAF_SHARE * power(filters_db)
     leaf &= np.prod(sizes.sides, axis=1) >= leaf_pixels
     density = np.array([2 * choice.oversampling for choice in choices])
-    aperture_taps = np.array([choice.aperture_taps for choice in choices])
+    # Past the ends filters extend as if they had more taps, but in the first stage.
+    further = np.where(np.array(stages) > 1, _OVERHANG, 1.0)
+    aperture_taps = further * [choice.aperture_taps for choice in choices]
     return Options(
         choices,
         np.array(stages),

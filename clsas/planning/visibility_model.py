@@ -405,7 +405,7 @@ class VisibilityModel:
     def rows(
         self,
         side: Side,
-        taps: int,
+        taps: float,
         density: float,
         beam_density: float = 0.0,
         *,
