@@ -152,8 +152,10 @@ def predicted_plan(
     )
     roots = stages[0].subimages
     batches = batches_within(sizes, roots, device, conditions.memory_bytes)
-    # The host lays out the virtual channels of each strip by itself, which takes as long.
-    work += Work(batch=float(-(-roots // batches.at_once) * len(sides) * model.strips))
+    # A stage of a sector takes the host as long for each strip as a batch does.
+    sectors = 1 + max(roots - batches.at_once, 0) // batches.prepared
+    launched = -(-roots // batches.at_once) + sectors * (model.strips - 1)
+    work += Work(batch=float(launched * len(sides)))
     errors = errors.times(candidate.margin)
     image = Factorization(
         sides=sides,
