@@ -116,8 +116,8 @@ _SMALL = {
 }
 """Times of these images relative to those of large ones, by lanes of a CPU: lines fit a cache, but
 buffers are touched for the first time. Geometric means over the cases of `scripts/bench
-predictions` on PoCL with AVX-512 and on Intel's runtime with AVX-512; those of 8 lanes are processor
-times on Zen 4 over those of `costs.defaults`."""
+predictions` on PoCL with AVX-512 and on Intel's runtime with AVX-512; for 8 lanes, processor times
+on Zen 4 over those that the default costs predict."""
 
 
 def scaled(device: Device) -> KnownCosts:
