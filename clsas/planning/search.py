@@ -43,13 +43,15 @@ from clsas.signal.spectrum import Spectrum
 
 _ROWS = (16, 32, 64, 128, 256, 512, 1024, 2048)  # of subimages, from whole work-items on
 _COLUMNS = (4, 8, 16, 32, 64, 128, 256, 512, 1024, 2048)
+OVERHANG = 1.5
+"""Factor of a filter's taps that extend past an aperture's ends after several stages: those of the
+stage before count half, where subimages are half as long."""
 MOST_STAGES = 5
 """Most stages of a tree. More add errors without saving work."""
 # Share of the filters' error power that expanding a leaf may add. Half of it leaves some near grids
 # without a leaf, so that they are imaged exactly; twice gains 3 % of time.
 _LEAF_SHARE = 0.25
 _MOST_OVERHANG = 1.1  # of roots that fit an image, over its rows or columns
-_OVERHANG = 1.5  # of taps: those of the stage before count half where subimages are half as long
 _SPARE_SAMPLES = 16  # of a line, for filters and padding; twice moves times by 3 % at most
 
 
@@ -356,7 +358,7 @@ def all_options(
     leaf &= np.prod(sizes.sides, axis=1) >= leaf_pixels
     density = np.array([2 * choice.oversampling for choice in choices])
     # Past the ends filters extend as if they had more taps, but in the first stage.
-    further = np.where(np.array(stages) > 1, _OVERHANG, 1.0)
+    further = np.where(np.array(stages) > 1, OVERHANG, 1.0)
     aperture_taps = further * [choice.aperture_taps for choice in choices]
     return Options(
         choices,

@@ -14,6 +14,8 @@ from clsas.core.image_error import relative_error_db
 from clsas.exact import reference
 from clsas.exact.backprojection import backproject
 from clsas.factorized.plan import Plan
+from clsas.factorized.sector import Geometry
+from clsas.factorized.surface import surface_of
 from clsas.opencl.device import open_device
 from clsas.planning import planner
 from clsas.planning.costs import Costs
@@ -163,6 +165,24 @@ def test_a_plan_tells_why_an_image_is_exact(name, squint_deg, along, reason):
     assert chosen.is_exact
     assert reason in chosen.describe()
     assert Plan.from_json(chosen.to_json()).image == chosen.image
+
+
+@pytest.mark.parametrize("name", ["helix", "raster", "planar", "passes"])
+def test_virtual_channels_are_as_many_as_predicted(name):
+    """Filters of each stage extend past the ends of those before: these count too."""
+    lines, grid = scene(name)
+    chosen = planned(name, -60, depth=3)
+    geometry = Geometry(lines, surface_of(grid), chosen)
+    sectors = list(geometry.sectors(100, 100))
+    for level, stage in enumerate(chosen.stages[:-1]):
+        needs = [sector.needs[level] for sector in sectors]
+        counts = np.concatenate([(need.last - need.first).ravel() for need in needs])
+        assert stage.channels == pytest.approx(counts[counts > 0].mean(), rel=0.25)
+
+
+def test_turns_of_a_helix_that_lie_above_each_other_are_held_in_half_precision():
+    """Many channels at the same angle are no crowd: each is in a row of its own."""
+    assert planned("helix", -40).half_precision == open_device().info.half_precision
 
 
 @pytest.mark.parametrize("name", ["helix", "planar", "passes"])
