@@ -78,7 +78,7 @@ def counts(loop: Loop) -> dict[str, int]:
     return {
         "instructions": len(loop.lines),
         "multiply-adds": loop.multiply_adds,
-        "permutes": loop.count(r"^vperm|^vblendv|^vshuf|^vunpck"),
+        "permutes": loop.count(r"^vperm|^vblendv|^vshuf|^vunpck|^vp?align"),
         "memory operands": loop.count(r"^v.*\("),
         "on the stack": loop.count(r"^v.*\(%r[sb]p"),
     }
