@@ -1,0 +1,118 @@
+"""Images by FastSAR, for `scripts/bench peers`; runs in an environment that holds FastSAR.
+
+Formers are set up once for each setting, and that time is told apart: FastSAR plans for a geometry,
+which it can use again. A mosaic plans in the same call as it forms. Its own timers tell both apart.
+"""
+
+import os
+import sys
+import time
+import warnings
+from functools import cache
+
+# One patch after the other, with timers: planning beside an image would share its cores.
+os.environ.update(FASTSAR_TIMING="1", FASTSAR_MOSAIC_PREFETCH="0")
+
+import numpy as np
+from fastsar import ExactFormer, ImageFormer, patches
+from protocol import serve
+
+warnings.simplefilter("ignore")  # of predicted errors; the table has the true ones
+SCENE = dict(np.load(sys.argv[1]))
+(COLUMNS, ROWS), (STEP_X, STEP_Y) = SCENE["pixels"].tolist(), SCENE["step_m"].tolist()
+CENTRE_M = SCENE["corner_m"] + [COLUMNS / 2 * STEP_X, ROWS / 2 * STEP_Y, 0.0]
+FIRST_HZ, STEP_HZ = float(SCENE["first_hz"]), float(SCENE["step_hz"])
+SAMPLES = SCENE["history"].shape[1]
+
+
+@cache
+def exact(interpolator: str, upsampling: int) -> tuple[ExactFormer, float]:
+    """Return a former of exact images, and the seconds that its setup took."""
+    start = time.perf_counter()
+    former = ExactFormer(
+        SCENE["positions_m"],
+        FIRST_HZ,
+        STEP_HZ,
+        SAMPLES,
+        COLUMNS,
+        ROWS,
+        STEP_X,
+        STEP_Y,
+        backend="cpu",
+        window=False,
+        interp=interpolator,
+        upsample=upsampling,
+        ref=SCENE["ref_m"],
+        center=tuple(CENTRE_M),
+    )
+    return former, time.perf_counter() - start
+
+
+@cache
+def whole(tile: int, finer_x: int, finer_y: int) -> tuple[ImageFormer, float]:
+    """Return a former of the whole image on a finer grid, and the seconds that its setup took.
+
+    Smaller pixels make smaller final tiles, within which a wave may be taken as plane.
+    """
+    start = time.perf_counter()
+    former = ImageFormer(
+        SCENE["positions_m"] - CENTRE_M,
+        FIRST_HZ,
+        STEP_HZ,
+        SAMPLES,
+        COLUMNS * finer_x,
+        ROWS * finer_y,
+        STEP_X / finer_x,
+        STEP_Y / finer_y,
+        backend="cpu",
+        window=False,
+        T=tile,
+        ref=SCENE["ref_m"],
+    )
+    return former, time.perf_counter() - start
+
+
+def mosaic(patch: int, target_db: float) -> tuple[np.ndarray, float, float]:
+    """Return an image of patches, and the seconds of planning and of all the rest."""
+    timers = patches._Timer.acc
+    timers.clear()
+    start = time.perf_counter()
+    image = patches.form_mosaic(
+        {
+            "S": SCENE["history"],
+            "fmin": FIRST_HZ,
+            "df": STEP_HZ,
+            "ref": SCENE["ref_m"],
+            "band": tuple(SCENE["band_hz"]),
+        },
+        SCENE["positions_m"],
+        SCENE["corner_m"],
+        COLUMNS,
+        ROWS,
+        STEP_X,
+        STEP_Y,
+        patch=(patch, patch),
+        backend="cpu",
+        target_db=target_db,
+    )
+    seconds = time.perf_counter() - start
+    planning = timers["form_mosaic: plan and former"]
+    return image, planning, seconds - planning
+
+
+def answer(former: str, image_file: str, **settings: float | str) -> dict:
+    """Form an image; return the seconds of planning and of imaging."""
+    if former == "mosaic":
+        image, planning, seconds = mosaic(**settings)
+    else:
+        form, planning = {"exact": exact, "whole": whole}[former](**settings)
+        start = time.perf_counter()
+        image = form(SCENE["history"])
+        seconds = time.perf_counter() - start
+        if former == "whole":
+            image = image[:: settings["finer_x"], :: settings["finer_y"]]
+    np.save(image_file, image.T)
+    return {"planning": planning, "seconds": seconds}
+
+
+serve(answer)
