@@ -15,10 +15,10 @@ import clsas
 SCENE = dict(np.load(sys.argv[1]))
 LINES = clsas.RangeLines(
     SCENE["samples"],
-    SCENE["positions_m"],
-    SCENE["positions_m"],
     SCENE["first_range_m"],
     float(SCENE["range_step_m"]),
+    SCENE["positions_m"],
+    SCENE["positions_m"],
     float(SCENE["carrier_hz"]),
     float(SCENE["sound_speed_m_s"]),
 )

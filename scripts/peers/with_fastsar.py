@@ -8,16 +8,18 @@ import os
 import sys
 import time
 import warnings
+from collections.abc import Callable
 from functools import cache
 
 # One patch after the other, with timers: planning beside an image would share its cores.
 os.environ.update(FASTSAR_TIMING="1", FASTSAR_MOSAIC_PREFETCH="0")
 
 import numpy as np
-from fastsar import ExactFormer, ImageFormer, patches
+from fastsar import ExactFormer, ImageFormer, ffbp_cpu, patches
 from protocol import serve
 
 warnings.simplefilter("ignore")  # of predicted errors; the table has the true ones
+ffbp_cpu.lib()  # compiles its kernels, which planning should not count
 SCENE = dict(np.load(sys.argv[1]))
 (COLUMNS, ROWS), (STEP_X, STEP_Y) = SCENE["pixels"].tolist(), SCENE["step_m"].tolist()
 CENTRE_M = SCENE["corner_m"] + [COLUMNS / 2 * STEP_X, ROWS / 2 * STEP_Y, 0.0]
@@ -26,7 +28,7 @@ SAMPLES = SCENE["history"].shape[1]
 
 
 @cache
-def exact(interpolator: str, upsampling: int) -> tuple[ExactFormer, float]:
+def exact(interpolator: str, upsampling: int) -> tuple[Callable, float]:
     """Return a former of exact images, and the seconds that its setup took."""
     start = time.perf_counter()
     former = ExactFormer(
@@ -49,14 +51,21 @@ def exact(interpolator: str, upsampling: int) -> tuple[ExactFormer, float]:
 
 
 @cache
-def whole(tile: int, finer_x: int, finer_y: int) -> tuple[ImageFormer, float]:
-    """Return a former of the whole image on a finer grid, and the seconds that its setup took.
+def whole(target_db: float) -> tuple[Callable, float]:
+    """Return a former of the whole image, and the seconds that its setup took.
 
-    Smaller pixels make smaller final tiles, within which a wave may be taken as plane.
+    FastSAR's own rule chooses final tiles, on a finer grid where they are too large for a wave to be
+    taken as plane, by its predicted error.
     """
     start = time.perf_counter()
+    positions_m = SCENE["positions_m"] - CENTRE_M
+    highest_hz = FIRST_HZ + SAMPLES * STEP_HZ
+    grid = COLUMNS, ROWS, STEP_X, STEP_Y
+    tile, (finer_x, finer_y), _ = patches.tile_plan(
+        positions_m, highest_hz, *grid, *np.eye(3)[:2], target_db
+    )
     former = ImageFormer(
-        SCENE["positions_m"] - CENTRE_M,
+        positions_m,
         FIRST_HZ,
         STEP_HZ,
         SAMPLES,
@@ -69,7 +78,11 @@ def whole(tile: int, finer_x: int, finer_y: int) -> tuple[ImageFormer, float]:
         T=tile,
         ref=SCENE["ref_m"],
     )
-    return former, time.perf_counter() - start
+
+    def form(history: np.ndarray) -> np.ndarray:
+        return former(history)[::finer_x, ::finer_y]
+
+    return form, time.perf_counter() - start
 
 
 def mosaic(patch: int, target_db: float) -> tuple[np.ndarray, float, float]:
@@ -109,8 +122,6 @@ def answer(former: str, image_file: str, **settings: float | str) -> dict:
         start = time.perf_counter()
         image = form(SCENE["history"])
         seconds = time.perf_counter() - start
-        if former == "whole":
-            image = image[:: settings["finer_x"], :: settings["finer_y"]]
     np.save(image_file, image.T)
     return {"planning": planning, "seconds": seconds}
 
