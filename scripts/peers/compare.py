@@ -16,13 +16,13 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from peers import scenes
+from peers.codes import Code, Method, installed, methods
+from peers.workers import worker
 
 import clsas
 from clsas.exact import reference
 from clsas.trials import tables
-from peers import scenes
-from peers.codes import Code, Method, installed, methods
-from peers.workers import worker
 
 ERROR_PIXELS = 300
 SIZES = (256, 512, 1024, 2048)

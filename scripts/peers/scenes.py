@@ -1,8 +1,9 @@
 """Scenes that all codes image, and their lines in each code's conventions.
 
 A scene has channels, all of which count in every pixel of a square image in the plane z = 0. The
-straight track is that of the benchmark case `bp-2k`, or of a part of it. The circle looks down on its
-middle from 8 m above a radius of 15 m. The helix is that of the case `ffbp-helix`: 150 turns in air.
+straight track is that of the benchmark case `bp-2k`, or of a part of it. The circle has a radius of
+15 m and looks down on its middle from 8 m. The helix is that of the case `ffbp-helix`: 150 turns in
+air.
 """
 
 from __future__ import annotations
@@ -11,9 +12,11 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import scipy.fft
 from numpy.typing import NDArray
 
 import clsas
+from clsas.signal.spectrum import measure_spectrum
 from clsas.trials import cases
 from clsas.trials.cases import Case
 from clsas.trials.dense_cases import DenseCase, helix
@@ -22,8 +25,8 @@ Scene = Case | DenseCase
 PADDING = 64  # zeros at both ends of a line, which keep its echoes from wrapping around
 LIGHT_M_S = 299_792_458.0  # the speed of waves in codes for radar
 
-# Along a full circle images resolve a quarter of a wavelength, 3 mm. With 4 channels to a pixel along
-# the side, neighbouring channels see phases of the farthest pixels half a cycle apart at most.
+# Along a full circle images resolve a quarter of a wavelength, 3 mm. With 4 channels to a pixel
+# along the side, neighbouring channels see phases of the farthest pixels half a cycle apart.
 _CIRCLE_PIXEL_M = 2.5e-3
 _CIRCLE_CHANNELS = 4
 
@@ -88,17 +91,33 @@ def write(path: Path, scene: Scene, lines: clsas.RangeLines) -> None:
     )
 
 
+def waves(lines: clsas.RangeLines, count: int) -> NDArray[np.int64]:
+    """Return the waves along `count` samples: within half a cycle a sample of the lines' centre."""
+    centre = round(measure_spectrum(lines).centre * count)
+    return np.arange(-(count // 2), count - count // 2) + centre
+
+
+def odd_length(least: int) -> int:
+    """Return an odd length, so that no wave is exactly half a cycle off, whose FFT is fast."""
+    length = scipy.fft.next_fast_len(least)
+    while length % 2 == 0:
+        length = scipy.fft.next_fast_len(length + 1)
+    return length
+
+
 def as_history(lines: clsas.RangeLines) -> dict[str, object]:
     """Return lines as samples over frequency, as of a radar with the same wavelengths.
 
     A point of amplitude A at range R gives S[p, k] = A exp(-j 4 pi f_k (R - ref_p) / c) in channel
     p at frequency f_k, with c the speed of light.
     """
-    samples = np.pad(lines.samples.astype(np.complex128), ((0, 0), (PADDING, PADDING)))
-    count = samples.shape[1]
+    count = odd_length(lines.length + 2 * PADDING)
+    ends = PADDING, count - lines.length - PADDING
+    samples = np.pad(lines.samples.astype(np.complex128), ((0, 0), ends))
     first_m = lines.first_range_m - PADDING * lines.range_step_m
-    cycles_per_m = np.arange(-(count // 2), count - count // 2) / (count * lines.range_step_m)
-    spectrum = np.fft.fftshift(np.fft.fft(samples, axis=1), axes=1)
+    wave = waves(lines, count)
+    cycles_per_m = wave / (count * lines.range_step_m)
+    spectrum = np.fft.fft(samples, axis=1)[:, wave % count]
     ref_m = first_m + count // 2 * lines.range_step_m
     cycles = lines.carrier_cycles_per_m * ref_m[:, None]
     cycles = cycles + cycles_per_m * (ref_m - first_m)[:, None]
@@ -117,9 +136,10 @@ def as_profiles(lines: clsas.RangeLines) -> dict[str, object]:
     """
     begin_m = lines.first_range_m.min() - PADDING * lines.range_step_m
     shift = (lines.first_range_m - begin_m) / lines.range_step_m
-    count = int(np.ceil(shift.max())) + lines.length + PADDING
+    count = odd_length(int(np.ceil(shift.max())) + lines.length + PADDING)
+    wave = waves(lines, count)
     spectrum = np.fft.fft(lines.samples.astype(np.complex128), count, axis=1)
-    spectrum *= np.exp(-2j * np.pi * np.fft.fftfreq(count) * shift[:, None])
+    spectrum[:, wave % count] *= np.exp(-2j * np.pi * wave / count * shift[:, None])
     return {
         "profiles": np.fft.ifft(spectrum, axis=1).astype(np.complex64),
         "begin_m": begin_m,

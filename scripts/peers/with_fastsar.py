@@ -54,8 +54,8 @@ def exact(interpolator: str, upsampling: int) -> tuple[Callable, float]:
 def whole(target_db: float) -> tuple[Callable, float]:
     """Return a former of the whole image, and the seconds that its setup took.
 
-    FastSAR's own rule chooses final tiles, on a finer grid where they are too large for a wave to be
-    taken as plane, by its predicted error.
+    FastSAR's own rule chooses final tiles by its predicted error, on a finer grid where they are
+    too large for a wave to be taken as plane.
     """
     start = time.perf_counter()
     positions_m = SCENE["positions_m"] - CENTRE_M

@@ -113,10 +113,7 @@ def answer(former: str, image_file: str, **settings: float) -> dict:
     """Form an image; return the seconds that it took."""
     start = time.perf_counter()
     with torch.inference_mode():
-        if former in FORMERS:
-            image = FORMERS[former](**settings)
-        else:
-            image = polar(former, **settings)
+        image = FORMERS[former](**settings) if former in FORMERS else polar(former, **settings)
     seconds = time.perf_counter() - start
     np.save(image_file, image.reshape(ROWS, COLUMNS).numpy())
     return {"planning": 0.0, "seconds": seconds}
