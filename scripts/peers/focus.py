@@ -6,26 +6,28 @@ one judge forms the images of both: clsas, along the corrected and along the tru
 
 from __future__ import annotations
 
+import itertools
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 from peers import scenes
 from peers.codes import Code, installed
-from peers.workers import Ask, worker
+from peers.workers import worker
 
 import clsas
+from clsas.core.lines import wavelength_m
 from clsas.trials import focusing, navigating, tables
 
 COLUMNS = ("scene", "code, settings", "peak before, dB", "after, dB", "residual, wavelengths")
 PASS = "gotcha/data_3dsar_pass1_az001_HH.mat"
 SONAR_SETTINGS = {
     "gpga, wls, pattern": {"former": "gpga", "estimator": "wls", "max_iters": 20},
-    "gpga, pd, pattern": {"former": "gpga", "estimator": "pd", "max_iters": 20},
     "gpga_tde, 4 x 2 blocks, pattern": {
         "former": "gpga_tde",
         "azimuth_divisions": 4,
@@ -96,75 +98,130 @@ def polar_grid(
     }
 
 
-def write(
-    path: Path, lines: clsas.RangeLines, frame: Frame, grid: dict[str, object], **others: object
-) -> None:
-    """Write lines said to be on a track, and the grid on which torchbp focuses."""
-    np.savez(
-        path,
-        frame_m=frame.of_points(lines.tx_m),
-        range_step_m=lines.range_step_m,
-        **scenes.as_profiles(lines),
-        **grid,
-        **others,
-    )
+@dataclass(frozen=True)
+class Trial:
+    """Lines said to be on a wrong track, what is right, and how torchbp is to focus them.
+
+    Attributes
+    ----------
+    words : str
+        The scene.
+    true, told : RangeLines
+        Lines on their track, and on the track that both codes are told.
+    grid : Grid
+        Grid on which clsas focuses.
+    peak_db : callable
+        Returns the peak of an image of lines over that of the true ones, dB.
+    axes : dict
+        torchbp's grid, in its frame.
+    others : dict
+        What else torchbp is told.
+    settings : dict
+        Settings of torchbp, by their words.
+    """
+
+    words: str
+    true: clsas.RangeLines
+    told: clsas.RangeLines
+    grid: clsas.Grid
+    peak_db: Callable[[clsas.RangeLines], float]
+    axes: dict[str, object]
+    others: dict[str, object]
+    settings: dict[str, dict]
+
+    @property
+    def frame(self) -> Frame:
+        """The frame in which torchbp works."""
+        return Frame.of(self.told, self.grid)
+
+    def left_wavelengths(self, lines: clsas.RangeLines) -> float:
+        """Return the rms of what is left of the sway, wavelengths."""
+        left_m = (lines.tx_m - self.true.tx_m) @ self.frame.axes[0]
+        return float(np.std(navigating.detrended(left_m)) / wavelength_m(lines))
 
 
-def _others(
-    ask: Ask, folder: Path, settings: dict[str, dict]
-) -> Iterator[tuple[str, float, NDArray[np.float32] | str]]:
-    """Yield what torchbp finds with several settings: words, seconds, and displacements."""
-    for words, each in settings.items():
-        answer = ask(image_file=str(folder / "moved.npy"), **each)
-        if "refused" in answer:
-            yield f"torchbp, {words}", 0.0, answer["refused"]
-        else:
-            yield f"torchbp, {words}", answer["seconds"], np.load(folder / "moved.npy")
-
-
-def sonar_rows(device: str, code: Code | None) -> Iterator[list[str]]:
-    """Yield a row per scene of `clsas.trials.focusing` and code."""
+def sonar_trials(device: str) -> Iterator[Trial]:
+    """Yield the scenes of `clsas.trials.focusing`."""
     for name, scene in focusing.SCENES.items():
-        sway_m = scene.sway_m
-        true, told = focusing.recorded(scene.targets, sway_m)
-        before_db = focusing.peak_db(told, true, device)
-
-        def row(
-            code: str, lines: clsas.RangeLines, seconds: float, first: str, before_db: float,
-            true: clsas.RangeLines, sway_m: NDArray[np.float64],
-        ) -> list[str]:  # fmt: skip
-            left_m = navigating.detrended(lines.tx_m[:, 1] - true.tx_m[:, 1])
-            return [
-                first,
-                code,
-                f"{before_db:.2f}",
-                f"{focusing.peak_db(lines, true, device):.2f}",
-                f"{np.std(left_m) / focusing.WAVELENGTH_M:.4f}",
-                f"{seconds:.2f}",
-            ]
-
-        start = time.perf_counter()
-        found = clsas.autofocus(told, focusing.GRID, device=device)
-        seconds = time.perf_counter() - start
-        first = f"{name}: {scene.smooth:g} smooth, {scene.white:g} white"
-        yield row(f"clsas, {device}", found.lines, seconds, first, before_db, true, sway_m)
-        if code is None:
-            continue
+        true, told = focusing.recorded(scene.targets, scene.sway_m)
         frame = Frame.of(told, focusing.GRID)
         sine_step = focusing.WAVELENGTH_M / (2.5 * np.ptp(told.tx_m[:, 0]))
         points_m = frame.of_points(corners_m(focusing.GRID))
-        grid = polar_grid(points_m, told.range_step_m, sine_step)
-        length = focusing.SONAR.tx_length_m / focusing.WAVELENGTH_M
-        with tempfile.TemporaryDirectory() as name_of_folder:
-            folder = Path(name_of_folder)
-            write(folder / "scene.npz", told, frame, grid, element_wavelengths=length)
-            with worker(code.python, code.program, folder / "scene.npz") as ask:
-                for words, seconds, moved in _others(ask, folder, SONAR_SETTINGS):
-                    if isinstance(moved, str):
-                        yield ["", words, "", f"refused: {moved}", "", ""]
-                        continue
-                    lines = frame.moved(told, moved)
-                    yield row(words, lines, seconds, "", before_db, true, sway_m)
+        yield Trial(
+            f"{name}: {scene.smooth:g} smooth, {scene.white:g} white",
+            true,
+            told,
+            focusing.GRID,
+            partial(focusing.peak_db, true=true, device=device),
+            polar_grid(points_m, told.range_step_m, sine_step),
+            {"element_wavelengths": focusing.SONAR.tx_length_m / focusing.WAVELENGTH_M},
+            SONAR_SETTINGS,
+        )
+
+
+def radar_trials(path: Path, device: str) -> Iterator[Trial]:
+    """Yield the recorded radar pass, with sways that nobody is told."""
+    true, grid = focusing.radar_pass(path), focusing.RADAR_GRID
+    given_db = focusing.reflector_db(true, device)
+    frame = Frame.of(true, grid)
+    middle_m = frame.of_points(corners_m(grid)).mean(axis=(0, 1))
+    half_m = np.ptp(grid.axes_m[0]) / 2
+    for smooth, white in focusing.RADAR_ERRORS:
+        yield Trial(
+            f"radar: {smooth:g} smooth, {white:g} white",
+            true,
+            focusing.swaying(true, smooth, white),
+            grid,
+            lambda lines: focusing.reflector_db(lines, device) - given_db,
+            {
+                "x": (middle_m[0] - half_m, middle_m[0] + half_m),
+                "y": (middle_m[1] - half_m, middle_m[1] + half_m),
+                "nx": grid.shape[0],
+                "ny": grid.shape[1],
+            },
+            {},
+            RADAR_SETTINGS,
+        )
+
+
+def rows(trial: Trial, device: str, code: Code | None) -> Iterator[list[str]]:
+    """Yield a row of what clsas finds, and rows of what torchbp does."""
+
+    def told(words: str, code: str, lines: clsas.RangeLines, seconds: float) -> list[str]:
+        before = trial.told if words else None
+        return [
+            words,
+            code,
+            "" if before is None else f"{trial.peak_db(before):.2f}",
+            f"{trial.peak_db(lines):.2f}",
+            f"{trial.left_wavelengths(lines):.4f}",
+            f"{seconds:.2f}",
+        ]
+
+    start = time.perf_counter()
+    found = clsas.autofocus(trial.told, trial.grid, device=device)
+    yield told(trial.words, f"clsas, {device}", found.lines, time.perf_counter() - start)
+    if code is None:
+        return
+    frame = trial.frame
+    with tempfile.TemporaryDirectory() as folder:
+        scene_file, moved_file = Path(folder) / "scene.npz", Path(folder) / "moved.npy"
+        np.savez(
+            scene_file,
+            frame_m=frame.of_points(trial.told.tx_m),
+            range_step_m=trial.told.range_step_m,
+            **scenes.as_profiles(trial.told),
+            **trial.axes,
+            **trial.others,
+        )
+        with worker(code.python, code.program, scene_file) as ask:
+            for words, settings in trial.settings.items():
+                answer = ask(image_file=str(moved_file), **settings)
+                if "refused" in answer:
+                    yield ["", f"torchbp, {words}", "", f"refused: {answer['refused']}", "", ""]
+                else:
+                    lines = frame.moved(trial.told, np.load(moved_file))
+                    yield told("", f"torchbp, {words}", lines, answer["seconds"])
 
 
 def peers_autofocus(device: str, torchbp: Path | None, recordings: Path | None) -> None:
@@ -173,6 +230,10 @@ def peers_autofocus(device: str, torchbp: Path | None, recordings: Path | None) 
     code = codes.get("torchbp")
     if code is not None:
         code = Code(code.python, Path(__file__).with_name("focus_with_torchbp.py"))
-    tables.table([*COLUMNS, "seconds"], sonar_rows(device, code))
-    for name, reason in absent.items():
-        print(f"\n{name} is not measured: {reason}")
+    trials = sonar_trials(device)
+    if recordings is not None:
+        trials = itertools.chain(trials, radar_trials(recordings / PASS, device))
+    found = itertools.chain.from_iterable(rows(trial, device, code) for trial in trials)
+    tables.table([*COLUMNS, "seconds"], found)
+    if "torchbp" in absent:
+        print(f"\ntorchbp is not measured: {absent['torchbp']}")
