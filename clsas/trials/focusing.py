@@ -95,7 +95,11 @@ def peak_db(lines: RangeLines, true: RangeLines, device: Device | str | None = N
 
 def smooth_residual_m(found: Autofocus, sway_m: NDArray[np.float64]) -> float:
     """Return the rms of what is left of the smooth part of a sway."""
-    left_m = detrended(found.correction_m[:, 1] - sway_m)
+    return smooth_rms_m(detrended(found.correction_m[:, 1] - sway_m))
+
+
+def smooth_rms_m(left_m: NDArray[np.float64]) -> float:
+    """Return the rms of the smooth part of a residual."""
     return float(np.std(gaussian_filter1d(left_m, _SMOOTHED)))
 
 

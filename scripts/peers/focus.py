@@ -24,7 +24,15 @@ import clsas
 from clsas.core.lines import wavelength_m
 from clsas.trials import focusing, navigating, tables
 
-COLUMNS = ("scene", "code, settings", "peak before, dB", "after, dB", "residual, wavelengths")
+COLUMNS = (
+    "scene",
+    "code, settings",
+    "peak before, dB",
+    "after, dB",
+    "residual, wavelengths",
+    "its smooth part",
+    "seconds",
+)
 PASS = "gotcha/data_3dsar_pass1_az001_HH.mat"
 SONAR_SETTINGS = {
     "gpga, wls, pattern": {"former": "gpga", "estimator": "wls", "max_iters": 20},
@@ -134,10 +142,9 @@ class Trial:
         """The frame in which torchbp works."""
         return Frame.of(self.told, self.grid)
 
-    def left_wavelengths(self, lines: clsas.RangeLines) -> float:
-        """Return the rms of what is left of the sway, wavelengths."""
-        left_m = (lines.tx_m - self.true.tx_m) @ self.frame.axes[0]
-        return float(np.std(navigating.detrended(left_m)) / wavelength_m(lines))
+    def left_m(self, lines: clsas.RangeLines) -> NDArray[np.float64]:
+        """Return what is left of the sway, without what no image shows."""
+        return navigating.detrended((lines.tx_m - self.true.tx_m) @ self.frame.axes[0])
 
 
 def sonar_trials(device: str) -> Iterator[Trial]:
@@ -188,13 +195,14 @@ def rows(trial: Trial, device: str, code: Code | None) -> Iterator[list[str]]:
     """Yield a row of what clsas finds, and rows of what torchbp does."""
 
     def told(words: str, code: str, lines: clsas.RangeLines, seconds: float) -> list[str]:
-        before = trial.told if words else None
+        left_m, wave_m = trial.left_m(lines), wavelength_m(lines)
         return [
             words,
             code,
-            "" if before is None else f"{trial.peak_db(before):.2f}",
+            f"{trial.peak_db(trial.told):.2f}" if words else "",
             f"{trial.peak_db(lines):.2f}",
-            f"{trial.left_wavelengths(lines):.4f}",
+            f"{left_m.std() / wave_m:.4f}",
+            f"{focusing.smooth_rms_m(left_m) / wave_m:.4f}",
             f"{seconds:.2f}",
         ]
 
@@ -218,7 +226,7 @@ def rows(trial: Trial, device: str, code: Code | None) -> Iterator[list[str]]:
             for words, settings in trial.settings.items():
                 answer = ask(image_file=str(moved_file), **settings)
                 if "refused" in answer:
-                    yield ["", f"torchbp, {words}", "", f"refused: {answer['refused']}", "", ""]
+                    yield ["", f"torchbp, {words}", "", f"refused: {answer['refused']}", "", "", ""]
                 else:
                     lines = frame.moved(trial.told, np.load(moved_file))
                     yield told("", f"torchbp, {words}", lines, answer["seconds"])
@@ -234,6 +242,6 @@ def peers_autofocus(device: str, torchbp: Path | None, recordings: Path | None) 
     if recordings is not None:
         trials = itertools.chain(trials, radar_trials(recordings / PASS, device))
     found = itertools.chain.from_iterable(rows(trial, device, code) for trial in trials)
-    tables.table([*COLUMNS, "seconds"], found)
+    tables.table(COLUMNS, found)
     if "torchbp" in absent:
         print(f"\ntorchbp is not measured: {absent['torchbp']}")
