@@ -2,8 +2,8 @@
 
 A scene has channels, all of which count in every pixel of a square image in the plane z = 0. The
 straight track is that of the benchmark case `bp-2k`, or of a part of it. The circle has a radius of
-15 m and looks down on its middle from 8 m. The helix is that of the case `ffbp-helix`: 150 turns in
-air.
+15 m and looks down on its middle from 8 m. The helix is that of the case `ffbp-helix`, in air: all
+150 turns from 150 pixels along a side on, fewer turns with fewer pixels.
 """
 
 from __future__ import annotations
@@ -29,6 +29,7 @@ LIGHT_M_S = 299_792_458.0  # the speed of waves in codes for radar
 # along the side, neighbouring channels see phases of the farthest pixels half a cycle apart.
 _CIRCLE_PIXEL_M = 2.5e-3
 _CIRCLE_CHANNELS = 4
+_PER_TURN = 360  # channels of the helix
 
 
 def straight(pixels: int) -> Case:
@@ -57,10 +58,16 @@ def circle(pixels: int) -> DenseCase:
 
 
 def spiral(pixels: int) -> DenseCase:
-    """Return the 54 000 channels of `ffbp-helix`, with so many pixels along a side of 0.24 m."""
-    case = cases.FACTORIZED_CASES["ffbp-helix"]
-    assert isinstance(case, DenseCase)
-    return replace(case, pixels=pixels)
+    """Return as many turns of the helix of `ffbp-helix` as pixels along a side of 0.24 m."""
+    whole = cases.FACTORIZED_CASES["ffbp-helix"]
+    assert isinstance(whole, DenseCase)
+
+    def track() -> NDArray[np.float64]:
+        # The middle of the whole track, whose turns are 5 mm apart.
+        spare = (len(whole.track()) - _PER_TURN * pixels) // 2
+        return whole.track()[max(spare, 0) :][: _PER_TURN * pixels]
+
+    return replace(whole, track=track, pixels=pixels)
 
 
 TRACKS = {"straight": straight, "circle": circle, "helix": spiral}

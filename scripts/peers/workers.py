@@ -111,5 +111,8 @@ def worker(
 
     try:
         yield ask
+    except BaseException:
+        process.kill()  # its image may take minutes
+        raise
     finally:
         process.communicate()

@@ -9,7 +9,7 @@ import pytest
 
 import clsas
 from clsas.exact import reference
-from clsas.trials import focusing
+from clsas.trials import cases, focusing
 
 SCRIPTS = Path(__file__).parents[2] / "scripts"
 sys.path.append(str(SCRIPTS))
@@ -100,6 +100,14 @@ def test_a_part_of_the_scene_keeps_its_spacings():
     assert (whole.channels, part.channels) == (2048, 512)
     for one, other in zip(whole.grid.vectors_m[1:], part.grid.vectors_m[1:], strict=True):
         np.testing.assert_allclose(one, other)
+
+
+def test_the_helix_has_a_turn_for_every_pixel_along_a_side():
+    whole = cases.FACTORIZED_CASES["ffbp-helix"].track()
+    np.testing.assert_array_equal(scenes.spiral(150).track(), whole)
+    part = scenes.spiral(30).track()
+    assert len(part) == 30 * 360
+    assert part[:, 2].mean() == pytest.approx(whole[:, 2].mean(), abs=1e-3)
 
 
 @pytest.mark.parametrize("pixels", [128, 512])
