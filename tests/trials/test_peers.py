@@ -127,6 +127,15 @@ def test_errors_do_not_count_a_common_factor():
     assert compare.error_db(2j * ideal, np.arange(3), ideal) < -120
 
 
+def test_errors_are_relative_to_the_whole_image():
+    """Whether the pixels that are compared are bright or dark."""
+    image = np.array([100.0, 1, 1, 1], complex)
+    chosen = np.array([1, 2, 3])
+    wrong = image + [0, 0.1, -0.1, 0]
+    expected = 20 * np.log10(np.sqrt(0.02 / 3) / np.sqrt((1e4 + 3) / 4))
+    assert compare.error_db(wrong, chosen, image[chosen]) == pytest.approx(expected, abs=0.1)
+
+
 def test_a_program_answers_with_what_it_found(program, tmp_path):
     with workers.worker(sys.executable, program, tmp_path / "none") as ask:
         assert ask(image_file="a", level=-50.0) == {"file": "a", "level": -50.0}
