@@ -47,9 +47,11 @@ MOST_DISAGREEMENT = 1 / 40
 speckle disagree by 0.044 and more, bright ones by 0.011 to 0.016 (400 pings)."""
 
 _DRIFTS = 3  # times that drift is measured at most
-_NEIGHBOURHOODS = (2.0, 1.0)  # Fresnel lengths around responses, along the track
+_NEIGHBOURHOODS = (3.0, 2.0, 1.0)  # Fresnel lengths around responses, along the track
 _SWEEPS = 2  # times that single pings are moved at most
-_RESPONSES, _RESPONSES_FOR_DRIFT = 200, 40
+# Of a track of six apertures 40 for drift, or no neighbourhood of 3, left a stretch off by half a
+# wavelength or a tenth (the scene "large" of `scripts/bench navigation`).
+_RESPONSES, _RESPONSES_FOR_DRIFT = 200, 120
 _OFFSETS = np.arange(-4.0, 5.0)  # samples in range, of which drift sees images
 _LEAST_RESPONSES = 8  # halves of which can agree
 _LEAST_GRADIENT = 0.05  # of range per displacement, rms

@@ -108,13 +108,13 @@ def peak_db(
     return float(20 * np.log10(image / ideal))
 
 
-def residual_m(found: Autofocus, sway_m: NDArray[np.float64], smoothed: float = 0) -> float:
-    """Return the rms of what is left of a sway, the largest of any 400 pings, or its smooth part.
+def residual_m(error_m: NDArray[np.float64], smoothed: float = 0) -> float:
+    """Return the rms of what is left of a sway, [pings], the largest of any 400 pings.
 
     Over so many pings a response stays in the beam. A trend of theirs is left out. `smoothed` is
     the number of pings of a mean.
     """
-    error_m, worst_m = found.correction_m[:, 1] - sway_m, 0.0
+    worst_m = 0.0
     for first in range(0, max(len(error_m) - PINGS, 0) + 1, PINGS // 4):
         left_m = detrended(error_m[first : first + PINGS])
         left_m = gaussian_filter1d(left_m, smoothed) if smoothed else left_m
@@ -122,9 +122,9 @@ def residual_m(found: Autofocus, sway_m: NDArray[np.float64], smoothed: float = 
     return worst_m
 
 
-def smooth_residual_m(found: Autofocus, sway_m: NDArray[np.float64]) -> float:
-    """Return the rms of what is left of the smooth part of a sway."""
-    return residual_m(found, sway_m, _SMOOTHED)
+def smooth_residual_m(error_m: NDArray[np.float64]) -> float:
+    """Return the rms of what is left of the smooth part of a sway, [pings]."""
+    return residual_m(error_m, _SMOOTHED)
 
 
 @dataclass(frozen=True)
@@ -194,14 +194,15 @@ def rows(devices: Iterable[str]) -> Iterator[list[str]]:
             sway_m = scene.sway_m
             true, told = recorded(scene.targets, sway_m)
             found, images = _timed(told, scene.grid, device)
-            left = residual_m(found, sway_m) / WAVELENGTH_M
+            left_m = found.correction_m[:, 1] - sway_m
+            left = residual_m(left_m) / WAVELENGTH_M
             yield [
                 f"{name}, {device}",
                 f"{scene.smooth:g} smooth, {scene.white:g} white",
                 f"{peak_db(told, true, device, grid=scene.grid):.2f}",
                 f"{peak_db(found.lines, true, device, grid=scene.grid):.2f}",
                 f"{left:.4f}",
-                f"{smooth_residual_m(found, sway_m) / WAVELENGTH_M:.4f}",
+                f"{smooth_residual_m(left_m) / WAVELENGTH_M:.4f}",
                 f"{images:.1f}",
             ]
 
