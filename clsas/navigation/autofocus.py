@@ -31,6 +31,7 @@ from clsas.navigation.responses import (
     Passage,
     brightest,
     contributions,
+    received_share,
 )
 from clsas.opencl.device import Device, open_device
 from clsas.planning.factorize import factorize
@@ -49,9 +50,10 @@ speckle disagree by 0.044 and more, bright ones by 0.011 to 0.016 (400 pings).""
 _DRIFTS = 3  # times that drift is measured at most
 _NEIGHBOURHOODS = (3.0, 2.0, 1.0)  # Fresnel lengths around responses, along the track
 _SWEEPS = 2  # times that single pings are moved at most
-# Of a track of six apertures 40 for drift, or no neighbourhood of 3, left a stretch off by half a
-# wavelength or a tenth (the scene "large" of `scripts/bench navigation`).
-_RESPONSES, _RESPONSES_FOR_DRIFT = 200, 120
+_RESPONSES, _FIRST_RESPONSES = 200, 40
+# Responses that a ping receives, on average, of those that drift is measured by. On a long track
+# too few leave a stretch off by half a wavelength; too many are no echoes, but side lobes.
+_RECEIVED_FOR_DRIFT = 18
 _OFFSETS = np.arange(-4.0, 5.0)  # samples in range, of which drift sees images
 _LEAST_RESPONSES = 8  # halves of which can agree
 _LEAST_GRADIENT = 0.05  # of range per displacement, rms
@@ -197,6 +199,7 @@ class _Focus:
         self.device, self.progress = device, progress
         self.moved_m = np.zeros((len(passage.axes), passage.pings))
         self.deviation_m = np.full(passage.pings, np.inf)
+        self.for_drift = _FIRST_RESPONSES
         oversampling = self.readout.spectrum.oversampling
         self.cell_m = lines.range_step_m * min(max(oversampling, 1.0), 64.0)
         self.steps: list[tuple[str, float]] = []
@@ -208,8 +211,9 @@ class _Focus:
         self._keep(self.moved_m, image, self.before)
 
     def check_geometry(self, names: tuple[str, ...]) -> None:
-        """Refuse unknowns that the responses do not tell apart."""
-        found = self._contributions(self.points_m[:_RESPONSES_FOR_DRIFT])
+        """Refuse unknowns that the responses do not tell apart; see how far along they are seen."""
+        found = self._contributions(self.points_m[:_FIRST_RESPONSES])
+        self.for_drift = math.ceil(_RECEIVED_FOR_DRIFT / received_share(found))
         weights = np.abs(found.values[..., 0]) ** 2
         total = max(float(weights.sum()), 1e-300)
         for name, gradient in zip(names, found.gradient, strict=True):
@@ -285,7 +289,7 @@ class _Focus:
 
     def _drift(self) -> NDArray[np.float64] | None:
         offsets_m = self.given.range_step_m * _OFFSETS
-        found = self._contributions(self.points_m[:_RESPONSES_FOR_DRIFT], offsets_m)
+        found = self._contributions(self.points_m[: self.for_drift], offsets_m)
         return drift_m(self.passage, found)
 
     def _gradients(self) -> NDArray[np.float64]:

@@ -183,6 +183,17 @@ def contributions(
     return Contributions(values, gradient, range_m)
 
 
+def received_share(found: Contributions) -> float:
+    """Return the share of the channels that receive a response: the median over the responses.
+
+    Channels with equal power count fully, others less: (sum p)^2/(n sum p^2).
+    """
+    power = np.square(np.abs(found.values[..., 0]), dtype=np.float64)
+    total, squares = power.sum(axis=0), np.sum(power**2, axis=0)
+    share = total**2 / np.maximum(len(power) * squares, 1e-300)
+    return float(np.clip(np.median(share), 1 / len(power), 1.0))
+
+
 def _gradient(
     points_m: NDArray[np.float64], lines: RangeLines, axes: NDArray[np.float64]
 ) -> NDArray[np.float64]:
