@@ -60,7 +60,7 @@ INLINE void prefetch_line(__global const sample_t *line, int pitch, int start, i
 
 /* What a chunk of channels is aligned and summed with. */
 typedef struct {
-    float range_weight[TAPS][CHUNK], aperture_weight[APERTURE_TAPS][CHUNK];
+    float range_weight[TAPS][CHUNK], aperture_weight[APERTURE_TAPS * CHUNK]; /* tap by tap */
 #if ROWS == 1
     float row_weight[ACROSS_TAPS][CHUNK];
 #endif
@@ -124,7 +124,7 @@ INLINE void store_weights(__local Chunk *chunk, int c, Shifts shifts, __global c
 #endif
 #pragma unroll
     for (int t = 0; t < APERTURE_TAPS; t++)
-        STORE_LOCAL(share[t], &chunk->aperture_weight[t][c]);
+        STORE_LOCAL(share[t], &chunk->aperture_weight[t * CHUNK + c]);
 }
 
 /* WIDTH samples of a line, filtered: sum_t weight[t] line[k + t]. */

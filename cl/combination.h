@@ -77,12 +77,12 @@ INLINE void combine(const ChunkLines *lines, __local const Chunk *chunk, int cou
                 from++;
             while (to < count && first_virtual[to] <= number)
                 to++;
-            __local const float *weights = chunk->aperture_weight[0] + number * CHUNK;
+            const int first_weight = number * CHUNK;
             for (int c = from; c < to; c++) {
 #if ROWS == 1
-                const float weight = chunk->row_weight[row][c] * weights[chunk->weight_of[c]];
+                const float weight = chunk->row_weight[row][c] * chunk->aperture_weight[first_weight + chunk->weight_of[c]];
 #else
-                const float weight = weights[chunk->weight_of[c]];
+                const float weight = chunk->aperture_weight[first_weight + chunk->weight_of[c]];
 #endif
 #pragma unroll
                 for (int m = 0; m < TOGETHER; m++) {
@@ -175,8 +175,8 @@ INLINE void combine(const ChunkLines *lines, __local const Chunk *chunk, int cou
 #endif
 #pragma unroll
         for (int t = 0; t < APERTURE_TAPS; t++) {
-            re[t] += chunk->aperture_weight[t][c] * line_re;
-            im[t] += chunk->aperture_weight[t][c] * line_im;
+            re[t] += chunk->aperture_weight[t * CHUNK + c] * line_re;
+            im[t] += chunk->aperture_weight[t * CHUNK + c] * line_im;
         }
     }
 #pragma unroll
