@@ -12,12 +12,18 @@
 #define ACROSS_TAPS (ROWS ? APERTURE_TAPS : 1)
 
 /* Samples that are aligned at a time: the first stage's long lines are fetched in long pieces. */
-#define BLOCK (WIDTH > 1 ? (SHIFTS_GIVEN ? 16 : 8) * WIDTH : 1)
+#if WIDTH > 1
+#define BLOCK ((SHIFTS_GIVEN ? 18 : 12) * WIDTH)
+#endif
+
+/* Whether registers hold the sums of all virtual channels that are open at a time: a GPU's, and the 32 of AVX-512. */
+#define RUNNING_SUMS (WIDTH == 1 || AVX == 512)
 
 /* Lines of different channels lie apart, so a CPU prefetches those of a later channel. Simulators lack the builtin. */
 #if defined(__clang__) && WIDTH > 1 && !defined(NO_PREFETCH)
 #define PREFETCH(p) __builtin_prefetch((const void *)(size_t)(p))
 #define CHANNELS_AHEAD 4
+#define CACHE_LINE (64 / (int)sizeof(sample_t)) /* samples */
 #endif
 
 /* The lines of a child's parent. */
@@ -40,23 +46,41 @@ INLINE __global const sample_t *line_of(const Parent *parent, int channel)
 #endif
 }
 
+#ifdef PREFETCH
+/* Prefetches what align_line() reads of a line. */
+INLINE void prefetch_line(__global const sample_t *line, int pitch, int start, int vectors)
+{
+    line += CLAMP(start, 0, pitch - BLOCK - WIDTH);
+    for (int k = 0; k < vectors * WIDTH; k += CACHE_LINE) {
+        PREFETCH(line + k);
+        PREFETCH(line + k + pitch);
+    }
+}
+#endif
+
 /* What a chunk of channels is aligned and summed with. */
 typedef struct {
-    float range_weight[TAPS][CHUNK], aperture_weight[APERTURE_TAPS][CHUNK];
+    float range_weight[TAPS][CHUNK], aperture_weight[APERTURE_TAPS * CHUNK]; /* tap by tap */
 #if ROWS == 1
     float row_weight[ACROSS_TAPS][CHUNK];
 #endif
     float cosine[CHUNK], sine[CHUNK]; /* of the phase; with RAMP of its change over WIDTH samples */
 #if RAMP
     float phase[CHUNK]; /* at the child's centre, cycles */
+    float ramp[CHUNK];
 #endif
     int start[CHUNK];
+#if !RUNNING_SUMS
+    int weight_of[CHUNK]; /* less CHUNK times a virtual channel: where aperture_weight has the channel's for it */
+#endif
 } Chunk;
 
+#if WIDTH > 1
 /* A chunk's lines over a block of samples, aligned on the child's centre. */
 typedef struct {
     vfloat re[BLOCK / WIDTH][CHUNK], im[BLOCK / WIDTH][CHUNK];
 } Aligned;
+#endif
 
 /* How WIDTH channels are aligned: by `start` and `nu` samples, and a phase. */
 typedef struct {
@@ -100,7 +124,7 @@ INLINE void store_weights(__local Chunk *chunk, int c, Shifts shifts, __global c
 #endif
 #pragma unroll
     for (int t = 0; t < APERTURE_TAPS; t++)
-        STORE_LOCAL(share[t], &chunk->aperture_weight[t][c]);
+        STORE_LOCAL(share[t], &chunk->aperture_weight[t * CHUNK + c]);
 }
 
 /* WIDTH samples of a line, filtered: sum_t weight[t] line[k + t]. */
@@ -112,8 +136,24 @@ INLINE void store_weights(__local Chunk *chunk, int c, Shifts shifts, __global c
     __builtin_shufflevector(low, high, t, t + 1, t + 2, t + 3, t + 4, t + 5, t + 6, t + 7, t + 8, t + 9, \
                             t + 10, t + 11, t + 12, t + 13, t + 14, t + 15)
 #else
+/* Both halves of a vector are shifted by one instruction, where compilers take two. */
+#ifdef AVX
+INLINE vfloat shifted_halves(vfloat low, vfloat high, const int t)
+{
+    vfloat shifted;
+    __asm__("vpalignr %3, %1, %2, %0" : "=x"(shifted) : "x"(low), "x"(high), "i"(4 * t));
+    return shifted;
+}
+#define SHIFTED_HALVES(low, high, t) shifted_halves(low, high, (t) & 3)
+#else
+#define HALF_LANE(lane, t) ((lane) + ((t) & 3) + ((lane) % 4 + ((t) & 3) < 4 ? 0 : 4))
+#define SHIFTED_HALVES(low, high, t)                                                                                   \
+    __builtin_shufflevector(low, high, HALF_LANE(0, t), HALF_LANE(1, t), HALF_LANE(2, t), HALF_LANE(3, t),             \
+                            HALF_LANE(4, t), HALF_LANE(5, t), HALF_LANE(6, t), HALF_LANE(7, t))
+#endif
+#define BETWEEN(low, high) __builtin_shufflevector(low, high, 4, 5, 6, 7, 8, 9, 10, 11)
 #define SHIFTED(low, high, t) \
-    __builtin_shufflevector(low, high, t, t + 1, t + 2, t + 3, t + 4, t + 5, t + 6, t + 7)
+    ((t) < 4 ? SHIFTED_HALVES(low, BETWEEN(low, high), t) : SHIFTED_HALVES(BETWEEN(low, high), high, t))
 #endif
 INLINE vfloat filtered(const float *weight, vfloat low, vfloat high)
 {
@@ -136,49 +176,121 @@ INLINE vfloat filtered(const float *weight, vfloat low, vfloat high)
 }
 #endif
 
-/* Aligns channel c of a chunk, whose line this is, over samples `block` to `end` - 1. `next` is where, less `block`, to
- * prefetch from. */
-INLINE void align_line(Aligned *aligned, __local const Chunk *chunk, int c, __global const sample_t *line, int pitch,
-                       int block, int end, vfloat phase_re, vfloat phase_im, __global const sample_t *next)
-{
+/* How one channel of a chunk is aligned, and its line. */
+typedef struct {
+    __global const sample_t *line;
+    int pitch;
     float weight[TAPS];
+    vfloat phase_re, phase_im;
+#if RAMP
+    float step_re, step_im; /* turn of the phase over WIDTH samples */
+#endif
+} Channel;
+
+/* Channel c of a chunk, number `number` of all; its phase is that at a sample so far from the child's centre. */
+INLINE Channel channel_at(__local const Chunk *chunk, int c, const Parent *parent, int number, int from_centre,
+                          __global const float *phase_polynomials)
+{
+    Channel channel = {line_of(parent, number), parent->pitch};
 #pragma unroll
     for (int t = 0; t < TAPS; t++)
-        weight[t] = chunk->range_weight[t][c];
+        channel.weight[t] = chunk->range_weight[t][c];
 #if RAMP
-    const float step_re = chunk->cosine[c], step_im = chunk->sine[c];
-#endif
-    const int start = chunk->start[c];
-#ifdef SLIDING
-    const int before = CLAMP(start + block, 0, pitch - TAPS - WIDTH);
-    vfloat re_low = LOAD_RE(line, before, pitch), im_low = LOAD_IM(line, before, pitch);
-#endif
-    for (int k = block; k < end; k += WIDTH) {
-#ifdef PREFETCH
-        PREFETCH(next + k);
-        PREFETCH(next + k + pitch);
-#endif
-#ifdef SLIDING
-        const int after = CLAMP(start + k + WIDTH, 0, pitch - WIDTH);
-        const vfloat re_high = LOAD_RE(line, after, pitch), im_high = LOAD_IM(line, after, pitch);
-        const vfloat re = filtered(weight, re_low, re_high), im = filtered(weight, im_low, im_high);
-        re_low = re_high;
-        im_low = im_high;
+    sine_and_cosine(chunk->phase[c] + chunk->ramp[c] * (LANES + (float)from_centre), phase_polynomials, &channel.phase_im,
+                    &channel.phase_re);
+    channel.step_re = chunk->cosine[c];
+    channel.step_im = chunk->sine[c];
 #else
-        const int position = CLAMP(start + k, 0, pitch - TAPS - WIDTH);
+    channel.phase_re = chunk->cosine[c];
+    channel.phase_im = chunk->sine[c];
+#endif
+    return channel;
+}
+
+#if WIDTH == 1
+/* A chunk's lines at sample k of the child, which are aligned when they are asked for. */
+typedef struct {
+    const Parent *parent;
+    int first; /* number of the chunk's first channel */
+    int k, from_centre;
+    __global const float *phase_polynomials;
+} ChunkLines;
+
+INLINE void aligned_samples(const ChunkLines *lines, __local const Chunk *chunk, int c, float *re, float *im)
+{
+    const Channel channel =
+        channel_at(chunk, c, lines->parent, lines->first + c, lines->from_centre, lines->phase_polynomials);
+    __global const sample_t *sample = channel.line + 2 * CLAMP(chunk->start[c] + lines->k, 0, channel.pitch - TAPS - 1);
+    float2 sum = 0.0f;
+#pragma unroll
+    for (int t = 0; t < TAPS; t++)
+        sum += channel.weight[t] * LOAD_PAIR(sample + 2 * t);
+    *re = sum.x * channel.phase_re - sum.y * channel.phase_im;
+    *im = sum.x * channel.phase_im + sum.y * channel.phase_re;
+}
+#else
+/* A chunk's lines in a block: at vector n, or in all n vectors without RUNNING_SUMS. */
+typedef struct {
+    const Aligned *aligned;
+    int n;
+} ChunkLines;
+
+INLINE void aligned_samples(const ChunkLines *lines, __local const Chunk *chunk, int c, vfloat *re, vfloat *im)
+{
+    *re = lines->aligned->re[lines->n][c];
+    *im = lines->aligned->im[lines->n][c];
+}
+
+INLINE void store_aligned(Aligned *aligned, int n, int c, Channel *channel, vfloat re, vfloat im)
+{
+    aligned->re[n][c] = re * channel->phase_re - im * channel->phase_im;
+    aligned->im[n][c] = re * channel->phase_im + im * channel->phase_re;
+#if RAMP
+    const vfloat turned = channel->phase_re * channel->step_re - channel->phase_im * channel->step_im;
+    channel->phase_im = channel->phase_re * channel->step_im + channel->phase_im * channel->step_re;
+    channel->phase_re = turned;
+#endif
+}
+
+#ifdef SLIDING
+/* Aligns a line of which POSITION(k) says where it is read for sample k: k itself, or within the line. */
+#define ALIGN_VECTORS(POSITION)                                                               \
+    {                                                                                         \
+        vfloat re_low = LOAD_RE(channel.line, POSITION(start), channel.pitch);                \
+        vfloat im_low = LOAD_IM(channel.line, POSITION(start), channel.pitch);                \
+        for (int n = 0; n < vectors; n++) {                                                   \
+            const int after = POSITION(start + (n + 1) * WIDTH);                              \
+            const vfloat re_high = LOAD_RE(channel.line, after, channel.pitch);               \
+            const vfloat im_high = LOAD_IM(channel.line, after, channel.pitch);               \
+            store_aligned(aligned, n, c, &channel, filtered(channel.weight, re_low, re_high), \
+                          filtered(channel.weight, im_low, im_high));                         \
+            re_low = re_high;                                                                 \
+            im_low = im_high;                                                                 \
+        }                                                                                     \
+    }
+#define AS_IT_IS(k) (k)
+#define WITHIN_LINE(k) CLAMP(k, 0, channel.pitch - WIDTH)
+#endif
+
+/* Aligns channel c of a chunk over so many vectors of a block, of which the first begins at the line's sample `start`. */
+INLINE void align_line(Aligned *aligned, int c, Channel channel, int start, int vectors)
+{
+#ifdef SLIDING
+    if (start >= 0 && start + (vectors + 1) * WIDTH <= channel.pitch)
+        ALIGN_VECTORS(AS_IT_IS)
+    else
+        ALIGN_VECTORS(WITHIN_LINE)
+#else
+    for (int n = 0; n < vectors; n++) {
+        const int position = CLAMP(start + n * WIDTH, 0, channel.pitch - TAPS - WIDTH);
         vfloat re = 0.0f, im = 0.0f;
 #pragma unroll
         for (int t = 0; t < TAPS; t++) {
-            re += weight[t] * LOAD_RE(line, position + t, pitch);
-            im += weight[t] * LOAD_IM(line, position + t, pitch);
+            re += channel.weight[t] * LOAD_RE(channel.line, position + t, channel.pitch);
+            im += channel.weight[t] * LOAD_IM(channel.line, position + t, channel.pitch);
         }
-#endif
-        aligned->re[(k - block) / WIDTH][c] = re * phase_re - im * phase_im;
-        aligned->im[(k - block) / WIDTH][c] = re * phase_im + im * phase_re;
-#if RAMP
-        const vfloat turned = phase_re * step_re - phase_im * step_im;
-        phase_im = phase_re * step_im + phase_im * step_re;
-        phase_re = turned;
-#endif
+        store_aligned(aligned, n, c, &channel, re, im);
     }
+#endif
 }
+#endif

@@ -12,6 +12,7 @@
  * ranges, references    see parts.h; parts are groups.
  * drift                 with ALIGNED: by how much less every range grows, per metre along x y z.
  * geometry, centres     see antennas.h; `centres` holds those of all groups, from number first_range on those at work.
+ * groups                groups at work.
  * offsets               float [3][points], m from the groups' centres: x y z of the points of all groups.
  * samples_per_m         samples per metre of range, which is half a path.
  * cycles_per_sample     phase per sample of range.
@@ -21,7 +22,7 @@
  * represented, weight_sums  as for backproject_tiles.
  * pixels                float2, STACK WIDTH per group, from group number first_group on.
  *
- * Global size: groups.
+ * Global size: groups, or more.
  */
 
 #define CHANNEL_VALUES(p) (*(p))
@@ -110,7 +111,7 @@ __kernel void backproject_points(__global const sample_t *lines, int line_pitch,
                                  __global const float *reference_phase, int channel_pitch,
 #endif
                                  __global const float *geometry, int geometry_pitch, __global const float *centres,
-                                 __global const float *offsets, int points, float samples_per_m,
+                                 __global const float *offsets, int points, int groups, float samples_per_m,
                                  float cycles_per_sample, __global const float *filter,
                                  __global const float *phase_polynomials,
 #if BEAM
@@ -125,6 +126,8 @@ __kernel void backproject_points(__global const sample_t *lines, int line_pitch,
                                  __global float2 *pixels, int first_group)
 {
     const int group = get_global_id(0);
+    if (group >= groups)
+        return;
     const Part part = part_at(ranges, first_range + group, lines, line_pitch);
 #if !OVERWRITE
     if (part.begin >= part.end)

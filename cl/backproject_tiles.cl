@@ -44,9 +44,11 @@
 /* A GPU keeps indexed arrays in registers only where loops are unrolled. On a CPU, unrolled loops would spill, for every
  * channel, all that is the same for every block. */
 #if WIDTH == 1
+#define EACH_CHANNEL _Pragma("unroll")
 #define EACH_WINDOW _Pragma("unroll")
 #define EACH_BLOCK _Pragma("unroll")
 #else
+#define EACH_CHANNEL
 #define EACH_WINDOW _Pragma("unroll 1")
 #define EACH_BLOCK _Pragma("unroll 1")
 #endif
@@ -159,6 +161,26 @@ INLINE Windows item_windows(const Polynomial *position, const Positions *at, int
     return windows_about(c0 + j * (c1 + j * (c2 + j * position->c3)), reference, pitch);
 }
 
+/* A channel's echoes over a work-item's pixels. */
+typedef struct {
+    Polynomial position; /* in its line, samples */
+    Windows windows;
+    __global const sample_t *line;
+    float phase; /* cycles, where the position is 0 */
+    float channels; /* that the line stands for */
+#if BEAM
+    ItemBeam beam;
+#endif
+} ItemChannel;
+
+/* Channels that are prepared before any adds its echoes: what comes before the first block of a channel is a long chain,
+ * which a CPU overlaps with those of other channels only if they follow each other. */
+#if WIDTH == 1
+#define CHANNELS_AT_ONCE 1
+#else
+#define CHANNELS_AT_ONCE 8
+#endif
+
 __kernel void backproject_tiles(__global const sample_t *lines, int line_pitch, __global const int *ranges,
                                 int first_range,
 #if ALIGNED
@@ -198,47 +220,56 @@ __kernel void backproject_tiles(__global const sample_t *lines, int line_pitch, 
 
     Sums sums;
     clear_sums(&sums);
-    for (int channel = part.begin; channel < part.end; channel++) {
-        const int entry = channel - part.begin;
-        __global const float *term = expansions + entry;
+    for (int first = part.begin; first < part.end; first += CHANNELS_AT_ONCE) {
+        ItemChannel of_item[CHANNELS_AT_ONCE];
+        int count = 0;
+EACH_CHANNEL
+        for (int channel = first; channel < first + CHANNELS_AT_ONCE && channel < part.end; channel++) {
+            const int entry = channel - part.begin;
+            __global const float *term = expansions + entry;
+            ItemChannel *item_channel = &of_item[count];
 #if BEAM
-        ItemBeam item_beam;
-        if (!find_item_beam(term + RANGE_TERMS * channel_pitch, channel_pitch, &beam, &at, &item_beam))
-            continue;
+            if (!find_item_beam(term + RANGE_TERMS * channel_pitch, channel_pitch, &beam, &at, &item_channel->beam))
+                continue;
 #endif
 #if ALIGNED
-        const Reference reference = {centre_sample, 0.0f, 0.0f};
+            const Reference reference = {centre_sample, 0.0f, 0.0f};
 #else
-        const size_t pair = first_entry + entry;
-        const Reference reference = {reference_sample[pair], reference_fraction[pair], reference_phase[pair]};
+            const size_t pair = first_entry + entry;
+            const Reference reference = {reference_sample[pair], reference_fraction[pair], reference_phase[pair]};
 #endif
-        /* Half a sample less is what interpolate() wants. */
-        const float start = reference.fraction - 0.5f;
-        const Polynomial position = polynomial_in_j(start, coefficients_at(term, channel_pitch), at.i);
-        const float cycles = reference.phase - start * cycles_per_sample;
-        const float phase = cycles - ROUNDED(cycles);
-
+            /* Half a sample less is what interpolate() wants. */
+            const float start = reference.fraction - 0.5f;
+            const float cycles = reference.phase - start * cycles_per_sample;
+            item_channel->position = polynomial_in_j(start, coefficients_at(term, channel_pitch), at.i);
+            item_channel->phase = cycles - ROUNDED(cycles);
 #if BEAM && NORMALISE && ALIGNED
-        const float channels = represented[channel];
+            item_channel->channels = represented[channel];
 #else
-        const float channels = 1.0f;
+            item_channel->channels = 1.0f;
 #endif
-        __global const sample_t *line = LINE(part.lines, entry, line_pitch);
-        const Windows windows = item_windows(&position, &at, reference.sample, line_pitch);
+            item_channel->line = LINE(part.lines, entry, line_pitch);
+            item_channel->windows = item_windows(&item_channel->position, &at, reference.sample, line_pitch);
+            count++;
+        }
+EACH_CHANNEL
+        for (int n = 0; n < CHANNELS_AT_ONCE && n < count; n++) {
+            const ItemChannel *item_channel = &of_item[n];
 EACH_WINDOW
-        for (int window = 0; window < WINDOWS; window++) {
-            const Lookup lookup = lookup_in(&windows, window, line, line_pitch);
+            for (int window = 0; window < WINDOWS; window++) {
+                const Lookup lookup = lookup_in(&item_channel->windows, window, item_channel->line, line_pitch);
 EACH_BLOCK
-            for (int block = window * BLOCKS_PER_WINDOW; block < (window + 1) * BLOCKS_PER_WINDOW; block++) {
-                FORGET_MEMORY;
-                const vfloat t = value_at(&position, at.j[block]);
+                for (int block = window * BLOCKS_PER_WINDOW; block < (window + 1) * BLOCKS_PER_WINDOW; block++) {
+                    FORGET_MEMORY;
+                    const vfloat t = value_at(&item_channel->position, at.j[block]);
 #if BEAM
-                const vfloat weight = block_weights(&item_beam, &beam, block, at.j[block]);
+                    const vfloat weight = block_weights(&item_channel->beam, &beam, block, at.j[block]);
 #else
-                const vfloat weight = 1.0f;
+                    const vfloat weight = 1.0f;
 #endif
-                add_echoes(&sums, block, &lookup, t, filter, t * cycles_per_sample + phase, phase_polynomials, weight,
-                           channels);
+                    add_echoes(&sums, block, &lookup, t, filter, t * cycles_per_sample + item_channel->phase,
+                               phase_polynomials, weight, item_channel->channels);
+                }
             }
         }
     }

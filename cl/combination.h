@@ -21,92 +21,140 @@ INLINE __global sample_t *virtual_line(const Child *child, int number)
     return LINE(child->lines, number - child->first, child->pitch);
 }
 
+/* From a virtual channel's line to that in the next row. */
+INLINE size_t row_pitch(const Child *child)
+{
+    return (size_t)(child->end - child->first) * 2 * child->pitch;
+}
+
 /* The same in the row `row` rows after. */
 INLINE Child row_of(const Child *child, int row)
 {
-    const int lines = row * (child->end - child->first);
-    return (Child){child->lines + (long)lines * 2 * child->pitch, child->pitch, child->first, child->end};
+    return (Child){child->lines + row * row_pitch(child), child->pitch, child->first, child->end};
 }
 
-INLINE void store_sum(vfloat re, vfloat im, const Child *child, int number, int k)
+#if !RUNNING_SUMS
+/* Vectors of a block that are summed together, each weight serving all: their sums and a weight fit 16 registers. */
+#define TOGETHER 6
+
+/* Adds a chunk's `count` aligned lines, `vectors` vectors of a block, to samples k on of the virtual channels in row `row` of
+ * the band, which earlier chunks and bands have left or not. first_virtual is that of the chunk's channels. Virtual channels
+ * before `open` are finished; earlier chunks have added to APERTURE_TAPS from there on. is_new is whether no earlier band
+ * has added to the row. With ROWS == 2 sums are added to all rows of the band, with a weight each.
+ *
+ * Sums are finished one virtual channel after the other, since the channels that contribute to one follow each other. Sums
+ * of all that are open at a time would not fit the registers, and branches between few channels are hard to predict. */
+INLINE void combine(const ChunkLines *lines, __local const Chunk *chunk, int count, __global const int *first_virtual,
+#if ROWS == 2
+                    const float *row_weight,
+#else
+                    int is_new, int row,
+#endif
+                    const Child *child, int open, int k)
 {
-    if (is_of(child, number)) {
-        STORE_RE(re, virtual_line(child, number), k, child->pitch);
-        STORE_IM(im, virtual_line(child, number), k, child->pitch);
+    const Aligned *aligned = lines->aligned;
+    const int vectors = lines->n, end = min(first_virtual[count - 1] + APERTURE_TAPS, child->end);
+    for (int n = 0; n < vectors; n += TOGETHER) {
+        int from = 0, to = 0;
+        for (int number = max(open, child->first); number < end; number++) {
+            __global sample_t *line = virtual_line(child, number) + k + n * WIDTH;
+#if ROWS < 2
+            const int is_left = number < open + APERTURE_TAPS || !is_new;
+#else
+            const int is_left = 0;
+#endif
+            vfloat re[TOGETHER], im[TOGETHER];
+#pragma unroll
+            for (int m = 0; m < TOGETHER; m++) {
+                re[m] = im[m] = 0.0f;
+                if (is_left && n + m < vectors) {
+                    re[m] = LOAD_RE(line, m * WIDTH, child->pitch);
+                    im[m] = LOAD_IM(line, m * WIDTH, child->pitch);
+                }
+            }
+            /* The channels that contribute. */
+            while (from < count && first_virtual[from] <= number - APERTURE_TAPS)
+                from++;
+            while (to < count && first_virtual[to] <= number)
+                to++;
+            const int first_weight = number * CHUNK;
+            for (int c = from; c < to; c++) {
+#if ROWS == 1
+                const float weight = chunk->row_weight[row][c] * chunk->aperture_weight[first_weight + chunk->weight_of[c]];
+#else
+                const float weight = chunk->aperture_weight[first_weight + chunk->weight_of[c]];
+#endif
+#pragma unroll
+                for (int m = 0; m < TOGETHER; m++) {
+                    re[m] += weight * aligned->re[n + m][c];
+                    im[m] += weight * aligned->im[n + m][c];
+                }
+            }
+#if ROWS == 2
+            for (int r = 0; r < ACROSS_TAPS; r++, line += row_pitch(child))
+                for (int m = 0; m < TOGETHER && n + m < vectors; m++) {
+                    const int at = m * WIDTH, pitch = child->pitch;
+                    STORE_RE(LOAD_RE(line, at, pitch) + row_weight[r] * re[m], line, at, pitch);
+                    STORE_IM(LOAD_IM(line, at, pitch) + row_weight[r] * im[m], line, at, pitch);
+                }
+#else
+#pragma unroll
+            for (int m = 0; m < TOGETHER; m++)
+                if (n + m < vectors) {
+                    STORE_RE(re[m], line, m * WIDTH, child->pitch);
+                    STORE_IM(im[m], line, m * WIDTH, child->pitch);
+                }
+#endif
+        }
     }
 }
-
+#else
 #if ROWS == 2
-/* Adds a sum along the band to virtual channel `number` of every row, with the row's weight. */
-INLINE void add_to_rows(vfloat re, vfloat im, const float *row_weight, const Child *child, int number, int k)
+INLINE void finish_sum(vfloat re, vfloat im, const float *row_weight, const Child *child, int number, int k)
 {
     if (!is_of(child, number))
         return;
     __global sample_t *line = virtual_line(child, number);
-    const size_t row_pitch = (size_t)(child->end - child->first) * 2 * child->pitch;
-#pragma unroll
-    for (int r = 0; r < ACROSS_TAPS; r++, line += row_pitch) {
-        STORE_RE(LOAD_RE(line, k, child->pitch) + row_weight[r] * re, line, k, child->pitch);
-        STORE_IM(LOAD_IM(line, k, child->pitch) + row_weight[r] * im, line, k, child->pitch);
+    for (int r = 0; r < ACROSS_TAPS; r++, line += row_pitch(child)) {
+        vfloat left_re, left_im;
+        load_sample(&left_re, &left_im, line, k, child->pitch);
+        store_sample(left_re + row_weight[r] * re, left_im + row_weight[r] * im, line, k, child->pitch);
     }
 }
-
-/* As combine() below, where a chunk's channels have equal weights across the rows: sums along the band are finished first.
- * The lines of the rows hold what was added to them before. */
-INLINE void combine_in_rows(const Aligned *aligned, int n, __local const Chunk *chunk, int count,
-                            __global const int *first_virtual, const float *row_weight, const Child *child, int k)
-{
-    vfloat re[APERTURE_TAPS], im[APERTURE_TAPS];
-#pragma unroll
-    for (int t = 0; t < APERTURE_TAPS; t++)
-        re[t] = im[t] = 0.0f;
-    int number = first_virtual[0];
-    for (int c = 0; c < count; c++) {
-        for (; number < first_virtual[c]; number++) {
-            add_to_rows(re[0], im[0], row_weight, child, number, k);
-#pragma unroll
-            for (int t = 0; t + 1 < APERTURE_TAPS; t++) {
-                re[t] = re[t + 1];
-                im[t] = im[t + 1];
-            }
-            re[APERTURE_TAPS - 1] = im[APERTURE_TAPS - 1] = 0.0f;
-        }
-        const vfloat line_re = aligned->re[n][c], line_im = aligned->im[n][c];
-#pragma unroll
-        for (int t = 0; t < APERTURE_TAPS; t++) {
-            re[t] += chunk->aperture_weight[t][c] * line_re;
-            im[t] += chunk->aperture_weight[t][c] * line_im;
-        }
-    }
-#pragma unroll
-    for (int t = 0; t < APERTURE_TAPS; t++)
-        add_to_rows(re[t], im[t], row_weight, child, number + t, k);
-}
+#define FINISH_SUM(re, im, number) finish_sum(re, im, row_weight, child, number, k)
 #else
-/* Adds a chunk's `count` aligned lines, vector `n` of their block, to samples k on of the virtual channels from `number`
- * on, in row `row` of the band. first_virtual is that of the chunk's channels; is_new is whether no earlier band has added
- * to the row.
+INLINE void finish_sum(vfloat re, vfloat im, const Child *child, int number, int k)
+{
+    if (is_of(child, number))
+        store_sample(re, im, virtual_line(child, number), k, child->pitch);
+}
+#define FINISH_SUM(re, im, number) finish_sum(re, im, child, number, k)
+#endif
+
+/* The same for WIDTH samples from k on, at which `lines` are those of the chunk. Registers hold the sums of all virtual
+ * channels that are open at a time.
  *
- * The sums of the APERTURE_TAPS virtual channels that are open are two arrays of this function: with a structure of arrays
- * the stage took 1.4 times as long on Intel's runtime, and 1.1 times on PoCL with arrays that other functions are given. */
-INLINE void combine(const Aligned *aligned, int n, __local const Chunk *chunk, int count,
-                    __global const int *first_virtual, int is_first_chunk, int is_new, int row, const Child *child,
-                    int number, int k)
+ * The sums are two arrays of this function: PoCL took 1.1 times as long with arrays that other functions are given. */
+INLINE void combine(const ChunkLines *lines, __local const Chunk *chunk, int count, __global const int *first_virtual,
+#if ROWS == 2
+                    const float *row_weight,
+#else
+                    int is_new, int row,
+#endif
+                    const Child *child, int open, int k)
 {
     vfloat re[APERTURE_TAPS], im[APERTURE_TAPS];
-    /* Earlier chunks have left the sums that are open. */
+    int number = open;
 #pragma unroll
     for (int t = 0; t < APERTURE_TAPS; t++) {
         re[t] = im[t] = 0.0f;
-        if (!(is_first_chunk && is_new) && is_of(child, number + t)) {
-            re[t] = LOAD_RE(virtual_line(child, number + t), k, child->pitch);
-            im[t] = LOAD_IM(virtual_line(child, number + t), k, child->pitch);
-        }
+        if (ROWS < 2 && is_of(child, number + t))
+            load_sample(&re[t], &im[t], virtual_line(child, number + t), k, child->pitch);
     }
     for (int c = 0; c < count; c++) {
         for (; number < first_virtual[c]; number++) {
             /* No later channel contributes to the first of them: another one opens after the last. */
-            store_sum(re[0], im[0], child, number, k);
+            FINISH_SUM(re[0], im[0], number);
 #pragma unroll
             for (int t = 0; t + 1 < APERTURE_TAPS; t++) {
                 re[t] = re[t + 1];
@@ -115,27 +163,25 @@ INLINE void combine(const Aligned *aligned, int n, __local const Chunk *chunk, i
             re[APERTURE_TAPS - 1] = im[APERTURE_TAPS - 1] = 0.0f;
 #if ROWS == 1
             const int opened = number + APERTURE_TAPS;
-            if (!is_new && is_of(child, opened)) {
-                re[APERTURE_TAPS - 1] = LOAD_RE(virtual_line(child, opened), k, child->pitch);
-                im[APERTURE_TAPS - 1] = LOAD_IM(virtual_line(child, opened), k, child->pitch);
-            }
+            if (!is_new && is_of(child, opened))
+                load_sample(&re[APERTURE_TAPS - 1], &im[APERTURE_TAPS - 1], virtual_line(child, opened), k, child->pitch);
 #endif
         }
+        vfloat line_re, line_im;
+        aligned_samples(lines, chunk, c, &line_re, &line_im);
 #if ROWS == 1
-        const vfloat line_re = chunk->row_weight[row][c] * aligned->re[n][c];
-        const vfloat line_im = chunk->row_weight[row][c] * aligned->im[n][c];
-#else
-        const vfloat line_re = aligned->re[n][c], line_im = aligned->im[n][c];
+        line_re *= chunk->row_weight[row][c];
+        line_im *= chunk->row_weight[row][c];
 #endif
 #pragma unroll
         for (int t = 0; t < APERTURE_TAPS; t++) {
-            re[t] += chunk->aperture_weight[t][c] * line_re;
-            im[t] += chunk->aperture_weight[t][c] * line_im;
+            re[t] += chunk->aperture_weight[t * CHUNK + c] * line_re;
+            im[t] += chunk->aperture_weight[t * CHUNK + c] * line_im;
         }
     }
 #pragma unroll
     for (int t = 0; t < APERTURE_TAPS; t++)
-        store_sum(re[t], im[t], child, number + t, k);
+        FINISH_SUM(re[t], im[t], number + t);
 }
 #endif
 

@@ -10,17 +10,20 @@
 
 #include "vectors.h"
 
-/* sample_t stores one real or imaginary part. LOAD_PARTS and STORE_PARTS move WIDTH consecutive ones. */
+/* sample_t stores one real or imaginary part. LOAD_PARTS and STORE_PARTS move WIDTH consecutive ones, LOAD_PAIR and
+ * STORE_PAIR both parts of an interleaved sample. */
 #if !HALF
 typedef float sample_t;
 #define LOAD_PARTS(p) LOAD(p)
 #define STORE_PARTS(value, p) STORE(value, p)
 #define LOAD_PART(p) (*(p))
 #define LOAD_PAIR(p) (*(__global const float2 *)(p))
+#define STORE_PAIR(value, p) (*(__global float2 *)(p) = (value))
 #else
 typedef half sample_t;
 #define LOAD_PART(p) vload_half(0, p)
 #define LOAD_PAIR(p) vload_half2(0, p)
+#define STORE_PAIR(value, p) vstore_half2(value, 0, p)
 #if WIDTH == 1
 #define LOAD_PARTS(p) vload_half(0, p)
 #define STORE_PARTS(value, p) vstore_half(value, 0, p)
@@ -70,3 +73,26 @@ INLINE void STORE_PARTS(vfloat value, __global half *p)
 #define STORE_RE(value, line, k, pitch) STORE_PARTS(value, (line) + (k))
 #define STORE_IM(value, line, k, pitch) STORE_PARTS(value, (line) + (k) + (pitch))
 #endif
+
+/* The same of both parts. */
+INLINE void load_sample(vfloat *re, vfloat *im, __global const sample_t *line, int k, int pitch)
+{
+#if WIDTH == 1
+    const float2 sample = LOAD_PAIR(line + 2 * k);
+    *re = sample.x;
+    *im = sample.y;
+#else
+    *re = LOAD_RE(line, k, pitch);
+    *im = LOAD_IM(line, k, pitch);
+#endif
+}
+
+INLINE void store_sample(vfloat re, vfloat im, __global sample_t *line, int k, int pitch)
+{
+#if WIDTH == 1
+    STORE_PAIR((float2)(re, im), line + 2 * k);
+#else
+    STORE_RE(re, line, k, pitch);
+    STORE_IM(im, line, k, pitch);
+#endif
+}

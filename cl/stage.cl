@@ -67,6 +67,18 @@
 #define WAIT_FOR_GROUP
 #endif
 
+/* Adds the lines of a chunk from sample k on to those of virtual channels. */
+#if ROWS == 2
+#define COMBINE(lines, k) \
+    combine(lines, &chunk, count, first_virtual + first, row_weight, &child, first_virtual[first], k)
+#else
+#define COMBINE(lines, k)                                                                                         \
+    for (int row = 0; row < ACROSS_TAPS; row++) {                                                                 \
+        const Child of_row = row_of(&child, row);                                                                 \
+        combine(lines, &chunk, count, first_virtual + first, row >= old_rows, row, &of_row, open, k);             \
+    }
+#endif
+
 __kernel void stage(__global const sample_t *parent_lines, int parent_pitch, __global const int *bands, int band_count,
                     int first_child, int children_per_root, __global const int *first_virtual,
                     __global const float *tap_position, int channel_pitch,
@@ -89,7 +101,9 @@ __kernel void stage(__global const sample_t *parent_lines, int parent_pitch, __g
                     int lines_per_child, int length, int part_length, int guard)
 {
     __local Chunk chunk;
+#if WIDTH > 1
     Aligned aligned;
+#endif
 
     const int item = get_local_id(0), items = get_local_size(0);
     const int from = get_group_id(1) * part_length, to = length - from < part_length ? length : from + part_length;
@@ -147,7 +161,8 @@ __kernel void stage(__global const sample_t *parent_lines, int parent_pitch, __g
         for (int t = 0; t < ACROSS_TAPS; t++)
             row_weight[t] = LANE(share[t], 0);
 #else
-        int open = child.first - APERTURE_TAPS + 1; /* the first virtual channel that later channels may contribute to */
+        /* The first virtual channel that later channels may contribute to; no channel has contributed yet. */
+        int open = child.first - APERTURE_TAPS;
 #endif
         for (int first = begin; first < end; first += CHUNK) {
             const int count = end - first < CHUNK ? end - first : CHUNK;
@@ -165,6 +180,10 @@ __kernel void stage(__global const sample_t *parent_lines, int parent_pitch, __g
                                                       cycles_per_m, first_sample);
 #endif
                 store_weights(&chunk, c, shifts, range_filter, aperture_filter, LOAD(tap_position + channel));
+#if !RUNNING_SUMS
+                for (int lane = 0; lane < WIDTH; lane++)
+                    chunk.weight_of[c + lane] = c + lane - CHUNK * first_virtual[channel + lane];
+#endif
 #if ROWS == 1
                 vfloat share[ACROSS_TAPS];
                 filter_weights(aperture_filter, ACROSS_TAPS, LOAD(row_position + channel), share);
@@ -175,6 +194,7 @@ __kernel void stage(__global const sample_t *parent_lines, int parent_pitch, __g
                 vfloat sine, cosine;
 #if RAMP
                 STORE_LOCAL(shifts.cycles, &chunk.phase[c]);
+                STORE_LOCAL(LOAD(ramp + channel), &chunk.ramp[c]);
                 sine_and_cosine(WIDTH * LOAD(ramp + channel), phase_polynomials, &sine, &cosine);
 #else
                 sine_and_cosine(shifts.cycles, phase_polynomials, &sine, &cosine);
@@ -183,38 +203,33 @@ __kernel void stage(__global const sample_t *parent_lines, int parent_pitch, __g
                 STORE_LOCAL(sine, &chunk.sine[c]);
             }
             WAIT_FOR_GROUP;
-            for (int block = from + item * BLOCK; block < to; block += items * BLOCK) {
-                const int block_end = to - block < BLOCK ? to : block + BLOCK;
+#if WIDTH == 1
+            for (int k = from + item; k < to; k += items) {
+                const ChunkLines lines = {&parent, first, k, k - half_length, phase_polynomials};
+                COMBINE(&lines, k);
+            }
+#else
+            for (int block = from; block < to; block += BLOCK) {
+                const int vectors = (to - block < BLOCK ? to - block : BLOCK) / WIDTH;
                 for (int c = 0; c < count; c++) {
 #ifdef PREFETCH
                     const int ahead = c + CHANNELS_AHEAD < count ? c + CHANNELS_AHEAD : count - 1;
-                    __global const sample_t *next = line_of(&parent, first + ahead)
-                        + CLAMP(chunk.start[ahead] + block, 0, parent_pitch - BLOCK - WIDTH) - block;
-#else
-                    __global const sample_t *next = 0;
+                    prefetch_line(line_of(&parent, first + ahead), parent_pitch, chunk.start[ahead] + block, vectors);
 #endif
-#if RAMP
-                    vfloat phase_re, phase_im;
-                    sine_and_cosine(chunk.phase[c] + ramp[first + c] * (LANES + (float)(block - half_length)),
-                                    phase_polynomials, &phase_im, &phase_re);
-#else
-                    const float phase_re = chunk.cosine[c], phase_im = chunk.sine[c];
-#endif
-                    align_line(&aligned, &chunk, c, line_of(&parent, first + c), parent_pitch, block, block_end, phase_re,
-                               phase_im, next);
+                    const Channel channel = channel_at(&chunk, c, &parent, first + c, block - half_length, phase_polynomials);
+                    align_line(&aligned, c, channel, chunk.start[c] + block, vectors);
                 }
-                for (int k = block; k < block_end; k += WIDTH) {
-#if ROWS == 2
-                    combine_in_rows(&aligned, (k - block) / WIDTH, &chunk, count, first_virtual + first, row_weight, &child, k);
-#else
-                    for (int r = 0; r < ACROSS_TAPS; r++) {
-                        const Child of_row = row_of(&child, r);
-                        combine(&aligned, (k - block) / WIDTH, &chunk, count, first_virtual + first, first == begin,
-                                r >= old_rows, r, &of_row, open, k);
-                    }
-#endif
+#if RUNNING_SUMS
+                for (int n = 0; n < vectors; n++) {
+                    const ChunkLines lines = {&aligned, n};
+                    COMBINE(&lines, block + n * WIDTH);
                 }
+#else
+                const ChunkLines lines = {&aligned, vectors};
+                COMBINE(&lines, block);
+#endif
             }
+#endif
 #if ROWS < 2
             /* A work-item without samples has passed no channel, so this does not rely on combine(). */
             open = max(open, first_virtual[first + count - 1]);
@@ -222,7 +237,7 @@ __kernel void stage(__global const sample_t *parent_lines, int parent_pitch, __g
         }
 #if ROWS < 2
         /* Virtual channels beyond the last that any channel contributes to, and rows without any. */
-        const int beyond = end > begin ? max(open + APERTURE_TAPS, child.first) : child.first;
+        const int beyond = max(open + APERTURE_TAPS, child.first);
         for (int r = old_rows; r < ACROSS_TAPS; r++) {
             const Child of_row = row_of(&child, r);
             clear_lines(&of_row, beyond, from, to, item, items);

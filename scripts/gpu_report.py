@@ -30,13 +30,24 @@ PARTS = {
     "Scaling": [PYTHON, "scripts/bench", "scaling", "--largest", "8192", "--device", "{device}"],
 }
 
+QUICK = {
+    "Devices": PARTS["Devices"],
+    "Self test": PARTS["Self test"],
+    "Tests": [*PARTS["Tests"], "tests/opencl"],
+    "Factorized imaging": [*PARTS["Factorized imaging"], "--case", "ffbp-thesis"],
+    "Scaling": [PYTHON, "scripts/bench", "scaling", "--largest", "512", "--device", "{device}"],
+}
+"""A selection of some minutes, which shows whether a report can be made."""
+
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--device", default="gpu", help="as `clsas devices` shows it")
     parser.add_argument("--out", type=Path, default=Path("gpu-report.md"))
     parser.add_argument("--only", default="", help="parts whose name contains this")
+    parser.add_argument("--quick", action="store_true", help="some parts, in minutes")
     given = parser.parse_args()
+    parts = QUICK if given.quick else PARTS
     try:
         info = open_device(given.device).info
     except DeviceError as error:
@@ -51,7 +62,7 @@ def main() -> int:
         )
         failed = [
             name
-            for name, command in PARTS.items()
+            for name, command in parts.items()
             if given.only in name and not run(name, command, given.device, report)
         ]
         ended = f"failed: {', '.join(failed)}" if failed else "all parts ended well"

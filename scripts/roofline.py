@@ -17,7 +17,7 @@ import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
-from peers import compare
+from peers import scenes
 
 import clsas
 from clsas.opencl.device import open_device
@@ -78,7 +78,7 @@ def counts(loop: Loop) -> dict[str, int]:
     return {
         "instructions": len(loop.lines),
         "multiply-adds": loop.multiply_adds,
-        "permutes": loop.count(r"^vperm|^vblendv|^vshuf|^vunpck"),
+        "permutes": loop.count(r"^vperm|^vblendv|^vshuf|^vunpck|^vp?align"),
         "memory operands": loop.count(r"^v.*\("),
         "on the stack": loop.count(r"^v.*\(%r[sb]p"),
     }
@@ -160,7 +160,7 @@ def _formed(case: str, accuracy_db: float, device: int, cache: str) -> dict[str,
 def _form(case: str, accuracy_db: float, index: int) -> dict[str, float]:
     device = open_device(index)
     factorized = case in cases.FACTORIZED_CASES
-    scene = cases.FACTORIZED_CASES[case] if factorized else compare.scene(PIXELS)
+    scene = cases.FACTORIZED_CASES[case] if factorized else scenes.straight(PIXELS)
     lines, grid = scene.lines(), scene.grid
     found: dict[str, float] = {}
     plan = None

@@ -64,15 +64,37 @@ TRACKS = {
 }
 
 
+def turning(tx_m):
+    """Headings around the vertical axis."""
+    angle = np.arctan2(tx_m[:, 1], tx_m[:, 0])
+    return np.stack([-np.sin(angle), np.cos(angle), 0 * angle], axis=1)
+
+
+def to_and_fro():
+    """Headings of the raster's lines."""
+    return np.repeat([1.0, -1.0] * 24, 64)[:, None] * [1.0, 0.0, 0.0]
+
+
+def headings(name, squint_deg=0.0):
+    """Directions of the beam for an aperture; None for those of its passes."""
+    if name == "passes":
+        return None
+    if name == "planar":
+        return np.array([0.6, 0.8, 0.0])
+    if name == "raster":  # with a squint, a beam and its opposite differ
+        return to_and_fro() if squint_deg == 0 else np.array([1.0, 0.0, 0.0])
+    return turning(TRACKS[name]())
+
+
 def pixel_m(name):
     return 0.004 if "helix" in name else 0.02
 
 
 @cache
-def scene(name, kind="plane"):
+def scene(name, kind="plane", side=96):
     """Noise in every channel of an aperture, and a grid around the origin."""
     step_m, tx = pixel_m(name), TRACKS[name]()
-    grid = around(0, 0, pixel_m=(step_m, step_m), shape=(96, 96))
+    grid = around(0, 0, pixel_m=(step_m, step_m), shape=(side, side))
     options = {}
     if kind == "hills":
         row, column = np.indices(grid.shape)

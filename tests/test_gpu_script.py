@@ -5,6 +5,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 from clsas.opencl.device import open_device
 
 ROOT = Path(__file__).parents[1]
@@ -17,10 +19,11 @@ def run(*arguments):
     )  # fmt: skip
 
 
-def test_a_report_holds_what_a_part_printed(tmp_path):
+@pytest.mark.parametrize("selection", [(), ("--quick",)])
+def test_a_report_holds_what_a_part_printed(tmp_path, selection):
     report = tmp_path / "report.md"
     info = open_device().info
-    done = run("--device", info.label, "--only", "Devices", "--out", report)
+    done = run("--device", info.label, "--only", "Devices", "--out", report, *selection)
     assert done.returncode == 0, done.stderr
     text = report.read_text()
     assert f"# clsas on {info.name}" in text

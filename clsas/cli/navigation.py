@@ -166,6 +166,8 @@ def navigate(
         )  # fmt: skip
     clsas.save(output, found.lines)
     results = numbers.of_navigation(found)
+    shape_m = results["shape_sd_m"]
+    shape = "unknown" if np.isnan(shape_m) else f"{1e3 * shape_m:.3g} mm or less"
     report(
         as_json,
         f"{output}: {results['pings']} pings, {results['overlap']} overlapping phase centres or "
@@ -174,7 +176,7 @@ def navigate(
         f"{np.degrees(results['yaw_rms_rad']):.3g} degrees of yaw and "
         f"{1e3 * results['surge_rms_m']:.3g} mm of surge, rms\n"
         f"  standard deviation per ping {1e6 * results['sway_step_sd_m']:.3g} um of sway, "
-        f"{1e6 * results['yaw_step_sd_rad']:.3g} urad of yaw",
+        f"{1e6 * results['yaw_step_sd_rad']:.3g} urad of yaw; of the track's shape {shape}",
         file=output,
         **results,
     )

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import fft
 
-from clsas.core import validate
+from clsas.core import decibels, validate
 
 if TYPE_CHECKING:
     from clsas.core.lines import RangeLines
@@ -17,6 +17,14 @@ if TYPE_CHECKING:
 _BLOCK = 1 << 22  # complex128 samples of the channels that are filtered together
 _EQUAL_RANGE = 1e-3  # steps by which first ranges of pings may differ: an error of -50 dB
 STATISTICS = ("mean", "median")
+DEAD_DB = -20.0
+"""Power of a channel relative to the usual one up to which it counts as dead. At -10 dB channels
+at the ends of a track, where targets leave the beam, would count too."""
+
+
+def are_dead(power: NDArray[np.float64], usual: NDArray[np.float64] | float) -> NDArray[np.bool_]:
+    """Return which channels hold no signal, by their power and that of the usual channel."""
+    return power <= usual * decibels.power(DEAD_DB)
 
 
 def high_passed(lines: RangeLines, cutoff_hz: float, name: str = "cutoff_hz") -> RangeLines:

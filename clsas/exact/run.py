@@ -263,10 +263,11 @@ class _Run:
         else:
             offset_m = layout.offset_m[job.parts]
             job.slot.fill("offsets", offset_m.reshape(-1, 3).T)
-            size = (len(offset_m),)
+            size = (p.device.in_whole_groups(len(offset_m)),)
             positions = job.geometry | {
                 "offsets": job.slot["offsets"],
                 "points": len(offset_m) * layout.part_pixels,
+                "groups": len(offset_m),
                 "first_group": job.first_part,
             }
         return p.device.run(

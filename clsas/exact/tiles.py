@@ -145,11 +145,11 @@ class Tiles:
 
         The first is for steps from row to row. Where steps are not at right angles it is (1, 1).
         """
+        axes = self._axes()
+        if axes is None:
+            return 1.0, 1.0
         origin_m, *steps_m = self.grid.vectors_m
         lengths_m = [float(np.linalg.norm(step)) for step in steps_m]
-        if abs(steps_m[0] @ steps_m[1]) > 1e-9 * lengths_m[0] * lengths_m[1] or not all(lengths_m):
-            return 1.0, 1.0
-        axes = np.stack([step / length for step, length in zip(steps_m, lengths_m, strict=True)])
         half_m = np.array([self.down, self.across]) * self.side / 2 * lengths_m
         middle_m = origin_m + (half_m - np.array(lengths_m) / 2) @ axes
         away_m = antennas_m - middle_m
@@ -160,6 +160,35 @@ class Tiles:
         distance_m = np.sqrt(farthest_m**2 + nearest_m**2 + height_m2[:, None])
         down, across = np.max(farthest_m / np.maximum(distance_m, 1e-150), axis=0)
         return float(down), float(across)
+
+    def cosines_in_beam(self, beam: BeamWindow, along: NDArray[np.float64]) -> tuple[float, float]:
+        """Return the bounds of `cosines_of` for ways on which a beam's weights are not 0.
+
+        Parameters
+        ----------
+        beam : BeamWindow
+        along : float64 [n, 3]
+            The track's unit directions, in its order. Between two of them it turns directly.
+        """
+        axes = self._axes()
+        if axes is None:
+            return 1.0, 1.0
+        step = float(np.linalg.norm(np.diff(along, axis=0), axis=1).max(initial=0.0))
+        from_nearer = math.asin(min(step / 2, 1.0))  # of two directions, to those between them
+        aspect = math.asin(min(float(np.abs(beam.limits).max()), 1.0)) + from_nearer
+        # From an axis to the track's direction, then from there to the nearest way in the beam.
+        angle = np.arccos(np.clip(np.abs(along @ axes.T), 0.0, 1.0))
+        off = np.maximum(math.pi / 2 - aspect - angle, 0.0).min(axis=0)
+        down, across = np.cos(off)
+        return float(down), float(across)
+
+    def _axes(self) -> NDArray[np.float64] | None:
+        """Return unit vectors from row to row and from column to column, if at right angles."""
+        steps_m = np.stack(self.grid.vectors_m[1:])
+        lengths_m = np.linalg.norm(steps_m, axis=1)
+        if abs(steps_m[0] @ steps_m[1]) > 1e-9 * lengths_m.prod() or not lengths_m.all():
+            return None
+        return steps_m / lengths_m[:, None]
 
     def nearest_m(self, antennas_m: NDArray[np.float64]) -> float:
         """Return a lower bound of the distance between antennas [n, 3] and tile centres."""

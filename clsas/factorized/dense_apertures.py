@@ -8,7 +8,7 @@ dimensions.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -37,6 +37,7 @@ _FITTED = 768  # channels to which a sheet is fitted
 _TRIED = (8, 2)  # intervals of a sheet's splines, and coefficients across it
 _REFINED = ((64, 2), (8, 3), (64, 3))  # the same, until all channels lie on the sheet
 _SHEET_CLOSE = 3e-5  # wavelengths rms: then nothing is to be aligned
+_ALONG_CLOSE = 1e-4  # rms of directions: less than any beam resolves
 _OPEN = np.pi / 6  # of a ring's gap: then its ends are apart
 _OVERLAP = 0.08  # of a closed ring's ends
 _FLAT = 1e-6  # of the length: extents that are none
@@ -54,6 +55,15 @@ def mean_track_of(lines: RangeLines, shape: Shape) -> MeanTrack | None:
     if shape == "track":
         return mean_track(lines)
     return strips(lines) if shape == "strips" else sheet(lines)
+
+
+def shapes_after(shape: Shape) -> tuple[Shape, ...]:
+    """Return the shapes that channels may have besides one: see `simplest_track`.
+
+    It has tried those before, so that these are none.
+    """
+    order = ("track", *DENSE_SHAPES)
+    return order[order.index(shape) + 1 :]
 
 
 def simplest_track(lines: RangeLines) -> tuple[Shape, MeanTrack | None]:
@@ -100,7 +110,8 @@ def _near_each_other(centres_m: NDArray[np.float64]) -> list[NDArray[np.int64]] 
 
     Channels are of one pass if a chain of near neighbours joins them.
     """
-    count, tree = len(centres_m), KDTree(centres_m)
+    # Such a tree takes half the time of a balanced one to make, and more to search, but for few.
+    count, tree = len(centres_m), KDTree(centres_m, balanced_tree=False, compact_nodes=False)
     some = centres_m[some_channels(count, _SCREENED)]
     # A helix or a planar array is no passes: its channels have many neighbours within a jump.
     step_m = float(np.median(tree.query(some, k=2)[0][:, -1]))
@@ -140,22 +151,82 @@ def sheet(lines: RangeLines) -> MeanTrack | None:
         return None
     surface = min(ranked)[2]
     along, across = surface.coordinates(centres_m - middle_m)
-    best, best_m = None, np.inf
-    for intervals, powers in (_TRIED, *_REFINED):
-        if len(some) < _CHANNELS_PER_TERM * (intervals + 3) * powers:
-            continue
-        spline, rms_m = _fitted(
-            (along[some], across[some]), some_m, surface.closed, intervals, powers
-        )
-        if rms_m < 0.5 * best_m:
-            best, best_m = spline, rms_m
-        if best_m <= _SHEET_CLOSE * wavelength_m(lines):
-            break
-    if best is None:
+    found = _smoothest(
+        (along[some], across[some]), some_m, surface.closed, _SHEET_CLOSE * wavelength_m(lines)
+    )
+    if found is None:
         return None
+    best, _ = found
     coefficients = best.c.copy()
     coefficients[:, 0] += middle_m
-    return MeanTrack(BSpline(best.t, coefficients, best.k), along, across=across)
+    spline = BSpline(best.t, coefficients, best.k)
+    return MeanTrack(spline, along, across=across, is_closed=surface.closed)
+
+
+def smooth_over_sheet(
+    track: MeanTrack, along: NDArray[np.float64], *, either_sign: bool
+) -> MeanTrack:
+    """Return the smooth directions nearest to those of a sheet's channels, as its positions.
+
+    Parameters
+    ----------
+    track : MeanTrack
+        The sheet.
+    along : float64 [channels, 3]
+        Directions of the channels.
+    either_sign : bool
+        True if a direction and its opposite mean the same: a scan may go to and fro.
+    """
+    assert track.across is not None
+    some = some_channels(len(along), _FITTED)
+    part, given = track.some(some), along[some]
+    assert part.across is not None
+    signs = [np.ones(len(given))]
+    if either_sign:
+        signs.append(_same_way(part, given))
+    fits = [
+        _smoothest(
+            (part.coordinate, part.across), sign[:, None] * given, track.is_closed, _ALONG_CLOSE
+        )
+        for sign in np.unique(signs, axis=0)
+    ]
+    spline, _ = min((fit for fit in fits if fit is not None), key=lambda fit: fit[1])
+    return replace(track, spline=spline)
+
+
+def _same_way(track: MeanTrack, along: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return signs that turn directions [channels, 3] into the same way along or across a sheet."""
+    assert track.across is not None
+    places = track.coordinate, track.across
+    toward = []
+    for axes_m in (track.tangents_m(*places), track.sideways_m(*places)):
+        length_m = np.maximum(np.linalg.norm(axes_m, axis=1), 1e-30)
+        toward.append(np.einsum("ci,ci->c", along, axes_m) / length_m)
+    clearest = max(toward, key=lambda each: float(np.abs(each).mean()))
+    return np.where(clearest < 0, -1.0, 1.0)
+
+
+def _smoothest(
+    coordinates: tuple[NDArray[np.float64], NDArray[np.float64]],
+    values: NDArray[np.float64],
+    closed: bool,
+    close: float,
+) -> tuple[BSpline, float] | None:
+    """Return the simplest sheet of values [n, 3] that is close to them, and its rms distance.
+
+    None with too few values.
+    """
+    best: BSpline | None = None
+    best_rms = np.inf
+    for intervals, powers in (_TRIED, *_REFINED):
+        if len(values) < _CHANNELS_PER_TERM * (intervals + 3) * powers:
+            continue
+        spline, rms = _fitted(coordinates, values, closed, intervals, powers)
+        if rms < 0.5 * best_rms:
+            best, best_rms = spline, rms
+        if best_rms <= close:
+            break
+    return None if best is None else (best, best_rms)
 
 
 def _follows_one_curve(lines: RangeLines) -> bool:

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from clsas.factorized.aperture import SampledLines, cycles_per_extent
+from clsas.factorized.beam_directions import BeamDirections, beam_rate
 from clsas.factorized.surface import Surface
-from clsas.factorized.tracks import MeanTrack
+from clsas.factorized.tracks import ACROSS_AT, ALONG_AT, MeanTrack
 from clsas.factorized.tree import (
     Bands,
     ChannelRanges,
@@ -18,6 +21,7 @@ from clsas.factorized.tree import (
     interpolated_channels,
 )
 from clsas.signal.interpolation import Interpolator
+from clsas.sonar.beam import BeamWindow
 
 
 def strip_channels(
@@ -97,6 +101,10 @@ class SheetRates:
     along: NDArray[np.float64]
     across: NDArray[np.float64]
 
+    def plus(self, factor: float, others: SheetRates) -> SheetRates:
+        """Return these rates and some times others."""
+        return SheetRates(self.along + factor * others.along, self.across + factor * others.across)
+
     def times(self, extents: NDArray[np.float64]) -> SheetRates:
         """Return the rates [roots, samples] of subimages of some extents, [roots, axes]."""
         return SheetRates(
@@ -135,6 +143,29 @@ def sheet_rates(
     return SheetRates(
         along.reshape(*shape, len(track.lines_along), -1).max(axis=-2),
         across.reshape(*shape, len(track.lines_across), -1).max(axis=-2),
+    )
+
+
+def sheet_beam_rates(
+    beam: BeamWindow,
+    track: MeanTrack,
+    directions: BeamDirections,
+    centres_m: NDArray[np.float64],
+    sides_m: NDArray[np.float64],
+) -> SheetRates:
+    """Return the largest phase rates of a beam's weights, [boxes, samples]: see `beam_rate`."""
+
+    def largest(lines: tuple[MeanTrack, ...], *, places: Sequence[tuple[Any, Any]]) -> NDArray:
+        rates = [
+            beam_rate(beam, line, directions.at(*np.broadcast_arrays(*place)), centres_m, sides_m)
+            for line, place in zip(lines, places, strict=True)
+        ]
+        return np.max(rates, axis=0)
+
+    along, across = track.lines_along, track.lines_across
+    return SheetRates(
+        largest(along, places=[(along[0].samples, at) for at in ALONG_AT]),
+        largest(across, places=[(at, across[0].samples) for at in ACROSS_AT]),
     )
 
 
@@ -234,7 +265,9 @@ def _of_sheet(
 ) -> VirtualChannels:
     position_m = track.positions_on_grid_m(found.columns, found.rows)
     position_m = position_m.reshape(len(position_m), -1, 3)
-    return VirtualChannels(found.coordinate, position_m, order, base, between, aperture, bands)
+    return VirtualChannels(
+        found.coordinate, position_m, order, base, between, aperture, bands, found.rows
+    )
 
 
 def all_channels(

@@ -31,7 +31,7 @@ class Work:
     reference
         Root subimages times channels, on the host.
     batch
-        Stages of batches of roots: launches, tables, transfers.
+        Stages of batches of roots: launches, tables, transfers; and of further strips.
     subimage
         Subimages, stage by stage.
     line

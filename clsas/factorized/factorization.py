@@ -33,9 +33,12 @@ class ExactImage:
     ----------
     accuracy_db : float
         Relative rms error of its interpolation.
+    reason : str
+        Why the image cannot be factorized, in words; "" if it can, but not faster.
     """
 
     accuracy_db: Number
+    reason: str = ""
     method: Literal["exact"] = "exact"
 
     sides: ClassVar[tuple[Size, ...]] = ()

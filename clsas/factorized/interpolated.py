@@ -7,7 +7,7 @@ interpolated from those of fewer, virtual channels; their lines are weighted sum
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Protocol
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +16,7 @@ from pydantic.dataclasses import dataclass
 
 from clsas.core import reprs
 from clsas.core.lines import RangeLines
-from clsas.factorized import tree, visibility
+from clsas.factorized import tree
 from clsas.factorized.dense_apertures import Shape
 from clsas.factorized.dense_channels import (
     SheetChannels,
@@ -51,9 +51,8 @@ class VisiblePhases(Protocol):
     def beam(self) -> BeamWindow | None:
         """The beam."""
 
-    @property
-    def beam_rates(self) -> NDArray[np.float64]:
-        """Cycles of the beam's weights per unit of the aperture coordinate."""
+    def beam_phase_cycles(self, visible: NDArray[np.bool_], *, most: bool = False) -> float:
+        """Return the cycles that a beam's weights count for, their mean or maximum; 0 without."""
 
     def visible(self, side: tuple[int, int]) -> NDArray[np.bool_]:
         """Return which track samples touch a subimage with their beam."""
@@ -66,22 +65,58 @@ class VisiblePhases(Protocol):
     ) -> float:
         """Return the visible phase cycles of subimages of a size, their mean or maximum."""
 
-    def visible_phase_cycles(
-        self, rates: NDArray[np.float64], visible: NDArray[np.bool_], *, most: bool = False
-    ) -> float:
-        """Return the phase accumulated along the visible aperture, its mean or maximum."""
-
     def virtual_channels(self, taps: Any, density: float, phase_cycles: Any) -> Any:
         """Return the number of virtual channels for some phase cycles."""
 
     def rows(
-        self, side: tuple[int, int], taps: int, density: float, *, most: bool = False
+        self,
+        side: tuple[int, int],
+        taps: float,
+        density: float,
+        beam_density: float = 0.0,
+        *,
+        most: bool = False,
     ) -> float:
         """Return the number of rows of virtual channels across a sheet; 1 without one."""
 
     @property
     def strips(self) -> int:
         """Number of curves that make the mean track."""
+
+
+class _Overhang(NamedTuple):
+    """Virtual channels past the aperture's ends, where filters extend beyond the last channel.
+
+    Each stage interpolates the virtual channels that the one before has there, and has more past
+    these. So they become more from stage to stage, as if filters had more taps.
+
+    Attributes
+    ----------
+    columns, rows : float
+        Virtual channels along the aperture, and across a sheet, without those past the ends.
+    taps_along, taps_across : float
+        Taps of filters that would extend as far.
+    """
+
+    columns: float
+    rows: float
+    taps_along: float
+    taps_across: float
+
+    @classmethod
+    def after(cls, before: _Overhang | None, columns: float, rows: float, taps: int) -> _Overhang:
+        """Return that of the next stage; `before` is None for the first."""
+        if before is None:
+            return cls(columns, rows, taps, taps)
+        # Those of the stage before count as fewer: virtual channels lie farther apart now.
+        along, across = (
+            taps + of_taps * min(now / max(then, 1e-9), 1.0)
+            for of_taps, now, then in (
+                (before.taps_along, columns, before.columns),
+                (before.taps_across, rows, before.rows),
+            )
+        )
+        return cls(columns, rows, along, across)
 
 
 @dataclass(frozen=True, eq=False, config=CONFIG)
@@ -197,8 +232,8 @@ class InterpolatedAperture:
         for oversampling, side in zip(self.oversampling, sides, strict=True):
             extents = oversampling * surface.extents_in(side, sides[0], roots)
             rate = np.einsum("ra,ars->rs", extents, rates)
-            if len(nodes) == len(sides) - 1:
-                rate += self._beam_rate(geometry, root_m)
+            if len(nodes) == len(sides) - 1 and geometry.beam is not None:
+                rate += self.beam_cycles * geometry.beam_rates(roots, root_m)
             nodes.append(interpolated(track, rate, place, self.filter))
             place = nodes[-1].coordinate
         return nodes
@@ -216,23 +251,14 @@ class InterpolatedAperture:
         parent: SheetChannels | None = None
         for oversampling, side in zip(self.oversampling, sides, strict=True):
             own = rates.times(oversampling * surface.extents_in(side, sides[0], roots))
-            if len(nodes) == len(sides) - 1:
-                own.along[:] += self._beam_rate(geometry, root_m)
+            if len(nodes) == len(sides) - 1 and geometry.beam is not None:
+                own = own.plus(self.beam_cycles, geometry.sheet_beam_rates(roots, root_m))
             if parent is not None:
                 virtual, parent = later_on_sheet(track, own, parent, self.filter)
             else:
                 virtual, parent = first_on_sheet(track, own, *places, self.filter)
             nodes.append(virtual)
         return nodes
-
-    def _beam_rate(
-        self, geometry: Geometry, root_m: NDArray[np.float64]
-    ) -> NDArray[np.float64] | float:
-        """Return the phase rate that the beam's weights count for, [roots, samples]; 0 without."""
-        if geometry.beam is None or geometry.along is None:
-            return 0.0
-        rate = visibility.beam_rate(geometry.beam, geometry.track, geometry.along, root_m)
-        return self.beam_cycles * rate
 
     def predicted_channels(
         self, model: VisiblePhases, sides: tuple[tuple[int, int], ...]
@@ -242,36 +268,39 @@ class InterpolatedAperture:
         found: list[StageChannels] = []
         everywhere_seen, bands = np.ones_like(model.visible(sides[0])), model.strips
         used = model.lines.channels * model.visible_share(sides[0])
+        before: _Overhang | None = None
         for level, (oversampling, side) in enumerate(zip(self.oversampling, sides, strict=True)):
             seen = model.visible(side)
-            if level:
-                before = self.oversampling[level - 1]
-                turns = before * model.subimage_phase_cycles(sides[level - 1], seen)
-                columns = model.virtual_channels(taps, density, turns)
-                used = min(
-                    found[-1].count, columns * model.rows(sides[level - 1], taps, density * before)
-                )
+            beam_cycles = self.beam_cycles if level == len(sides) - 1 else 0.0
+            dense = density * oversampling, density * beam_cycles
             turns = oversampling * model.subimage_phase_cycles(side, seen)
-            most_rows = model.rows(side, taps, density * oversampling, most=True)
+            turns += beam_cycles * model.beam_phase_cycles(seen)
+            past = _Overhang.after(before, density * turns, model.rows(side, 0, *dense), taps)
+            if before is not None:
+                parent, above = sides[level - 1], self.oversampling[level - 1]
+                seen_turns = above * model.subimage_phase_cycles(parent, seen)
+                columns = model.virtual_channels(before.taps_along, density, seen_turns)
+                rows = model.rows(parent, before.taps_across, density * above)
+                used = min(found[-1].count, columns * rows)
+            rows, most_rows = (
+                model.rows(side, past.taps_across, *dense, most=most) for most in (False, True)
+            )
             everywhere, most = (
                 most_rows
                 * (
-                    density * oversampling * model.subimage_phase_cycles(side, where, most=True)
-                    + model.strips * (taps + 2)
+                    dense[0] * model.subimage_phase_cycles(side, where, most=True)
+                    + dense[1] * model.beam_phase_cycles(where, most=True)
+                    + model.strips * (past.taps_along + 2)
                 )
                 for where in (everywhere_seen, seen)
             )
             if model.beam is not None:
-                if level == len(sides) - 1:
-                    turns += self.beam_cycles * model.visible_phase_cycles(model.beam_rates, seen)
-                    beam_cycles = model.visible_phase_cycles(model.beam_rates, seen, most=True)
-                    most += density * self.beam_cycles * beam_cycles
                 most *= 1 + BEAM_MARGIN
-            count = model.virtual_channels(taps, density, turns)
-            count *= model.rows(side, taps, density * oversampling)
+            count = rows * model.virtual_channels(past.taps_along, density, turns)
             summed = taps**self.dimensions * used / count
             if self.dimensions == 2 and level == 0:
                 bands = math.ceil(most_rows) + 2
+            before = past
             found.append(StageChannels(used, count, summed, everywhere, most, bands))
             if self.dimensions == 2:
                 bands = math.ceil(most_rows) + 3  # the rows, for the next stage

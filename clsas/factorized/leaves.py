@@ -15,9 +15,9 @@ from clsas.core.lines import RangeLines, wavelength_m
 from clsas.exact.groups import Groups
 from clsas.exact.lookup import lookup_options
 from clsas.exact.tiles import Tiles
-from clsas.factorized import visibility
 from clsas.factorized.buffers import Level, leaf_tables
 from clsas.factorized.sector import Geometry, Sector
+from clsas.factorized.tracks import MeanTrack
 from clsas.opencl.buffers import (
     Slot,
     beam_table,
@@ -104,14 +104,13 @@ class Leaves:
         """Start copying the tables of a sector's leaves to the device."""
         position_m = sector.positions_m(-1)
         rows = [float_pairs(position_m.reshape(-1, 3))]
-        if self.geometry.along is not None:
-            along = visibility.interpolated_directions(
-                self.geometry.track.samples, self.geometry.along, sector.nodes[-1].coordinate
-            )
+        if self.geometry.directions is not None:
+            nodes = sector.nodes[-1]
+            along = self.geometry.directions.at(nodes.coordinate, nodes.across)
             rows.append((along * self.beam.per_sine).astype(np.float32).reshape(-1, 3))
         values = {"geometry": np.concatenate(rows, axis=1).T} | self._parts(sector)
         if self.normalise:
-            values["represented"] = _represented(sector).reshape(1, -1)
+            values["represented"] = represented(sector, self.geometry.track).reshape(1, -1)
         parts = values["ranges"].size // 3
         points = values["offsets"].shape[1] if "offsets" in values else None
         tables = leaf_tables(len(rows[0]), parts, points, self.plan.beam)
@@ -166,20 +165,46 @@ class Leaves:
         return found
 
 
-def _represented(sector: Sector) -> NDArray[np.float32]:
+def represented(sector: Sector, track: MeanTrack) -> NDArray[np.float32]:
     """Return how many raw channels each virtual channel of the leaves stands for, [roots, n].
 
-    Cubics interpolate the beam's weights, which are smooth along the track. The stages' filters err
-    as little on average, but with the same sign on a function so smooth.
+    Cubics interpolate the beam's weights, which are smooth along the track and across a sheet. The
+    stages' filters err as little on average, but with the same sign on a function so smooth.
     """
-    nodes = sector.nodes[-1].coordinate
-    shares = np.empty(nodes.shape)
-    for root, (at, place) in enumerate(zip(nodes, sector.coordinate, strict=True)):
-        first = np.clip(np.searchsorted(at, place) - 2, 0, len(at) - 4)
-        index = first[:, None] + np.arange(4)
-        near = at[index]
-        weights = np.ones(near.shape)
-        for one, other in permutations(range(4), 2):
-            weights[:, one] *= (place - near[:, other]) / (near[:, one] - near[:, other])
+    nodes = sector.nodes[-1]
+    shares = np.empty(nodes.coordinate.shape)
+    strip = track.strip_of(sector.coordinate[0])
+    for root, (at, place) in enumerate(zip(nodes.coordinate, sector.coordinate, strict=True)):
+        if nodes.rows is not None and sector.across is not None:
+            columns = at[: len(at) // len(nodes.rows[root])]
+            column, along = _cubics(columns, place)
+            row, across = _cubics(nodes.rows[root], sector.across[root])
+            index = len(columns) * row[:, :, None] + column[:, None]
+            weights = across[:, :, None] * along[:, None]
+        elif nodes.bands is not None:
+            first = nodes.bands.first[root][strip]
+            index, weights = _cubics(at, place, first, first + nodes.bands.width[root][strip])
+        else:
+            index, weights = _cubics(at, place)
         shares[root] = np.bincount(index.ravel(), weights.ravel(), len(at))
     return shares.astype(np.float32)
+
+
+def _cubics(
+    at: NDArray[np.float64],
+    place: NDArray[np.float64],
+    first: NDArray[np.int64] | int = 0,
+    stop: NDArray[np.int64] | int | None = None,
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Return which four of ascending coordinates interpolate places, and their weights, [n, 4].
+
+    Those of each place are from `first` on, and before `stop`.
+    """
+    stop = len(at) if stop is None else stop
+    begin = np.clip(np.searchsorted(at, place) - 2, first, np.asarray(stop) - 4)
+    index = begin[:, None] + np.arange(4)
+    near = at[index]
+    weights = np.ones(near.shape)
+    for one, other in permutations(range(4), 2):
+        weights[:, one] *= (place - near[:, other]) / (near[:, one] - near[:, other])
+    return index, weights

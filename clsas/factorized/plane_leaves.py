@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -30,6 +31,9 @@ class PlaneLeaves(Leaves):
         on_cpu = device.info.kind == "cpu" and not self.normalise
         self.shared = device.share(image) if on_cpu else None
         layout = Tiles(plane, chosen.tile[0], self.width)
+        beam, along = self.geometry.beam, self.geometry.along
+        if beam is not None and along is not None:
+            layout = replace(layout, cosines=layout.cosines_in_beam(beam, along))
         options = self._options(layout)
         tile = {"TILE_ROWS": chosen.tile[0], "TILE_COLUMNS": chosen.tile[1]}
         self.expand = expansion_kernel(device, self.geometry.beam)

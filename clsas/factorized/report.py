@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 from clsas.core import reprs
 from clsas.core.tables import Report, Table
+from clsas.factorized.factorization import ExactImage
 
 if TYPE_CHECKING:
     from clsas.factorized.factorization import Factorization
@@ -48,9 +49,10 @@ def report(plan: Plan) -> Report:
     parts: list[str | Table] = [_headline(plan)]
     if plan.left_out:
         parts.append(f"Left out, far below the tolerance: {', '.join(plan.left_out)}")
-    if plan.is_exact:
-        reason = "" if plan.tolerance_db is None else ": no factorization is faster within it"
-        parts.append(f"Plain backprojection{reason}.")
+    if isinstance(plan.image, ExactImage):
+        reason = plan.image.reason or "no factorization is faster within the tolerance"
+        because = "" if plan.tolerance_db is None else f": {reason}"
+        parts.append(f"Plain backprojection{because}.")
     else:
         parts += [_filters(plan.factorization), _stages(plan.stages)]
     parts += ["Error by cause, with its margin; powers add up:", *plan.prediction.errors.describe()]

@@ -16,8 +16,14 @@ from clsas.core.geometry import pairwise_range_m
 from clsas.core.lines import RangeLines, some_channels
 from clsas.factorized import tree, visibility
 from clsas.factorized.aperture import cycles_per_extent, drift, own_drift, stretches
+from clsas.factorized.beam_directions import BeamDirections, beam_rate
 from clsas.factorized.dense_apertures import mean_track_of
-from clsas.factorized.dense_channels import SheetRates, all_channels, sheet_rates
+from clsas.factorized.dense_channels import (
+    SheetRates,
+    all_channels,
+    sheet_beam_rates,
+    sheet_rates,
+)
 from clsas.factorized.interpolated import BEAM_MARGIN
 from clsas.factorized.plan import Plan
 from clsas.factorized.surface import Surface
@@ -126,10 +132,11 @@ class Geometry:
             )
         self.channels = np.argsort(track.coordinate, kind="stable")
         self.track = track.some(self.channels)
+        self.directions: BeamDirections | None = None
         self.along: NDArray[np.float64] | None = None
         if beam is not None:
-            along = beam.directions(lines)[self.channels]
-            self.along = visibility.beam_directions(along, self.track, track.samples)
+            self.directions = BeamDirections.of(beam, beam.directions(lines), track)
+            self.along = self.directions.at(track.samples)
         self.phase_centres_m = lines.phase_centres_m[self.channels]
         self.drift, own = drift(lines), own_drift(lines)
         self.own_drift = own if own is None else own[self.channels]
@@ -292,6 +299,27 @@ class Geometry:
     def sheet_rates(self, roots: NDArray[np.int64], root_m: NDArray[np.float64]) -> SheetRates:
         """Return the largest phase rates of subimages in some roots, along and across a sheet."""
         return sheet_rates(self.track, *self._boxes(roots, root_m))
+
+    def beam_rates(
+        self, roots: NDArray[np.int64], root_m: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Return the phase rates of the beam's weights in some roots: see `beam_rate`."""
+        assert self.beam is not None
+        assert self.along is not None
+        return beam_rate(self.beam, self.track, self.along, root_m, self._sides_m(roots))
+
+    def sheet_beam_rates(self, roots: NDArray[np.int64], root_m: NDArray[np.float64]) -> SheetRates:
+        """Return the phase rates of the beam's weights in some roots, along and across a sheet."""
+        assert self.beam is not None
+        assert self.directions is not None
+        sides_m = self._sides_m(roots)
+        return sheet_beam_rates(self.beam, self.track, self.directions, root_m, sides_m)
+
+    def _sides_m(self, roots: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Return the sides of the largest of some roots, [axes, 3]."""
+        side = self.factorization.sides[0]
+        extents = self.surface.extents_in(side, side, roots).max(axis=0)
+        return extents[:, None] * self.surface.steps_m
 
     def _boxes(
         self, roots: NDArray[np.int64], root_m: NDArray[np.float64]

@@ -92,8 +92,9 @@ class SurfaceLeaves(Leaves):
             pixels = self._pixels(tables, count * size)
             self.device.run(
                 self.backproject,
-                (count,),
+                (self.device.in_whole_groups(count),),
                 lines=samples,
+                groups=count,
                 ranges=tables["ranges"],
                 first_range=groups.start - first,
                 centre_sample=self.level.centre,

@@ -20,8 +20,10 @@ from scipy.interpolate import BSpline
 _SAMPLES = 257  # of the track, at which rates are evaluated; half: errors 0.1 dB larger
 # Past either end, each twice as far as the one before; half: images up to 16 % slower.
 _SAMPLES_BEYOND = 12
-_ALONG_AT = (0.0, 0.5, 1.0)
-_ACROSS_AT = tuple(np.linspace(0, 1, 9))
+ALONG_AT = (0.0, 0.5, 1.0)
+"""Coordinates across a sheet of the lines along it at which rates are evaluated."""
+ACROSS_AT = tuple(np.linspace(0, 1, 9))
+"""Aperture coordinates of the lines across a sheet at which rates are evaluated."""
 STRIP_SAMPLES = 40
 """Samples of each of several strips, and of lines across a sheet."""
 APART = 16.0
@@ -47,6 +49,8 @@ class MeanTrack:
         Coordinate of each phase centre across a sheet, 0 to 1; None without a sheet.
     sampled : int
         Samples of each strip at which rates are evaluated.
+    is_closed : bool
+        True for a sheet whose first and last column coincide: a whole ring.
     """
 
     spline: BSpline
@@ -54,6 +58,7 @@ class MeanTrack:
     others: tuple[BSpline, ...] = ()
     across: NDArray[np.float64] | None = None
     sampled: int = _SAMPLES
+    is_closed: bool = False
 
     @property
     def strips(self) -> int:
@@ -196,12 +201,12 @@ class MeanTrack:
     @functools.cached_property
     def lines_along(self) -> tuple[MeanTrack, ...]:
         """Lines along a sheet at which phase rates are evaluated."""
-        return tuple(self.line_along(each) for each in _ALONG_AT)
+        return tuple(self.line_along(each) for each in ALONG_AT)
 
     @functools.cached_property
     def lines_across(self) -> tuple[MeanTrack, ...]:
         """Lines across a sheet at which phase rates are evaluated."""
-        return tuple(self.line_across(each) for each in _ACROSS_AT)
+        return tuple(self.line_across(each) for each in ACROSS_AT)
 
     @functools.cached_property
     def sampled_m(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -270,7 +275,7 @@ class MeanTrack:
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return coordinates along and across a sheet; `sight` are unit vectors to the points."""
         assert self.across is not None
-        sideways = self._sideways_m(self.coordinate, self.across)
+        sideways = self.sideways_m(self.coordinate, self.across)
         axes = np.stack([tangent, sideways])
         length = np.einsum("aci,aci->ac", axes, axes)
         toward = np.einsum("pci,aci->apc", sight, axes)
@@ -285,7 +290,7 @@ class MeanTrack:
             self.across + (second * square[0] - first * mixed) / determinant,
         )
 
-    def _sideways_m(
+    def sideways_m(
         self, coordinate: NDArray[np.float64], across: NDArray[np.float64]
     ) -> NDArray[np.float64]:
         """Return the derivative of a sheet's position by the coordinate across it, [..., 3]."""

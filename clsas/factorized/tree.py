@@ -71,6 +71,8 @@ class VirtualChannels:
         Filter that weights the contributions; None if each channel is added to a single one.
     bands : Bands or None
         The channels of strips, or of rows of a sheet; None for a single curve.
+    rows : float64 [roots, rows] or None
+        Coordinates across a sheet of the rows of virtual channels; None without one.
     """
 
     coordinate: NDArray[np.float64]
@@ -80,6 +82,14 @@ class VirtualChannels:
     between: NDArray[np.float64]
     aperture: Interpolator | None
     bands: Bands | None = None
+    rows: NDArray[np.float64] | None = None
+
+    @property
+    def across(self) -> NDArray[np.float64] | None:
+        """Coordinates across a sheet, [roots, virtual channels]; None without one."""
+        if self.rows is None:
+            return None
+        return np.repeat(self.rows, self.coordinate.shape[1] // self.rows.shape[1], axis=1)
 
     @property
     def taps(self) -> int:

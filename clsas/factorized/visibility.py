@@ -1,4 +1,4 @@
-"""Visibility along the track: directions of the beam, and the stretch that covers a subimage."""
+"""Visibility along the track: the stretch from which a beam covers a subimage."""
 
 from __future__ import annotations
 
@@ -6,41 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsas.factorized.tracks import MeanTrack
-from clsas.sonar.beam import BeamWindow
 from clsas.sonar.visibility import BeamTrack, Boxes
 
 _STEP = 2  # visibility is evaluated at every second sample of the track
 _MARGIN = 0.2  # of the step between two such samples, for what the beam does in between
-
-
-def beam_directions(
-    along: NDArray[np.float64], track: MeanTrack, coordinate: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Return unit directions at aperture coordinates, [..., 3], from the channels' own [n, 3]."""
-    order = np.argsort(track.coordinate, kind="stable")
-    return interpolated_directions(track.coordinate[order], along[order], coordinate)
-
-
-def interpolated_directions(
-    given: NDArray[np.float64], along: NDArray[np.float64], coordinate: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Return unit directions at aperture coordinates, [..., 3], from those at ascending `given`."""
-    between = np.stack([np.interp(coordinate, given, axis) for axis in along.T], axis=-1)
-    return between / np.linalg.norm(between, axis=-1, keepdims=True)
-
-
-def beam_rate(
-    beam: BeamWindow, track: MeanTrack, along: NDArray[np.float64], points_m: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Phase rate at which a beam's weights change along the track, [points, samples].
-
-    Virtual channels must sample the weights, too. An edge of the beam counts as one cycle. `along`
-    is the track's direction at `track.samples`.
-    """
-    sight = points_m[:, None] - track.sampled_m[0]
-    sight /= np.maximum(np.linalg.norm(sight, axis=-1, keepdims=True), 1e-9)
-    sine = np.einsum("psi,si->ps", sight, along)
-    return np.abs(np.gradient(sine, track.samples, axis=1)) / beam.edge
 
 
 def visible_stretches(

@@ -13,7 +13,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,42 +22,46 @@ from clsas.core.contrast import contrast
 from clsas.core.grid import Grid
 from clsas.core.image import Image
 from clsas.core.lines import RangeLines
-from clsas.navigation.checks import check_navigation
+from clsas.navigation.checks import check_navigation, mean_wavelength_m
 from clsas.navigation.drift import drift_m
-from clsas.navigation.gradient import phase_gradient_m, sharpest_m
+from clsas.navigation.gradient import disagreement_m, phase_gradient_m, sharpest_m
 from clsas.navigation.responses import (
     READ_DB,
     Contributions,
     Passage,
     brightest,
     contributions,
+    received_share,
 )
 from clsas.opencl.device import Device, open_device
 from clsas.planning.factorize import factorize
 from clsas.planning.planner import plan
 from clsas.signal.readout import Readout
-from clsas.signal.spectrum import cycles_per_m_at
 from clsas.sonar.beam import BeamWindow
 
 UNKNOWNS = ("sway", "heave", "surge")
 
 IMAGE_TOLERANCE_DB = -30.0
 """Tolerance of the images in between: errors far below responses."""
-MOST_DISAGREEMENT = 1 / 50
+MOST_DISAGREEMENT = 1 / 40
 """Wavelengths of range that halves of the responses may disagree about single pings. Responses of
-speckle disagree by 0.03 and more, bright ones by 0.01."""
+speckle disagree by 0.044 and more, bright ones by 0.011 to 0.016 (400 pings)."""
 
 _DRIFTS = 3  # times that drift is measured at most
-_NEIGHBOURHOODS = (2.0, 1.0)  # Fresnel lengths around responses, along the track
+_NEIGHBOURHOODS = (3.0, 2.0, 1.0)  # Fresnel lengths around responses, along the track
 _SWEEPS = 2  # times that single pings are moved at most
-_RESPONSES, _RESPONSES_FOR_DRIFT = 200, 40
+_RESPONSES, _FIRST_RESPONSES = 200, 40
+# Responses that a ping receives, on average, of those that drift is measured by. On a long track
+# too few leave a stretch off by half a wavelength; too many are no echoes, but side lobes.
+_RECEIVED_FOR_DRIFT = 18
 _OFFSETS = np.arange(-4.0, 5.0)  # samples in range, of which drift sees images
 _LEAST_RESPONSES = 8  # halves of which can agree
 _LEAST_GRADIENT = 0.05  # of range per displacement, rms
 _APART = 4.0  # range resolution cells between responses
-_DEVIATION_PER_MEDIAN = 1.4826  # of the magnitude of normal errors
 _GAIN = 1.02  # of sharpness, for which a step is repeated
-_LEAST_CYCLES = 0.02  # per sample, from lines about 0 Hz to those with a carrier
+_LARGE_CHANGE = 1 / 8  # wavelengths rms, likewise: finer steps find what smaller ones leave
+# Wavelengths rms, for which an image is formed. Less changes the sharpness by 0.2 % at most.
+_LEAST_CHANGE = 1 / 400
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,11 +157,22 @@ def autofocus(
     validate.progress(progress)
     names = _checked_unknowns(unknowns)
     check_navigation(lines, 10, "autofocus", may_stand=True)
-    readout = Readout.of(lines, READ_DB)
-    passage = Passage.of(lines, names, _mean_wavelength_m(readout))
+    readout = Readout.of(_of_unit_level(lines), READ_DB)
+    passage = Passage.of(lines, names, mean_wavelength_m(readout))
     focus = _Focus(readout, grid, passage, beam, open_device(device), progress)
     focus.check_geometry(names)
-    return focus.result()
+    found = focus.result()
+    return replace(found, lines=replace(found.lines, samples=lines.samples))
+
+
+def _of_unit_level(lines: RangeLines) -> RangeLines:
+    """Return lines whose largest sample is about 1: single precision holds squared intensities."""
+    largest = float(np.abs(lines.samples).max())
+    if not largest:
+        return lines
+    # A power of two changes no sample's digits.
+    scale = np.float32(2.0 ** -np.clip(math.frexp(largest)[1], -126, 126))
+    return replace(lines, samples=lines.samples * scale)
 
 
 def _checked_unknowns(unknowns: Sequence[str]) -> tuple[str, ...]:
@@ -166,17 +180,6 @@ def _checked_unknowns(unknowns: Sequence[str]) -> tuple[str, ...]:
     if not names or len(set(names)) < len(names):
         raise ValueError(f"unknowns must be one or several of {UNKNOWNS}, got {names}")
     return names
-
-
-def _mean_wavelength_m(readout: Readout) -> float:
-    """Return the wavelength at the centre of the lines' band, which may hold the carrier still."""
-    cycles_per_m = abs(cycles_per_m_at(readout.lines, readout.spectrum.centre))
-    if not cycles_per_m * readout.lines.range_step_m > _LEAST_CYCLES:
-        raise ValueError(
-            "carrier_hz must be that of the lines, or their samples must hold the carrier still; "
-            f"got {readout.lines.carrier_hz:g} Hz, and samples about 0 Hz"
-        )
-    return 2 / cycles_per_m
 
 
 class _Focus:
@@ -196,18 +199,21 @@ class _Focus:
         self.device, self.progress = device, progress
         self.moved_m = np.zeros((len(passage.axes), passage.pings))
         self.deviation_m = np.full(passage.pings, np.inf)
+        self.for_drift = _FIRST_RESPONSES
         oversampling = self.readout.spectrum.oversampling
         self.cell_m = lines.range_step_m * min(max(oversampling, 1.0), 64.0)
         self.steps: list[tuple[str, float]] = []
         # The track changes little between images, so that one plan does for all of them.
         self.plan = plan(lines, grid, tolerance_db=IMAGE_TOLERANCE_DB, beam=beam, device=device)
-        self.image = self._form(self.moved_m)
-        self.found: Contributions | None = None
-        self.sharpness = self.before = sharpness(self.image)
+        image = self._form(self.moved_m)
+        self.found: Contributions | None
+        self.before = sharpness(image)
+        self._keep(self.moved_m, image, self.before)
 
     def check_geometry(self, names: tuple[str, ...]) -> None:
-        """Refuse unknowns that the responses do not tell apart."""
-        found = self._responses
+        """Refuse unknowns that the responses do not tell apart; see how far along they are seen."""
+        found = self._contributions(self.points_m[:_FIRST_RESPONSES])
+        self.for_drift = math.ceil(_RECEIVED_FOR_DRIFT / received_share(found))
         weights = np.abs(found.values[..., 0]) ** 2
         total = max(float(weights.sum()), 1e-300)
         for name, gradient in zip(names, found.gradient, strict=True):
@@ -231,25 +237,23 @@ class _Focus:
 
     def result(self) -> Autofocus:
         """Focus, and return what was found."""
-        responses = self._responses.points if self.before else 0
+        responses = len(self.points_m) if self.before else 0
         if responses < _LEAST_RESPONSES:
             return self._unfocused(
                 f"the grid shows {responses} responses, at least {_LEAST_RESPONSES} are needed"
             )
         stages, dropped = list(self._stages()), ""
         for number, (name, find) in enumerate(stages, start=1):
-            # What gained nothing once gains nothing from the same image again.
+            # Nothing is gained twice from the same image, and little where little was.
             if name != dropped and not self._try(name, find):
                 dropped = name
             if self.progress is not None:
                 self.progress(number, len(stages))
-        wave_m = self.passage.wavelength_m
-        apart_m = self._disagreement_m()
-        if apart_m > MOST_DISAGREEMENT * wave_m:
+        apart = disagreement_m(self.passage, self._responses) / self.passage.wavelength_m
+        if apart > MOST_DISAGREEMENT:
             return self._unfocused(
                 f"one half of the responses and the other want the pings moved by displacements "
-                f"that differ by {apart_m / wave_m:.2g} wavelengths rms, at most "
-                f"{MOST_DISAGREEMENT:g}"
+                f"that differ by {apart:.2g} wavelengths rms, at most {MOST_DISAGREEMENT:g}"
             )
         return self._outcome(focused=True)
 
@@ -275,40 +279,27 @@ class _Focus:
             focused=focused,
         )
 
-    def _disagreement_m(self) -> float:
-        """Return how far apart in range two halves of the responses want single pings.
-
-        Responses of a scene agree, as they all see the one track. Brightest pixels of speckle can
-        be made brighter, but every one in its own way.
-        """
-        found = self._responses
-        first, second = (
-            sharpest_m(self.passage, found.of(some))[0]
-            for some in (slice(0, None, 2), slice(1, None, 2))
-        )
-        apart = first - second - np.median(first - second, axis=1, keepdims=True)
-        gradient = found.gradient[:, self.passage.lines.ping_starts]
-        apart_m = np.einsum("up,upk->pk", apart, gradient)
-        # The median passes over single pings that one half puts half a wavelength of path off.
-        return float(np.median(np.abs(apart_m))) * _DEVIATION_PER_MEDIAN / 2
-
     def _stages(self) -> Iterator[tuple[str, Callable[[], NDArray[np.float64] | None]]]:
         """Yield what is tried, from coarse to fine."""
         for _ in range(_DRIFTS):
             yield "drift between subapertures", self._drift
-        fresnel_m = self.passage.fresnel_length_m(self._responses)
-        for each_m in fresnel_m * np.array(_NEIGHBOURHOODS):
-            yield f"phase gradient within {each_m:.2g} m", partial(self._gradient, each_m)
+        yield "phase gradients", self._gradients
         for _ in range(_SWEEPS):
             yield "sharpness of single pings", self._pings
 
     def _drift(self) -> NDArray[np.float64] | None:
         offsets_m = self.given.range_step_m * _OFFSETS
-        found = self._contributions(_RESPONSES_FOR_DRIFT, offsets_m)
+        found = self._contributions(self.points_m[: self.for_drift], offsets_m)
         return drift_m(self.passage, found)
 
-    def _gradient(self, neighbourhood_m: float) -> NDArray[np.float64]:
-        return phase_gradient_m(self.passage, self._responses, neighbourhood_m)
+    def _gradients(self) -> NDArray[np.float64]:
+        found, total_m = self._responses, np.zeros_like(self.moved_m)
+        for neighbourhood in _NEIGHBOURHOODS:
+            if total_m.any():
+                found = self._contributions(self.points_m, moved_m=self.moved_m + total_m)
+            length_m = neighbourhood * self.passage.fresnel_length_m(found)
+            total_m = total_m + phase_gradient_m(self.passage, found, length_m)
+        return total_m
 
     def _pings(self) -> NDArray[np.float64]:
         found_m, self.deviation_m = sharpest_m(self.passage, self._responses)
@@ -318,32 +309,43 @@ class _Focus:
     def _responses(self) -> Contributions:
         """Contributions to the brightest responses of the present image."""
         if self.found is None:
-            self.found = self._contributions(_RESPONSES)
+            self.found = self._contributions(self.points_m)
         return self.found
 
     def _contributions(
-        self, count: int, offsets_m: NDArray[np.float64] | None = None
+        self,
+        points_m: NDArray[np.float64],
+        offsets_m: NDArray[np.float64] | None = None,
+        moved_m: NDArray[np.float64] | None = None,
     ) -> Contributions:
-        points_m = brightest(self.image, count, _APART * self.cell_m)
-        if not len(points_m):
-            points_m = self.grid.positions_m().reshape(-1, 3)[:1]
-        lines = self._lines(self.moved_m)
+        """Return contributions to points along the present track, or along another."""
+        lines = self._lines(self.moved_m if moved_m is None else moved_m)
         return contributions(self.passage, self.readout, lines, points_m, self.beam, offsets_m)
 
     def _try(self, name: str, find: Callable[[], NDArray[np.float64] | None]) -> bool:
-        """Keep a correction if it makes the image sharper; return whether it does so by much."""
+        """Keep a correction if it makes the image sharper; return whether it is worth another."""
         found_m = find()
         if found_m is None:
             return False
         moved_m = _detrended(self.moved_m + found_m, self.passage.along_m)
+        change_m = math.sqrt(float(np.mean(np.sum((moved_m - self.moved_m) ** 2, axis=0))))
+        change = change_m / self.passage.wavelength_m
+        if change <= _LEAST_CHANGE:
+            return False
         image = self._form(moved_m)
         reached = sharpness(image)
         self.steps.append((name, reached))
         before = self.sharpness
         if reached > before:
-            self.moved_m, self.image, self.sharpness = moved_m, image, reached
-            self.found = None
-        return reached > _GAIN * before
+            self._keep(moved_m, image, reached)
+        return reached > _GAIN * before and change > _LARGE_CHANGE
+
+    def _keep(self, moved_m: NDArray[np.float64], image: Image, reached: float) -> None:
+        """Hold a track, its image and its brightest responses."""
+        self.moved_m, self.sharpness, self.found = moved_m, reached, None
+        self.points_m = brightest(image, _RESPONSES, _APART * self.cell_m)
+        if not len(self.points_m):
+            self.points_m = self.grid.positions_m().reshape(-1, 3)[:1]
 
     def _form(self, moved_m: NDArray[np.float64]) -> Image:
         lines = self._lines(moved_m)

@@ -7,8 +7,28 @@ import numpy as np
 from clsas.core import validate
 from clsas.core.lines import RangeLines
 from clsas.core.pings import Transmissions
+from clsas.signal.readout import Readout
+from clsas.signal.spectrum import cycles_per_m_at
 
 _REMEDY = "lines.without_still_pings() drops them"
+_LEAST_CYCLES = 0.02  # per sample, from lines about 0 Hz to those with a carrier
+
+
+def mean_wavelength_m(readout: Readout) -> float:
+    """Return the wavelength at the centre of the lines' band, which may hold the carrier still.
+
+    Raises
+    ------
+    ValueError
+        If the lines tell no wavelength.
+    """
+    cycles_per_m = abs(cycles_per_m_at(readout.lines, readout.spectrum.centre))
+    if not cycles_per_m * readout.lines.range_step_m > _LEAST_CYCLES:
+        raise ValueError(
+            "carrier_hz must be that of the lines, or their samples must hold the carrier still; "
+            f"got {readout.lines.carrier_hz:g} Hz, and samples about 0 Hz"
+        )
+    return 2 / cycles_per_m
 
 
 def check_navigation(lines: RangeLines, least_pings: int, purpose: str, *, may_stand: bool) -> None:

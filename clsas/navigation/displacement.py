@@ -17,6 +17,7 @@ import scipy.fft
 from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
 
+from clsas.core.conditioning import are_dead
 from clsas.core.lines import RangeLines
 from clsas.navigation.directions import Alignment, Frame, alignment, ranges_m
 from clsas.navigation.overlap import Array, Overlap
@@ -111,6 +112,18 @@ class Correlator:
         self.step_m = lines.range_step_m
         counts = np.maximum(np.diff(swath.edges_m) / self.step_m, 1.0)
         self.samples = counts.astype(np.int64)
+
+    @cached_property
+    def heard(self) -> NDArray[np.bool_]:
+        """False for channels that are dead beside the others of their ping, [channels].
+
+        A ping without any echo is not: its pairs are not coherent.
+        """
+        lines = self.readout.lines
+        samples = lines.samples
+        power = np.einsum("cs,cs->c", samples, samples.conj(), dtype=np.complex128).real
+        usual = np.array([np.median(each) for each in np.split(power, lines.ping_starts[1:])])
+        return ~(are_dead(power, usual[lines.ping_numbers]) & (usual[lines.ping_numbers] > 0))
 
     @cached_property
     def independent(self) -> NDArray[np.float64]:

@@ -14,8 +14,10 @@ from collections.abc import Sequence
 
 import numpy as np
 import scipy.fft
+import scipy.linalg
 from numpy.typing import NDArray
 
+from clsas.core.phasors import phasors
 from clsas.navigation.responses import Contributions, Passage
 
 _LENGTH = 1.5
@@ -60,7 +62,8 @@ def drift_m(passage: Passage, found: Contributions) -> NDArray[np.float64] | Non
         some = channels[each]
         at_m = channel_m[some] - starts_m[each]
         taper = np.sin(np.pi * at_m / length_m) ** 2
-        turn = (taper * np.exp(-2j * np.pi * frequency[:, None] * at_m)).astype(np.complex64)
+        cycles = frequency[:, None] * at_m
+        turn = taper.astype(np.float32) * phasors((-2 * np.pi * cycles).astype(np.float32))
         values = found.values[some]
         # Products of small matrices keep to one thread: waiting for others takes longer.
         image = turn @ values.transpose(1, 0, 2)
@@ -129,21 +132,22 @@ def _shifts(
     """
     size = [scipy.fft.next_fast_len(2 * images[0].shape[axis]) for axis in (1, 2)]
     spectra: dict[int, NDArray[np.complex64]] = {}
-    shifts = np.zeros((len(pairs), len(groups)))
-    for number, (first, second) in enumerate(pairs):
+    products = []
+    for first, second in pairs:
         for each in (first, second):
             if each not in spectra:
                 spectra[each] = scipy.fft.rfftn(images[each], s=size, axes=(1, 2))
                 spectra.pop(each - max(_LAGS) - 1, None)
         both = spectra[first].conj() * spectra[second]
-        for of, group in enumerate(groups):
-            power = scipy.fft.irfftn(both[group].sum(axis=0), s=size)
-            row, column = np.unravel_index(int(np.argmax(power)), power.shape)
-            before, at, after = (power[(row + n) % size[0], column] for n in (-1, 0, 1))
-            bend = before - 2 * at + after
-            shifts[number, of] = (row + size[0] // 2) % size[0] - size[0] // 2
-            shifts[number, of] += 0.5 * (before - after) / bend if bend < 0 else 0.0
-    return shifts
+        products.append([both[group].sum(axis=0) for group in groups])
+    power = scipy.fft.irfftn(np.array(products), s=size, axes=(2, 3))
+    peaks = np.argmax(power.reshape(*power.shape[:2], -1), axis=2)
+    row, column = np.unravel_index(peaks, size)
+    pair, group = np.ogrid[: len(pairs), : len(groups)]
+    before, at, after = (power[pair, group, (row + n) % size[0], column] for n in (-1, 0, 1))
+    bend = before - 2 * at + after
+    fraction = np.where(bend < 0, 0.5 * (before - after) / np.where(bend < 0, bend, 1.0), 0.0)
+    return (row + size[0] // 2) % size[0] - size[0] // 2 + fraction
 
 
 def _slopes(
@@ -185,7 +189,8 @@ def _slopes(
     level = np.kron(np.eye(unknowns), np.full(count, 1 / count))
     design = np.concatenate([design.reshape(-1, unknowns * count), level])
     right = np.concatenate([right.ravel(), np.zeros(unknowns)])
-    return np.linalg.lstsq(design, right, rcond=None)[0].reshape(unknowns, count)
+    found = scipy.linalg.lstsq(design, right, lapack_driver="gelsy", check_finite=False)[0]
+    return found.reshape(unknowns, count)
 
 
 def _integrated(

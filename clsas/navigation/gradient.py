@@ -10,12 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
+from clsas.core.phasors import phasors
 from clsas.navigation.responses import Contributions, Passage
 
 _PASSES = 3  # of alternating least squares: steps of the track, and the responses' own slopes
 _TRIED = 9  # displacements within half a wavelength: 4 per cycle of the sharpness
 _NEWTON = 3  # steps from the best of them
 _SWEEPS = 2  # over all pings
+_DEVIATION_PER_MEDIAN = 1.4826  # of the magnitude of normal errors
 _BLOCKS = 16  # of pings that are moved together: few enough to leave the sum over the others
 
 
@@ -55,7 +57,7 @@ def phase_gradient_m(
 
 
 def _phase(product: NDArray[np.complex64], expected: NDArray[np.float64]) -> NDArray[np.float32]:
-    return np.angle(product * np.exp(-1j * expected.astype(np.float32)))
+    return np.angle(product * phasors(-expected.astype(np.float32)))
 
 
 def _turns(passage: Passage, found: Contributions) -> NDArray[np.float64]:
@@ -95,10 +97,10 @@ def sharpest_m(
         for some in np.array_split(order, min(_BLOCKS, pings)):
             for axis, turn in enumerate(turns[:, some]):
                 others = total - turned[some]
-                mine = turned[some] * np.exp(-1j * turn * moved_m[axis, some, None])
+                mine = turned[some] * phasors(-turn * moved_m[axis, some, None])
                 level = np.abs(others) ** 2 + np.abs(mine) ** 2
                 best_m = _sharpest(level, others.conj() * mine, turn, furthest_m)
-                mine *= np.exp(1j * turn * best_m[:, None])
+                mine *= phasors(turn * best_m[:, None])
                 total = total + np.sum(mine - turned[some], axis=0)
                 moved_m[axis, some], turned[some] = best_m, mine
     mean = total / pings
@@ -106,6 +108,26 @@ def sharpest_m(
     information = 2 * np.einsum("apk,k->ap", turns**2, np.abs(mean) ** 2).astype(np.float64)
     variance = np.sum(noise / np.maximum(information, 1e-300), axis=0)
     return np.einsum("pau,ap->up", directions, moved_m), np.sqrt(variance)
+
+
+def disagreement_m(passage: Passage, found: Contributions) -> float:
+    """Return how far apart in range two halves of the responses want single pings, metres.
+
+    Responses of a scene agree, as they all see the one track. Brightest pixels of speckle can be
+    made brighter, but every one in its own way. It is a median over ways to halve them: a single
+    one may put most of the bright ones into one half.
+    """
+    quarter = np.arange(found.points) % 4
+    gradient = found.gradient[:, passage.lines.ping_starts]
+    apart_m = []
+    for other in (1, 2, 3):
+        first = (quarter == 0) | (quarter == other)
+        moved_m = [sharpest_m(passage, found.of(some))[0] for some in (first, ~first)]
+        apart = moved_m[0] - moved_m[1]
+        apart -= np.median(apart, axis=1, keepdims=True)
+        # This median passes over single pings that one half puts half a wavelength of path off.
+        apart_m.append(np.median(np.abs(np.einsum("up,upk->pk", apart, gradient))))
+    return float(np.median(apart_m)) * _DEVIATION_PER_MEDIAN / 2
 
 
 def _directions(turns: NDArray[np.float64], weights: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -129,8 +151,8 @@ def _sharpest(
     and `turn` are [pings, points].
     """
     step_m = 2 * furthest_m / (_TRIED - 1)
-    rotation = np.exp(1j * turn * step_m)
-    tried = cross * np.exp(-1j * turn * furthest_m)
+    rotation = phasors(turn * np.float32(step_m))
+    tried = cross * phasors(-turn * np.float32(furthest_m))
     sharpness = np.empty((_TRIED, len(cross)), np.float32)
     for number in range(_TRIED):
         sharpness[number] = np.sum((level + 2 * tried.real) ** 2, axis=1)
@@ -138,7 +160,7 @@ def _sharpest(
     first_m = np.float32(step_m) * np.argmax(sharpness, axis=0).astype(np.float32) - furthest_m
     moved_m = first_m.copy()
     for _ in range(_NEWTON):
-        at = cross * np.exp(1j * turn * moved_m[:, None])
+        at = cross * phasors(turn * moved_m[:, None])
         intensity = level + 2 * at.real
         slope = -2 * turn * at.imag
         bend = np.sum(slope**2 - 2 * intensity * turn**2 * at.real, axis=1)

@@ -11,16 +11,17 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from clsas.core import reprs, validate
+from clsas.core.conditioning import DEAD_DB
 from clsas.core.lines import RangeLines
-from clsas.navigation.checks import check_navigation
+from clsas.navigation.accuracy import Accuracy, check_plausible
+from clsas.navigation.checks import check_navigation, mean_wavelength_m
 from clsas.navigation.displacement import Correlator
 from clsas.navigation.overlap import Array, moved
 from clsas.navigation.passes import Displacements, measured
 from clsas.navigation.smoother import Step, persistence, shape_deviation_m, smooth
-from clsas.navigation.swath import Swath
+from clsas.navigation.swath import Swath, check_sizes, checked_swath
 from clsas.signal.compression import compress
 from clsas.signal.echoes import Echoes
-from clsas.signal.spectrum import measure_spectrum
 from clsas.sonar.track import Track
 
 UNKNOWNS = ("sway", "yaw", "surge")
@@ -28,9 +29,6 @@ YAW_SD_RAD = math.radians(1.0)
 """Standard deviation of a navigation's yaw, unless given."""
 
 _LEAST_SHARE = 0.25  # of the pairs of pings, that must be coherent
-_LEAST_DEVIATION, _MOST_DEVIATION = 1e-9, 1e6  # of a navigation, metres and radians
-_LEAST_WINDOW = 16  # samples
-_WINDOW_CELLS = 150.0  # range resolution cells of a window, unless given
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,6 +85,10 @@ class Micronavigation:
 
         An image is as sharp as this is small: a shift and a turn of the whole track move and turn
         the image. NaN if echoes of some pings were not coherent.
+
+        It does not hold errors that all windows of range share, such as a constant error of yaw,
+        which bends the whole track. Over 5000 points of speckle and 100 pings the error was 2.2,
+        2.0 and 0.7 times this, for three seeds: yaw erred by 10, 12 and 2 microradians per ping.
         """
         deviations = self.sway_steps_sd_m, self.yaw_steps_sd_rad
         if not all(np.isfinite(each).all() for each in deviations):
@@ -171,8 +173,9 @@ def micronavigate(
     Warns
     -----
     ClsasWarning
-        If some pairs of pings are not coherent: the navigation bridges them. If the track turns
-        back, so that pings may be out of order.
+        If some pairs of pings are not coherent: the navigation bridges them. If channels are dead:
+        they are left out. If what is found is far beyond the accuracy of the navigation. If the
+        track turns back, so that pings may be out of order.
 
     Notes
     -----
@@ -196,17 +199,23 @@ def micronavigate(
     names = _checked_unknowns(unknowns)
     check_navigation(lines, 2, "micronavigation", may_stand=False)
     array = Array.of(lines)
-    swath = _swath(lines, range_m, window_m, side, seabed_z_m, element_length_m)
-    fixes = _fixes(
-        array.pings,
-        {"sway_sd_m": sway_sd_m, "yaw_sd_rad": yaw_sd_rad, "surge_sd_m": surge_sd_m},
-        correlation_pings,
-    )
+    swath = checked_swath(lines, range_m, window_m, side, seabed_z_m, element_length_m)
+    accuracy = Accuracy.of(array.pings, sway_sd_m, yaw_sd_rad, surge_sd_m, correlation_pings)
     longest_m = float(np.diff(swath.edges_m).max())
     most_step_m = validate.number("most_step_m", most_step_m, "m", above=0.0, most=longest_m)
     correlator = Correlator(lines, swath)
-    found = measured(lines, array, correlator, names, fixes[:, :2], most_step_m, progress)
-    return _result(lines, array, swath, found, fixes)
+    check_sizes(lines, array, swath, mean_wavelength_m(correlator.readout))
+    dead = int((~correlator.heard).sum())
+    if dead:
+        validate.warn(
+            f"{dead} of {lines.channels} channels hold no signal, or {-DEAD_DB:.0f} dB less than "
+            f"others of their ping (the first is channel {int(np.argmin(correlator.heard))}): they "
+            "are left out of what is correlated"
+        )
+    found = measured(
+        lines, array, correlator, names, accuracy.deviations[:, :2], most_step_m, progress
+    )
+    return _result(lines, array, swath, found, accuracy)
 
 
 def _checked_unknowns(unknowns: Sequence[str]) -> tuple[str, ...]:
@@ -221,24 +230,22 @@ def _result(
     array: Array,
     swath: Swath,
     found: Displacements,
-    fixes: NDArray[np.float64],
+    accuracy: Accuracy,
 ) -> Micronavigation:
-    """Fuse displacements with the navigation; `fixes` are [pings, 3]: sway, yaw and surge."""
+    """Fuse displacements with the navigation."""
     _check_coherence(found)
     count = len(found.moved)
     misfit = max(float(found.misfit[found.coherent].mean()), 1.0)
     persist = persistence(found.scatter[found.coherent])
-    # Errors of a navigation between two pings are no larger than those of both.
-    bridged = 2 * fixes[:-1] ** 2
-    steps, along = [], []
-    for ping in range(count):
-        covariance, deviation_m = persist * misfit * found.covariance[ping], found.surge_sd_m[ping]
-        if not found.coherent[ping]:
-            covariance, deviation_m = np.diag(bridged[ping, :2]), math.sqrt(bridged[ping, 2])
-        steps.append(Step.over(found.moved[ping], covariance, found.levers_m[ping]))
-        along.append(Step.along(found.surge_m[ping], deviation_m))
-    states, covariances = smooth(steps, fixes[:, :2])
-    surges, spreads = smooth(along, fixes[:, 2:])
+    steps: list[Step | None] = [None] * count
+    along: list[Step | None] = [None] * count
+    for ping in np.flatnonzero(found.coherent).tolist():
+        covariance = persist * misfit * found.covariance[ping]
+        steps[ping] = Step.over(found.moved[ping], covariance, found.levers_m[ping])
+        along[ping] = Step.along(found.surge_m[ping], found.surge_sd_m[ping])
+    states, covariances = smooth(steps, accuracy.deviations[:, :2], accuracy.correlation_pings)
+    surges, spreads = smooth(along, accuracy.deviations[:, 2:], accuracy.correlation_pings)
+    check_plausible(np.concatenate([states, surges], axis=1), accuracy)
     corrected = moved(lines, array, states[:, 0], states[:, 1], surges[:, 0])
     at = Array.of(corrected)
     heading = np.arctan2(at.forward[:, 1], at.forward[:, 0])
@@ -271,87 +278,11 @@ def _check_coherence(found: Displacements) -> None:
         raise ValueError(
             f"lines must be coherent from ping to ping; {without} of {len(found.coherent)} pairs "
             f"of pings are not: their coherence is at most {found.coherence.max():.2f} in any "
-            f"window. Check range_m, and the navigation's advance from ping to ping"
+            f"window, and {found.least_coherence.min():.2f} at least is needed to tell echoes from "
+            f"noise. Check range_m, and the navigation's advance from ping to ping"
         )
     if without:
         validate.warn(
             f"{without} of {len(found.coherent)} pairs of pings are not coherent (the first after "
             f"ping {int(np.argmin(found.coherent))}): the navigation's accuracy bridges them"
         )
-
-
-def _swath(
-    lines: RangeLines,
-    range_m: tuple[float, float] | None,
-    window_m: float | None,
-    side: str,
-    seabed_z_m: float | None,
-    element_length_m: float | tuple[float, float] | None,
-) -> Swath:
-    """Return the swath of checked arguments."""
-    validate.one_of("side", side, ("port", "starboard"))
-    nearest, farthest = float(lines.first_range_m.max()), float(lines.last_range_m.min())
-    if range_m is None:
-        # Rays are read where every channel has samples, whatever it is displaced.
-        spare = 0.02 * (farthest - nearest)
-        near, far = nearest + spare, farthest - spare
-    else:
-        near, far = map(float, validate.array("range_m", range_m, np.float64, (2,)))
-    if not nearest <= near < far <= farthest:
-        raise ValueError(
-            f"range_m must lie within what every channel has, {nearest:.6g} to {farthest:.6g} m, "
-            f"got ({near:.6g}, {far:.6g})"
-        )
-    if window_m is None:
-        cell_m = lines.range_step_m * max(measure_spectrum(lines).oversampling, 1.0)
-        window_m = min(_WINDOW_CELLS * cell_m, far - near)
-    window_m = validate.number(
-        "window_m",
-        window_m,
-        "m",
-        least=_LEAST_WINDOW * lines.range_step_m,
-        most=(far - near) * (1 + 1e-9),
-    )
-    if seabed_z_m is not None:
-        seabed_z_m = validate.number("seabed_z_m", seabed_z_m, "m")
-        height_m = float(np.abs(lines.phase_centres_m[:, 2] - seabed_z_m).max())
-        if height_m >= near:
-            raise ValueError(
-                f"seabed_z_m must lie less than the nearest range of {near:.4g} m from the sonar's "
-                f"height, got {height_m:.4g} m: rays must reach the seabed beside it"
-            )
-    lengths = None
-    if element_length_m is not None:
-        given = np.atleast_1d(validate.array(
-            "element_length_m", np.ravel(element_length_m), np.float64, (None,)))  # fmt: skip
-        if given.size > 2 or given.min() <= 0:
-            raise ValueError(
-                "element_length_m must be one or two lengths above 0 m, got "
-                f"{validate.shown(element_length_m)}"
-            )
-        lengths = float(given[0]), float(given[-1])
-    windows = max(int((far - near) / window_m + 1e-9), 1)
-    edges = np.linspace(near, far, windows + 1)
-    return Swath(edges, 1 if side == "port" else -1, seabed_z_m, lengths)
-
-
-def _fixes(
-    pings: int, deviations: dict[str, ArrayLike], correlation_pings: float | None
-) -> NDArray[np.float64]:
-    """Return the navigation's standard deviations as independent measurements, [pings, n].
-
-    Errors that persist over n pings average out like white ones that are sqrt(2 n) times as large.
-    """
-    persist = float(pings)
-    if correlation_pings is not None:
-        persist = validate.number("correlation_pings", correlation_pings, "pings", least=0.5)
-    found = []
-    for name, value in deviations.items():
-        checked = validate.array(name, value, np.float64, (pings,), broadcast=True)
-        if checked.min() < _LEAST_DEVIATION or checked.max() > _MOST_DEVIATION:
-            wrong = checked.min() if checked.min() < _LEAST_DEVIATION else checked.max()
-            raise ValueError(
-                f"{name} must be from {_LEAST_DEVIATION:g} to {_MOST_DEVIATION:g}, got {wrong:g}"
-            )
-        found.append(checked * math.sqrt(2 * persist))
-    return np.stack(found, axis=1)

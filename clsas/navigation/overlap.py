@@ -118,10 +118,17 @@ class Overlap:
         return len(self.first)
 
 
-def overlap(lines: RangeLines, array: Array, ping: int) -> Overlap:
-    """Return the overlap of a ping with the next."""
+def overlap(
+    lines: RangeLines, array: Array, ping: int, heard: NDArray[np.bool_] | None = None
+) -> Overlap:
+    """Return the overlap of a ping with the next, of the channels [channels] that are `heard`."""
     centres_m, forward = lines.phase_centres_m, array.forward[ping]
     here, there = array.channels(ping), array.channels(ping + 1)
+    if heard is not None:
+        here, there = here[heard[here]], there[heard[there]]
+    if min(len(here), len(there)) < 2:
+        none = np.zeros(0, np.int64)
+        return Overlap(none, none, np.zeros(0), array.reference_m[ping])
     origin_m = array.reference_m[ping]
     at, at_next = ((centres_m[each] - origin_m) @ forward for each in (here, there))
     order = np.argsort(at_next, kind="stable")

@@ -50,6 +50,8 @@ class Displacements:
         Pairs of channels that share a phase centre.
     coherent : bool [pings - 1]
         False where no window is more coherent than noise would be.
+    least_coherence : float64 [windows]
+        What noise would not reach.
     """
 
     moved: NDArray[np.float64]
@@ -62,6 +64,7 @@ class Displacements:
     scatter: NDArray[np.float64]
     pairs: NDArray[np.int64]
     coherent: NDArray[np.bool_]
+    least_coherence: NDArray[np.float64]
 
 
 def measured(
@@ -69,11 +72,13 @@ def measured(
     array: Array,
     correlator: Correlator,
     unknowns: tuple[str, ...],
-    fixes: NDArray[np.float64],
+    accuracy: NDArray[np.float64],
     most_step_m: float,
     progress: Callable[[int, int], None] | None,
 ) -> Displacements:
-    """Return the displacements between all pings; `fixes` are those of sway and yaw for `smooth`.
+    """Return the displacements between all pings.
+
+    `accuracy` holds the navigation's standard deviations of sway and yaw, [pings, 2].
 
     Every pass aligns the channels by all that was found before it: what is left is small, and
     linear in the displacement. Where the advance differs from the navigation's, channels are then
@@ -81,7 +86,8 @@ def measured(
     """
     yaw = "yaw" in unknowns
     # Without yaw the track does not turn as a whole either.
-    passes = _Passes(lines, array, correlator, fixes if yaw else fixes * [1.0, 0.0], progress)
+    accuracy = accuracy if yaw else accuracy * [1.0, 0.0]
+    passes = _Passes(lines, array, correlator, accuracy, progress)
     passes.settle(most_step_m)
     passes.narrow()
     deviation_m = np.zeros(array.pings - 1)
@@ -130,11 +136,11 @@ class _Passes:
         lines: RangeLines,
         array: Array,
         correlator: Correlator,
-        fixes: NDArray[np.float64],
+        accuracy: NDArray[np.float64],
         progress: Callable[[int, int], None] | None,
     ) -> None:
         self.lines, self.array, self.correlator = lines, array, correlator
-        self.fixes, self.yaw = fixes, bool(np.any(fixes[:, 1] > 0))
+        self.accuracy, self.yaw = accuracy, bool(np.any(accuracy[:, 1] > 0))
         self.progress = _Progress(progress)
         count = array.pings - 1
         self.moved, self.surge_m = np.zeros((count, 2)), np.zeros(count)
@@ -189,7 +195,7 @@ class _Passes:
         corrected, here = self._corrected()
         found = np.zeros((len(self.overlaps), 2))
         for ping in np.flatnonzero(self.coherent).tolist():
-            pairs = overlap(corrected, here, ping)
+            pairs = overlap(corrected, here, ping, self.correlator.heard)
             found[ping] = surge(self.correlator, corrected, here, pairs, self.directions)
             self.progress.done(ping + 1, self.array.pings - 1)
         return found[:, 0], found[:, 1]
@@ -208,6 +214,7 @@ class _Passes:
             scatter=np.stack([step.scatter for step in self.steps]),
             pairs=np.array([each.pairs for each in self.overlaps]),
             coherent=self.coherent,
+            least_coherence=self._least_coherence,
         )
 
     def _corrected(self) -> tuple[RangeLines, Array]:
@@ -222,14 +229,15 @@ class _Passes:
                 Step.over(each, np.zeros((2, 2)), levers_m)
                 for each, levers_m in zip(self.moved, self._levers_m(there), strict=True)
             ],
-            self.fixes,
+            self.accuracy,
         )
         corrected = moved(advanced, there, states[:, 0], states[:, 1], none)
         return corrected, Array.of(corrected)
 
     def _paired(self, lines: RangeLines, array: Array) -> list[Overlap]:
         """Return the overlaps of all pings; refuse those of too few channels."""
-        found = [overlap(lines, array, ping) for ping in range(array.pings - 1)]
+        heard = self.correlator.heard
+        found = [overlap(lines, array, ping, heard) for ping in range(array.pings - 1)]
         fewest = int(np.argmin([each.pairs for each in found]))
         if found[fewest].pairs < LEAST_PAIRS:
             advance_m = np.linalg.norm(np.diff(array.reference_m[fewest : fewest + 2], axis=0))
@@ -255,5 +263,8 @@ class _Passes:
 
     def _is_coherent(self, step: Displacement) -> bool:
         """Return whether any window is more coherent than noise would be."""
-        noise = 1 / np.sqrt(self.correlator.independent)
-        return bool(np.any(step.coherence > _LEAST_COHERENCE * noise))
+        return bool(np.any(step.coherence > self._least_coherence))
+
+    @property
+    def _least_coherence(self) -> NDArray[np.float64]:
+        return _LEAST_COHERENCE / np.sqrt(self.correlator.independent)

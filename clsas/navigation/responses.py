@@ -14,6 +14,8 @@ from clsas.core.geometry import pairwise_range_m
 from clsas.core.grid import Grid
 from clsas.core.image import Image
 from clsas.core.lines import RangeLines, wavelength_m
+from clsas.core.phasors import phasors
+from clsas.core.threads import in_threads
 from clsas.signal.readout import Readout
 from clsas.sonar.beam import BeamWindow
 from clsas.sonar.directions import track_directions
@@ -21,7 +23,7 @@ from clsas.sonar.visibility import sines
 
 READ_DB = -40.0
 """Accuracy of what is read of the lines."""
-_READ_AT_ONCE = 1 << 21  # samples: bounds the memory
+_READ_AT_ONCE = 1 << 17  # samples of a thread: bounds the memory
 
 
 def directions(lines: RangeLines, unknowns: tuple[str, ...]) -> NDArray[np.float64]:
@@ -133,7 +135,7 @@ class Contributions:
         """Number of points."""
         return self.values.shape[1]
 
-    def of(self, points: slice) -> Contributions:
+    def of(self, points: NDArray[np.bool_]) -> Contributions:
         """Return the contributions to some of the points."""
         return Contributions(
             self.values[:, points], self.gradient[:, :, points], self.range_m[:, points]
@@ -158,7 +160,8 @@ def contributions(
     gradient, range_m = np.empty((len(passage.axes), *shape)), np.empty(shape)
     along = None if beam is None else beam.directions(lines)
     step = max(_READ_AT_ONCE // max(len(points_m) * len(offsets_m), lines.length), 1)
-    for first in range(0, lines.channels, step):
+
+    def read(first: int) -> None:
         some = np.arange(first, min(first + step, lines.channels))
         part = lines.select(slice(int(some[0]), int(some[-1]) + 1))
         gradient[:, some] = _gradient(points_m, part, passage.axes[:, passage.ping[some]])
@@ -169,12 +172,26 @@ def contributions(
         at_m = (path_m[..., None] + offsets_m).reshape(len(some), -1)
         turns = lines.carrier_cycles_per_m * at_m
         phase = (2 * np.pi * (turns - np.rint(turns))).astype(np.float32)
-        read = readout.read(some, at_m) * np.exp(1j * phase)
-        values[some] = read.reshape(len(some), len(points_m), -1)
+        received = readout.read(some, at_m) * phasors(phase)
+        values[some] = received.reshape(len(some), len(points_m), -1)
         if beam is not None and along is not None:
             sine = sines(points_m, part.phase_centres_m, along[some])
             values[some] *= beam.weights(sine, wavelength_m(lines))[..., None]
+
+    for _ in in_threads(read, range(0, lines.channels, step)):
+        pass
     return Contributions(values, gradient, range_m)
+
+
+def received_share(found: Contributions) -> float:
+    """Return the share of the channels that receive a response: the median over the responses.
+
+    Channels with equal power count fully, others less: (sum p)^2/(n sum p^2).
+    """
+    power = np.square(np.abs(found.values[..., 0]), dtype=np.float64)
+    total, squares = power.sum(axis=0), np.sum(power**2, axis=0)
+    share = total**2 / np.maximum(len(power) * squares, 1e-300)
+    return float(np.clip(np.median(share), 1 / len(power), 1.0))
 
 
 def _gradient(

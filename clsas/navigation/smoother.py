@@ -8,9 +8,11 @@ relates both states linearly:
     sway' = sway + yaw l - yaw' l' + a,
 
 with the measured sway a and yaw b, and l, l' the distances from either array's middle forward to
-the middle of the overlap. The navigation itself is a measurement of (0, 0) at every ping. A Kalman
-filter forward and the smoother of Rauch, Tung and Striebel (1965) backward give the states that
-explain both, and their covariances.
+the middle of the overlap. Before any echo the navigation's own accuracy tells how large states are:
+they are a Gauss-Markov process, which has that standard deviation at every ping and persists over
+some pings. A Kalman filter forward and the smoother of Rauch, Tung and Striebel (1965) backward
+give the states that explain both, and their covariances. A covariance is never larger than that of
+the navigation.
 """
 
 from __future__ import annotations
@@ -72,11 +74,11 @@ class Step:
         return cls(np.eye(1), np.array([moved]), np.array([[deviation**2]]))
 
 
-def integrated(steps: Sequence[Step], fixes: NDArray[np.float64]) -> NDArray[np.float64]:
+def integrated(steps: Sequence[Step], deviations: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the states of all pings, [pings, n], by steps taken as exact.
 
     The first state is the one that keeps the track nearest to its navigation: a common shift and
-    turn. `fixes` are as those of `smooth`; a number whose fixes are 0 begins at 0.
+    turn. `deviations` are those of the navigation, [pings, n]; a number whose are 0 begins at 0.
     """
     size = len(steps[0].drift)
     states, from_first = [np.zeros(size)], [np.eye(size)]
@@ -84,39 +86,77 @@ def integrated(steps: Sequence[Step], fixes: NDArray[np.float64]) -> NDArray[np.
         states.append(step.transition @ states[-1] + step.drift)
         from_first.append(step.transition @ from_first[-1])
     found, changes = np.stack(states), np.stack(from_first)
-    free = np.all(fixes > 0, axis=0)
-    weights = np.where(free, 1 / np.where(free, fixes, 1.0), 0.0)
+    free = np.all(deviations > 0, axis=0)
+    weights = np.where(free, 1 / np.where(free, deviations, 1.0), 0.0)
     design = (weights[..., None] * changes)[..., free].reshape(-1, int(free.sum()))
     first = np.linalg.lstsq(design, -(weights * found).ravel(), rcond=None)[0]
     return found + changes[..., free] @ first
 
 
 def smooth(
-    steps: Sequence[Step], fixes: NDArray[np.float64]
+    steps: Sequence[Step | None], deviations: NDArray[np.float64], correlation_pings: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the states of all pings, [pings, n], and their covariances, [pings, n, n].
 
-    `fixes` are the standard deviations of the navigation as a measurement of every ping,
-    [pings, n].
+    Parameters
+    ----------
+    steps : sequence of Step or None, [pings - 1]
+        Relations between consecutive states; None where the echoes tell none.
+    deviations : float64 [pings, n]
+        Standard deviations of the navigation.
+    correlation_pings : float
+        Pings over which errors of the navigation persist: those of two pings that are k apart have
+        the correlation exp(-k/correlation_pings).
     """
-    pings, size = fixes.shape
-    variances = [np.diag(each**2) for each in fixes]
-    states, ahead = np.zeros((pings, size)), np.zeros((pings, size))
-    covariances, spread = np.zeros((pings, size, size)), np.zeros((pings, size, size))
-    covariances[0] = variances[0]
-    for ping, step in enumerate(steps, start=1):
-        ahead[ping] = step.transition @ states[ping - 1] + step.drift
-        spread[ping] = step.transition @ covariances[ping - 1] @ step.transition.T + step.spread
-        gain = np.linalg.solve(spread[ping] + variances[ping], spread[ping]).T
-        states[ping] = ahead[ping] - gain @ ahead[ping]
-        covariance = (np.eye(size) - gain) @ spread[ping]
-        covariances[ping] = (covariance + covariance.T) / 2
+    pings, size = deviations.shape
+    keep = np.exp(-1 / correlation_pings)
+    states, covariances = np.zeros((pings, size)), np.zeros((pings, size, size))
+    covariances[0] = np.diag(deviations[0] ** 2)
+    both: list[tuple[NDArray[np.float64], NDArray[np.float64]]] = []  # of a ping and the next
+    for ping, step in enumerate(steps):
+        change = np.diag(keep * deviations[ping + 1] / deviations[ping])
+        fresh = (1 - keep**2) * deviations[ping + 1] ** 2
+        mean, covariance = _extended(states[ping], covariances[ping], change, np.diag(fresh))
+        if step is not None:
+            mean, covariance = _measured(mean, covariance, step)
+        both.append((mean, covariance))
+        states[ping + 1], covariances[ping + 1] = mean[size:], covariance[size:, size:]
     for ping in range(pings - 2, -1, -1):
-        carried = steps[ping].transition @ covariances[ping]
-        gain = np.linalg.solve(spread[ping + 1], carried).T
-        states[ping] += gain @ (states[ping + 1] - ahead[ping + 1])
-        covariances[ping] += gain @ (covariances[ping + 1] - spread[ping + 1]) @ gain.T
+        mean, covariance = both[ping]
+        here, ahead, across = (
+            covariance[:size, :size],
+            covariance[size:, size:],
+            covariance[size:, :size],
+        )
+        gain = np.linalg.solve(ahead, across).T
+        states[ping] = mean[:size] + gain @ (states[ping + 1] - mean[size:])
+        covariances[ping] = here + gain @ (covariances[ping + 1] - ahead) @ gain.T
     return states, covariances
+
+
+def _extended(
+    state: NDArray[np.float64],
+    covariance: NDArray[np.float64],
+    change: NDArray[np.float64],
+    fresh: NDArray[np.float64],
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return mean and covariance of a state and the next: `change` of it, and `fresh` noise."""
+    across = change @ covariance
+    return (
+        np.concatenate([state, change @ state]),
+        np.block([[covariance, across.T], [across, across @ change.T + fresh]]),
+    )
+
+
+def _measured(
+    mean: NDArray[np.float64], covariance: NDArray[np.float64], step: Step
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return mean and covariance of a state and of the next, given the step between them."""
+    seen = np.hstack([-step.transition, np.eye(len(step.drift))])
+    spread = seen @ covariance @ seen.T + step.spread
+    gain = np.linalg.solve(spread, seen @ covariance).T
+    covariance = covariance - gain @ seen @ covariance
+    return mean + gain @ (step.drift - seen @ mean), (covariance + covariance.T) / 2
 
 
 def shape_deviation_m(

@@ -34,6 +34,8 @@ _ALIGNMENT = 4096  # bytes: of pages
 # image takes 1 to 5 of them.
 _MOST_KERNELS = 32
 
+_GROUP = 64  # work-items of a GPU's work-groups: two warps, or a wavefront
+
 _HOW_TO_GET_A_DEVICE = """\
 No OpenCL device was found. Any one of these gives one:
   - a CPU driver from PyPI:  {command}
@@ -202,7 +204,9 @@ class Device:
         """Enqueue a kernel over `size` work-items, with an argument for each of its parameters.
 
         Unless `local` says otherwise, work-items that hold vectors are work-groups of their own
-        (PoCL compiles a kernel anew for every local size), and else the driver chooses.
+        (PoCL compiles a kernel anew for every local size). On a GPU 64 along the first axis form
+        one, which share what a tile or a line needs, or as many as divide the axis. Elsewhere the
+        driver chooses.
 
         Parameters
         ----------
@@ -225,12 +229,18 @@ class Device:
         """
         if local is None and self.info.width > 1:
             local = (1,) * len(size)
+        elif local is None and self.info.kind == "gpu":
+            local = (math.gcd(size[0], _GROUP), *[1] * (len(size) - 1))
         ordered = kernel.ordered(arguments)
         with self._lock:
             event = kernel.compiled(self.queue, size, local, *ordered, wait_for=wait_for)
             if self._events is not None:
                 self._events.append((kernel.name, event))
         return event
+
+    def in_whole_groups(self, items: int) -> int:
+        """Return a number of work-items, on a GPU with those that fill the last work-group."""
+        return -(-items // _GROUP) * _GROUP if self.info.kind == "gpu" else items
 
     @contextlib.contextmanager
     def profile(self) -> Iterator[dict[str, KernelTimes]]:

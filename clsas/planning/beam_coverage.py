@@ -15,15 +15,26 @@ _BINS = 512  # of power by aspect angle; half or twice as many change nothing
 # Largest change of direction from one channel to the next, over the beam's width. At a kink a beam
 # swings past pixels between two channels, which no virtual channel can follow.
 _MOST_TURNED = 1 / 16
+_CELLS = 8, 3  # along and across a sheet: smooth directions are cubic across it at most
+_LEAST_HELD = 0.9  # of these cells that hold channels, where directions differ
+_EVERY_DIRECTION = (-2.0, 2.0)  # sines of the aspect angle, beyond any
+# Of the best pixel's sum of weights: normalising amplifies errors by its inverse.
+_LEAST_COVERED = 0.25
+_LEAST_SHARE_COVERED = 0.1  # of an image: less gives little gain, and few samples of errors
+_LEAST_PARTIAL = 0.25  # of an image: a step of the beam that few pixels see costs these more
 
 
 def trimmed(model: VisibilityModel, share: float) -> VisibilityModel:
-    """Return a model without the outermost edges of the beam.
+    """Return a model without the channels that subimages hardly receive from.
 
-    An image of noise loses `share` of its power.
+    Where the beam sweeps over the grid these are its outermost edges: an image of noise loses
+    `share` of its power. Elsewhere every channel is used for every subimage, and weights count in
+    the leaves only.
     """
     if model.beam is None or model.limits is None:
         return model
+    if model.track.is_sheet or not sweeps_once(model):
+        return model.with_limits(*_EVERY_DIRECTION)
     low, high = np.clip(model.limits, -1, 1)
     on_track, bounds = model.on_track, []
     of_track = sines(_points_m(model), model.track_m[on_track], model.along[on_track])
@@ -42,23 +53,73 @@ def trimmed(model: VisibilityModel, share: float) -> VisibilityModel:
     return model.with_limits(float(edges[first]), float(edges[min(last + 1, _BINS)]))
 
 
-def sweeps_once(model: VisibilityModel) -> bool:
-    """Return whether the beam sweeps once, at an even rate, over every sample point.
+def obstacle(model: VisibilityModel) -> str:
+    """Return why virtual channels cannot follow the beam, in words; "" if they can."""
+    beam = model.beam
+    if beam is None:
+        return ""
+    if model.track.is_sheet and _directions_unknown(model):
+        return "the heading turns, and large parts of the smooth aperture hold no channel"
+    if not model.track.is_sheet and _turns_between_channels(model):
+        return "the heading changes from channel to channel by more than 1/16 of the beam's width"
+    # Normalising divides by a small sum at the beam's edge, and amplifies errors there.
+    if beam.normalise and coverage(model, 1).min() < _LEAST_COVERED:
+        return "the beam normalises, and some pixels are hardly covered"
+    # If few pixels see a step of the beam, their error exceeds the prediction for all.
+    if beam.jumps and 0 < partly_visible_share(model) < _LEAST_PARTIAL:
+        return "only few pixels see the step at the beam's edge"
+    # If hardly any pixel is visible there is little to gain, and errors are not predictable.
+    if float(coverage(model, 2).mean()) < _LEAST_SHARE_COVERED:
+        return "the beam covers hardly any of the image"
+    return ""
 
-    Virtual channels cannot follow a beam that swings as fast as it sweeps. Seen from a point, the
-    sine of the aspect angle changes along a straight track by (1 - sine^2)/distance. Rates between
-    half and one and a half times the mean are followed.
+
+def _directions_unknown(model: VisibilityModel) -> bool:
+    """Return whether directions differ over a sheet, but parts of it hold no channel.
+
+    The smooth directions are then those of no channel, and may be anything.
     """
-    if model.beam is None:
-        return True
-    # Neighbours on the track must look in much the same direction. At a kink the beam may swing
-    # past a point within a few channels, and a track may lead back beside itself.
+    assert model.directions is not None
+    track, (columns, rows) = model.track, _CELLS
+    at = model.directions.at(track.coordinate, track.across)
+    if np.linalg.norm(at - at.mean(axis=0), axis=1).max() <= _MOST_TURNED * _width(model):
+        return False
+    cell = [
+        np.clip((each * count).astype(np.int64), 0, count - 1)
+        for each, count in ((track.coordinate, columns), (track.across, rows))
+    ]
+    held = len(np.unique(cell[0] * rows + cell[1]))
+    return held < _LEAST_HELD * columns * rows
+
+
+def _width(model: VisibilityModel) -> float:
+    """Return the width of the beam, in sine of the aspect angle."""
+    assert model.beam is not None
+    return float(np.ptp(np.clip(model.beam.limits, -1, 1)))
+
+
+def _turns_between_channels(model: VisibilityModel) -> bool:
+    """Return whether neighbours on the track look in different directions.
+
+    At a kink the beam may swing past a point within a few channels, and a track may lead back
+    beside itself.
+    """
     order = np.argsort(model.track.coordinate, kind="stable")
     strip = model.track.strip_of(model.track.coordinate[order])
     turned = np.linalg.norm(np.diff(model.channels_along[order], axis=0), axis=1)
     turned = turned[np.diff(strip) == 0]
-    if turned.max(initial=0.0) > _MOST_TURNED * np.ptp(np.clip(model.beam.limits, -1, 1)):
-        return False
+    return bool(turned.max(initial=0.0) > _MOST_TURNED * _width(model))
+
+
+def sweeps_once(model: VisibilityModel) -> bool:
+    """Return whether the beam sweeps once, at an even rate, over every sample point.
+
+    A subimage then needs the channels of one stretch of each strip. Seen from a point, the sine of
+    the aspect angle changes along a straight track by (1 - sine^2)/distance. Rates between half and
+    one and a half times the mean count as even.
+    """
+    if model.beam is None:
+        return True
     strip = model.track.strip_of(model.track.samples)
     return all(_sweeps_once(model, strip == each) for each in range(model.strips))
 

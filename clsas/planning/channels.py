@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -59,9 +60,13 @@ def own_drift(model: VisibilityModel) -> NDArray[np.float64] | None:
 
 @shared
 def peak_density(model: VisibilityModel) -> float:
-    """Peak channel density along the aperture, relative to the mean."""
+    """Peak channel density along the aperture, relative to the mean.
+
+    Many channels of a sheet may lie at the same place along it, one in each of its rows.
+    """
     place = np.sort(model.track.coordinate)
-    some = min(_NEIGHBOURS, len(place) - 1)
+    rows = math.ceil(2 * math.sqrt(len(place))) if model.track.is_sheet else 1
+    some = min(max(_NEIGHBOURS, rows), len(place) - 1)
     closest = float((place[some:] - place[:-some]).min())
     length = model.strips if model.strips > 1 else float(place[-1] - place[0])
     average = length * some / (len(place) - 1)

@@ -17,7 +17,6 @@ from clsas.exact.layout import ROUNDING
 from clsas.exact.tiles import BLOCKS
 from clsas.factorized.aperture import drift, stretches
 from clsas.factorized.thesis import stage_errors_m
-from clsas.factorized.visibility import interpolated_directions
 from clsas.opencl.device import Device
 from clsas.planning.caching import cached
 from clsas.planning.channels import own_drift, track_error_m
@@ -156,8 +155,8 @@ def _mean_track_error(model: VisibilityModel, side: Side, extents: NDArray[np.fl
     # Lines are stretched by turning their phase; their envelope stays.
     wrong += (2 * np.pi * model.rms_cycles_per_m * stretched_m) ** 2
     weights = np.ones_like(wrong)
-    if model.beam is not None:
-        directions = interpolated_directions(track.samples, model.along, part.coordinate)
+    if model.beam is not None and model.directions is not None:
+        directions = model.directions.at(part.coordinate, part.across)
         virtual = [sines(*each, directions) for each in zip(points_m, virtual_m, strict=True)]
         channels = [sines(each, middle_m, model.channels_along[index]) for each in points_m]
         weights, of_virtual = (

@@ -46,6 +46,11 @@ _OVERSHOOT = 1.3  # of the excess, added to the reserve; twice: errors 0.2 dB le
 _LEAST_BEAM_CYCLES = 0.5  # of an edge of the beam at first; half: 2 % faster, twice: 3 % slower
 _MOST_BEAM_CYCLES = 64.0  # beyond, virtual channels take the weights for a step
 
+_NOT_SMOOTH = (
+    "channels are too far from a smooth aperture, by their place, motion or heading, for the "
+    "smallest subimages"
+)
+
 
 @dataclass(frozen=True, eq=False)
 class _Problem:
@@ -126,20 +131,37 @@ class _Trial:
     oversampling: tuple[float, ...] = ()
 
 
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """Result of a search.
+
+    Attributes
+    ----------
+    plan : Plan or None
+        The fastest factorization; None if there is none, or none as fast as asked for.
+    least_bytes : float
+        Without a plan, the least memory of those that did not fit.
+    obstacle : str
+        Why an image cannot be factorized at all, in words; "" if it can.
+    """
+
+    plan: Plan | None = None
+    least_bytes: float = math.inf
+    obstacle: str = ""
+
+
 def fastest(
     model: VisibilityModel, conditions: Conditions, seconds: float, choices: Allowed
-) -> tuple[Plan | None, float]:
-    """Return the fastest plan within a tolerance, if it takes less than some seconds.
-
-    Beside it, where there is none, the least memory of those that did not fit.
-    """
+) -> Outcome:
+    """Return the fastest plan within a tolerance, if it takes less than some seconds."""
     problem = _Problem(model, conditions)
     problem = replace(problem, model=trimmed(model, _EDGES_SHARE * problem.allowed))
     most_root = root_limits(problem.model, _ROOTS_SHARE * problem.allowed)
-    needed, trial = math.inf, None
-    if most_root is not None:
-        beam_cycles = 0.0 if model.beam is None else _LEAST_BEAM_CYCLES
-        trial = _Trial(choices, most_root, beam_cycles, problem.reserved)
+    if most_root is None:
+        return Outcome(obstacle=_NOT_SMOOTH)
+    beam_cycles = 0.0 if model.beam is None else _LEAST_BEAM_CYCLES
+    trial: _Trial | None = _Trial(choices, most_root, beam_cycles, problem.reserved)
+    needed = math.inf
     while trial is not None:
         tree = trial.tree
         if tree is None:
@@ -161,8 +183,8 @@ def fastest(
             trial = replace(trial, most_root=smaller, tree=None)
         else:
             found.kept.update(track=model.track, surface=model.surface)
-            return found, needed
-    return None, needed
+            return Outcome(found)
+    return Outcome(least_bytes=needed)
 
 
 def off_track(model: VisibilityModel, conditions: Conditions) -> bool:

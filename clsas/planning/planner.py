@@ -14,7 +14,7 @@ from clsas.core.decibels import in_db, power
 from clsas.core.grid import Grid
 from clsas.core.lines import RangeLines
 from clsas.exact.backprojection import ACCURACY_DB
-from clsas.factorized.dense_apertures import DENSE_SHAPES
+from clsas.factorized.dense_apertures import shapes_after
 from clsas.factorized.estimates import ErrorBudget
 from clsas.factorized.filters import ALIGN_TAPS
 from clsas.factorized.left_out import with_left_out
@@ -23,11 +23,11 @@ from clsas.factorized.thesis import NearestBeams
 from clsas.opencl.device import Device, open_device
 from clsas.planning import costs as stored_costs
 from clsas.planning import scaling
-from clsas.planning.beam_coverage import coverage, partly_visible_share, sweeps_once
+from clsas.planning.beam_coverage import obstacle
 from clsas.planning.costs import Costs, KnownCosts
 from clsas.planning.errors import leaf_error, nearest_errors
 from clsas.planning.exact_image import Exact, expect
-from clsas.planning.fastest import fastest, off_track
+from clsas.planning.fastest import Outcome, fastest, off_track
 from clsas.planning.prediction import (
     MARGIN_DB,
     OUTSIDE,
@@ -56,9 +56,8 @@ NEAREST_UPSAMPLING = 8.0
 # `scripts/bench sensitivity` halves and doubles these; without a remark nothing changes.
 _WORTH = 0.95  # of the time of an exact image, at most: less gain is within predictions' scatter
 _SEARCH_S = 0.05  # that a search takes at least: 0.05 to 0.12 s on a core of 2.5 GHz
-_LEAST_COVERED = 0.25  # of the best pixel's sum of weights: normalising amplifies by its inverse
-_LEAST_SHARE_COVERED = 0.1  # of an image: less gives little gain, and few samples of errors
-_LEAST_PARTIAL = 0.25  # of an image: a step of the beam that few pixels see costs these more
+
+_NO_EXTENT = "all channels are at one place, or there is a single pixel"
 
 
 def plan(
@@ -208,6 +207,7 @@ def _chosen(
     """Return the plan of checked arguments."""
     beam, exact, room = model.beam, conditions.exact, conditions.memory_bytes
     least: float = exact.memory_bytes
+    reason = ""
     if stages:
         if model.track is None:
             raise ValueError("lines must have channels at more than one place for stages")
@@ -220,44 +220,57 @@ def _chosen(
     elif stages is None and _worth_a_search(exact, conditions.costs, exact_fits, allowed):
         is_free = exact_fits and allowed is None
         to_beat = _WORTH * conditions.costs.seconds(exact.work) if is_free else math.inf
-        faster, needed = _fastest_of_shapes(model, conditions, to_beat, allowed or Allowed())
-        if faster is not None:
-            return faster
-        least = min(least, needed)
+        outcome = _fastest_of_shapes(model, conditions, to_beat, allowed or Allowed())
+        if outcome.plan is not None:
+            return outcome.plan
+        least, reason = min(least, outcome.least_bytes), outcome.obstacle
     if not exact_fits:
         raise ValueError(
             f"memory_bytes must be at least {math.ceil(10 * least / 2**20) / 10:.1f} MiB for this "
             f"image, got {room / 2**20:.3g} MiB"
         )
-    return exact_plan(model, conditions)
+    return exact_plan(model, conditions, reason)
 
 
 def _fastest_of_shapes(
     model: VisibilityModel, conditions: Conditions, seconds: float, choices: Allowed
-) -> tuple[Plan | None, float]:
+) -> Outcome:
     """Return the fastest plan with a mean track of any shape: see `fastest`.
 
     Strips and sheets are tried where channels lie too far from one curve for roots as large as
     the image.
     """
     if model.track is None or model.grid.size == 1:
-        return None, math.inf
-    best, least, others = None, math.inf, DENSE_SHAPES
-    if _divisible(model):
-        best, least = fastest(model, conditions, seconds, choices)
-        if model.shape == "track" and not off_track(model, conditions):
-            others = ()
+        return Outcome(obstacle=_NO_EXTENT)
+    others = shapes_after(model.shape)
+    best = _fastest_unless(obstacle(model), model, conditions, seconds, choices)
+    if model.shape == "track" and not best.obstacle and not off_track(model, conditions):
+        others = ()
     for shape in others:
-        if shape == model.shape:
-            continue
         # Another search must pay for itself.
-        to_beat = seconds if best is None else _WORTH * best.predicted_seconds
+        to_beat = seconds if best.plan is None else _WORTH * best.plan.predicted_seconds
         other = model.with_shape(shape) if to_beat > _SEARCH_S else None
-        if other is None or not _divisible(other):
+        if other is None:
             continue
-        found, needed = fastest(other, conditions, to_beat - _SEARCH_S, choices)
-        best, least = found or best, min(least, needed)
-    return best, least
+        found = _fastest_unless(obstacle(other), other, conditions, to_beat - _SEARCH_S, choices)
+        if found.plan is not None:
+            best = found
+        elif best.plan is None:
+            best = replace(
+                found,
+                least_bytes=min(best.least_bytes, found.least_bytes),
+                obstacle=best.obstacle if found.obstacle else "",
+            )
+    return best
+
+
+def _fastest_unless(
+    hindrance: str, model: VisibilityModel, conditions: Conditions, seconds: float, choices: Allowed
+) -> Outcome:
+    """Return the fastest plan, unless something hinders any: see `fastest`."""
+    if hindrance:
+        return Outcome(obstacle=hindrance)
+    return fastest(model, conditions, seconds, choices)
 
 
 def tolerance_in_db(
@@ -300,25 +313,6 @@ def _allowed(taps: tuple[int, int] | None, depth: int | None) -> Allowed | None:
 def _worth_a_search(exact: Exact, costs: Costs, exact_fits: bool, allowed: Allowed | None) -> bool:
     """Return whether a search may pay, or is needed because the exact image does not fit."""
     return not exact_fits or allowed is not None or costs.seconds(exact.work) > _SEARCH_S
-
-
-def _divisible(model: VisibilityModel) -> bool:
-    """Return whether an image can be factorized at all."""
-    if not sweeps_once(model):
-        return False
-    if model.beam is None:
-        return True
-    # Sums of weights, to normalise by, are interpolated along a single curve only.
-    if model.track.is_dense and model.beam.normalise:
-        return False
-    # Normalising divides by a small sum at the beam's edge, and amplifies errors there.
-    if model.beam.normalise and coverage(model, 1).min() < _LEAST_COVERED:
-        return False
-    # If few pixels see a step of the beam, their error exceeds the prediction for all.
-    if model.beam.jumps and 0 < partly_visible_share(model) < _LEAST_PARTIAL:
-        return False
-    # If hardly any pixel is visible there is little to gain, and errors are not predictable.
-    return float(coverage(model, 2).mean()) >= _LEAST_SHARE_COVERED
 
 
 def decibels(wavelengths: float) -> float:

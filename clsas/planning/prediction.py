@@ -152,7 +152,10 @@ def predicted_plan(
     )
     roots = stages[0].subimages
     batches = batches_within(sizes, roots, device, conditions.memory_bytes)
-    work += Work(batch=float(-(-roots // batches.at_once) * len(sides)))
+    # A stage of a sector takes the host as long for each strip as a batch does.
+    sectors = 1 + max(roots - batches.at_once, 0) // batches.prepared
+    launched = -(-roots // batches.at_once) + sectors * (model.strips - 1)
+    work += Work(batch=float(launched * len(sides)))
     errors = errors.times(candidate.margin)
     image = Factorization(
         sides=sides,
@@ -174,10 +177,10 @@ def predicted_plan(
     return _plan(model, image, conditions, batches.memory_bytes, stages, work, errors)
 
 
-def exact_plan(model: VisibilityModel, conditions: Conditions) -> Plan:
-    """Return the plan of the exact image."""
+def exact_plan(model: VisibilityModel, conditions: Conditions, reason: str) -> Plan:
+    """Return the plan of the exact image; see `ExactImage` for the reason."""
     exact = conditions.exact
-    image = ExactImage(accuracy_db=exact.accuracy_db)
+    image = ExactImage(accuracy_db=exact.accuracy_db, reason=reason)
     errors = ErrorBudget(exact=power(exact.accuracy_db))
     plan = _plan(model, image, conditions, exact.memory_bytes, [], exact.work, errors)
     return replace(plan, prediction=replace(plan.prediction, error_db=exact.accuracy_db))

@@ -43,6 +43,9 @@ from clsas.signal.spectrum import Spectrum
 
 _ROWS = (16, 32, 64, 128, 256, 512, 1024, 2048)  # of subimages, from whole work-items on
 _COLUMNS = (4, 8, 16, 32, 64, 128, 256, 512, 1024, 2048)
+OVERHANG = 1.5
+"""Factor of a filter's taps that extend past an aperture's ends after several stages: those of the
+stage before count half, where subimages are half as long."""
 MOST_STAGES = 5
 """Most stages of a tree. More add errors without saving work."""
 # Share of the filters' error power that expanding a leaf may add. Half of it leaves some near grids
@@ -96,7 +99,9 @@ class Sizes:
     half_range_extent_m : float64
         Largest difference in range between a pixel and the centre.
     beam_cycles : float64
-        Phase cycles of a beam's weights along the visible aperture; see `visibility.beam_rate`.
+        Phase cycles of a beam's weights along the visible aperture; see `beam_rate`.
+    beam_cycles_across : float
+        The same across a sheet.
     leaf_error : float64
         Error power that expanding a leaf of this size adds.
     """
@@ -109,6 +114,7 @@ class Sizes:
     half_range_extent_m: NDArray[np.float64]
     beam_cycles: NDArray[np.float64]
     leaf_error: NDArray[np.float64]
+    beam_cycles_across: float = 0.0
     _in_roots: dict[int, Division] = field(default_factory=dict, init=False)
 
     @functools.cached_property
@@ -200,10 +206,11 @@ def all_sizes(model: VisibilityModel, most: Side, device: Device) -> Sizes:
         return Sizes(model, sides, *np.zeros((6, 0)))
     visible = model.visible_by_size(pairs)
     share = mean_over_points(visible.sum(axis=-1)) / np.count_nonzero(model.on_track)
-    beam_cycles = np.zeros(len(sides))
+    beam_cycles, across = np.zeros(len(sides)), 0.0
     if model.beam is not None:
         rates = model.beam_rates * model.spacing
         beam_cycles = mean_over_points(np.einsum("nps,ps->np", visible, rates))
+        across = model.beam_phase_cycles_across()
     return Sizes(
         model,
         sides,
@@ -213,6 +220,7 @@ def all_sizes(model: VisibilityModel, most: Side, device: Device) -> Sizes:
         half_range_extent_m=model.half_range_extents_m(pairs),
         beam_cycles=beam_cycles,
         leaf_error=leaf_error(model, sides, device),
+        beam_cycles_across=across,
     )
 
 
@@ -239,6 +247,8 @@ class Options:
         Phase cycles that the beam's weights add to those of a leaf.
     rows : float64 [options, 1]
         Rows of virtual channels besides those for the phase across a sheet.
+    leaf_beam_rows : float
+        Phase cycles across a sheet that the beam's weights add to those of a leaf.
     row_lines_s : float64 [options, sizes]
         Each virtual channel of a sheet, for all subimages of a size: see `adding_in_rows`.
     """
@@ -253,6 +263,7 @@ class Options:
     roots_s: NDArray[np.float64]
     leaf_beam_cycles: NDArray[np.float64]
     rows: NDArray[np.float64]
+    leaf_beam_rows: float
     row_lines_s: NDArray[np.float64]
 
     def onward_s(
@@ -282,7 +293,7 @@ class Options:
         leaf_cycles = np.diag(division.cycles) + self.leaf_beam_cycles[index]
         of_leaf = density[..., 0] * leaf_cycles + ends[..., 0]
         if rows is not None:
-            of_leaf = of_leaf * rows
+            of_leaf = of_leaf * (rows + density[..., 0] * self.leaf_beam_rows)
         onward_s = of_leaf * self.leaves_s[some][:, index]
         formed_s = np.zeros(1)
         if rows is not None:
@@ -346,7 +357,9 @@ def all_options(
     leaf = sizes.leaf_error <= _LEAF_SHARE * power(filters_db)
     leaf &= np.prod(sizes.sides, axis=1) >= leaf_pixels
     density = np.array([2 * choice.oversampling for choice in choices])
-    aperture_taps = np.array([choice.aperture_taps for choice in choices])
+    # Past the ends filters extend as if they had more taps, but in the first stage.
+    further = np.where(np.array(stages) > 1, OVERHANG, 1.0)
+    aperture_taps = further * [choice.aperture_taps for choice in choices]
     return Options(
         choices,
         np.array(stages),
@@ -358,6 +371,7 @@ def all_options(
         roots_s=np.asarray(costs.seconds(roots)),
         leaf_beam_cycles=beam_cycles * sizes.beam_cycles,
         rows=aperture_taps[:, None],
+        leaf_beam_rows=beam_cycles * sizes.beam_cycles_across,
         row_lines_s=np.asarray(
             costs.seconds(adding_in_rows(counts, samples + 2 * GUARD, aperture_taps[:, None]))
         ),

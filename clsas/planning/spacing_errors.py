@@ -18,10 +18,10 @@ from scipy.sparse import csr_array
 
 from clsas.core.decibels import power
 from clsas.core.lines import wavelength_m
+from clsas.factorized.beam_directions import interpolated_directions
 from clsas.factorized.dense_channels import strip_channels
 from clsas.factorized.tracks import MeanTrack
 from clsas.factorized.tree import interpolated_channels
-from clsas.factorized.visibility import interpolated_directions
 from clsas.planning.caching import cached
 from clsas.planning.channels import carriers
 from clsas.planning.sample_pixels import SAMPLED_PIXELS, SPREAD_POINTS, mean_over_relief, pixels_m
@@ -158,7 +158,7 @@ class _Line:
     along : float64 [samples, 3] or None
         Unit directions of the beam at `track.samples`.
     beam_rates : float64 [points, samples]
-        See `VisibilityModel.beam_rates`; 0 across a sheet, where weights change little.
+        See `VisibilityModel.beam_rates`.
     """
 
     track: MeanTrack
@@ -171,18 +171,21 @@ class _Line:
 @cached
 def _line(model: VisibilityModel, place: _Place) -> _Line:
     kind, at = place
-    along = model.along
-    beam_rates = None if along is None else model.beam_rates
+    directions = model.directions
     if kind == "track":
         channels = np.sort(model.track.coordinate)
-        return _Line(model.track, model.rates, channels, along, beam_rates)
+        return _Line(model.track, model.rates, channels, model.along, model.beam_rates)
     evenly = np.linspace(0, 1, 4 * _SAMPLED_PLACES)
     if kind == "along":
-        return _Line(model.track.line_along(at), model.rates, evenly, along, beam_rates)
-    line, rates = model.track.line_across(at), model.rates_across
-    if along is not None:
-        here = interpolated_directions(model.track.samples, along, np.array([at]))
-        along, beam_rates = np.repeat(here, len(line.samples), axis=0), np.zeros(rates.shape[1:])
+        line = model.track.line_along(at)
+        places = line.samples, np.full(line.samples.shape, at)
+        rates, beam_rates = model.rates, model.beam_rates
+    else:
+        line = model.track.line_across(at)
+        places = np.full(line.samples.shape, at), line.samples
+        rates = model.rates_across
+        beam_rates = 0.0 if directions is None else model.beam_rates_across
+    along = None if directions is None else directions.at(*places)
     return _Line(line, rates, evenly, along, beam_rates)
 
 

@@ -16,10 +16,10 @@ from clsas.core.grid import Grid
 from clsas.core.lines import RangeLines, some_channels
 from clsas.exact.tiles import STACK
 from clsas.factorized.aperture import cycles_per_extent
+from clsas.factorized.beam_directions import BeamDirections, beam_rate
 from clsas.factorized.dense_apertures import Shape, mean_track_of, simplest_track
-from clsas.factorized.dense_channels import SheetRates, sheet_rates
+from clsas.factorized.dense_channels import SheetRates, sheet_beam_rates, sheet_rates
 from clsas.factorized.surface import LEAST_SIDE, surface_of, within_roots
-from clsas.factorized.visibility import beam_directions, beam_rate
 from clsas.planning.caching import cached, shared
 from clsas.signal.ambiguity import Ambiguity, ambiguity
 from clsas.signal.interpolation import Interpolator, Resampling
@@ -67,8 +67,10 @@ class VisibilityModel:
         Sample points all over the grid, also near its corners.
     track_m : float64 [samples, 3]
         Positions at `track.samples`.
+    directions : BeamDirections or None
+        Unit directions of the beam anywhere on the track, with a beam.
     along : float64 [samples, 3] or None
-        Unit directions of the track there, with a beam.
+        Those at `track.samples`.
     spacing : float64 [samples]
         Weight of each sample in integrals over the track's parameter.
     on_track : bool [samples]
@@ -77,10 +79,8 @@ class VisibilityModel:
         Distance and unit vector from every track sample to every point.
     nearest_m : float
         Lower bound of the distance between pixels and channels.
-    beam_rates : float64 [points, samples]
-        Change of the beam's weights along the track as a phase rate; see `visibility.beam_rate`.
     limits : (low, high) or None
-        Sines of the aspect angle between which weights are not 0.
+        Sines of the aspect angle between which channels are used for a subimage.
     shape : str
         Shape of the mean track: see `clsas.factorized.dense_apertures`.
     root : (rows, columns) or None
@@ -91,8 +91,8 @@ class VisibilityModel:
     root: Side | None
     shape: Shape = "track"
     along: Any
+    directions: BeamDirections | None
     channels_along: Any
-    beam_rates: Any
 
     def __init__(
         self,
@@ -118,7 +118,7 @@ class VisibilityModel:
 
     def _put_track(self, track: Any) -> None:
         """Set what follows from the mean track."""
-        self.track, self.along, beam = track, None, self.beam
+        self.track, self.along, self.directions, beam = track, None, None, self.beam
         if track is None:
             return
         self.surface = surface_of(self.grid)
@@ -132,8 +132,8 @@ class VisibilityModel:
         if not hasattr(self, "nearest_m"):
             self.nearest_m = self._nearest_m()
         if beam is not None:
-            self.along = beam_directions(self.channels_along, self.track, self.track.samples)
-            self.beam_rates = beam_rate(beam, self.track, self.along, self.points_m)
+            self.directions = BeamDirections.of(beam, self.channels_along, self.track)
+            self.along = self.directions.at(self.track.samples)
 
     def _nearest_m(self) -> float:
         """Lower bound of the distance between pixels and channels."""
@@ -364,6 +364,34 @@ class VisibilityModel:
         return self._sheet_rates(self._root_extents, self.points_m).across
 
     @property
+    @cached
+    def beam_rates(self) -> NDArray[np.float64]:
+        """Change of the beam's weights along the track as a phase rate, [points, samples].
+
+        The largest within roots of the model's size, if it has any: see `beam_rate`.
+        """
+        if self.beam is None:
+            return np.zeros(self.distance_m.shape)
+        if self.track.is_sheet:
+            return self._sheet_beam_rates.along
+        sides_m = self._root_extents[:, None] * self.surface.steps_m
+        return beam_rate(self.beam, self.track, self.along, self.points_m, sides_m)
+
+    @property
+    @cached
+    def beam_rates_across(self) -> NDArray[np.float64]:
+        """The same across a sheet, at the samples of a line across."""
+        return self._sheet_beam_rates.across
+
+    @property
+    @cached
+    def _sheet_beam_rates(self) -> SheetRates:
+        assert self.beam is not None
+        assert self.directions is not None
+        sides_m = self._root_extents[:, None] * self.surface.steps_m
+        return sheet_beam_rates(self.beam, self.track, self.directions, self.points_m, sides_m)
+
+    @property
     def _root_extents(self) -> NDArray[np.float64]:
         if self.root is None:
             return np.zeros(len(self.surface.steps_m))
@@ -374,14 +402,43 @@ class VisibilityModel:
         """Number of curves that make the mean track."""
         return int(self.track.strips)
 
-    def rows(self, side: Side, taps: int, density: float, *, most: bool = False) -> float:
-        """Return the number of rows of virtual channels across a sheet; 1 without one."""
+    def rows(
+        self,
+        side: Side,
+        taps: float,
+        density: float,
+        beam_density: float = 0.0,
+        *,
+        most: bool = False,
+    ) -> float:
+        """Return the number of rows of virtual channels across a sheet; 1 without one.
+
+        They are as many per cycle of the phase as `density`, and per cycle of the beam's weights as
+        `beam_density`.
+        """
         if not self.track.is_sheet:
             return 1.0
-        rates = np.tensordot(self.extents(side, most=most), self.rates_across, 1)
+        rates = density * np.tensordot(self.extents(side, most=most), self.rates_across, 1)
+        cycles = _over_points(rates @ self._spacing_across, most)
+        if beam_density:
+            cycles += beam_density * self.beam_phase_cycles_across(most=most)
+        return cycles + taps
+
+    @property
+    def _spacing_across(self) -> NDArray[np.float64]:
+        """Weights of the samples of a line across a sheet in integrals over it."""
         line = self.track.line_across(0.5)
-        cycles = np.where(line.on_track, rates, 0.0) @ _spacing(line.samples)
-        return density * _over_points(cycles, most) + taps
+        return np.where(line.on_track, _spacing(line.samples), 0.0)
+
+    def beam_phase_cycles_across(self, *, most: bool = False) -> float:
+        """Return the cycles that the beam's weights count for across a sheet; 0 without one."""
+        if not self.track.is_sheet:
+            return 0.0
+        return _over_points(self.beam_rates_across @ self._spacing_across, most)
+
+    def beam_phase_cycles(self, visible: NDArray[np.bool_], *, most: bool = False) -> float:
+        """Return the cycles that the beam's weights count for along the visible aperture."""
+        return self.visible_phase_cycles(self.beam_rates, visible, most=most)
 
     def visible_phase_cycles(
         self, rates: NDArray[np.float64], visible: NDArray[np.bool_], *, most: bool = False
@@ -481,7 +538,7 @@ def _over_points(values: NDArray[np.float64], most: bool) -> float:
 
 
 def _mean_and_max(values: NDArray[np.float64]) -> tuple[float, float]:
-    return float(values.mean()), float(values.max())
+    return float(values.sum()) / values.size, float(values.max())
 
 
 def _spacing(samples: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy.signal.windows import hann
 
 from clsas.core import decibels
+from clsas.core.conditioning import DEAD_DB, are_dead
 from clsas.core.lines import RangeLines, some_channels
 from clsas.core.pings import Transmissions
 from clsas.products.inspection_result import runs
@@ -17,9 +18,6 @@ from clsas.signal.ambiguity import end_powers
 from clsas.signal.spectrum import NEEDED_OVERSAMPLING, Spectrum
 from clsas.sonar.sampling import Finding
 
-DEAD_DB = -20.0
-"""Power of a channel relative to the median one below which it counts as dead. At -10 dB channels
-at the ends of a track, where targets leave the beam, would count too."""
 _SILENT_DB = -300.0  # stands for no signal
 _SAME_LEVEL = 1e-5
 """Of the largest level: samples within this are equal but for rounding. Within 1e-3 the beats of
@@ -102,7 +100,7 @@ def check_levels(levels: Levels, receivers: int | None) -> list[Finding]:
     found = []
     alive = levels.power[levels.power > 0]
     usual = float(np.median(alive)) if alive.size else 0.0
-    dead = levels.power <= usual * decibels.power(DEAD_DB)
+    dead = are_dead(levels.power, usual)
     if dead.all():
         found.append(
             Finding(

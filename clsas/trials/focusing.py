@@ -31,10 +31,11 @@ from clsas.trials.navigating import detrended, said_to_be_on
 WAVELENGTH_M = 0.015
 PINGS, STEP_M = 400, 0.02
 GRID = Grid.plane(x=(1.5, 6.5, 320), y=(18.0, 21.0, 220))
+LARGE_PINGS, LARGE_GRID = 1500, Grid.plane(x=(1.5, 28.5, 1000), y=(18.0, 27.0, 1000))
 SONAR = Sonar(Pulse(100e3, 30e3, 1e-3), [[0.0, 0.0, 0.0]], tx_length_m=0.06, rx_length_m=0.06)
 
 _SMOOTHED = 12  # pings, over which the smooth part of a residual is a mean
-_REPEATS = 3  # of which the fastest counts
+_REPEATS = 5  # in turns, of which the fastest counts
 
 
 def smooth_m(
@@ -54,13 +55,20 @@ def _scaled(values: NDArray[np.float64], rms: float) -> NDArray[np.float64]:
     return values * (rms / np.std(values)) if rms else np.zeros_like(values)
 
 
-def points(seed: int = 0) -> PointTargets:
-    """Return isolated points."""
+def points(seed: int = 0, *, count: int = 60, grid: Grid = GRID) -> PointTargets:
+    """Return isolated points on a grid."""
     random = np.random.default_rng(seed)
+    x_m, y_m = grid.axes_m
     at = np.stack(
-        [random.uniform(1.8, 6.2, 60), random.uniform(18.2, 20.8, 60), np.zeros(60)], axis=1
+        [
+            random.uniform(x_m[0] + 0.3, x_m[-1] - 0.3, count),
+            random.uniform(y_m[0] + 0.2, y_m[-1] - 0.2, count),
+            np.zeros(count),
+        ],
+        axis=1,
     )
-    return PointTargets(at, random.uniform(0.3, 1, 60) * np.exp(2j * np.pi * random.random(60)))
+    level = random.uniform(0.3, 1, count)
+    return PointTargets(at, level * np.exp(2j * np.pi * random.random(count)))
 
 
 def speckle(bright: int, seed: int = 0) -> PointTargets:
@@ -79,24 +87,44 @@ def speckle(bright: int, seed: int = 0) -> PointTargets:
 
 def recorded(scene: PointTargets, sway_m: NDArray[np.float64]) -> tuple[RangeLines, RangeLines]:
     """Return lines of a swaying track: as they are, and as the navigation has them."""
-    course = (0, 0, 0), (STEP_M, 0, 0), PINGS, 1.0
+    course = (0, 0, 0), (STEP_M, 0, 0), len(sway_m), 1.0
     track = Track.straight(*course, sway_m=sway_m)
-    true = compress(simulate(SONAR, track, scene, range_m=(17.2, 22.5)))
+    far_m = max(22.5, float(scene.positions_m[:, 1].max()) + 1)
+    true = compress(simulate(SONAR, track, scene, range_m=(17.2, far_m)))
     return true, said_to_be_on(true, SONAR, Track.straight(*course))
 
 
-def peak_db(lines: RangeLines, true: RangeLines, device: Device | str | None = None) -> float:
+def peak_db(
+    lines: RangeLines,
+    true: RangeLines,
+    device: Device | str | None = None,
+    *,
+    grid: Grid = GRID,
+) -> float:
     """Return the brightest pixel of lines over that of the true ones, dB."""
     image, ideal = (
-        np.abs(factorize(each, GRID, -40.0, device=device).pixels).max() for each in (lines, true)
+        np.abs(factorize(each, grid, -40.0, device=device).pixels).max() for each in (lines, true)
     )
     return float(20 * np.log10(image / ideal))
 
 
-def smooth_residual_m(found: Autofocus, sway_m: NDArray[np.float64]) -> float:
-    """Return the rms of what is left of the smooth part of a sway."""
-    left_m = detrended(found.correction_m[:, 1] - sway_m)
-    return float(np.std(gaussian_filter1d(left_m, _SMOOTHED)))
+def residual_m(error_m: NDArray[np.float64], smoothed: float = 0) -> float:
+    """Return the rms of what is left of a sway, [pings], the largest of any 400 pings.
+
+    Over so many pings a response stays in the beam. A trend of theirs is left out. `smoothed` is
+    the number of pings of a mean.
+    """
+    worst_m = 0.0
+    for first in range(0, max(len(error_m) - PINGS, 0) + 1, PINGS // 4):
+        left_m = detrended(error_m[first : first + PINGS])
+        left_m = gaussian_filter1d(left_m, smoothed) if smoothed else left_m
+        worst_m = max(worst_m, float(np.std(left_m)))
+    return worst_m
+
+
+def smooth_residual_m(error_m: NDArray[np.float64]) -> float:
+    """Return the rms of what is left of the smooth part of a sway, [pings]."""
+    return residual_m(error_m, _SMOOTHED)
 
 
 @dataclass(frozen=True)
@@ -111,22 +139,32 @@ class Scene:
         Sway that changes over some metres, and from ping to ping.
     seed : int
         Of the smooth sway.
+    points : int
+        Number of isolated points.
+    grid : Grid
+    pings : int
     """
 
     bright: int | None
     smooth: float
     white: float
     seed: int = 0
+    points: int = 60
+    grid: Grid = GRID
+    pings: int = PINGS
 
     @property
     def targets(self) -> PointTargets:
         """Points of the scene."""
-        return points() if self.bright is None else speckle(self.bright)
+        if self.bright is None:
+            return points(count=self.points, grid=self.grid)
+        return speckle(self.bright)
 
     @property
     def sway_m(self) -> NDArray[np.float64]:
         """Sway of every ping."""
-        return smooth_m(self.smooth * WAVELENGTH_M, self.seed) + white_m(self.white * WAVELENGTH_M)
+        smooth = smooth_m(self.smooth * WAVELENGTH_M, self.seed, pings=self.pings)
+        return smooth + white_m(self.white * WAVELENGTH_M, pings=self.pings)
 
 
 SCENES = {
@@ -136,6 +174,7 @@ SCENES = {
     "points-smooth-and-white": Scene(None, 2, 0.05),
     "points-white": Scene(None, 0, 0.1),
     "speckle-smooth": Scene(20, 2, 0, seed=4),
+    "large": Scene(None, 2, 0.05, points=400, grid=LARGE_GRID, pings=LARGE_PINGS),
 }
 COLUMNS = (
     "scene",
@@ -154,15 +193,16 @@ def rows(devices: Iterable[str]) -> Iterator[list[str]]:
         for name, scene in SCENES.items():
             sway_m = scene.sway_m
             true, told = recorded(scene.targets, sway_m)
-            found, images = _timed(told, GRID, device)
-            left = np.std(detrended(found.correction_m[:, 1] - sway_m)) / WAVELENGTH_M
+            found, images = _timed(told, scene.grid, device)
+            left_m = found.correction_m[:, 1] - sway_m
+            left = residual_m(left_m) / WAVELENGTH_M
             yield [
                 f"{name}, {device}",
                 f"{scene.smooth:g} smooth, {scene.white:g} white",
-                f"{peak_db(told, true, device):.2f}",
-                f"{peak_db(found.lines, true, device):.2f}",
+                f"{peak_db(told, true, device, grid=scene.grid):.2f}",
+                f"{peak_db(found.lines, true, device, grid=scene.grid):.2f}",
                 f"{left:.4f}",
-                f"{smooth_residual_m(found, sway_m) / WAVELENGTH_M:.4f}",
+                f"{smooth_residual_m(left_m) / WAVELENGTH_M:.4f}",
                 f"{images:.1f}",
             ]
 
@@ -174,11 +214,9 @@ def _timed(lines: RangeLines, grid: Grid, device: str) -> tuple[Autofocus, float
         factorize(lines, grid, IMAGE_TOLERANCE_DB, device=device)
 
     found = autofocus(lines, grid, device=device)
-    seconds = [
-        min(_seconds(each) for _ in range(_REPEATS))
-        for each in (image, partial(autofocus, lines, grid, device=device))
-    ]
-    return found, seconds[1] / seconds[0]
+    work = image, partial(autofocus, lines, grid, device=device)
+    seconds = np.min([[_seconds(each) for each in work] for _ in range(_REPEATS)], axis=0)
+    return found, float(seconds[1] / seconds[0])
 
 
 def _seconds(work: Callable[[], object]) -> float:

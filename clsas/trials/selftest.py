@@ -150,10 +150,17 @@ def variants(device: Device) -> dict[str, Device]:
 
 
 def driven(device: Device, width: int, permute: bool) -> Device:
-    """Return a device whose kernels are built for vectors of `width` floats, permuted or not."""
+    """Return a device whose kernels are built for vectors of `width` floats, permuted or not.
+
+    One float is what a GPU's are built for: the device is then driven as a GPU in every way, with
+    work-groups of 64, its own buffers, copies to and from them, and half precision.
+    """
     if (width, permute) == (device.info.width, device.info.permute):
         return device
-    info = dataclasses.replace(device.info, width=width, stage_width=width, permute=permute)
+    kind = "gpu" if width == 1 else device.info.kind
+    info = dataclasses.replace(
+        device.info, kind=kind, width=width, stage_width=width, permute=permute
+    )
     return dataclasses.replace(device, info=info, _kernels={})
 
 

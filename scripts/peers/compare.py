@@ -1,209 +1,200 @@
-"""Exact images by other codes beside those of clsas: `scripts/bench peers`.
+"""Images by other codes beside those of clsas: `scripts/bench peers`.
 
-The scene is `bp-2k`, or a part of it with fewer pixels and channels: the same spacings and ranges.
-All codes form the same image of it, in turns. Other codes come from PyPI, into an environment of
-their own in the cache folder. A program beside this one runs each of them; it reads requests from
-its standard input. torchbp is not on PyPI and is not measured.
+All codes form the same images, in turns. Each runs in a process of its own, other codes in
+environments of their own in the cache folder. FastSAR comes from PyPI, torchbp from a checkout.
 """
 
 from __future__ import annotations
 
 import statistics
-import subprocess
 import sys
 import tempfile
-import time
-import venv
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, replace
-from functools import partial
+from collections.abc import Iterable, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from peers import scenes
+from peers.codes import Code, Method, installed, methods
+from peers.workers import worker
 
-import clsas
-from clsas.core.cache import cache_folder
 from clsas.exact import reference
-from clsas.trials import cases, tables
-from clsas.trials.cases import Case
+from clsas.trials import tables
 
-FASTSAR = "fastsar==0.1.8"
-# Interpolator and upsampling: linear is the fastest, cubic on 8 times the samples its default.
-FASTSAR_SETTINGS = (("linear", 8), ("cubic", 4), ("cubic", 8))
-ACCURACIES_DB = (-50.0, -80.0)
-ERROR_PIXELS = 300
-PADDING = 64  # zeros at both ends of a line, which keep its echoes from wrapping around
-LIGHT_M_S = 299_792_458.0  # the speed of waves in codes for radar
+ERROR_PIXELS = 1000
+SIZES = (256, 512, 1024, 2048)
+COLUMNS = ("image", "code", "settings", "seconds: median (min to max)", "planning s", "GBP/s")
 
 
-class PeerError(Exception):
-    """Another code cannot be installed or run here."""
+@dataclass
+class Measured:
+    """What a method took on a number of cores, and how much it erred; or why it refused."""
 
+    method: Method
+    cores: int | None
+    planning: float = 0.0
+    seconds: list[float] = field(default_factory=list)
+    error_db: float = np.nan
+    refused: str = ""
 
-@dataclass(frozen=True)
-class Method:
-    """A way to an exact image: `form` returns the seconds that it took, and the image."""
-
-    name: str
-    form: Callable[[], tuple[float, NDArray[np.complex64]]]
-
-
-def scene(pixels: int) -> Case:
-    """Return the part of `bp-2k` with so many pixels along either side, and as many channels."""
-    whole = cases.EXACT_CASES["bp-2k"]
-    (left, right), (near, far) = whole.x_m, whole.y_m
-    steps = (pixels - 1) / (whole.pixels - 1)
-    half, middle = (right - left) / 2 * steps, (left + right) / 2
-    return replace(
-        whole,
-        channels=whole.channels * pixels // whole.pixels,
-        x_m=(middle - half, middle + half),
-        y_m=(near, near + (far - near) * steps),
-        pixels=pixels,
-    )
-
-
-def as_radar(case: Case, lines: clsas.RangeLines) -> dict[str, object]:
-    """Return lines as samples over frequency, as of a radar with the same wavelengths.
-
-    A point of amplitude A at range R gives S[p, k] = A exp(-j 4 pi f_k (R - ref_p) / c) in channel
-    p at frequency f_k, with c the speed of light.
-    """
-    samples = np.pad(lines.samples.astype(np.complex128), ((0, 0), (PADDING, PADDING)))
-    count = samples.shape[1]
-    first_m = lines.first_range_m - PADDING * lines.range_step_m
-    cycles_per_m = np.arange(-(count // 2), count - count // 2) / (count * lines.range_step_m)
-    spectrum = np.fft.fftshift(np.fft.fft(samples, axis=1), axes=1)
-    ref_m = first_m + count // 2 * lines.range_step_m
-    cycles = lines.carrier_cycles_per_m * ref_m[:, None]
-    cycles = cycles + cycles_per_m * (ref_m - first_m)[:, None]
-    return {
-        "history": (spectrum * np.exp(2j * np.pi * cycles)).astype(np.complex64),
-        "positions_m": lines.tx_m,
-        "ref_m": ref_m,
-        "first_hz": (lines.carrier_cycles_per_m + cycles_per_m[0]) * LIGHT_M_S / 2,
-        "step_hz": LIGHT_M_S / 2 / (count * lines.range_step_m),
-        "pixels": case.pixels,
-        "x_m": case.x_m,
-        "y_m": case.y_m,
-    }
-
-
-def environment(requirement: str) -> Path:
-    """Return the Python of an environment that holds a package from PyPI; make it if needed."""
-    folder = cache_folder() / "peers" / requirement
-    python = folder / "bin" / "python"
-    if not (folder / "ready").exists():
-        print(f"installing {requirement} in {folder}", file=sys.stderr)
-        venv.create(folder, with_pip=True, clear=True)
-        done = subprocess.run(
-            [python, "-m", "pip", "install", "--quiet", requirement],
-            capture_output=True,
-            text=True,
-            check=False,
-        )
-        if done.returncode:
-            last = done.stderr.strip().splitlines()[-1:]
-            raise PeerError(f"{requirement} cannot be installed: {''.join(last)}")
-        (folder / "ready").touch()
-    return python
-
-
-@contextmanager
-def worker(python: Path, program: Path, scene_file: Path) -> Iterator[Callable[..., str]]:
-    """Yield a function that sends a request to a program of another code and returns its answer."""
-    process = subprocess.Popen(
-        [python, program, scene_file], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
-    )
-
-    def ask(*words: object) -> str:
-        assert process.stdin is not None
-        assert process.stdout is not None
-        print(*words, file=process.stdin, flush=True)
-        answer = process.stdout.readline().strip()
-        if not answer:
-            raise PeerError(f"{program.name} ended with {process.wait()}, its messages are above")
-        return answer
-
-    try:
-        yield ask
-    finally:
-        assert process.stdin is not None
-        process.stdin.close()
-        process.wait()
-
-
-def fastsar(ask: Callable[..., str], folder: Path) -> list[Method]:
-    """Return FastSAR's exact images."""
-
-    def form(interpolator: str, upsampling: int) -> tuple[float, NDArray[np.complex64]]:
-        seconds = float(ask(interpolator, upsampling, folder / "image.npy"))
-        return seconds, np.load(folder / "image.npy").T
-
-    return [
-        Method(f"FastSAR, {kind} on {factor}-fold upsampled lines", partial(form, kind, factor))
-        for kind, factor in FASTSAR_SETTINGS
-    ]
-
-
-def ours(lines: clsas.RangeLines, grid: clsas.Grid, device: str) -> list[Method]:
-    """Return the exact images of clsas."""
-
-    def form(accuracy_db: float) -> tuple[float, NDArray[np.complex64]]:
-        start = time.perf_counter()
-        image = clsas.backproject(lines, grid, accuracy_db=accuracy_db, device=device)
-        return time.perf_counter() - start, image.pixels
-
-    return [
-        Method(f"clsas, {device}, {level:g} dB asked for", partial(form, level))
-        for level in ACCURACIES_DB
-    ]
+    @property
+    def median(self) -> float:
+        """Median of the seconds."""
+        return statistics.median(self.seconds)
 
 
 def error_db(
     pixels: NDArray[np.complex64], chosen: NDArray[np.int64], ideal: NDArray[np.complex128]
 ) -> float:
-    """Return the relative rms error at some pixels, after the best common complex factor.
+    """Return the rms error at some pixels over the rms of the image, dB.
 
-    Other codes scale images by their own windows and transforms.
+    The best common complex factor is taken out: other codes scale images by their own windows and
+    transforms. The level is that of all pixels, since few of an image of points are bright.
     """
     found = pixels.ravel()[chosen].astype(np.complex128)
     factor = np.vdot(found, ideal) / np.vdot(found, found)
-    return clsas.relative_error_db(factor * found, ideal)
+    error = np.linalg.norm(factor * found - ideal) / np.sqrt(len(chosen))
+    level = np.abs(factor) * np.linalg.norm(pixels) / np.sqrt(pixels.size)
+    return float(20 * np.log10(max(error / level, np.finfo(float).tiny)))
 
 
-def peers(devices: list[str], pixels: int, repeats: int = 3) -> None:
-    """Print speed and true error of exact images by clsas and by other codes."""
-    case = scene(pixels)
-    lines, grid = case.lines(), case.grid
-    chosen = np.random.default_rng(0).choice(grid.size, min(ERROR_PIXELS, grid.size), replace=False)
-    ideal = reference.ideal(lines, grid.at(chosen))
+def measure(
+    scene: scenes.Scene,
+    codes: dict[str, Code],
+    chosen: Iterable[Method],
+    cores: Sequence[int | None] = (None,),
+    repeats: int = 3,
+) -> list[Measured]:
+    """Return what methods take for a scene, by turns; a first image of each is not timed."""
+    lines, grid = scene.lines(), scene.grid
+    count = min(ERROR_PIXELS, grid.size)
+    pixels = np.random.default_rng(0).choice(grid.size, count, replace=False)
+    ideal = reference.ideal(lines, grid.at(pixels))
+    here = [method for method in chosen if method.code in codes]
+    found = [Measured(method, each) for method in here for each in cores]
     with ExitStack() as opened:
         folder = Path(opened.enter_context(tempfile.TemporaryDirectory()))
-        np.savez(folder / "scene.npz", **as_radar(case, lines))
-        methods = [method for device in devices for method in ours(lines, grid, device)]
-        try:
-            program = Path(__file__).with_name("fastsar_exact.py")
-            ask = opened.enter_context(worker(environment(FASTSAR), program, folder / "scene.npz"))
-            others = fastsar(ask, folder)
-            errors_db = [error_db(each.form()[1], chosen, ideal) for each in others]
-        except PeerError as error:
-            print(f"FastSAR is not measured: {error}", file=sys.stderr)
-            others, errors_db = [], []
-        errors_db = [error_db(each.form()[1], chosen, ideal) for each in methods] + errors_db
-        methods += others
-        seconds: list[list[float]] = [[] for _ in methods]
-        for _ in range(repeats):
-            for method, taken in zip(methods, seconds, strict=True):
-                taken.append(method.form()[0])
-    pairs = lines.channels * grid.size
-    rows = []
-    for method, taken, found_db in zip(methods, seconds, errors_db, strict=True):
-        middle = statistics.median(taken)
-        spread = f"{middle:.3f} ({min(taken):.3f} to {max(taken):.3f})"
-        rows.append([method.name, spread, f"{pairs / middle / 1e9:.2f}", f"{found_db:.1f}"])
-    print(f"{lines.channels} channels, {pixels} x {pixels} pixels, every channel in every pixel\n")
-    tables.table(["exact images", "seconds: median (min to max)", "GBP/s", "true error dB"], rows)
-    print("\ntorchbp is not on PyPI and is not measured.", file=sys.stderr)
+        image_file = folder / "image.npy"
+        scenes.write(folder / "scene.npz", scene, lines)
+        asks = {
+            (name, each): opened.enter_context(
+                worker(codes[name].python, codes[name].program, folder / "scene.npz", each)
+            )
+            for name in {method.code for method in here}
+            for each in cores
+        }
+        for turn in range(1 + repeats):
+            for one in found:
+                if one.refused:
+                    continue
+                ask = asks[one.method.code, one.cores]
+                answer = ask(image_file=str(image_file), **one.method.settings)
+                if "refused" in answer:
+                    one.refused = answer["refused"]
+                elif turn == 0:
+                    one.planning = answer["planning"]
+                    one.error_db = error_db(np.load(image_file), pixels, ideal)
+                else:
+                    one.seconds.append(answer["seconds"])
+    return found
+
+
+def row(one: Measured, pairs: int) -> list[str]:
+    """Return a method's row of the table of a track."""
+    method = one.method
+    name = [method.kind, method.code, method.words]
+    if one.refused:
+        return [*name, f"refused: {one.refused}", "", "", ""]
+    return [
+        *name,
+        f"{one.median:.3f} ({min(one.seconds):.3f} to {max(one.seconds):.3f})",
+        f"{one.planning:.2f}",
+        f"{pairs / one.median / 1e9:.2f}",
+        f"{one.error_db:.1f}",
+    ]
+
+
+def _told(one: Measured) -> str:
+    return "refused" if one.refused else f"{one.median:.3f} s, {one.error_db:.0f} dB"
+
+
+def _say_absent(absent: dict[str, str]) -> None:
+    for name, reason in absent.items():
+        print(f"\n{name} is not measured: {reason}")
+
+
+def _describe(track: str, scene: scenes.Scene, pixels: int) -> None:
+    print(f"\n{track}: {scene.channels} channels, {pixels} x {pixels} pixels,", end=" ")
+    print("every channel in every pixel\n")
+
+
+def peers(
+    devices: list[str], tracks: Iterable[str], pixels: int | None, torchbp: Path | None
+) -> None:
+    """Print times and true errors of exact and factorized images by all codes, per track."""
+    codes, absent = installed(torchbp)
+    for track in tracks:
+        side = pixels or scenes.PIXELS[track]
+        scene = scenes.TRACKS[track](side)
+        pairs = scene.channels * scene.grid.size
+        _describe(track, scene, side)
+        found = measure(scene, codes, methods(devices))
+        tables.table([*COLUMNS, "true error dB"], [row(one, pairs) for one in found])
+    _say_absent(absent)
+
+
+def peers_scaling(
+    devices: list[str], tracks: Iterable[str], largest: int, torchbp: Path | None
+) -> None:
+    """Print times and errors of the codes' best settings against the pixels along a side."""
+    codes, absent = installed(torchbp)
+    best = [method for method in methods(devices) if method.best]
+    sizes = [size for size in SIZES if size <= largest]
+    for track in tracks:
+        found = []
+        for size in sizes:
+            print(f"{track}, {size} x {size} pixels", file=sys.stderr, flush=True)
+            found.append(measure(scenes.TRACKS[track](size), codes, best))
+        print(f"\n{track}: median of 3, and error\n")
+        rows = []
+        for several in zip(*found, strict=True):
+            method = several[0].method
+            grows = ""
+            if not any(one.refused for one in several):
+                power = tables.exponent(sizes, [one.median for one in several])
+                grows = f"N^{power:.2f}"
+            name = f"{method.code}, {method.words}"
+            rows.append([method.kind, name, *map(_told, several), grows])
+        tables.table(["image", "code, settings", *(f"N = {n}" for n in sizes), "at the end"], rows)
+    _say_absent(absent)
+
+
+def peers_cores(
+    devices: list[str],
+    tracks: Iterable[str],
+    pixels: int | None,
+    cores: Sequence[int],
+    torchbp: Path | None,
+) -> None:
+    """Print times of the codes' best settings on several numbers of cores."""
+    codes, absent = installed(torchbp)
+    best = [method for method in methods(devices) if method.best]
+    for track in tracks:
+        side = pixels or scenes.PIXELS[track]
+        scene = scenes.TRACKS[track](side)
+        _describe(track, scene, side)
+        found = measure(scene, codes, best, cores)
+        rows = []
+        for begin in range(0, len(found), len(cores)):
+            several = found[begin : begin + len(cores)]
+            method = several[0].method
+            gain = ""
+            if not any(one.refused for one in several):
+                gain = f"{several[0].median / several[-1].median:.2f}"
+            name = f"{method.code}, {method.words}"
+            rows.append([method.kind, name, *map(_told, several), gain])
+        counts = [f"{each} core{'s' * (each > 1)}" for each in cores]
+        tables.table(["image", "code, settings", *counts, "gain"], rows)
+    _say_absent(absent)

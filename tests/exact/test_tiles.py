@@ -231,6 +231,38 @@ def test_ranges_change_within_a_block_by_no_more_than_allowed(width, seed):
         assert change_m >= 0.5 * least_m
 
 
+@pytest.mark.parametrize("squint", [0.0, 25.0])
+@pytest.mark.parametrize("heading", [0.0, 20.0, 90.0])
+def test_ranges_change_within_a_block_by_no_more_than_allowed_in_a_beam(heading, squint):
+    """Ways that the beam covers are bounded by it, wherever the antennas of a turning track are."""
+    rng = np.random.default_rng(3)
+    grid = Grid.plane((0, 1.27, 128), (40, 40.63, 64))
+    bare, (rows, columns) = Tiles(grid, 64, 8), BLOCKS[8]
+    beam = BeamWindow(20.0, "hann", squint_deg=squint)
+    angle = np.deg2rad(heading + np.linspace(-10, 10, 7))
+    along = np.stack([np.cos(angle), np.sin(angle), np.zeros(7)], axis=1)
+    tiles = dataclasses.replace(bare, cosines=bare.cosines_in_beam(beam, along))
+    # Directions of the track between the given ones, and ways at all angles within the beam.
+    between = np.deg2rad(heading + rng.uniform(-10, 10, 4000))
+    forward = np.stack([np.cos(between), np.sin(between), np.zeros(4000)], axis=1)
+    sine = rng.uniform(*beam.limits, 4000)[:, None]
+    around = np.cross(forward, rng.standard_normal((4000, 3)))
+    around /= np.linalg.norm(around, axis=1)[:, None]
+    way = sine * forward + np.sqrt(1 - sine**2) * around
+    row, column = np.mgrid[:rows, :columns].reshape(2, -1) - np.array(
+        [[(rows - 1) / 2], [(columns - 1) / 2]]
+    )
+    place_m = row[:, None] * grid.row_step_m + column[:, None] * grid.column_step_m
+    change_m = np.abs(place_m @ way.T).max()
+    sizes_m = np.geomspace(1e-3, 1, 500)
+    least_m = next(most_m for most_m in sizes_m if tiles.windows(most_m))
+    assert change_m <= least_m
+    assert least_m < 1.1 * change_m
+
+
 def test_grids_that_are_not_rectangles_have_no_bound_of_directions():
     grid = Grid.oriented([0, 40, 0], [0.01, 0.002, 0], [0.002, 0.01, 0], (64, 64))
-    assert Tiles(grid, 64, 8).cosines_of(np.array([[0.0, 0.0, 0.0]])) == (1.0, 1.0)
+    tiles = Tiles(grid, 64, 8)
+    assert tiles.cosines_of(np.array([[0.0, 0.0, 0.0]])) == (1.0, 1.0)
+    beam = BeamWindow(5.0)
+    assert tiles.cosines_in_beam(beam, np.array([[1.0, 0.0, 0.0]])) == (1.0, 1.0)

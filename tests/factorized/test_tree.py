@@ -10,6 +10,7 @@ from clsas.core.image_error import relative_error_db
 from clsas.exact.backprojection import backproject
 from clsas.factorized import tree, visibility
 from clsas.factorized.aperture import cycles_per_extent, mean_track
+from clsas.factorized.beam_directions import BeamDirections
 from clsas.factorized.surface import surface_of
 from clsas.factorized.tree import Division, interpolated_channels, nearest_nodes
 from clsas.planning.factorize import factorize
@@ -213,7 +214,7 @@ def test_subimages_beyond_the_grid_are_not_missed(shape, everything, monkeypatch
 def test_places_from_where_leaves_are_seen_hold_all_that_weigh():
     lines, grid = made(near)
     beam, track = BEAMS[0], mean_track(lines)
-    along = visibility.beam_directions(beam.directions(lines), track, track.samples)
+    along = BeamDirections.of(beam, beam.directions(lines), track).along
     division = Division(surface_of(grid), ((16, 16),))
     corners = division.roots[:, None]
     half_m = 8 * np.stack([grid.row_step_m, grid.column_step_m])
@@ -222,7 +223,7 @@ def test_places_from_where_leaves_are_seen_hold_all_that_weigh():
     )
     place = np.linspace(0, 1, 2001)
     position_m = track.positions_m(place)
-    direction = visibility.beam_directions(beam.directions(lines), track, place)
+    direction = BeamDirections.of(beam, beam.directions(lines), track).at(place)
     for (corner,), (first,), (last,) in zip(corners, begin, end, strict=True):
         for pixel in corner + np.array([[0, 0], [0, 15], [15, 0], [15, 15], [7, 8]]):
             pixel_m = grid.origin_m + pixel @ np.stack([grid.row_step_m, grid.column_step_m])
@@ -240,13 +241,13 @@ def test_boxes_are_seen_from_where_they_are_and_from_hardly_more(beam, range_m):
     track_m = np.stack([80 * place - 40, 0.3 * np.sin(9 * place), 0 * place], axis=1)
     lines = thesis_lines(Grid.plane((-1, 1, 4), (29, 30, 4)), track_m)
     track = mean_track(lines)
-    along = visibility.beam_directions(beam.directions(lines), track, track.samples)
+    along = BeamDirections.of(beam, beam.directions(lines), track).along
     random = np.random.default_rng(1)
     centres_m = random.uniform((-70, 0.7 * range_m, -1), (70, 1.3 * range_m, 1), (300, 3))
     half_m = range_m * np.array([[0.02, 0, 0], [0, 0.01, 0]])
     begin, end = visibility.visible_stretches(beam.limits, track, along, centres_m, half_m)
     place, spacing = np.linspace(0, 1, 4001), 2 / 256  # of those that are looked at
-    direction = visibility.interpolated_directions(track.samples, along, place)
+    direction = BeamDirections.of(beam, beam.directions(lines), track).at(place)
     boxes = Visibility.of(centres_m, half_m, track.positions_m(place), direction)
     seen = boxes.overlap(beam.limits, np.ones(2)) > 0
     ever = seen.any(axis=1)
@@ -265,5 +266,7 @@ def test_boxes_are_seen_from_where_they_are_and_from_hardly_more(beam, range_m):
 def test_directions_between_channels_are_of_length_one():
     lines, _ = made(arc)
     track = mean_track(lines)
-    along = visibility.beam_directions(BEAMS[0].directions(lines), track, np.linspace(-1, 2, 50))
+    along = BeamDirections.of(BEAMS[0], BEAMS[0].directions(lines), track).at(
+        np.linspace(-1, 2, 50)
+    )
     np.testing.assert_allclose(np.linalg.norm(along, axis=1), 1)

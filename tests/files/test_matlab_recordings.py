@@ -5,6 +5,7 @@ import zlib
 
 import numpy as np
 import pytest
+from damaging import refused
 from scipy.constants import speed_of_light
 from scipy.io import savemat
 
@@ -266,27 +267,4 @@ def test_nesting_without_end_is_refused(tmp_path):
 @pytest.mark.parametrize("compressed", [True, False])
 def test_damaged_files_end_in_one_error_or_the_same_lines(tmp_path, compressed):
     whole = save(tmp_path / "pass.mat", phase_history(8, 16), compressed).read_bytes()
-    random = np.random.default_rng(1)
-    path = tmp_path / "damaged.mat"
-    refused = 0
-    for _ in range(150):
-        content = bytearray(whole)
-        if random.random() < 0.3:
-            content = content[: random.integers(len(content))]
-        else:
-            for place in random.integers(0, len(content), 3):
-                content[place] ^= 1 << random.integers(8)
-        path.write_bytes(content)
-        said = message_of(path)
-        assert said is None or "damaged.mat" in said
-        refused += said is not None
-    assert refused > 60
-
-
-def message_of(path):
-    """The message of the one error that loading a file may end in, or None."""
-    try:
-        clsas.load(path)
-    except (ValueError, TypeError) as error:
-        return str(error)
-    return None
+    assert refused(whole, tmp_path / "damaged.mat", number=150, flips=3) > 60

@@ -5,7 +5,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from dense import TRACKS, scene
+from dense import TRACKS, headings, scene, to_and_fro, turning
 from factorizing import EXACT_IS_SLOW, peak_device_bytes
 
 from clsas.core.grid import Grid
@@ -14,8 +14,11 @@ from clsas.core.image_error import relative_error_db
 from clsas.exact import reference
 from clsas.exact.backprojection import backproject
 from clsas.factorized.plan import Plan
+from clsas.factorized.sector import Geometry
+from clsas.factorized.surface import surface_of
 from clsas.opencl.device import open_device
 from clsas.planning import planner
+from clsas.planning.costs import Costs
 from clsas.planning.factorize import factorize
 from clsas.planning.planner import plan
 from clsas.sonar.beam import BeamWindow
@@ -86,44 +89,100 @@ def test_the_oracle_agrees(name):
     assert found_db < -49
 
 
-def test_passes_with_a_beam():
-    """Every pass has its own direction."""
-    lines, grid = scene("passes")
-    beam = BeamWindow(25, "hann")
-    chosen = planned("passes", -40, beam=beam)
-    assert chosen.factorization.aperture.shape == "strips"
-    points = Grid.points(grid.positions_m())
-    pixels = backproject(lines, points, beam=beam, accuracy_db=-80).pixels
-    error_db = relative_error_db(factorize(lines, grid, chosen), Image(pixels, grid))
-    assert_keeps(chosen, error_db)
+WINDOWS = {
+    "all": None,
+    "hann": BeamWindow(20, "hann"),
+    "squinted": BeamWindow(20, "hann", squint_deg=6),
+    "normalising": BeamWindow(25, "hann", normalise=True),
+}
+SIDE = 64
+CASES = [(kind, window) for window in WINDOWS for kind in ("plane", *KINDS)]
 
 
-@pytest.mark.parametrize("tolerance_db", [-30, -50])
+def with_headings(name, beam):
+    """A beam with the headings of an aperture's platform."""
+    if beam is None:
+        return None
+    return dataclasses.replace(beam, along=headings(name, beam.squint_deg))
+
+
+def exactly(lines, grid, beam):
+    """The exact image; point by point a window is evaluated for every pixel."""
+    pixels = backproject(lines, Grid.points(grid.positions_m()), beam=beam, accuracy_db=-80).pixels
+    return Image(pixels, grid)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("kind", "window"), CASES)
+@pytest.mark.parametrize("name", [name for name in TRACKS if name != "spiral"])
+def test_every_aperture_with_every_beam(name, kind, window):
+    """On a plane and off it, with separate and with moving receivers."""
+    lines, grid = scene(name, kind, SIDE)
+    beam = with_headings(name, WINDOWS[window])
+    chosen = plan(lines, grid, tolerance_db=-40, beam=beam, costs=EXACT_IS_SLOW)
+    assert not chosen.is_exact
+    error_db = relative_error_db(factorize(lines, grid, chosen), exactly(lines, grid, beam))
+    assert error_db <= -40
+    assert -4 <= error_db - chosen.predicted_error_db <= 1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("window", ["all", "hann", "squinted"])
+def test_images_of_a_helix_pay_with_a_beam(window):
+    """Costs are those of a CPU: an image of some size is factorized because that is faster."""
+    lines, grid = scene("helix", side=224)
+    beam = with_headings("helix", WINDOWS[window])
+    chosen = plan(lines, grid, tolerance_db=-40, beam=beam, costs=Costs())
+    assert chosen.factorization.aperture.shape == "sheet"
+    assert chosen.predicted_seconds < chosen.exact_seconds
+    error_db = relative_error_db(factorize(lines, grid, chosen), exactly(lines, grid, beam))
+    assert error_db <= -40
+    assert -4 <= error_db - chosen.predicted_error_db <= 1
+
+
+@pytest.mark.slow
+def test_the_oracle_agrees_with_a_beam_that_turns():
+    lines, grid = scene("helix")
+    beam = with_headings("helix", WINDOWS["squinted"])
+    image = factorize(lines, grid, planned("helix", -50, beam=beam))
+    found_db = reference.sampled_error_db(
+        image, lambda *given: reference.ideal(lines, *given, beam=beam), pixels=60
+    )
+    assert found_db < -49
+
+
 @pytest.mark.parametrize(
-    ("name", "kind"),
+    ("name", "squint_deg", "along", "reason"),
     [
-        ("raster", "plane"),
-        ("spiral", "plane"),
-        ("planar", "bistatic"),
-        ("planar", "moving"),
-        ("planar", "hills"),
+        ("spiral", 0.0, turning(TRACKS["spiral"]()), "too far from a smooth aperture, by their"),
+        ("raster", 6.0, to_and_fro(), "too far from a smooth aperture, by their"),
     ],
 )
-def test_sheets_with_a_beam(name, kind, tolerance_db):
-    """A sonar whose heading stays the same, wherever it moves to."""
-    lines, grid = scene(name, kind)
-    beam = BeamWindow(25, "hann", along=(1.0, 0.0, 0.0))
-    chosen = planned(name, tolerance_db, kind, beam=beam)
-    assert chosen.factorization.aperture.shape == "sheet"
-    points = Grid.points(grid.positions_m())
-    pixels = backproject(lines, points, beam=beam, accuracy_db=-80).pixels
-    error_db = relative_error_db(factorize(lines, grid, chosen), Image(pixels, grid))
-    assert_keeps(chosen, error_db)
+def test_a_plan_tells_why_an_image_is_exact(name, squint_deg, along, reason):
+    """Neighbours look elsewhere: in the middle of the spiral, and on the way back of a scan."""
+    beam = BeamWindow(20, "hann", squint_deg=squint_deg, along=along)
+    chosen = planned(name, -40, beam=beam)
+    assert chosen.is_exact
+    assert reason in chosen.describe()
+    assert Plan.from_json(chosen.to_json()).image == chosen.image
 
 
-def test_a_beam_that_normalises_needs_a_single_curve():
-    beam = BeamWindow(25, "hann", along=(1.0, 0.0, 0.0), normalise=True)
-    assert planned("planar", -40, beam=beam).is_exact
+@pytest.mark.parametrize("name", ["helix", "raster", "planar", "passes"])
+def test_virtual_channels_are_as_many_as_predicted(name):
+    """Filters of each stage extend past the ends of those before: these count too."""
+    lines, grid = scene(name)
+    chosen = planned(name, -60, depth=3)
+    geometry = Geometry(lines, surface_of(grid), chosen)
+    sectors = list(geometry.sectors(100, 100))
+    for level, stage in enumerate(chosen.stages[:-1]):
+        needs = [sector.needs[level] for sector in sectors]
+        counts = np.concatenate([(need.last - need.first).ravel() for need in needs])
+        assert stage.channels == pytest.approx(counts[counts > 0].mean(), rel=0.25)
+
+
+def test_turns_of_a_helix_that_lie_above_each_other_are_held_in_half_precision():
+    """Many channels at the same angle are no crowd: each is in a row of its own."""
+    assert planned("helix", -40).half_precision == open_device().info.half_precision
 
 
 @pytest.mark.parametrize("name", ["helix", "planar", "passes"])

@@ -2,6 +2,7 @@
 
 import json
 import math
+import warnings
 from dataclasses import replace
 from pathlib import Path
 
@@ -50,7 +51,7 @@ def test_smooth_sway_is_found(name):
     found = autofocus(told, GRID)
     assert peak_db(told, true) < -3
     assert abs(peak_db(found.lines, true)) <= 0.3
-    assert smooth_residual_m(found, sway_m) <= WAVELENGTH_M / 100
+    assert smooth_residual_m(found.correction_m[:, 1] - sway_m) <= WAVELENGTH_M / 100
     assert found.focused
     assert found.sharpness_after > 2 * found.sharpness_before
 
@@ -61,7 +62,7 @@ def test_smooth_sway_and_jitter():
     true, told = recorded(points(), sway_m)
     found = autofocus(told, GRID)
     assert abs(peak_db(found.lines, true)) <= 0.5
-    assert smooth_residual_m(found, sway_m) <= WAVELENGTH_M / 100
+    assert smooth_residual_m(found.correction_m[:, 1] - sway_m) <= WAVELENGTH_M / 100
 
 
 @pytest.mark.slow
@@ -180,7 +181,7 @@ def test_lines_that_hold_their_carrier_still_are_focused_alike():
     usual, found = autofocus(told, GRID), autofocus(with_carrier(told), GRID)
     assert found.focused
     assert np.abs(found.correction_m - usual.correction_m).max() <= WAVELENGTH_M / 30
-    assert smooth_residual_m(found, sway_m) <= WAVELENGTH_M / 100
+    assert smooth_residual_m(found.correction_m[:, 1] - sway_m) <= WAVELENGTH_M / 100
 
 
 @pytest.mark.slow
@@ -272,3 +273,33 @@ def test_an_unknown_that_responses_do_not_see():
         autofocus(told, GRID, unknowns="heave")
     with pytest.raises(TypeError, match="unknowns must be one or several"):
         autofocus(told, GRID, unknowns=3)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scale", [1e-25, 1e10, 1e30])
+def test_the_level_of_samples_does_not_matter(scale):
+    """Recorders count in volts or in integers of 32 bits."""
+    scene = SCENES["points-smooth"]
+    true, told = recorded(scene.targets, scene.sway_m)
+    loud = replace(told, samples=(told.samples * scale).astype(np.complex64))
+    found = autofocus(loud, GRID)
+    assert found.focused
+    assert abs(peak_db(replace(found.lines, samples=told.samples), true)) <= 0.3
+    assert np.array_equal(found.lines.samples, loud.samples)
+    assert smooth_residual_m(found.correction_m[:, 1] - scene.sway_m) <= WAVELENGTH_M / 100
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [4, 5])
+def test_two_bright_points_are_too_few(seed):
+    """The scene is told as one without responses, or its track is found: never in between."""
+    sway_m = smooth_m(2 * WAVELENGTH_M, seed)
+    _, told = recorded(speckle(2), sway_m)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        found = autofocus(told, GRID)
+    if found.focused:
+        assert smooth_residual_m(found.correction_m[:, 1] - sway_m) <= WAVELENGTH_M / 16
+    else:
+        assert any("no bright responses" in str(each.message) for each in caught)
+        assert not found.correction_m.any()

@@ -297,3 +297,85 @@ def test_the_order_of_receivers_does_not_matter(straight):
     found, reversed_ = (micronavigate(each, **options) for each in (told, told.select(order)))
     np.testing.assert_allclose(reversed_.sway_m, found.sway_m, atol=1e-6)
     assert np.std(detrended(found.sway_m - moved_m)) <= WAVELENGTH_M / 100
+
+
+def small(pings=8, receivers=56, overlapping=24, **motion):
+    """Lines of few pings on a straight track that the navigation tells, and what it hides."""
+    sonar, advance_m = overlapping_array(receivers, overlapping)
+    course = (0, 0, 0), (advance_m, 0, 0), pings, 1.0
+    true, told = clsas.Track.straight(*course, **motion), clsas.Track.straight(*course)
+    return recorded(sonar, true, told, seabed(true, 12, 15, 5000), 12, 15)
+
+
+@pytest.fixture(scope="module")
+def swaying():
+    return small(sway_m=0.004 * np.sin(np.arange(8)))
+
+
+@pytest.mark.slow
+def test_deviations_are_no_larger_than_those_of_the_navigation(swaying):
+    for unknowns in (("sway",), ("sway", "yaw", "surge")):
+        for correlation in (None, 2.0, 1e4):
+            found = micronavigate(
+                swaying, range_m=(12, 15), element_length_m=WAVELENGTH_M, unknowns=unknowns,
+                sway_sd_m=0.1, yaw_sd_rad=0.02, surge_sd_m=0.05, correlation_pings=correlation,
+            )  # fmt: skip
+            assert found.sway_sd_m.max() <= 0.1 * (1 + 1e-6)
+            assert found.yaw_sd_rad.max() <= 0.02 * (1 + 1e-6)
+            assert found.surge_sd_m.max() <= 0.05 * (1 + 1e-6)
+
+
+@pytest.mark.slow
+def test_dead_receivers_are_left_out(swaying):
+    """Of 48 receivers a dead one among the overlapping ones, and another for three pings."""
+    options = {"range_m": (12, 15), "element_length_m": WAVELENGTH_M}
+    whole = micronavigate(swaying, **options)
+    samples = swaying.samples.copy()
+    samples[4::48] = 0
+    samples[30 : 30 + 3 * 48 : 48] *= 1e-3
+    with pytest.warns(ClsasWarning, match=r"11 of 384 channels hold no signal.*channel 4\)"):
+        found = micronavigate(replace(swaying, samples=samples), **options)
+    assert found.overlap.tolist() == [22, 22, 22, 23, 23, 23, 23]
+    assert np.std(detrended(found.sway_m - whole.sway_m)) < WAVELENGTH_M / 100
+
+
+@pytest.mark.slow
+def test_implausible_corrections_are_told():
+    """Conjugated samples turn the other way; so does a wrong accuracy of the navigation."""
+    lines = small(yaw_rad=np.radians(3) * np.sin(np.arange(8)))
+    options = {"range_m": (12, 15), "element_length_m": WAVELENGTH_M}
+    with pytest.warns(ClsasWarning, match="the yaw found is .* times the accuracy.*yaw_sd_rad"):
+        micronavigate(lines, yaw_sd_rad=np.radians(0.2), **options)
+    micronavigate(lines, yaw_sd_rad=np.radians(3), **options)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"element_length_m": 30.0}, "element_length_m must be from .* got 30 m"),
+        ({"element_length_m": 1e-9}, "element_length_m must be from .* twentieth"),
+        ({"yaw_sd_rad": 20.0}, "yaw_sd_rad must be from 1e-09 to 3.142 rad, got 20 rad"),
+        ({"sway_sd_m": 1e4}, "sway_sd_m must be from 1e-09 to 1000 m, got 10000 m"),
+        ({"range_m": (12.0, 12.05)}, "range_m must be at least 16 samples long"),
+        ({"range_m": (15.0, 12.0)}, "the nearer first"),
+    ],
+)
+@pytest.mark.slow
+def test_lengths_in_other_units_are_refused(swaying, options, message):
+    with pytest.raises(ValueError, match=message):
+        micronavigate(swaying, **options)
+
+
+@pytest.mark.parametrize("factor", [1e-3, 1e3])
+@pytest.mark.slow
+def test_positions_in_other_units_are_refused(swaying, factor):
+    scaled = replace(swaying, tx_m=factor * swaying.tx_m, rx_m=factor * swaying.rx_m)
+    with pytest.raises(ValueError, match=r"phase centres of a ping must extend .* in metres"):
+        micronavigate(scaled, range_m=(12, 15), element_length_m=WAVELENGTH_M)
+
+
+@pytest.mark.slow
+def test_lines_without_variety_are_told_from_noise(swaying):
+    constant = replace(swaying, samples=np.ones_like(swaying.samples))
+    with pytest.raises(ValueError, match=r"at most 1\.00 in any window, and [0-9.]+ at least"):
+        micronavigate(constant, range_m=(12, 15))

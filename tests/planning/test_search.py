@@ -49,8 +49,10 @@ def cost_of(tree, view, filters_db, most, leaf_pixels, beam_cycles, device, cost
     division = sizes.in_root(path[0])
     cycles, place = division.cycles, {int(size): n for n, size in enumerate(division.index)}
 
+    taps_past_ends = choice.aperture_taps * (search.OVERHANG if len(path) > 1 else 1)
+
     def channels(phase_cycles):
-        return view.virtual_channels(choice.aperture_taps, 2 * choice.oversampling, phase_cycles)
+        return view.virtual_channels(taps_past_ends, 2 * choice.oversampling, phase_cycles)
 
     total = options.roots_s[0, path[0]]
     for parent, child in pairwise(path):
