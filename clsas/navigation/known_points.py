@@ -209,7 +209,7 @@ def calibrate_track(
     itself is unknown, so that phases tell nothing about a constant range. Residuals beyond the
     noise are taken as an error of the same size for all reflectors. Standard deviations hold this
     error, and that it is common to the receivers of a ping and persists over pings, as far as the
-    residuals show it. What a drift of the track has in common with an unknown they do not show.
+    residuals show it. A displacement or bend of the whole track they do not hold.
     """
     validate.instance("lines", lines, RangeLines)
     points = validate.array("points_m", points_m, np.float64, (None, 3))

@@ -298,6 +298,7 @@ def test_command(lines, tmp_path):
     assert done.exit_code == 0, done.output
     assert "time offset" in done.output
     assert "at 4 points" in done.output
+    assert "no displacement or bend of the whole track" in done.output
     done = CliRunner().invoke(main, [*command, "--json"])
     results = json.loads(done.output)
     assert results["sound_speed_m_s"] == pytest.approx(1490, abs=0.1)
