@@ -16,7 +16,7 @@ from clsas.cli.inputs import load, read_levels, read_scene, warn_of_sampling
 from clsas.cli.outputs import progress_bar, report
 from clsas.cli.parameters import HDF5, INPUT, Output
 from clsas.core import validate
-from clsas.core.conditioning import STATISTICS, high_passed
+from clsas.core.conditioning import STATISTICS, high_passed, tapered_ends
 from clsas.files.cphd_writing import SUFFIXES as CPHD
 from clsas.files.formats import SUFFIXES
 from clsas.signal.compression import check_options
@@ -163,7 +163,7 @@ def convert(
     if high_pass_hz is not None:
         steps.append(partial(high_passed, cutoff_hz=high_pass_hz, name="--high-pass-hz"))
     if taper_m is not None:
-        steps.append(lambda lines: lines.tapered_ends(taper_m))
+        steps.append(partial(tapered_ends, length_m=taper_m, name="--taper-m"))
     if steps or output.suffix.lower() in CPHD:
         obj = load(recording, clsas.RangeLines)
     else:

@@ -80,7 +80,8 @@ def known_points(
     seen = ", ".join(map(str, results["seen"]))
     report(
         as_json,
-        f"{output}: {found.describe()}\n  seen in {seen} channels",
+        f"{output}: {found.describe()}\n  seen in {seen} channels; ± holds noise and errors that "
+        "change along the track, but no displacement or bend of the whole track",
         file=output,
         **results,
     )

@@ -30,7 +30,8 @@ from clsas.processing.record import StepRecord
     "steps",
     multiple=True,
     type=click.Choice(STEPS),
-    help="Step to run instead of the scene's; repeat the option.",
+    help="Bring only this step up to date, and those of the scene that correct the lines before "
+    "it; repeat the option.",
 )
 @options.device
 @options.as_json
@@ -47,7 +48,7 @@ def process(
     The table [process] of the scene names the recording and the steps: inspect, calibrate,
     navigate, focus, image and mosaic. Results go into one folder, with a record of inputs, versions
     and numbers in process.json. The same command continues after an interruption, and runs again
-    only what has changed.
+    only what has changed. It replaces only files of that record, which belongs to one scene.
 
     \b
     Example:  clsas process scene.toml --lines lines.h5 -o processed

@@ -62,6 +62,13 @@ def creating(path: Path) -> Iterator[Path]:
         sync_folder(path.parent)
 
 
+@contextmanager
+def staging(folder: Path) -> Iterator[Path]:
+    """Yield an empty temporary folder within a folder, for files to move from; then remove it."""
+    with _temporary(folder / "staging", Path.mkdir) as (temporary, _):
+        yield temporary
+
+
 def make_folders(path: Path) -> None:
     """Create a folder and missing parents, and wait until they are on the disk."""
     missing = [each for each in (path, *path.parents) if not each.exists()]

@@ -64,10 +64,13 @@ def high_passed(lines: RangeLines, cutoff_hz: float, name: str = "cutoff_hz") ->
     return replace(lines, samples=samples)
 
 
-def tapered_ends(lines: RangeLines, length_m: float) -> RangeLines:
-    """Fade both ends of every line to zero; see `RangeLines.tapered_ends`."""
+def tapered_ends(lines: RangeLines, length_m: float, name: str = "length_m") -> RangeLines:
+    """Fade both ends of every line to zero; see `RangeLines.tapered_ends`.
+
+    Messages call the length by `name`.
+    """
     half = (lines.length - 1) * lines.range_step_m / 2
-    length = validate.number("length_m", length_m, "m", above=0.0, most=half)
+    length = validate.number(name, length_m, "m", above=0.0, most=half)
     from_end = np.arange(lines.length) * lines.range_step_m
     from_end = np.minimum(from_end, from_end[::-1])
     taper = np.sin(np.pi / 2 * np.minimum(from_end / length, 1)) ** 2

@@ -279,7 +279,7 @@ class RangeLines:
         Raises
         ------
         TypeError, ValueError
-            If the distance is not a positive number.
+            If the distance is not a positive number, or only one of several pings would stay.
         """
         return pings.without_still_pings(self, least_advance_m)
 

@@ -54,6 +54,8 @@ def load(path: str | os.PathLike) -> Saved:
         raise FileFormatError(str(error)) from None
     with path.open("rb") as file:
         start = file.read(128)
+    if not start:
+        raise FileFormatError(f"{path} is empty")
     if start.startswith(cphd.START):
         return cphd.read_cphd(path)
     if matlab.is_matlab(start):

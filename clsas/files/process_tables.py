@@ -19,8 +19,10 @@ from clsas.navigation.micronavigation import UNKNOWNS as NAVIGATED
 STEPS = ("inspect", "calibrate", "navigate", "focus", "image", "mosaic")
 """Steps of `clsas process`, in the order in which they run."""
 
+CORRECTIONS = ("calibrate", "navigate", "focus")
+"""Steps that correct the lines. They run if their table is there."""
+
 _USUAL = ("inspect", "image")
-_NAMED = ("calibrate", "navigate", "focus")  # which run if their table is there
 _Pair = Annotated[list[float], Field(min_length=2, max_length=2)]
 
 
@@ -100,9 +102,7 @@ class ProcessTable(Table):
                     if not path:
                         raise ValueError(f"{name} must be a path, got an empty one")
                     options[name] = folder / path
-            if "lines" in options and not options["lines"].exists():
-                raise ValueError(f"lines must be a file, there is no {options['lines']}")
-        for name in _NAMED:
+        for name in CORRECTIONS:
             if (table := getattr(self, name)) is not None:
                 options[name] = table.build()
         with located("[process]"):
@@ -120,7 +120,7 @@ def checked_steps(steps: Iterable[str] | None, options: dict[str, Any]) -> tuple
         If there is no such step, or "calibrate" has no points.
     """
     if steps is None:
-        chosen = {*_USUAL, *(name for name in _NAMED if name in options)}
+        chosen = {*_USUAL, *(name for name in CORRECTIONS if name in options)}
     else:
         chosen = set(validate.named("steps", list(steps), STEPS))
     if not chosen:

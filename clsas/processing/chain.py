@@ -7,30 +7,25 @@ import time
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from clsas.core import reprs, validate
+from clsas.core.atomic import staging, sync_folder
 from clsas.core.image import Image
 from clsas.core.json_types import json_able
 from clsas.core.lines import RangeLines
 from clsas.core.validate import ClsasWarning
 from clsas.files.formats import load
 from clsas.files.hdf5 import save
-from clsas.files.process_tables import checked_steps
+from clsas.files.process_tables import CORRECTIONS, STEPS, checked_steps
 from clsas.files.scene_files import SceneFile, read_scene
 from clsas.opencl.device import Device, open_device
-from clsas.processing.record import (
-    StepRecord,
-    contents_digest,
-    file_digest,
-    read_records,
-    step_digest,
-    write_records,
-)
-from clsas.processing.steps import RUN, Job, check_pictures, options_of
-from clsas.signal.compression import compress
+from clsas.processing.folders import checked_records, folder_of, made
+from clsas.processing.record import StepRecord, file_digest, step_digest, write_records
+from clsas.processing.recording import Recording, loaded
+from clsas.processing.steps import RUN, TABLES, Job, Outcome, check_pictures, options_of
 from clsas.signal.echoes import Echoes
 
 
@@ -64,7 +59,7 @@ class Processed:
 
     @property
     def lines(self) -> RangeLines:
-        """The lines as far as they are corrected, read from the folder."""
+        """The lines as far as these steps corrected them, read from the folder."""
         return self._lines()
 
     @property
@@ -90,7 +85,8 @@ def process(
 
     Every step is recorded in the folder `output`, in `process.json`: its inputs and options, the
     version of clsas, its numbers, warnings and files. A step that ran before with the same inputs,
-    options and version, and whose files are as they were written, is not run again.
+    options and version, and whose files are as they were written, is not run again. Files of a
+    step appear together once it is done, and replace all that it wrote before.
 
     Parameters
     ----------
@@ -100,9 +96,12 @@ def process(
         The recording, instead of the scene's. A path is any that `clsas.load` reads.
     output : path-like, optional
         Folder for the results, created if its parent is there. By default the scene's, else the
-        name of the scene's file without its suffix.
+        name of the scene's file without its suffix. Only files of this scene's record are
+        replaced.
     steps : sequence of str, optional
-        Steps to run, instead of the scene's. They always run in the order above.
+        Steps to bring up to date, instead of all of the scene's. They always run in the order
+        above. Those of the scene that correct the lines before them are brought up to date first,
+        so that a step always begins with the same lines; others are left alone.
     device : Device, str or int, optional
         See `clsas.opencl.device.choose`.
     progress : callable, optional
@@ -115,8 +114,9 @@ def process(
     Raises
     ------
     TypeError, ValueError
-        If an argument is of the wrong kind, the scene lacks what a step needs, or a step refuses
-        the lines. What was finished before is kept.
+        If an argument is of the wrong kind, the scene lacks what a step needs, the folder holds
+        the results of another scene or files that clsas did not write and would replace, or a step
+        refuses the lines. What was finished before is kept.
     OSError
         If a file cannot be read or written.
     DeviceError
@@ -125,46 +125,67 @@ def process(
     Warns
     -----
     ClsasWarning
-        What the steps warn of. The record holds it too.
+        What the steps warn of. The record holds it too. If files of steps that were left alone
+        belong to other lines or options.
     """
     if not isinstance(scene, SceneFile):
         scene = read_scene(validate.path("scene", scene))
     validate.progress(progress)
-    chosen = steps if steps is not None else scene.process.get("steps")
-    names = checked_steps(chosen, scene.process)
+    of_scene = checked_steps(scene.process.get("steps"), scene.process)
+    chosen = of_scene if steps is None else checked_steps(steps, scene.process)
+    names = _with_corrections(chosen, of_scene)
     if {"focus", "image", "mosaic"} & set(names):
         (grid,) = scene.need("grid")
         if "image" in names:
             validate.memory("[grid]", 16 * grid.size)  # two images
-    recording = _Recording.of(scene, lines)
-    folder = _folder(scene, output)
-    _check_apart(recording, folder)
-    folder.mkdir(exist_ok=True)
+    recording = Recording.of(scene, lines)
+    folder = folder_of(scene, output)
+    records = checked_records(scene, folder, recording, names)
     check_pictures()
-    chain = _Chain(scene, folder, recording, open_device(device))
-    for name in names:
-        chain.step(name, None if progress is None else partial(progress, name))
-    return Processed(folder, tuple(chain.records), tuple(chain.repeated), chain.lines)
+    with made(folder):
+        chain = _Chain(scene, folder, recording, open_device(device), records)
+        for name in STEPS:
+            if name in names:
+                chain.step(name, None if progress is None else partial(progress, name))
+            elif name in of_scene:
+                chain.leave(name)
+            else:
+                chain.tell(name, "the scene leaves it out")
+    return Processed(folder, tuple(chain.done), tuple(chain.repeated), chain.lines)
+
+
+def _with_corrections(chosen: tuple[str, ...], of_scene: tuple[str, ...]) -> tuple[str, ...]:
+    """Return steps, with those of the scene that correct the lines they begin with."""
+    # An inspection looks at the recording as it came.
+    last = max((STEPS.index(name) for name in chosen if name != "inspect"), default=0)
+    before = {name for name in of_scene if name in CORRECTIONS and STEPS.index(name) < last}
+    return tuple(name for name in STEPS if name in {*chosen, *before})
 
 
 class _Chain:
     """A processing on its way."""
 
     def __init__(
-        self, scene: SceneFile, folder: Path, recording: _Recording, device: Device
+        self,
+        scene: SceneFile,
+        folder: Path,
+        recording: Recording,
+        device: Device,
+        records: dict[str, StepRecord],
     ) -> None:
         self.scene, self.folder, self.recording, self.device = scene, folder, recording, device
-        self.before = read_records(folder)
-        self.records: list[StepRecord] = []
+        self.records = dict(records)  # of all steps, also of those that are left alone
+        self.done: list[StepRecord] = []
         self.repeated: list[str] = []
         self.digest = recording.digest
+        self.corrections: tuple[str, ...] = ()
         self.lines: Callable[[], RangeLines] = lambda: recording.lines
 
     def step(self, name: str, progress: Callable[[int, int], None] | None) -> None:
         """Run a step, unless it ran before with the same inputs."""
         options = options_of(name, self.scene)
-        digest = step_digest(name, options, self.recording.digest, self.digest)
-        record = self.before.get(name)
+        digest = self._digest(name, options)
+        record = self.records.get(name)
         # A mosaic has records of its own, patch by patch.
         kept = record is not None and record.digest == digest and name != "mosaic"
         messages: tuple[str, ...] = ()
@@ -172,13 +193,33 @@ class _Chain:
             record = self._run(name, digest, options, progress)
             self.repeated.append(name)
             messages = record.warnings
-        self.records.append(record)
-        if (corrected := f"{name}.h5") in record.files and name != "image":
-            self.digest, path = digest, self.folder / corrected
-            self.lines = lambda: _loaded(path)
-        write_records(self.folder, self.scene.name, self.recording.described, self.records)
+        self.done.append(record)
+        if name in CORRECTIONS:
+            self.digest, self.corrections = digest, (*self.corrections, name)
+            self.lines = lambda: loaded(self.folder / f"{name}.h5")
         for message in messages:
             validate.warn(f"{name}: {message}")
+
+    def leave(self, name: str) -> None:
+        """Leave the files of a step of the scene alone."""
+        digest, record = self._digest(name, options_of(name, self.scene)), self.records.get(name)
+        if record is not None and record.digest != digest:
+            self.tell(name, "its lines or options changed since")
+        if name in CORRECTIONS:
+            self.digest = digest
+
+    def tell(self, name: str, why: str) -> None:
+        """Warn of a step's files that are in the folder and do not belong to the other ones."""
+        record = self.records.get(name)
+        files = () if record is None else record.files
+        if found := [each for each in files if (self.folder / each).exists()]:
+            validate.warn(
+                f"the results of {name} in {str(self.folder)!r} are out of date, {why}: "
+                f"{', '.join(found)}"
+            )
+
+    def _digest(self, name: str, options: dict[str, Any]) -> str:
+        return step_digest(name, options, self.recording.digest, self.digest)
 
     def _run(
         self,
@@ -187,105 +228,69 @@ class _Chain:
         options: dict[str, Any],
         progress: Callable[[int, int], None] | None,
     ) -> StepRecord:
-        job = Job(
-            self.scene, self.folder, lambda: self.recording.lines, self.lines, self.device, progress
-        )
+        lines = self.lines()  # a damaged recording is refused before anything is written
         start = time.perf_counter()
-        with warnings.catch_warnings(record=True) as caught:
-            warnings.simplefilter("always")
-            outcome = RUN[name](job)
-        messages = []
-        for each in caught:
-            if issubclass(each.category, ClsasWarning):
-                messages.append(str(each.message))
-            else:
-                warnings.warn_explicit(each.message, each.category, each.filename, each.lineno)
-        files = list(outcome.files)
-        if outcome.lines is not None:
-            save(self.folder / f"{name}.h5", outcome.lines)
-            files.append(f"{name}.h5")
-        return StepRecord(
-            name=name,
-            digest=digest,
-            options=json_able(options),
-            numbers=json_able(outcome.numbers),
-            files={each: file_digest(self.folder / each) for each in files},
-            warnings=tuple(messages),
-            seconds=time.perf_counter() - start,
-            device=self.device.info.label,
-        )
-
-
-@dataclass(frozen=True, eq=False)
-class _Recording:
-    """The lines to begin with, read when they are needed.
-
-    Attributes
-    ----------
-    described : dict
-        What the record says of them.
-    digest : str
-        Of their contents, and how echoes are compressed.
-    """
-
-    described: dict[str, Any]
-    digest: str
-    _read: Callable[[], RangeLines | Echoes]
-    _compression: dict[str, Any]
-
-    @classmethod
-    def of(
-        cls, scene: SceneFile, given: RangeLines | Echoes | str | os.PathLike | None
-    ) -> _Recording:
-        """Return the recording given, or that of the scene."""
-        options = scene.compress
-        if isinstance(given, Echoes):
-            given = compress(given, **options)
-        if isinstance(given, RangeLines):
-            lines, digest = given, contents_digest(given)
-            return cls({"file": None, "digest": digest}, digest, lambda: lines, options)
-        path = scene.process.get("lines") if given is None else validate.path("lines", given)
-        if path is None:
-            raise ValueError(
-                f"{scene.name}: missing key 'lines' in [process], the recording to process"
+        with staging(self.folder) as staged:
+            job = Job(
+                scene=self.scene,
+                folder=staged,
+                store=self.scene.mosaic.get("store") or self.folder / "mosaic.zarr",
+                given=lambda: self.recording.lines,
+                lines=lines,
+                corrections=self.corrections,
+                device=self.device,
+                progress=progress,
             )
-        digest = file_digest(path)
-        of_both = step_digest("recording", options, digest)
-        return cls({"file": str(path), "digest": digest}, of_both, partial(_any, path), options)
+            outcome, messages = _outcome(name, job)
+            files = list(outcome.files)
+            if outcome.lines is not None:
+                save(staged / f"{name}.h5", outcome.lines)
+                files.append(f"{name}.h5")
+            record = StepRecord(
+                name=name,
+                digest=digest,
+                lines=self.digest,
+                corrections=self.corrections,
+                options=json_able(options),
+                numbers=json_able(outcome.numbers),
+                files={each: file_digest(staged / each) for each in files},
+                warnings=messages,
+                seconds=time.perf_counter() - start,
+                device=self.device.info.label,
+            )
+            self._keep(record, staged)
+        return record
 
-    @cached_property
-    def lines(self) -> RangeLines:
-        """The lines; those of echoes are compressed."""
-        read = self._read()
-        return compress(read, **self._compression) if isinstance(read, Echoes) else read
+    def _keep(self, record: StepRecord, staged: Path) -> None:
+        """Put a step's files in the place of all that it wrote before, and record them.
+
+        A crash leaves a record whose files are missing or old: the step then runs again.
+        """
+        before = self.records.get(record.name)
+        for name in set(() if before is None else before.files) - set(record.files):
+            (self.folder / name).unlink(missing_ok=True)
+        self.records[record.name] = record
+        ordered = [self.records[name] for name in STEPS if name in self.records]
+        write_records(self.folder, self.scene, self.recording.described, ordered)
+        for name in record.files:
+            (staged / name).replace(self.folder / name)
+        sync_folder(self.folder)
 
 
-def _any(path: Path) -> RangeLines | Echoes:
-    found = load(path)
-    if not isinstance(found, (RangeLines, Echoes)):
-        raise ValueError(f"{path} must hold RangeLines or Echoes, got {type(found).__name__}")
-    return found
-
-
-def _loaded(path: Path) -> RangeLines:
-    lines = _any(path)
-    validate.instance(str(path), lines, RangeLines)
-    assert isinstance(lines, RangeLines)  # for type checkers
-    return lines
-
-
-def _folder(scene: SceneFile, output: str | os.PathLike | None) -> Path:
-    if output is not None:
-        return validate.path("output", output)
-    if "output" in scene.process:
-        return scene.process["output"]
-    if not Path(scene.name).suffix:
-        raise ValueError("output must be given: the scene has no file that names a folder")
-    return Path(scene.name).with_suffix("")
-
-
-def _check_apart(recording: _Recording, folder: Path) -> None:
-    """Refuse a recording that a step could overwrite."""
-    file = recording.described["file"]
-    if file is not None and Path(file).parent.resolve() == folder.resolve():
-        raise ValueError(f"output must not be the folder of the recording, got {str(folder)!r}")
+def _outcome(name: str, job: Job) -> tuple[Outcome, tuple[str, ...]]:
+    """Return the outcome of a step, and clsas's warnings; its errors get the step's name."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        try:
+            outcome = RUN[name](job)
+        except (TypeError, ValueError) as error:
+            where = f"{job.scene.name or 'scene'}: {name} ({TABLES[name]})"
+            kind = TypeError if isinstance(error, TypeError) else ValueError
+            raise kind(f"{where}: {error}") from error
+    messages = []
+    for each in caught:
+        if issubclass(each.category, ClsasWarning):
+            messages.append(str(each.message))
+        else:
+            warnings.warn_explicit(each.message, each.category, each.filename, each.lineno)
+    return outcome, tuple(messages)

@@ -1,10 +1,15 @@
-"""Record of a processing: inputs, versions and numbers of every step, as JSON beside the image."""
+"""Record of a processing: inputs, versions and numbers of every step, as JSON beside the image.
+
+The record also says which files of a folder are clsas's own: those that its steps wrote.
+"""
 
 from __future__ import annotations
 
 import hashlib
 import json
+import os
 import platform
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -12,14 +17,15 @@ from typing import Any
 import numpy as np
 import scipy
 
-from clsas.core import reading, reprs
+from clsas.core import reading, reprs, validate
 from clsas.core.atomic import replacing
 from clsas.core.json_types import json_able
 from clsas.core.lines import RangeLines
 from clsas.core.version import __version__
+from clsas.files.scene_files import SceneFile
 
 NAME = "process.json"
-_FORMAT, _VERSION = "clsas processing", 1
+_FORMAT, _VERSION = "clsas processing", 2
 _BLOCK = 1 << 22  # bytes that are read at once
 
 
@@ -33,6 +39,10 @@ class StepRecord:
         The step: "inspect", "calibrate", "navigate", "focus", "image" or "mosaic".
     digest : str
         Of its inputs, its options and clsas's version.
+    lines : str
+        Digest of the lines that it began with: the recording's, or the correcting step's before it.
+    corrections : tuple of str
+        Steps that had corrected these lines.
     options : dict
         Options of the step, in types of JSON.
     numbers : dict
@@ -48,6 +58,8 @@ class StepRecord:
 
     name: str
     digest: str
+    lines: str = ""
+    corrections: tuple[str, ...] = ()
     options: dict[str, Any] = field(default_factory=dict)
     numbers: dict[str, Any] = field(default_factory=dict)
     files: dict[str, str] = field(default_factory=dict)
@@ -69,20 +81,44 @@ class StepRecord:
             return False
 
 
-def read_records(folder: Path) -> dict[str, StepRecord]:
-    """Return the records of a folder by step; those that cannot be read are left out."""
+def read_records(folder: Path, scene: SceneFile) -> dict[str, StepRecord]:
+    """Return the records of a scene's folder by step; none if there is no `process.json`.
+
+    Records of single steps that cannot be read are left out.
+
+    Raises
+    ------
+    ValueError
+        If `process.json` is no record of clsas, of another version, or of another scene.
+    OSError
+        If it cannot be read.
+    """
     try:
         document = reading.parse_json(reading.read_bytes(folder / NAME))
-    except (OSError, ValueError):
+    except FileNotFoundError:
         return {}
+    except (IsADirectoryError, ValueError):
+        document = None
+    holds = f"output {str(folder)!r} holds"
     if not isinstance(document, dict) or document.get("format") != _FORMAT:
-        return {}
+        raise ValueError(
+            f"{holds} a {NAME} that is no record of clsas: choose another output, or remove it"
+        )
     if document.get("version") != _VERSION or not isinstance(document.get("steps"), list):
-        return {}
+        raise ValueError(
+            f"{holds} a {NAME} of another version of clsas: choose another output, or remove the "
+            "folder"
+        )
+    if (other := document.get("scene")) != (own := _of_folder(scene, folder)):
+        raise ValueError(
+            f"{holds} the results of another scene, {validate.shown(other)} as seen from there, "
+            f"not {own!r}: choose another output, or remove the folder"
+        )
     found = {}
     for step in document["steps"]:
         try:
-            record = StepRecord(**{**step, "warnings": tuple(step["warnings"])})
+            tuples = {name: tuple(step[name]) for name in ("corrections", "warnings")}
+            record = StepRecord(**{**step, **tuples})
             if isinstance(record.files, dict) and all(_is_plain(name) for name in record.files):
                 found[str(record.name)] = record
         except (TypeError, LookupError):
@@ -91,7 +127,7 @@ def read_records(folder: Path) -> dict[str, StepRecord]:
 
 
 def write_records(
-    folder: Path, scene: str, given: dict[str, Any], records: list[StepRecord]
+    folder: Path, scene: SceneFile, given: dict[str, Any], records: Iterable[StepRecord]
 ) -> None:
     """Write the record of a folder in one step."""
     document = {
@@ -102,7 +138,7 @@ def write_records(
         "numpy": np.__version__,
         "scipy": scipy.__version__,
         "machine": platform.platform(),
-        "scene": scene,
+        "scene": _of_folder(scene, folder),
         "recording": given,
         "steps": [asdict(record) for record in records],
     }
@@ -140,6 +176,13 @@ def contents_digest(lines: RangeLines) -> str:
     for array in (lines.samples, *lines.per_channel.values()):
         sha.update(np.ascontiguousarray(array).data)
     return sha.hexdigest()[:16]
+
+
+def _of_folder(scene: SceneFile, folder: Path) -> str:
+    """Return a scene's file as seen from the folder, so that both may move together."""
+    if not Path(scene.name).is_file():
+        return scene.name
+    return os.path.relpath(os.path.realpath(scene.name), os.path.realpath(folder))
 
 
 def _is_plain(name: object) -> bool:

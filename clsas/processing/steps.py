@@ -21,6 +21,7 @@ from clsas.core.validate import warn
 from clsas.exact.backprojection import backproject
 from clsas.factorized.factorization import ExactImage
 from clsas.files.hdf5 import save
+from clsas.files.process_tables import CORRECTIONS
 from clsas.files.scene_files import SceneFile
 from clsas.files.scene_tables import EXACT_KEYS
 from clsas.mosaics.mosaic import mosaic
@@ -45,17 +46,25 @@ class Job:
     ----------
     scene : SceneFile
     folder : Path
-        Where results go.
-    given, lines : Callable
-        Return the lines of the recording, and as far as they are corrected.
+        Where files go. They are moved from there once the step is done.
+    store : Path
+        Where a mosaic goes, which continues what it finds there.
+    given : Callable
+        Returns the lines of the recording.
+    lines : RangeLines
+        As far as they are corrected.
+    corrections : tuple of str
+        Steps that corrected them.
     device : Device
     progress : Progress
     """
 
     scene: SceneFile
     folder: Path
+    store: Path
     given: Callable[[], RangeLines]
-    lines: Callable[[], RangeLines]
+    lines: RangeLines
+    corrections: tuple[str, ...]
     device: Device
     progress: Progress
 
@@ -128,17 +137,18 @@ def inspected(job: Job) -> Outcome:
 def calibrated(job: Job) -> Outcome:
     """Find time offset, sound speed and lever arm by known points."""
     options = job.options("calibrate")
-    found = calibrate_track(job.lines(), options.pop("points_m"), **options, progress=job.progress)
+    found = calibrate_track(job.lines, options.pop("points_m"), **options, progress=job.progress)
     return Outcome(found.figures, lines=found.lines)
 
 
 def navigated(job: Job) -> Outcome:
     """Correct the track by displaced phase centres."""
-    found = micronavigate(job.lines(), **job.options("navigate"), progress=job.progress)
+    found = micronavigate(job.lines, **job.options("navigate"), progress=job.progress)
     _write_track(job.folder / "navigate.csv", found)
     files = ["navigate.csv"]
     files += job.draw("navigate-track.png", lambda: plot.corrections(found))
-    files += job.draw("navigate-coherence.png", lambda: plot.coherence(found))
+    range_m = job.options("navigate").get("range_m")
+    files += job.draw("navigate-coherence.png", lambda: plot.coherence(found, range_m=range_m))
     return Outcome(numbers.of_navigation(found), files, found.lines)
 
 
@@ -146,7 +156,7 @@ def focused(job: Job) -> Outcome:
     """Correct the track by the bright responses of an image."""
     (grid,) = job.scene.need("grid")
     found = autofocus(
-        job.lines(), grid, beam=job.scene.image.get("beam"), **job.options("focus"),
+        job.lines, grid, beam=job.scene.image.get("beam"), **job.options("focus"),
         device=job.device, progress=job.progress,
     )  # fmt: skip
     _write_track(job.folder / "focus.csv", found)
@@ -159,8 +169,8 @@ def focused(job: Job) -> Outcome:
 def imaged(job: Job) -> Outcome:
     """Form the image; where the lines were corrected, also the one that they gave before."""
     (grid,) = job.scene.need("grid")
-    given, lines = job.given(), job.lines()
-    corrected = lines is not given
+    given, lines = job.given(), job.lines
+    corrected = bool(job.corrections)
     shares = (0, 2), (1, 2)
     if not corrected:
         image, error_db = _formed(job, lines, grid, (0, 1))
@@ -168,7 +178,9 @@ def imaged(job: Job) -> Outcome:
         before, _ = _formed(job, given, grid, shares[0])
         image, error_db = _formed(job, lines, grid, shares[1])
     save(job.folder / "image.h5", image)
-    files = ["image.h5", *job.draw("image.png", lambda: plot.image_db(image))]
+    # The folder may hold lines of steps that the scene has left out since.
+    title = f"After {', '.join(job.corrections)}" if corrected else "Recording as it came"
+    files = ["image.h5", *job.draw("image.png", lambda: plot.image_db(image, title=title))]
     found = numbers.of_image(image) | {"predicted_error_db": error_db}
     if corrected:
         save(job.folder / "before.h5", before)
@@ -184,11 +196,10 @@ def joined(job: Job) -> Outcome:
     (grid,) = scene.need("grid")
     request = request_of(scene)
     if set(request) & {"taps", "upsampling"}:
-        raise ValueError(f"{scene.name}: [image] taps and upsampling have no effect in a mosaic")
-    store = scene.mosaic.get("store") or job.folder / "mosaic.zarr"
+        raise ValueError("taps and upsampling have no effect in a mosaic")
     memory_mib = scene.mosaic.get("memory_mib")
     formed = mosaic(
-        job.lines(), grid, store, **request, beam=scene.image.get("beam"),
+        job.lines, grid, job.store, **request, beam=scene.image.get("beam"),
         patches=scene.mosaic.get("patches"), memory_bytes=memory_mib and memory_mib << 20,
         device=job.device,
     )  # fmt: skip
@@ -199,7 +210,7 @@ def joined(job: Job) -> Outcome:
         errors.append(patch.record.predicted_error_db)
         if job.progress is not None:
             job.progress(done, count)
-    return Outcome({"store": str(store), "patches": list(formed.shape), "formed": len(errors)})
+    return Outcome({"store": str(job.store), "patches": list(formed.shape), "formed": len(errors)})
 
 
 RUN: dict[str, Callable[[Job], Outcome]] = {
@@ -211,6 +222,24 @@ RUN: dict[str, Callable[[Job], Outcome]] = {
     "mosaic": joined,
 }
 """Function of every step, in the order in which they run."""
+
+
+FILES: dict[str, tuple[str, ...]] = {
+    "inspect": ("inspect.txt", "inspect.png"),
+    "calibrate": ("calibrate.h5",),
+    "navigate": ("navigate.csv", "navigate-track.png", "navigate-coherence.png", "navigate.h5"),
+    "focus": ("focus.csv", "focus-track.png", "focus-sharpness.png", "focus.h5"),
+    "image": ("image.h5", "image.png", "before.h5", "before-and-after.png"),
+    "mosaic": (),
+}
+"""Files that every step may write. A mosaic's store guards itself."""
+
+TABLES = {name: f"[process.{name}]" for name in CORRECTIONS} | {
+    "inspect": "[grid]",
+    "image": "[image]",
+    "mosaic": "[mosaic]",
+}
+"""Table of the scene file with every step's options."""
 
 
 def check_pictures() -> None:

@@ -100,7 +100,7 @@ def inspect(
     pings = Transmissions.of(given)
     moving = _Moving.of(given, pings)
     alike = None if np.ptp(pings.receivers) else int(pings.receivers[0])
-    found = check_track(pings, moving.wavelength_m, float(given.last_range_m.max()))
+    found = check_track(pings, given, moving.wavelength_m)
     found += check_levels(Levels.of(recorded, magnitudes=not is_echoes), alike)
     found += _check_samples(moving)
     found += check_spacing(

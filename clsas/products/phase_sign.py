@@ -93,9 +93,13 @@ def phase_sign(
             "the lines still have their carrier: conjugate lines give the conjugate image, which "
             "is as sharp"
         )
-    spots = _brightest_beside(lines, cell_m) if grid is None else _brightest_of(lines, grid, cell_m)
-    if not spots:
-        return None, "no echoes come from the grid" if grid is not None else "no range is positive"
+    try:
+        if grid is None:
+            spots = _brightest_beside(lines, cell_m)
+        else:
+            spots = _brightest_of(lines, grid, cell_m)
+    except _NotToldError as error:
+        return None, str(error)
     judged, reason = [], ""
     for spot in spots:
         try:
@@ -167,7 +171,13 @@ def _sharpness_along(image: Image) -> float:
 
 
 def _brightest_beside(lines: RangeLines, cell_m: float) -> list[_Spot]:
-    """Return places on either side of the track, at the ranges of the brightest samples."""
+    """Return places on either side of the track, at the ranges of the brightest samples.
+
+    Raises
+    ------
+    _NotToldError
+        If no place has such a range.
+    """
     part_of = some_channels(lines.channels, _SEARCHED_CHANNELS)
     level = np.abs(lines.samples[part_of])
     centres_m = lines.phase_centres_m
@@ -177,7 +187,8 @@ def _brightest_beside(lines: RangeLines, cell_m: float) -> list[_Spot]:
         across = np.cross([1.0, 0.0, 0.0], course)
     across /= np.linalg.norm(across)
     range_m = lines.first_range_m[part_of, None] + np.arange(lines.length) * lines.range_step_m
-    spots = []
+    spots: list[_Spot] = []
+    reason = "no samples are left to look at"
     for _ in range(_SPOTS):
         row, sample = np.unravel_index(int(level.argmax()), level.shape)
         if not level[row, sample]:
@@ -191,12 +202,25 @@ def _brightest_beside(lines: RangeLines, cell_m: float) -> list[_Spot]:
                 _Spot(centres_m[channel] + side * distance_m * across, channel, known=False)
                 for side in (1, -1)
             ]
+        elif not spots:
+            reason = (
+                f"no place has the range of the brightest echoes, {found_m:.4g} m: its transmitter "
+                f"and receiver are {2 * apart_m:.4g} m apart"
+            )
         level[np.abs(range_m - found_m) <= _CELLS / 2 * cell_m] = 0
+    if not spots:
+        raise _NotToldError(reason)
     return spots
 
 
 def _brightest_of(lines: RangeLines, grid: Grid, cell_m: float) -> list[_Spot]:
-    """Return the places of a grid from which channels receive most."""
+    """Return the places of a grid from which channels receive most.
+
+    Raises
+    ------
+    _NotToldError
+        If they receive nothing from it.
+    """
     energy = _Energy(lines)
     points_m = grid.spread(_GRID_POINTS)
     pitch_m = _pitch_m(points_m)
@@ -209,6 +233,8 @@ def _brightest_of(lines: RangeLines, grid: Grid, cell_m: float) -> list[_Spot]:
         spot = energy.spot(points_m[brightest], pitch_m)
         spots.append(energy.refined(spot, pitch_m, cell_m))
         left[np.linalg.norm(points_m - points_m[brightest], axis=1) < 3 * pitch_m] = 0
+    if not spots:
+        raise _NotToldError("no echoes come from the grid")
     return spots
 
 

@@ -20,9 +20,12 @@ _AROUND = 31  # steps in the running median, the usual advance near a ping
 _MOST_WAVELENGTHS = 500.0
 """Advance of a channel above which a unit is wrong. A satellite's radar has about 120: its antenna
 is as long. Positions in millimetres make 1000 times the advance."""
+_LEAST_PER_WAVELENGTH = 50.0
+"""Advances per wavelength and receiver above which a unit is wrong. Slow rails have 20; positions
+in kilometres make 1000 times as many, of advances of up to 20 wavelengths."""
 
 
-def check_track(pings: Transmissions, wavelength_m: float, last_range_m: float) -> list[Finding]:
+def check_track(pings: Transmissions, lines: RangeLines, wavelength_m: float) -> list[Finding]:
     """Return what is wrong with a track: its order first, which halts and gaps may follow from."""
     usual_m = pings.usual_step_m
     if not usual_m:
@@ -30,7 +33,7 @@ def check_track(pings: Transmissions, wavelength_m: float, last_range_m: float) 
     found = _check_order(pings) + _check_halts(pings)
     if not pings.disordered:
         found += _check_gaps(pings)
-    return found + _check_advance(pings, wavelength_m, last_range_m)
+    return found + _check_advance(pings, lines, wavelength_m)
 
 
 def _check_aperture(pings: Transmissions) -> list[Finding]:
@@ -58,10 +61,31 @@ def _check_aperture(pings: Transmissions) -> list[Finding]:
     ]
 
 
-def _check_advance(pings: Transmissions, wavelength_m: float, last_range_m: float) -> list[Finding]:
+def _check_advance(pings: Transmissions, lines: RangeLines, wavelength_m: float) -> list[Finding]:
     """Return an advance that only a slip of units can explain."""
-    usual_m = pings.usual_step_m
-    most_m = _MOST_WAVELENGTHS * wavelength_m * float(np.median(pings.receivers))
+    usual_m, last_range_m = pings.usual_step_m, float(lines.last_range_m.max())
+    receivers = float(np.median(pings.receivers))
+    most_m = _MOST_WAVELENGTHS * wavelength_m * receivers
+    # An array may advance by little; then it is long itself.
+    first_ping = lines.rx_m[: pings.starts[1]]
+    array_m = float(np.linalg.norm(np.ptp(first_ping, axis=0))) / 2
+    least_m = wavelength_m / _LEAST_PER_WAVELENGTH
+    # A band about 0 Hz has no wavelength to speak of.
+    if usual_m + array_m < least_m * receivers and wavelength_m < last_range_m:
+        of_array = ""
+        if receivers > 1:
+            of_array = f", and with its {receivers:g} receivers a ping is {array_m:.4g} m long"
+        return [
+            Finding(
+                "advance",
+                f"pings are {usual_m:.4g} m apart, less than 1/{_LEAST_PER_WAVELENGTH:g} of the "
+                f"wavelength of {wavelength_m:.4g} m{of_array}: too little for an aperture",
+                usual_m,
+                least_m,
+                "check units: positions in metres (not kilometres), carrier_hz in Hz (not kHz); of "
+                "a platform as slow as that, keep every nth ping: lines.select(...)",
+            )
+        ]
     if usual_m > last_range_m > 0:
         limit_m, words = last_range_m, f"the last range of {last_range_m:.4g} m"
     elif usual_m > most_m:

@@ -13,6 +13,9 @@ from clsas.core.lines import RangeLines
 from clsas.signal.compression import Window, band_window
 
 _BLOCK = 1 << 22  # complex128 samples of the channels that are transformed together
+_LEAST_OF_BAND = 1e-2
+"""Lowest frequency over the width of the band, below which a unit is wrong. Radars that look into
+the ground have 0.03; GHz taken for Hz make 1e-9 of it."""
 _EQUAL_STEPS = 1e-6  # cycles at a line's ends by which one common step may be wrong: -104 dB
 
 
@@ -68,6 +71,12 @@ def from_phase_history(
         If an argument has the wrong type or shape, is not finite or outside its limits, or the
         lines do not fit into memory.
 
+    Warns
+    -----
+    ClsasWarning
+        If the lowest frequency is less than a hundredth of the band, or a reference range is
+        negative.
+
     Notes
     -----
     With the centre frequency fc and weights w of sum 1,
@@ -103,6 +112,7 @@ def from_phase_history(
     carrier_hz = float(np.mean(first_hz + (count - 1) / 2 * step_hz))
     farthest_m = float(np.abs(reference_m).max() - offset_m[0])
     validate.phase(carrier_hz, speed, farthest_m)
+    _warn_of_slips(first_hz, step_hz * (count - 1), reference_m)
 
     lines = np.empty((channels, length), np.complex64)
     rows = max(1, _BLOCK // length)
@@ -126,6 +136,24 @@ def from_phase_history(
         carrier_hz=carrier_hz,
         sound_speed_m_s=speed,
     )
+
+
+def _warn_of_slips(
+    first_hz: NDArray[np.float64], band_hz: NDArray[np.float64], reference_m: NDArray[np.float64]
+) -> None:
+    """Warn of frequencies and ranges that are possible, and hardly ever meant."""
+    low = int(np.argmin(first_hz / band_hz))
+    if first_hz[low] < _LEAST_OF_BAND * band_hz[low]:
+        validate.warn(
+            f"first_frequency_hz is {first_hz[low]:g} Hz, less than 1/{1 / _LEAST_OF_BAND:g} of "
+            f"the band of {band_hz[low]:g} Hz: is it in Hz (not GHz), as transmitted (not after "
+            "mixing)?"
+        )
+    if reference_m.min() < 0:
+        validate.warn(
+            f"reference_range_m is negative, {reference_m.min():g} m at least: ranges are at least "
+            "half the distance from transmitter to receiver"
+        )
 
 
 def _weights(window: Window, count: int) -> NDArray[np.float64]:

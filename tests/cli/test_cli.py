@@ -8,6 +8,7 @@ import shutil
 import subprocess
 import sys
 import warnings
+from dataclasses import replace
 from pathlib import Path
 
 import click
@@ -164,6 +165,18 @@ def test_the_dial(made, tmp_path):
         result, image = image_of(made, tmp_path, *args)
         assert (result["method"], "plan_seconds" in result) == ("exact", False)
         assert clsas.relative_error_db(image, exact) < -100
+
+
+def test_mending_options_are_called_by_their_names(made, tmp_path):
+    convert = "convert", made[0] / "lines.h5", tmp_path / "mended.h5"
+    _, stderr = run(*convert, "--taper-m", "1000", code=1)
+    assert "Error: --taper-m must be finite and > 0 and <=" in stderr
+    lines = clsas.load(made[0] / "lines.h5")
+    still = tmp_path / "still.h5"
+    clsas.save(still, replace(lines, tx_m=lines.tx_m[0], rx_m=lines.rx_m[0]))
+    _, stderr = run("convert", still, tmp_path / "mended.h5", "--without-still-pings", code=1)
+    assert f"of {lines.channels} pings ({lines.channels} lines) only the first" in stderr
+    assert not (tmp_path / "mended.h5").exists()
 
 
 def test_a_plan_that_is_exact_is_as_accurate_as_asked_for(made, tmp_path):

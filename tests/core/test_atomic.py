@@ -34,7 +34,7 @@ def killed_in(statement, folder):
     program = f"""
 import os, signal
 from pathlib import Path
-from clsas.core.atomic import creating, replacing
+from clsas.core.atomic import creating, replacing, staging
 path = Path({str(folder / "a.h5")!r})
 with {statement} as part:
     (part / "x" if part.is_dir() else part).write_text("half")
@@ -45,7 +45,7 @@ with {statement} as part:
     return list(folder.glob(".clsas-*.part"))
 
 
-@pytest.mark.parametrize("statement", ["replacing(path)", "creating(path)"])
+@pytest.mark.parametrize("statement", ["replacing(path)", "creating(path)", "staging(path.parent)"])
 def test_the_next_writer_removes_what_a_killed_one_left(tmp_path, statement):
     assert len(killed_in(statement, tmp_path)) == 1
     with replacing(tmp_path / "b.h5") as part:

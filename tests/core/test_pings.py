@@ -58,7 +58,12 @@ def test_slow_pings_stay_and_the_distance_may_be_chosen():
 
 
 def test_a_platform_that_never_moves_and_a_single_ping():
-    assert kept(lines_at(np.zeros(5))) == [0]
+    for receivers, options in ((1, {}), (3, {}), (1, {"least_advance_m": 7.0})):
+        lines = lines_at(np.arange(5.0) if options else np.zeros(5), receivers)
+        with pytest.raises(
+            ValueError, match=rf"of 5 pings \({5 * receivers} lines\) only the first"
+        ):
+            lines.without_still_pings(**options)
     assert kept(lines_at(np.zeros(1))) == [0]
     assert Transmissions.of(lines_at(np.zeros(1))).turns.size == 0
 

@@ -34,7 +34,7 @@ def write_hdf5(*names):
 
 
 UNKNOWN = {
-    "empty": (write_bytes(b""), "is not an HDF5 file, nor one of CPHD or of MATLAB"),
+    "empty": (write_bytes(b""), "is empty"),
     "text": (write_bytes(b"hello\n" * 100), "is not an HDF5 file, nor one of CPHD or of MATLAB"),
     "noise": (
         write_bytes(np.random.default_rng(0).bytes(4096)),

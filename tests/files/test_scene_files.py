@@ -489,3 +489,12 @@ def test_a_damaged_track_is_one_short_message(tmp_path):
         with pytest.raises(ValueError, match=r"track\.csv") as error:
             read_track(path)
         assert len(str(error.value)) < 500
+
+
+def test_the_recording_to_process_may_be_elsewhere(tmp_path):
+    """Only `clsas process` reads it; every other command takes the rest of the scene."""
+    path = tmp_path / "scene.toml"
+    path.write_text(f'{GRID}\n[process]\nlines = "nowhere.h5"\n')
+    scene = config.read_scene(path)
+    assert scene.grid.shape == (4, 3)
+    assert scene.process["lines"] == tmp_path / "nowhere.h5"

@@ -158,6 +158,35 @@ def test_envelopes_do_where_phases_cannot_be_followed(lines):
     assert found.misfit_m == pytest.approx(6e-3, rel=0.3)
 
 
+@pytest.mark.slow
+def test_deviations_hold_an_error_that_persists_along_the_track(lines):
+    """Residuals of a drifting navigation are not as many measurements as there are channels."""
+    offsets = {name: TRUE[name] for name in ("time_offset", "sound_speed")}
+    scaled = []
+    for run in range(10):
+        drift = 2e-3 * np.sin(np.arange(160) / (20 + 3 * run) + run)[:, None] * np.array([0, 1, 0])
+        given = claimed(with_noise(lines, 40, np.random.default_rng(run)), passage(), offsets)
+        given = replace(given, tx_m=given.tx_m + drift, rx_m=given.rx_m + drift)
+        found = calibrate_track(given, POINTS, search_m=0.8)
+        scaled.append(errors(found, offsets) / found.sd)
+    assert np.sqrt(np.mean(np.square(scaled))) < 2
+    assert np.sqrt(np.mean(np.square(scaled))) > 0.2  # nor are they told too large
+
+
+def test_noise_is_no_reflector():
+    """A few of many channels reach any limit by chance; they may not decide."""
+    place_m = np.stack([0.01 * np.arange(640), np.zeros(640), np.zeros(640)], axis=1)
+    refused = []
+    for seed in range(8):
+        rng = np.random.default_rng(seed)
+        samples = rng.standard_normal((640, 240, 2)) @ [1, 1j]
+        noise = clsas.RangeLines(samples, 11.5, 0.0125, place_m, place_m, 1e5, 1500.0)
+        with pytest.raises(ValueError, match="points_m must be seen, but of none") as error:
+            calibrate_track(noise, [[3.0, 12.5, 0.0], [4.0, 13.5, 0.0]])
+        refused.append(max(map(int, re.findall(r"in (\d+) of", str(error.value)))))
+    assert max(refused) >= 3  # more than chance would let pass if only channels were counted
+
+
 def test_time_and_speed_look_alike_from_one_range():
     track = clsas.Track.straight((0, 0, 0), (0.02, 0, 0), 20, 1.0)
     at = np.array([[0.2, 15.0, 0.0]])
@@ -269,6 +298,7 @@ def test_command(lines, tmp_path):
     assert done.exit_code == 0, done.output
     assert "time offset" in done.output
     assert "at 4 points" in done.output
+    assert "no displacement or bend of the whole track" in done.output
     done = CliRunner().invoke(main, [*command, "--json"])
     results = json.loads(done.output)
     assert results["sound_speed_m_s"] == pytest.approx(1490, abs=0.1)

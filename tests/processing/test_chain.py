@@ -11,6 +11,7 @@ import clsas
 from clsas.cli import main
 from clsas.core.validate import ClsasWarning
 from clsas.files.process_tables import STEPS
+from clsas.processing import steps as steps_module
 
 pytest.importorskip("matplotlib")
 
@@ -74,6 +75,21 @@ def scene(folder, tmp_path):
 STEPS_HERE = ("calibrate", "focus", "image")
 
 
+def choose(scene, *steps):
+    """Let a scene have these steps."""
+    text = scene.read_text().replace(
+        'lines = "lines.h5"', f'lines = "lines.h5"\nsteps = {[*steps]}'
+    )
+    scene.write_text(text)
+
+
+@pytest.fixture
+def plain(scene):
+    """A scene whose only step is an image of the recording as it came."""
+    choose(scene, "image")
+    return scene
+
+
 @pytest.mark.slow
 def test_steps_run_in_their_order_and_improve_the_image(scene):
     told = []
@@ -107,9 +123,10 @@ def test_steps_run_in_their_order_and_improve_the_image(scene):
 @pytest.mark.slow
 def test_only_what_changed_runs_again(scene):
     def repeated(**options):
-        return clsas.process(scene, steps=steps, **options).repeated
+        return clsas.process(scene, **options).repeated
 
     steps = "calibrate", "image"
+    choose(scene, *steps)
     assert repeated() == steps
     assert repeated() == ()
     scene.write_text(scene.read_text().replace("tolerance_db = -40", "tolerance_db = -30"))
@@ -126,24 +143,138 @@ def test_only_what_changed_runs_again(scene):
     assert repeated(lines=other) == steps
 
 
-def test_a_damaged_record_is_made_anew(scene):
-    clsas.process(scene, steps=("image",))
-    path = scene.with_suffix("") / "process.json"
-    for text in ("{", "[]", '{"format": "clsas processing", "version": 1, "steps": [{"name": 1}]}'):
-        path.write_text(text)
-        assert clsas.process(scene, steps=("image",)).repeated == ("image",)
+def contents(folder):
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+def test_a_record_that_cannot_be_read_is_no_licence_to_replace(plain):
+    folder = clsas.process(plain).folder
+    path, before = folder / "process.json", contents(folder)
     record = json.loads(path.read_text())
-    record["steps"][0]["files"] = {"../lines.h5": "0"}
+    for text, message in (
+        ("{", "process.json that is no record of clsas: choose another output, or remove it"),
+        ("[]", "no record of clsas"),
+        (json.dumps(record | {"version": 1}), "of another version of clsas"),
+        (json.dumps(record | {"steps": [{"name": 1}]}), "holds image.h5, which image would"),
+    ):
+        path.write_text(text)
+        with pytest.raises(ValueError, match=message):
+            clsas.process(plain)
+        assert contents(folder) == before | {"process.json": text.encode()}
+    record["steps"][0]["files"] |= {"../lines.h5": "0"}
     path.write_text(json.dumps(record))
-    assert clsas.process(scene, steps=("image",)).repeated == ("image",)
+    with pytest.raises(ValueError, match="clsas did not write"):
+        clsas.process(plain)
+
+
+@pytest.mark.parametrize("name", ["image.h5", "image.png", "before.h5"])
+def test_files_of_others_are_never_replaced(plain, tmp_path, name):
+    folder = tmp_path / "mine"
+    folder.mkdir()
+    (folder / name).write_text("mine")
+    message = f"output '.*mine' holds {name}, which image would replace .* choose another output"
+    with pytest.raises(ValueError, match=message):
+        clsas.process(plain, output=folder)
+    assert contents(folder) == {name: b"mine"}
+    (folder / name).rename(folder / "notes.txt")
+    clsas.process(plain, output=folder)
+    assert (folder / "notes.txt").read_text() == "mine"
+
+
+def test_two_scenes_do_not_share_a_folder(plain, tmp_path):
+    other = tmp_path / "other.toml"
+    other.write_text(plain.read_text().replace("tolerance_db = -40", "tolerance_db = -30"))
+    folder = clsas.process(plain, output=tmp_path / "both").folder
+    before = contents(folder)
+    with pytest.raises(ValueError, match=r"another scene, '../scene.toml' .* not '../other.toml'"):
+        clsas.process(other, output=folder)
+    assert contents(folder) == before
+
+
+def test_scene_and_folder_may_move_together(plain, tmp_path, monkeypatch):
+    clsas.process(plain)
+    moved = tmp_path / "moved"
+    moved.mkdir()
+    for name in ("lines.h5", "scene.toml", "scene"):
+        (tmp_path / name).rename(moved / name)
+    monkeypatch.chdir(moved)
+    assert clsas.process("scene.toml").repeated == ()
+
+
+def test_a_killed_step_leaves_nothing_in_the_way(plain, monkeypatch):
+    """Files of a step appear together, once it is done."""
+    folder, image = plain.with_suffix(""), steps_module.RUN["image"]
+
+    def killed(job):
+        image(job)
+        raise KeyboardInterrupt
+
+    monkeypatch.setitem(steps_module.RUN, "image", killed)
+    with pytest.raises(KeyboardInterrupt):
+        clsas.process(plain)
+    assert not folder.exists()
+    monkeypatch.undo()
+    clsas.process(plain)
+    before = contents(folder)
+    plain.write_text(plain.read_text().replace("tolerance_db = -40", "tolerance_db = -30"))
+    monkeypatch.setitem(steps_module.RUN, "image", killed)
+    with pytest.raises(KeyboardInterrupt):
+        clsas.process(plain)
+    assert contents(folder) == before
 
 
 def test_what_was_finished_before_an_error_is_kept(scene):
-    scene.write_text(scene.read_text() + '[process.navigate]\nside = "starboard"\n')
-    steps = "calibrate", "navigate", "image"
-    with pytest.raises(ValueError, match="every ping of lines must have at least 2 receivers"):
-        clsas.process(scene, steps=steps)
-    assert clsas.process(scene, steps=("calibrate", "image")).repeated == ("image",)
+    text = scene.read_text()
+    scene.write_text(text + '[process.navigate]\nside = "starboard"\n')
+    choose(scene, "calibrate", "navigate", "image")
+    message = (
+        r"scene.toml: navigate \(\[process.navigate\]\): every ping of lines must have at least 2"
+    )
+    with pytest.raises(ValueError, match=message):
+        clsas.process(scene)
+    scene.write_text(text)
+    choose(scene, "calibrate", "image")
+    assert clsas.process(scene).repeated == ("image",)
+
+
+def test_a_single_step_begins_with_the_lines_that_the_scene_corrects(scene):
+    """Whether or not the corrections ran before, and whatever else is in the folder."""
+    choose(scene, "inspect", "calibrate", "image")
+    found = clsas.process(scene, steps=("image",))
+    assert found.repeated == ("calibrate", "image")
+    assert found["image"].corrections == ("calibrate",)
+    assert found["image"].lines == found["calibrate"].digest
+    with pytest.warns(ClsasWarning):  # of inspections
+        assert clsas.process(scene).repeated == ("inspect",)
+    assert clsas.process(scene, steps=("image",)).repeated == ()
+    assert clsas.process(scene, steps=("inspect",)).repeated == ()
+    assert clsas.process(scene).repeated == ()
+    record = json.loads((found.folder / "process.json").read_text())
+    assert [step["name"] for step in record["steps"]] == ["inspect", "calibrate", "image"]
+
+
+def test_results_that_no_longer_belong_to_the_lines_are_named(scene):
+    choose(scene, "calibrate", "image")
+    folder = clsas.process(scene).folder
+    scene.write_text(scene.read_text().replace("search_m = 0.4", "search_m = 0.3"))
+    message = "results of image in .* are out of date, its lines .* since: image.h5, image.png"
+    with pytest.warns(ClsasWarning, match=message):
+        assert clsas.process(scene, steps=("calibrate",)).repeated == ("calibrate",)
+    scene.write_text(scene.read_text().replace("'calibrate', ", ""))
+    with pytest.warns(ClsasWarning, match="out of date, the scene leaves it out: calibrate.h5"):
+        found = clsas.process(scene)
+    assert found["image"].corrections == ()
+    # What compared the image before and after the corrections is gone with them.
+    assert set(contents(folder)) == {"process.json", "calibrate.h5", "image.h5", "image.png"}
+
+
+def test_a_damaged_recording_leaves_no_folder(plain, tmp_path):
+    damaged = tmp_path / "damaged.h5"
+    damaged.write_bytes((plain.parent / "lines.h5").read_bytes()[:5000])
+    output = tmp_path / "output"
+    with pytest.raises(ValueError, match=r"damaged\.h5"):
+        clsas.process(plain, lines=damaged, output=output)
+    assert not output.exists()
 
 
 @pytest.mark.slow
@@ -160,7 +291,8 @@ def test_usual_steps_and_warnings_of_inspection(scene):
 
 def test_lines_and_echoes_in_memory(scene, tmp_path):
     lines = clsas.load(scene.parent / "lines.h5")
-    found = clsas.process(scene, lines=lines, output=tmp_path / "own", steps=("image",))
+    choose(scene, "image")
+    found = clsas.process(scene, lines=lines, output=tmp_path / "own")
     assert found.folder == tmp_path / "own"
     assert "before" not in found["image"].numbers
     np.testing.assert_array_equal(found.lines.samples, lines.samples)
@@ -171,9 +303,10 @@ def test_lines_and_echoes_in_memory(scene, tmp_path):
 def test_mosaic_continues(scene):
     pytest.importorskip("zarr")
     scene.write_text(scene.read_text() + "[mosaic]\npatches = [2, 2]\n")
-    found = clsas.process(scene, steps=("calibrate", "mosaic"))
+    choose(scene, "calibrate", "mosaic")
+    found = clsas.process(scene)
     assert found["mosaic"].numbers["formed"] == 4
-    again = clsas.process(scene, steps=("calibrate", "mosaic"))
+    again = clsas.process(scene)
     assert again["mosaic"].numbers["formed"] == 0
     assert clsas.Store.opened(found["mosaic"].numbers["store"]).image().shape == (121, 161)
 
@@ -184,7 +317,7 @@ def test_mosaic_continues(scene):
         ('[process]\nsteps = ["images"]', "must be one of"),
         ("[process]\nsteps = []", "steps must name one or several"),
         ('[process]\nsteps = ["calibrate"]', "calibrate needs"),
-        ('[process]\nlines = "nowhere.h5"', "there is no"),
+        (SCENE.replace("lines.h5", "nowhere.h5"), r"\[process\] lines must be a file, there is no"),
         ('[process]\noutput = ""', "output must be a path"),
         ("[process]\nstep = 1", "unknown key 'step' in \\[process\\]"),
         ("[process.calibrate]\npoints_m = [[1.0, 2.0]]", "points_m"),
@@ -225,8 +358,14 @@ def test_bad_arguments(scene, tmp_path):
         clsas.process(huge)
     described = clsas.Grid.plane((0, 1, 2), (0, 1, 2))
     clsas.save(tmp_path / "grid.h5", described)
+    output = tmp_path / "output"
     with pytest.raises(ValueError, match="must hold RangeLines or Echoes, got Grid"):
-        clsas.process(scene, lines=tmp_path / "grid.h5", steps=("image",))
+        clsas.process(scene, lines=tmp_path / "grid.h5", output=output)
+    assert not output.exists()
+    with pytest.raises(ValueError, match=r"cannot be made: there is no folder '.*no/such'"):
+        clsas.process(scene, output=tmp_path / "no/such/folder")
+    with pytest.raises(ValueError, match=r"output must be a folder, got the file '.*grid.h5'"):
+        clsas.process(scene, output=tmp_path / "grid.h5")
 
 
 @pytest.mark.slow

@@ -354,6 +354,51 @@ def test_positions_in_millimetres(lines):
     assert "order" not in found
 
 
+def in_an_array(lines, receivers=8):
+    """Every ping as if eight receivers had recorded it, half a wavelength apart."""
+    along_m = 0.0075 * np.arange(receivers)
+    rx_m = np.repeat(lines.rx_m, receivers, axis=0)
+    rx_m[:, 0] += np.tile(along_m, lines.channels)
+    return replace(
+        lines.select(np.repeat(np.arange(lines.channels), receivers)),
+        rx_m=rx_m,
+        tx_m=np.repeat(lines.tx_m, receivers, axis=0),
+    )
+
+
+def test_an_advance_too_small_for_any_aperture(lines):
+    """0.02 m per ping in kilometres is 1/750 of a wavelength of 15 mm."""
+    for recording in (lines, in_an_array(lines)):
+        found = clsas.inspect(moved(recording, lambda position_m: 1e-3 * position_m))["advance"]
+        assert found.value == pytest.approx(2e-5)
+        assert "less than 1/50 of the wavelength of 0.015" in found.message
+        assert "not kilometres" in found.remedy
+    khz = clsas.inspect(replace(lines, carrier_hz=100.0))
+    assert "carrier_hz in Hz (not kHz)" in khz["advance"].remedy
+    for slow in (0.02, 1.1 / 66):  # 0.4 mm, and 0.33 mm per ping
+        assert "advance" not in clsas.inspect(moved(lines, lambda m, slow=slow: slow * m))
+    # An array that overlaps itself almost wholly is slow, and no slip.
+    array = in_an_array(lines)
+    tx_m = 1e-2 * array.tx_m
+    slow_array = replace(array, tx_m=tx_m, rx_m=array.rx_m - array.tx_m + tx_m)
+    assert "advance" not in clsas.inspect(slow_array)
+
+
+def test_echoes_before_their_transmission(lines, five_points):
+    """A first range below zero puts echoes where no place is; a silent beginning may lie there."""
+    found = clsas.inspect(replace(lines, first_range_m=-5.0))
+    assert found["range_offset"].value > 0.3
+    assert "at ranges that no place has" in found["range_offset"].message
+    assert "time of the first sample" in found["range_offset"].remedy
+    begun = np.zeros((lines.channels, 3000), np.complex64)
+    begun[:, -lines.length :] = lines.samples
+    early = lines.first_range_m - (3000 - lines.length) * lines.range_step_m
+    assert early.max() < 0
+    assert "range_offset" not in clsas.inspect(replace(lines, samples=begun, first_range_m=early))
+    apart = clsas.inspect(replace(lines, rx_m=lines.rx_m + [0, 0, 60.0]))
+    assert "up to 30 m" in apart["range_offset"].message
+
+
 def test_a_time_in_samples_is_beyond_any_range(lines):
     first_m = lines.first_range_m / lines.range_step_m * lines.sound_speed_m_s / 2
     found = clsas.inspect(replace(lines, first_range_m=first_m), GRID)
@@ -426,6 +471,12 @@ def test_the_reason_why_a_sign_is_not_told_is_the_true_one(lines):
         (lines, beyond, "no echoes come from the grid"),
         (replace(lines, carrier_hz=0.0), GRID, "the lines still have their carrier"),
         (lines.select(slice(0, 5)), GRID, "5, fewer than 16"),
+        (replace(lines, first_range_m=-9.0), None, "no place has the range of the brightest"),
+        (
+            replace(lines, rx_m=lines.rx_m + [0, 0, 60]),
+            None,
+            "and receiver are 60 m",
+        ),
         (moved(lines, lambda _: circle + [2, 19.2, 0]), GRID, "channels on"),
     ):
         found = clsas.inspect(changed, grid)

@@ -1,5 +1,9 @@
 """Pictures of corrected tracks: what they draw, and what they refuse."""
 
+from dataclasses import replace
+from itertools import combinations
+from operator import attrgetter
+
 import numpy as np
 import pytest
 
@@ -79,6 +83,19 @@ def test_coherence_lies_over_pings_and_range():
     np.testing.assert_allclose(levels.images[0].get_extent(), (-0.5, PINGS - 1.5, 10, 18))
     assert beside.get_ylabel() == "Range (m)"
     assert "median" in legend(beside)
+    assert beside.get_xlim()[1] > 1  # a median of 1 is not hidden by the frame
+    (steps,) = (each for each in beside.patches if each.get_label() == "median")
+    np.testing.assert_allclose(steps.get_data().edges, [10, 12, 14, 16, 18])
+
+
+@pytest.mark.parametrize(("range_m", "shown"), [((12.0, 17.0), (12, 17)), (None, None)])
+def test_a_single_window_is_drawn_over_its_extent(range_m, shown):
+    found = navigated()
+    reach = found.lines.first_range_m.max(), found.lines.last_range_m.min()
+    middle_m = np.mean(range_m or reach)
+    single = replace(found, coherence=found.coherence[:, :1], range_m=np.array([middle_m]))
+    beside = clsas.plot.coherence(single, range_m=range_m).axes[0]
+    np.testing.assert_allclose(beside.get_ylim(), shown or reach)
 
 
 def test_sharpness_tells_steps_that_were_left_out():
@@ -98,6 +115,35 @@ def test_images_before_and_after_have_one_scale():
     with pytest.raises(ValueError, match="after must have the pixels of before"):
         clsas.plot.before_and_after(before, Image(np.ones((2, 2), complex), grid.window(
             slice(2), slice(2))))  # fmt: skip
+
+
+@pytest.mark.parametrize("y", [(10, 50, 200), (10, 210, 200), (10, 14, 20), (10, 10.4, 2)])
+def test_images_of_any_shape_have_room_for_their_texts(y):
+    grid = clsas.Grid.plane((0, 4, 20), y)
+    image = Image(np.ones(grid.shape, complex), grid)
+    figure = clsas.plot.before_and_after(image, image)
+    figure.canvas.draw()
+    before, after, bar = figure.axes
+    for text in ("title", "xaxis.label"):
+        of = [attrgetter(text)(axes).get_window_extent() for axes in (before, after)]
+        assert of[0].x1 < of[1].x0
+    below = [axes.xaxis.get_tightbbox() for axes in (before, after)]
+    scale = max((bar.xaxis, bar.yaxis), key=lambda axis: len(axis.label.get_text()))
+    boxes = [*below, scale.get_tightbbox(), after.get_window_extent()]
+    assert not any(one.overlaps(other) for one, other in combinations(boxes, 2))
+    size = [axes.get_window_extent().size for axes in (before, after)]
+    np.testing.assert_allclose(*size, rtol=1e-3)
+
+
+def test_images_of_zeros_are_called_so():
+    grid = clsas.Grid.plane((0, 1, 5), (0, 1, 4))
+    zero, one = (Image(level * np.ones((4, 5), complex), grid) for level in (0.0, 1.0))
+    for pair, words in (
+        ((zero, zero), ["Before: image is zero", "After: image is zero"]),
+        ((zero, one), ["Before: image is zero", "After: peak 0.0 dB"]),
+    ):
+        figure = clsas.plot.before_and_after(*pair)
+        assert [axes.get_title() for axes in figure.axes[:2]] == words
 
 
 @pytest.mark.parametrize("draw", ["corrections", "coherence", "sharpness"])

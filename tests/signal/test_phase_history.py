@@ -3,6 +3,7 @@ import pytest
 from scipy.constants import speed_of_light
 
 import clsas
+from clsas.core.validate import ClsasWarning
 from clsas.signal.phase_history import from_phase_history
 
 POINT_M = np.array([3.0, -4.0, 0.5])
@@ -86,6 +87,23 @@ def test_oversampling_only_interpolates():
     assert (sparse.length, dense.length) == (300, 600)
     np.testing.assert_allclose(dense.samples[:, ::2], sparse.samples, atol=1e-6)
     assert dense.range_step_m == sparse.range_step_m / 2
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        ({"first_frequency_hz": 9.3}, "first_frequency_hz is 9.3 Hz, less than 1/100 of the band"),
+        ({"reference_range_m": -10.0}, "reference_range_m is negative, -10 m at least"),
+    ],
+)
+def test_slips_that_are_possible_are_a_warning(wrong, said):
+    usual = {"first_frequency_hz": 9.3e9, "frequency_step_hz": 1e6, "reference_range_m": 10.0}
+    samples, at = np.ones((3, 4), complex), np.zeros((3, 3))
+    options = {"tx_m": at, "rx_m": at, "sound_speed_m_s": speed_of_light}
+    from_phase_history(samples, **usual, **options)  # warnings are errors here
+    with pytest.warns(ClsasWarning, match=said):
+        lines = from_phase_history(samples, **usual | wrong, **options)
+    assert lines.channels == 3
 
 
 @pytest.mark.parametrize(

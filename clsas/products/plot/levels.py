@@ -34,12 +34,13 @@ if TYPE_CHECKING:
 
 DYNAMIC_RANGE_DB = 60.0
 """Default dynamic range of a picture below the reference, dB."""
+FLAT = 0.4
+"""Height over width; flatter images have the scale of levels below them."""
 
 _MOST_PIXELS = 1500  # along an axis; pictures have fewer dots
 _SAME_DB = 1e-3  # levels closer than this differ by rounding only
 _COUNTED = 1 << 22  # most pixels from which percentiles are computed
 _WIDTH_IN = 7.0  # width of figures; nearly the height of those that are higher than wide
-_FLAT = 0.4  # height over width; flatter images have the scale of levels below them
 _PREVIEW_IN, _PREVIEW_DPI, _PREVIEW_COLOURS = 4.5, 96.0, 64  # in a notebook: 20 to 90 kB
 
 
@@ -154,7 +155,7 @@ def image(
     factor, unit = length_unit(max(float(np.abs(s.places_m).max()) for s in (across, upward)))
     places = factor * across.places_m, factor * upward.places_m
     extent = (*edges(*places), *edges(*reversed(places)))
-    flat = _height_per_width(image) < _FLAT
+    flat = height_per_width(image) < FLAT
     side = ("bottom" if flat else "right") if colour_bar else None
     draw_levels(axes, image.db(reference=reference), extent, scale, side)
     axes.set(
@@ -280,7 +281,7 @@ def add_colour_bar(
     ends = bool(level.min() < low - _SAME_DB), bool(level.max() > high + _SAME_DB)
     extend = pointed.get(ends, "neither")
     figure: Any = drawn.get_figure()
-    figure.colorbar(drawn, label=scale.label, extend=extend, **where)
+    figure.colorbar(drawn, extend=extend, **{"label": scale.label, **where})
 
 
 def edges(axis: NDArray, other: NDArray) -> tuple[float, float]:
@@ -300,14 +301,14 @@ def _greatest(level: NDArray[np.float32]) -> NDArray[np.float32]:
 
 def _size_in(image: Image, width_in: float = _WIDTH_IN) -> tuple[float, float]:
     """Return the size of a figure, inches, with as much room as an image and its labels take."""
-    high = _height_per_width(image)
-    if high < _FLAT:  # with the scale of levels below
+    high = height_per_width(image)
+    if high < FLAT:  # with the scale of levels below
         return width_in, max((width_in - 1.2) * high, 0.5) + 1.7
     axes_in = min(width_in - 1.9, width_in / high)
     return axes_in + 1.9, axes_in * high + 0.9
 
 
-def _height_per_width(image: Image) -> float:
+def height_per_width(image: Image) -> float:
     """Return height over width of an image as it is drawn; a default for lines and points."""
     if image.grid.points_m is not None or min(image.shape) == 1:
         return 0.75

@@ -13,6 +13,7 @@ from clsas.core.image import Image
 from clsas.navigation.autofocus import Autofocus
 from clsas.navigation.micronavigation import Micronavigation
 from clsas.products.plot.canvas import new_figure
+from clsas.products.plot.levels import FLAT, Scale, add_colour_bar, height_per_width
 from clsas.products.plot.levels import image as draw_image
 
 if TYPE_CHECKING:
@@ -20,6 +21,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _INTERVAL = 1.96  # standard deviations to either side: 95 %
+_PANEL_IN, _LEAST_PANEL_IN = 4.3, 1.7  # widths of two images side by side
+_HIGHEST_IN = 8.0  # of an image
 _LEAST_SHOWN = 1e-9  # metres and radians: what is smaller everywhere is not drawn
 
 
@@ -95,12 +98,15 @@ def _show_decades(axes: Axes) -> None:
     axes.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
 
 
-def coherence(found: Micronavigation) -> Figure:
-    """Draw the coherence of consecutive pings over range.
+def coherence(found: Micronavigation, *, range_m: tuple[float, float] | None = None) -> Figure:
+    """Draw the coherence of consecutive pings over range, window by window.
 
     Parameters
     ----------
     found : Micronavigation
+    range_m : (near, far), optional
+        Ranges that `micronavigate` was given, which its windows fill. By default a window is as
+        wide as the next one is away, and a single one reaches as far as the lines.
 
     Raises
     ------
@@ -110,24 +116,41 @@ def coherence(found: Micronavigation) -> Figure:
         If `found` is of another type.
     """
     validate.instance("found", found, Micronavigation)
-    values, range_m = found.coherence, found.range_m
-    step_m = float(np.median(np.diff(range_m))) if len(range_m) > 1 else 1.0
-    low_m, high_m = range_m[0] - step_m / 2, range_m[-1] + step_m / 2
+    values, edges_m = found.coherence, _edges_m(found, range_m)
     figure = new_figure(7.0, 4.0)
     beside, axes = figure.subplots(1, 2, sharey=True, width_ratios=(1, 3))
     drawn = axes.imshow(
         values.T, origin="lower", aspect="auto", vmin=0, vmax=1, cmap="cividis",
-        extent=(-0.5, len(values) - 0.5, low_m, high_m), interpolation="nearest",
+        extent=(-0.5, len(values) - 0.5, edges_m[0], edges_m[-1]), interpolation="nearest",
     )  # fmt: skip
     axes.set(xlabel="Ping (with the next one)")
     median, *spread = (np.quantile(values, share, axis=0) for share in (0.5, 0.1, 0.9))
-    beside.fill_betweenx(range_m, *spread, alpha=0.3, linewidth=0, label="10 to 90 %")
-    beside.plot(median, range_m, marker=".", linewidth=1.0, label="median")
-    beside.set(xlim=(0, 1), ylim=(low_m, high_m), xlabel="Coherence", ylabel="Range (m)")
+    for low, high, near_m, far_m in zip(*spread, edges_m, edges_m[1:], strict=False):
+        beside.fill_betweenx((near_m, far_m), low, high, alpha=0.3, linewidth=0, color="tab:blue")
+    beside.fill_betweenx([], [], [], alpha=0.3, color="tab:blue", label="10 to 90 %")
+    beside.stairs(median, edges_m, orientation="horizontal", baseline=None, label="median")
+    beside.set(
+        xlim=(0, 1.02), ylim=(edges_m[0], edges_m[-1]), xlabel="Coherence", ylabel="Range (m)"
+    )
     beside.grid(alpha=0.3)
     beside.legend(loc="lower left", fontsize="small")
     figure.colorbar(drawn, label="Coherence")
     return figure
+
+
+def _edges_m(found: Micronavigation, range_m: tuple[float, float] | None) -> NDArray[np.float64]:
+    """Return the ranges between windows, which are equally wide and fill `range_m`."""
+    middles_m, windows = found.range_m, len(found.range_m)
+    if range_m is not None:
+        near_m, far_m = map(float, range_m)
+    elif windows > 1:
+        half_m = float(middles_m[1] - middles_m[0]) / 2
+        near_m, far_m = middles_m[0] - half_m, middles_m[-1] + half_m
+    else:
+        first_m, last_m = found.lines.first_range_m.max(), found.lines.last_range_m.min()
+        half_m = float(min(middles_m[0] - first_m, last_m - middles_m[0]))
+        near_m, far_m = middles_m[0] - half_m, middles_m[0] + half_m
+    return np.linspace(near_m, far_m, windows + 1)
 
 
 def sharpness(found: Autofocus) -> Figure:
@@ -184,25 +207,30 @@ def before_and_after(before: Image, after: Image, **options: Any) -> Figure:
     if before.shape != after.shape:
         raise ValueError(f"after must have the pixels of before, {before.shape}, got {after.shape}")
     largest = max(float(np.abs(each.pixels).max()) for each in (before, after)) or 1.0
-    figure = new_figure(11.0, 5.0, layout="compressed")
+    scale = Scale(reference=largest, **options)
+    high = height_per_width(before)
+    # Titles and labels have room beside each other however narrow the images are.
+    axes_in = min(_PANEL_IN, _HIGHEST_IN / high)
+    narrow = axes_in < _LEAST_PANEL_IN
+    between = "\n" if narrow else " "
+    labels_in = 2.2 if high < FLAT else 1.5
+    size_in = 2 * max(axes_in, _LEAST_PANEL_IN) + 2.0, max(axes_in * high, 0.5) + labels_in
+    figure = new_figure(*size_in, layout="constrained" if narrow else "compressed")
     panels: NDArray[Any] = figure.subplots(1, 2, sharex=True, sharey=True)
     for axes, image, title in zip(panels, (before, after), ("Before", "After"), strict=True):
-        peak_db = 20 * np.log10(max(float(np.abs(image.pixels).max()) / largest, 1e-12))
+        peak = float(np.abs(image.pixels).max()) / largest
+        shown = f"peak {20 * np.log10(peak):.1f} dB".replace("-", "−") if peak else "image is zero"
         draw_image(
-            image, axes, reference=largest, colour_bar=axes is panels[-1],
-            title=f"{title}: peak {peak_db:.1f} dB".replace("-", "−"), **options,
+            image, axes, reference=largest, colour_bar=False,
+            title=f"{title}:{between}{shown}", **options,
         )  # fmt: skip
-    _label_bar(panels)
-    return figure
-
-
-def _label_bar(panels: NDArray[Any]) -> None:
-    """Say what 0 dB is: the larger peak of both images."""
-    figure = panels[0].get_figure(root=True)
     panels[-1].set_ylabel("")
-    for axes in figure.axes:
-        if axes not in panels:
-            axes.set_ylabel("Amplitude (dB re larger peak)")
+    levels = np.stack([each.db(reference=largest) for each in (before, after)])
+    add_colour_bar(
+        panels[-1].images[0], scale, levels, label="Amplitude (dB re larger peak)",
+        ax=panels, location="bottom" if high < FLAT else "right", aspect=30,
+    )  # fmt: skip
+    return figure
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,0 +1,73 @@
+"""The folder of a processing: which one, and what may be written there."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from clsas.core import validate
+from clsas.files.scene_files import SceneFile
+from clsas.processing.record import StepRecord, read_records
+from clsas.processing.recording import Recording
+from clsas.processing.steps import FILES
+
+
+def folder_of(scene: SceneFile, output: str | os.PathLike | None) -> Path:
+    """Return the folder given, or that of the scene; raises ValueError if there is neither."""
+    if output is not None:
+        return validate.path("output", output)
+    if "output" in scene.process:
+        return scene.process["output"]
+    if not Path(scene.name).suffix:
+        raise ValueError("output must be given: the scene has no file that names a folder")
+    return Path(scene.name).with_suffix("")
+
+
+def checked_records(
+    scene: SceneFile, folder: Path, recording: Recording, names: tuple[str, ...]
+) -> dict[str, StepRecord]:
+    """Return the records of the folder; steps may replace nothing there but what these name.
+
+    Raises
+    ------
+    ValueError
+        If the folder cannot be made, is that of the recording, has the record of another scene, or
+        holds a file that a step writes and no record names.
+    OSError
+        If the record cannot be read.
+    """
+    source = recording.described["file"]
+    if source is not None and Path(source).parent.resolve() == folder.resolve():
+        raise ValueError(f"output must not be the folder of the recording, got {str(folder)!r}")
+    if folder.exists() and not folder.is_dir():
+        raise ValueError(f"output must be a folder, got the file {str(folder)!r}")
+    if not folder.parent.is_dir():
+        raise ValueError(
+            f"output {str(folder)!r} cannot be made: there is no folder {str(folder.parent)!r}"
+        )
+    records = read_records(folder, scene)
+    own = {file for record in records.values() for file in record.files}
+    for name in names:
+        for file in FILES[name]:
+            if file not in own and os.path.lexists(folder / file):
+                raise ValueError(
+                    f"output {str(folder)!r} holds {file}, which {name} would replace and which "
+                    "clsas did not write: choose another output, or remove it"
+                )
+    return records
+
+
+@contextmanager
+def made(folder: Path) -> Iterator[None]:
+    """Make a folder if it is not there, and remove it again if nothing came into it."""
+    if folder.is_dir():
+        yield
+        return
+    folder.mkdir()
+    try:
+        yield
+    finally:
+        with suppress(OSError):  # it is not empty
+            folder.rmdir()
