@@ -66,6 +66,7 @@ def decide(
     upsampling: float | None = None,
     left_out_error: float = 0.0,
     estimate: bool = False,
+    windows: int = 1,
 ) -> Decision:
     """Decide how to form an exact image.
 
@@ -80,8 +81,9 @@ def decide(
     left_out_error : float
         Error power of effects that the model leaves out.
     estimate : bool
-        Estimate groups in place of gathering pixels, which takes longest. The range over which
-        blocks look samples up then plays no part.
+        Estimate groups in place of gathering pixels, which takes longest.
+    windows : int
+        Of estimated groups, in which they look samples up: see `Groups.windows`.
     """
     fixed = taps is not None and upsampling is not None
     geometry_error = GEOMETRY_ERROR if fixed else allowed(accuracy_db)
@@ -99,7 +101,7 @@ def decide(
     )
     layout: Tiles | Groups | GroupsEstimate
     if estimate:
-        layout = estimate_layout(grid, conditions, lines.length * lines.range_step_m)
+        layout = estimate_layout(grid, conditions, lines.length * lines.range_step_m, windows)
     else:
         layout = lay_out(grid, conditions)
     interpolator = interpolation.choose(

@@ -138,11 +138,14 @@ class GroupsEstimate:
         Padded pixels of a group.
     radius_m : float
         Largest distance of a pixel from its group's centre.
+    assumed_windows : int
+        See `windows`: how far apart the pixels of a block lie is not known yet.
     """
 
     grid: Grid
     part_pixels: int
     radius_m: float
+    assumed_windows: int = 1
     across: int = 1
 
     @property
@@ -151,8 +154,8 @@ class GroupsEstimate:
         return -(-self.grid.size // self.part_pixels)
 
     def windows(self, most_m: float) -> int:
-        """Return 1: how far apart the pixels of a block lie is not known yet."""
-        return 1
+        """Return the windows assumed, whatever pixels may be apart."""
+        return self.assumed_windows
 
 
 def gather(grid: Grid, largest_radius_m: float, width: int) -> Groups:

@@ -120,16 +120,19 @@ def lay_out(grid: Grid, conditions: Conditions) -> Tiles | Groups:
     return gather(grid, conditions.largest_radius_m, conditions.width) if found is None else found
 
 
-def estimate_layout(grid: Grid, conditions: Conditions, longest_m: float) -> Tiles | GroupsEstimate:
+def estimate_layout(
+    grid: Grid, conditions: Conditions, longest_m: float, windows: int
+) -> Tiles | GroupsEstimate:
     """Return the tiles of `lay_out`, or an estimate of its groups, which take long to gather.
 
-    Groups are assumed to be no wider than `longest_m`, the length of the lines.
+    Groups are assumed to be no wider than `longest_m`, the length of the lines, and to look samples
+    up in so many `windows`.
     """
     found = fitting_tiles(grid, conditions)
     if found is not None:
         return found
     radius_m = min(conditions.largest_radius_m, longest_m)
-    return GroupsEstimate(grid, STACK * conditions.width, radius_m)
+    return GroupsEstimate(grid, STACK * conditions.width, radius_m, windows)
 
 
 def fitting_tiles(grid: Grid, conditions: Conditions) -> Tiles | None:

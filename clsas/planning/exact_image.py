@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import partial
 
 from clsas.exact.blocks import Blocks, band_parts, blocks_of
 from clsas.exact.buffers import block_buffers, part_buffers
 from clsas.exact.decision import decide
 from clsas.exact.groups import Groups, GroupsEstimate
-from clsas.exact.tiles import Tiles
+from clsas.exact.tiles import STACK, Tiles
 from clsas.factorized.estimates import Work, backprojecting, upsampling
 from clsas.opencl.buffers import beam_buffers, pixel_buffers, total_bytes
 from clsas.opencl.device import Device
@@ -67,7 +68,8 @@ class Exact:
 def expect(model: VisibilityModel, accuracy_db: float, device: Device) -> Exact:
     """Predict an exact image, by the same decision that forms it."""
     lines, beam = model.lines, model.beam
-    decision = decide(
+    decided = partial(
+        decide,
         lines,
         model.grid,
         device=device,
@@ -78,16 +80,22 @@ def expect(model: VisibilityModel, accuracy_db: float, device: Device) -> Exact:
         along=model.channels_along,
         estimate=True,
     )
+    decision = decided()
     layout, interpolator, resampling = decision.layout, decision.interpolator, decision.resampling
     tiled = isinstance(layout, Tiles)
+    largest = decision
+    if not tiled and model.grid.points_m is not None:
+        # Points may lie far apart: samples are then looked up more slowly, in lines upsampled more.
+        others = [decided(windows=each) for each in (STACK, 0)]
+        largest = max((decision, *others), key=lambda each: each.resampling.length)
     share = most = 1.0
     if beam is not None and model.track is not None:
         share, most = model.visible_share(SMALL), model.visible_share(_LARGE, most=True)
     blocks = blocks_of(
         device,
         lines,
-        resampling,
-        interpolator.taps,
+        largest.resampling,
+        largest.interpolator.taps,
         radius_m=layout.radius_m,
         part_pixels=layout.part_pixels,
         tiled=tiled,
