@@ -148,8 +148,9 @@ class Trial:
 
 
 def sonar_trials(device: str) -> Iterator[Trial]:
-    """Yield the scenes of `clsas.trials.focusing`."""
-    for name, scene in focusing.SCENES.items():
+    """Yield the scenes of `clsas.trials.focusing` that lie on its small grid."""
+    small = {name: each for name, each in focusing.SCENES.items() if each.grid is focusing.GRID}
+    for name, scene in small.items():
         true, told = focusing.recorded(scene.targets, scene.sway_m)
         frame = Frame.of(told, focusing.GRID)
         sine_step = focusing.WAVELENGTH_M / (2.5 * np.ptp(told.tx_m[:, 0]))
