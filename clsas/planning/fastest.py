@@ -28,7 +28,8 @@ from clsas.planning.prediction import (
     margin_db,
     predicted_plan,
 )
-from clsas.planning.search import Allowed, Tree, largest_root, root_limits, search
+from clsas.planning.search import Allowed, Tree, search
+from clsas.planning.sizes import largest_root, root_limits
 from clsas.planning.spacing_errors import spacing_error
 from clsas.planning.visibility_model import VisibilityModel
 

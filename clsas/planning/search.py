@@ -7,9 +7,8 @@ lower bound of their time, until none of the others can be faster.
 
 from __future__ import annotations
 
-import functools
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
@@ -33,16 +32,13 @@ from clsas.factorized.filters import (
 )
 from clsas.opencl.buffers import GUARD
 from clsas.opencl.device import Device
-from clsas.planning.caching import cached
 from clsas.planning.channels import references
 from clsas.planning.costs import Costs
-from clsas.planning.errors import leaf_error, root_error
-from clsas.planning.visibility_model import Side, VisibilityModel, mean_over_points
+from clsas.planning.sizes import Division, Sizes, all_sizes
+from clsas.planning.visibility_model import Side, VisibilityModel
 from clsas.signal.interpolation import PHASES, upsampler
 from clsas.signal.spectrum import Spectrum
 
-_ROWS = (16, 32, 64, 128, 256, 512, 1024, 2048)  # of subimages, from whole work-items on
-_COLUMNS = (4, 8, 16, 32, 64, 128, 256, 512, 1024, 2048)
 OVERHANG = 1.5
 """Factor of a filter's taps that extend past an aperture's ends after several stages: those of the
 stage before count half, where subimages are half as long."""
@@ -51,7 +47,6 @@ MOST_STAGES = 5
 # Share of the filters' error power that expanding a leaf may add. Half of it leaves some near grids
 # without a leaf, so that they are imaged exactly; twice gains 3 % of time.
 _LEAF_SHARE = 0.25
-_MOST_OVERHANG = 1.1  # of roots that fit an image, over its rows or columns
 _SPARE_SAMPLES = 16  # of a line, for filters and padding; twice moves times by 3 % at most
 
 
@@ -79,149 +74,6 @@ class Tree:
         return choose(
             spectrum, self.align_taps, self.aperture_taps, stages, filters_db, self.dimensions
         )
-
-
-@dataclass(frozen=True, eq=False)
-class Sizes:
-    """Subimages of every size that the search considers, [sizes] each.
-
-    Attributes
-    ----------
-    model : VisibilityModel
-    sides : int64 [sizes, 2]
-        Rows and columns.
-    counts : float64
-        Number that hold a pixel.
-    padded_pixels : float64
-        Mean pixel count, padded to whole work-items.
-    visible_share : float64
-        Mean fraction of the channels whose beam touches one.
-    half_range_extent_m : float64
-        Largest difference in range between a pixel and the centre.
-    beam_cycles : float64
-        Phase cycles of a beam's weights along the visible aperture; see `beam_rate`.
-    beam_cycles_across : float
-        The same across a sheet.
-    leaf_error : float64
-        Error power that expanding a leaf of this size adds.
-    """
-
-    model: VisibilityModel
-    sides: NDArray[np.int64]
-    counts: NDArray[np.float64]
-    padded_pixels: NDArray[np.float64]
-    visible_share: NDArray[np.float64]
-    half_range_extent_m: NDArray[np.float64]
-    beam_cycles: NDArray[np.float64]
-    leaf_error: NDArray[np.float64]
-    beam_cycles_across: float = 0.0
-    _in_roots: dict[int, Division] = field(default_factory=dict, init=False)
-
-    @functools.cached_property
-    def pairs(self) -> tuple[Side, ...]:
-        """`sides` as pairs of int."""
-        return tuple((int(rows), int(columns)) for rows, columns in self.sides)
-
-    @functools.cached_property
-    def divides(self) -> NDArray[np.bool_]:
-        """True where subimages of one size divide into those of another, [sizes, sizes]."""
-        return (self.sides[:, None] % self.sides == 0).all(axis=-1)
-
-    @functools.cached_property
-    def anywhere(self) -> Division:
-        """All sizes, with the phases at the sample points: lower bounds of those in a root."""
-        return self._division((0, 0), np.arange(len(self.sides)))
-
-    def in_root(self, root: int) -> Division:
-        """Return the sizes that divide a root, with the largest phases in it."""
-        if root not in self._in_roots:
-            index = np.flatnonzero(self.divides[root])
-            self._in_roots[root] = self._division(self.pairs[root], index)
-        return self._in_roots[root]
-
-    def _division(self, root: Side, index: NDArray[np.int64]) -> Division:
-        """Return some sizes with their phases in a root, whose rows are 0 for sample points."""
-        if self.model.surface.is_plane:
-            extents = self.sides[index].astype(np.float64)
-        else:
-            of_root = root if any(root) else None
-            extents = np.stack([self.model.extents(self.pairs[i], root=of_root) for i in index])
-        cycles = self.model.phase_cycles_in_root(root, self.pairs)[index] @ extents.T
-        smaller = self.divides[np.ix_(index, index)].T & (index[:, None] != index)
-        of_axes = self.model.phase_cycles_across_root(root)
-        across = None if of_axes is None else extents @ of_axes
-        return Division(index, cycles, np.where(smaller, 0.0, np.inf), across)
-
-
-@dataclass(frozen=True, eq=False)
-class Division:
-    """Sizes that subimages in a root may have.
-
-    Attributes
-    ----------
-    index : int64 [n]
-        Which of the `Sizes`.
-    cycles : float64 [n, n]
-        Phase of a parent of size j, accumulated where a child of size i is visible.
-    divisible_s : float64 [n, n]
-        0 where a parent of size j may divide into children of size i, else infinite.
-    across : float64 [n] or None
-        Phase of subimages across a sheet; None without one.
-    """
-
-    index: NDArray[np.int64]
-    cycles: NDArray[np.float64]
-    divisible_s: NDArray[np.float64]
-    across: NDArray[np.float64] | None = None
-
-
-def _lengths(model: VisibilityModel) -> tuple[tuple[int, ...], ...]:
-    """Return rows and columns that subimages may have.
-
-    Every channel of a dense aperture is aligned for every root, so there roots fit the image too.
-    """
-    if not model.track.is_dense:
-        return _ROWS, _COLUMNS
-    found = []
-    for sides, n in zip((_ROWS, _COLUMNS), model.surface.plane.shape, strict=True):
-        least, fitting = sides[0], set(sides)
-        for parts in (1, 2, 4):
-            part = least * math.ceil(n / (least * parts))
-            if parts * part <= _MOST_OVERHANG * max(n, least):
-                fitting |= {part * 2**k for k in range(parts.bit_length())}
-        found.append(tuple(sorted(fitting)))
-    return tuple(found)
-
-
-@cached
-def all_sizes(model: VisibilityModel, most: Side, device: Device) -> Sizes:
-    """Return the sizes of subimages up to `most` rows and columns."""
-    rows, columns = (
-        [side for side in sides if side <= limit and side < 2 * max(n, min(sides))]
-        for sides, n, limit in zip(_lengths(model), model.surface.plane.shape, most, strict=True)
-    )
-    pairs = tuple(product(rows, columns))
-    sides = np.array(pairs, np.int64).reshape(-1, 2)
-    if not pairs:
-        return Sizes(model, sides, *np.zeros((6, 0)))
-    visible = model.visible_by_size(pairs)
-    share = mean_over_points(visible.sum(axis=-1)) / np.count_nonzero(model.on_track)
-    beam_cycles, across = np.zeros(len(sides)), 0.0
-    if model.beam is not None:
-        rates = model.beam_rates * model.spacing
-        beam_cycles = mean_over_points(np.einsum("nps,ps->np", visible, rates))
-        across = model.beam_phase_cycles_across()
-    return Sizes(
-        model,
-        sides,
-        counts=np.array([float(model.subimages(side)) for side in pairs]),
-        padded_pixels=np.array([model.padded_pixels(side, device.info.width) for side in pairs]),
-        visible_share=share,
-        half_range_extent_m=model.half_range_extents_m(pairs),
-        beam_cycles=beam_cycles,
-        leaf_error=leaf_error(model, sides, device),
-        beam_cycles_across=across,
-    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -419,31 +271,3 @@ def search(
     choice = options.choices[option]
     sides = tuple(sizes.pairs[i] for i in path)
     return Tree(sides, choice.align_taps, choice.aperture_taps, choice.dimensions)
-
-
-def largest_root(model: VisibilityModel) -> Side:
-    """Return the rows and columns of the largest roots of an image."""
-    rows, columns = (
-        min((side for side in sides if side >= n), default=sides[-1])
-        for sides, n in zip(_lengths(model), model.surface.plane.shape, strict=True)
-    )
-    return rows, columns
-
-
-def root_limits(model: VisibilityModel, allowed: float) -> Side | None:
-    """Return the largest rows and columns of roots that keep their errors within a power.
-
-    None where there are none.
-    """
-    rows, columns = largest_root(model)
-    if root_error(model, (rows, columns)) <= allowed:
-        return rows, columns
-    if root_error(model, (_ROWS[0], _COLUMNS[0])) > allowed:
-        return None
-    while root_error(model, (rows, columns)) > allowed:
-        smaller = [(rows // 2, columns), (rows, columns // 2)]
-        smaller = [side for side in smaller if side[0] >= _ROWS[0] and side[1] >= _COLUMNS[0]]
-        if not smaller:
-            return None
-        rows, columns = min(smaller, key=functools.partial(root_error, model))
-    return rows, columns

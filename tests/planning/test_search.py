@@ -9,12 +9,13 @@ from clsas.opencl.device import open_device
 from clsas.planning import search
 from clsas.planning.costs import Costs
 from clsas.planning.search import Allowed
+from clsas.planning.sizes import all_sizes
 from clsas.planning.visibility_model import VisibilityModel
 
 
 def priced(view, filters_db, most, leaf_pixels, beam_cycles, device, costs, allowed):
     """All sizes, and the options with the time of what they do."""
-    sizes = search.all_sizes(view, most, device)
+    sizes = all_sizes(view, most, device)
     return sizes, search.all_options(sizes, filters_db, leaf_pixels, beam_cycles, costs, allowed)
 
 
