@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from clsas.core.lines import some_channels, wavelength_m
 from clsas.planning.caching import shared
+from clsas.planning.sample_points import points_at_m
 from clsas.planning.visibility_model import VisibilityModel
 from clsas.sonar.visibility import sines
 
@@ -165,7 +166,7 @@ def partly_visible_share(model: VisibilityModel) -> float:
 
 def _points_m(model: VisibilityModel) -> NDArray[np.float64]:
     found: NDArray[np.float64] = model.from_cache(
-        "points of beam coverage", lambda: model.pixels_m(_SAMPLED_POINTS)
+        "points of beam coverage", lambda: points_at_m(model.surface, _SAMPLED_POINTS)
     )
     return found
 

@@ -12,7 +12,8 @@ from clsas.core.geometry import pairwise_range_m
 from clsas.core.lines import fastest
 from clsas.factorized import aperture
 from clsas.planning.caching import shared
-from clsas.planning.visibility_model import Side, VisibilityModel
+from clsas.planning.subimages import Side
+from clsas.planning.visibility_model import VisibilityModel
 from clsas.signal.spectrum import cycles_per_m_at
 
 _NEIGHBOURS = 64  # channels over which density is measured; half or twice: no change

@@ -22,7 +22,8 @@ from clsas.planning.caching import cached
 from clsas.planning.channels import own_drift, track_error_m
 from clsas.planning.sample_pixels import SPREAD_POINTS, mean_over_relief, pixels_m
 from clsas.planning.spacing_errors import bias_error, filter_error, spacing_error
-from clsas.planning.visibility_model import Side, VisibilityModel
+from clsas.planning.subimages import Side
+from clsas.planning.visibility_model import VisibilityModel
 from clsas.signal.interpolation import Interpolator
 from clsas.sonar.visibility import sines
 

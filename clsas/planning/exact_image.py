@@ -14,7 +14,8 @@ from clsas.exact.tiles import STACK, Tiles
 from clsas.factorized.estimates import Work, backprojecting, upsampling
 from clsas.opencl.buffers import beam_buffers, pixel_buffers, total_bytes
 from clsas.opencl.device import Device
-from clsas.planning.visibility_model import SMALL, VisibilityModel
+from clsas.planning.subimages import SMALL
+from clsas.planning.visibility_model import VisibilityModel
 
 _LARGE = (64, 64)  # rows and columns of a subimage that holds any part of an exact image
 

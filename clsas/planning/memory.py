@@ -127,7 +127,7 @@ class BufferSizes:
         """Return the tiles or groups of a root, and its pixels, at most."""
         if self.model.surface.is_plane:
             return self._divided(self.tile), math.prod(self.sides[0])
-        pixels = self.model.most_padded_pixels(self.sides[-1], self.sides[0], self.width)
+        pixels = self.model.subimages.most_padded_pixels(self.sides[-1], self.sides[0], self.width)
         return pixels // (STACK * self.width), pixels
 
 

@@ -317,7 +317,7 @@ def _stages(
         stages.append(Stage(rows, columns, count, samples=samples, seconds=seconds, **figures))
 
     for level, (side, of_stage) in enumerate(zip(candidate.sides, channels, strict=True)):
-        count = model.subimages(side)
+        count = model.subimages.count(side)
         samples = levels[level].length
         combined = count * of_stage.used
         work = combining(
@@ -338,7 +338,7 @@ def _stages(
             operations=combined * samples,
             error_db=error_db,
         )
-    pixels, backprojected = model.padded_pixels(side, width), count * of_stage.count
+    pixels, backprojected = model.subimages.padded_pixels(side, width), count * of_stage.count
     tiled, weighted = model.surface.is_plane, model.beam is not None
     taps = candidate.final.taps
     gathered = not tiled and _looked_up_singly(model, candidate, lines, device)

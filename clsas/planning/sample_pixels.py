@@ -7,7 +7,8 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from clsas.planning.visibility_model import Side, VisibilityModel
+from clsas.planning.subimages import Side
+from clsas.planning.visibility_model import VisibilityModel
 
 SAMPLED_PIXELS = 16
 """Pixels sampled of every subimage. Half as many move predicted errors by 0.05 dB at most."""

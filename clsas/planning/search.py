@@ -35,7 +35,8 @@ from clsas.opencl.device import Device
 from clsas.planning.channels import references
 from clsas.planning.costs import Costs
 from clsas.planning.sizes import Division, Sizes, all_sizes
-from clsas.planning.visibility_model import Side, VisibilityModel
+from clsas.planning.subimages import Side
+from clsas.planning.visibility_model import VisibilityModel
 from clsas.signal.interpolation import PHASES, upsampler
 from clsas.signal.spectrum import Spectrum
 

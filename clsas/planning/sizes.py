@@ -13,7 +13,9 @@ from numpy.typing import NDArray
 from clsas.opencl.device import Device
 from clsas.planning.caching import cached
 from clsas.planning.errors import leaf_error, root_error
-from clsas.planning.visibility_model import Side, VisibilityModel, mean_over_points
+from clsas.planning.sample_points import mean_over_points
+from clsas.planning.subimages import Side
+from clsas.planning.visibility_model import VisibilityModel
 
 _ROWS = (16, 32, 64, 128, 256, 512, 1024, 2048)  # of subimages, from whole work-items on
 _COLUMNS = (4, 8, 16, 32, 64, 128, 256, 512, 1024, 2048)
@@ -83,8 +85,10 @@ class Sizes:
         if self.model.surface.is_plane:
             extents = self.sides[index].astype(np.float64)
         else:
-            of_root = root if any(root) else None
-            extents = np.stack([self.model.extents(self.pairs[i], root=of_root) for i in index])
+            subimages, pairs = self.model.subimages, [self.pairs[i] for i in index]
+            extents = np.stack(
+                [subimages.extents(side, root if any(root) else side) for side in pairs]
+            )
         cycles = self.model.phase_cycles_in_root(root, self.pairs)[index] @ extents.T
         smaller = self.divides[np.ix_(index, index)].T & (index[:, None] != index)
         of_axes = self.model.phase_cycles_across_root(root)
@@ -153,8 +157,10 @@ def all_sizes(model: VisibilityModel, most: Side, device: Device) -> Sizes:
     return Sizes(
         model,
         sides,
-        counts=np.array([float(model.subimages(side)) for side in pairs]),
-        padded_pixels=np.array([model.padded_pixels(side, device.info.width) for side in pairs]),
+        counts=np.array([float(model.subimages.count(side)) for side in pairs]),
+        padded_pixels=np.array(
+            [model.subimages.padded_pixels(side, device.info.width) for side in pairs]
+        ),
         visible_share=share,
         half_range_extent_m=model.half_range_extents_m(pairs),
         beam_cycles=beam_cycles,

@@ -25,7 +25,8 @@ from clsas.factorized.tree import interpolated_channels
 from clsas.planning.caching import cached
 from clsas.planning.channels import carriers
 from clsas.planning.sample_pixels import SAMPLED_PIXELS, SPREAD_POINTS, mean_over_relief, pixels_m
-from clsas.planning.visibility_model import Side, VisibilityModel
+from clsas.planning.subimages import Side
+from clsas.planning.visibility_model import VisibilityModel
 from clsas.signal.interpolation import Interpolator
 
 _Pixels = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]

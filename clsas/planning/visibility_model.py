@@ -14,33 +14,30 @@ from scipy.spatial import KDTree
 
 from clsas.core.grid import Grid
 from clsas.core.lines import RangeLines, some_channels
-from clsas.exact.tiles import STACK
 from clsas.factorized.aperture import cycles_per_extent
 from clsas.factorized.beam_directions import BeamDirections, beam_rate
 from clsas.factorized.dense_apertures import Shape, mean_track_of, simplest_track
 from clsas.factorized.dense_channels import SheetRates, sheet_beam_rates, sheet_rates
-from clsas.factorized.surface import LEAST_SIDE, surface_of, within_roots
+from clsas.factorized.surface import LEAST_SIDE, surface_of
 from clsas.planning.caching import cached, shared
+from clsas.planning.sample_points import (
+    INNER_POINTS,
+    over_points,
+    points_at_m,
+    sample_points_m,
+    trapezoidal_weights,
+)
+from clsas.planning.subimages import SMALL, Side, Subimages
 from clsas.signal.ambiguity import Ambiguity, ambiguity
 from clsas.signal.interpolation import Interpolator, Resampling
 from clsas.signal.spectrum import cycles_per_m_at, measure_spectrum
 from clsas.sonar.beam import BeamWindow
 from clsas.sonar.visibility import Visibility
 
-Side = tuple[int, int]
-"""Rows and columns of a subimage."""
-
-_POINTS = (0.02, 0.25, 0.5, 0.75, 0.98)  # sample points, as fractions of the rows and columns
-_WEIGHTS = np.array([0.135, 0.24, 0.25, 0.24, 0.135])  # of these in means over the grid
-_POINT_WEIGHTS = np.outer(_WEIGHTS, _WEIGHTS).ravel() / _WEIGHTS.sum() ** 2
-_INNER = np.arange(len(_POINTS) ** 2).reshape(len(_POINTS), -1)[1:-1, 1:-1].ravel()
 _DENSE = 65  # points along either side, for the least distance of the grid; half: 0.05 dB
 _NEAREST_CHANNELS = 4096  # of a dense aperture, for that distance
 _MOST_OUTSIDE = 1e-6  # share of power above the highest frequency; half or twice: no change
 _SEARCH_STEP = 8  # the search uses every eighth sample of the track; a fourth chose the same trees
-
-SMALL = (16, 16)
-"""Rows and columns of a subimage that stands for a pixel."""
 
 
 class VisibilityModel:
@@ -63,6 +60,8 @@ class VisibilityModel:
         Unit directions of the track at the channels, with a beam.
     surface : Surface
         Positions of the grid's pixels.
+    subimages : Subimages
+        Of every size, on the surface.
     points_m : float64 [points, 3]
         Sample points all over the grid, also near its corners.
     track_m : float64 [samples, 3]
@@ -122,9 +121,10 @@ class VisibilityModel:
         if track is None:
             return
         self.surface = surface_of(self.grid)
-        self.points_m = self.pixels_m(_POINTS)
+        self.subimages = Subimages(self.surface)
+        self.points_m = sample_points_m(self.surface)
         self.track_m, _ = self.track.sampled_m
-        self.spacing = _spacing(self.track.samples)
+        self.spacing = trapezoidal_weights(self.track.samples)
         sight = self.points_m[:, None] - self.track_m
         self.distance_m = np.maximum(np.linalg.norm(sight, axis=-1), 1e-9)
         self.sight = sight / self.distance_m[..., None]
@@ -137,7 +137,7 @@ class VisibilityModel:
 
     def _nearest_m(self) -> float:
         """Lower bound of the distance between pixels and channels."""
-        dense_m = self.pixels_m(np.linspace(0, 1, _DENSE))
+        dense_m = points_at_m(self.surface, np.linspace(0, 1, _DENSE))
         # Pixels between the dense points may be closer; half a step bounds by how much.
         steps_m = np.linalg.norm(self.surface.steps_m[:2], axis=1)
         step_m = steps_m @ (np.array(self.surface.plane.shape) - 1) / (_DENSE - 1)
@@ -186,74 +186,12 @@ class VisibilityModel:
         """Errors that the lines themselves leave open."""
         return ambiguity(self.lines, self.grid, self.spectrum, self.beam, self.channels_along)
 
-    # The grid and its subimages.
+    def extents(self, side: Side, *, most: bool = False) -> NDArray[np.float64]:
+        """Return the extents of subimages of a size in roots of the model's: see `Subimages`.
 
-    def pixels_m(self, fractions: Sequence[float] | NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return positions at some fractions of the rows and columns, [n, 3]."""
-        index = np.stack(np.meshgrid(fractions, fractions, indexing="ij"), axis=-1).reshape(-1, 2)
-        index = index * (np.array(self.surface.plane.shape) - 1)
-        origin_m: Any = self.surface.plane.origin_m
-        plane_m = origin_m + index @ self.surface.steps_m[:2]
-        if self.surface.is_plane:
-            return plane_m
-        # As far off the plane as the pixels around.
-        around = (index // LEAST_SIDE * LEAST_SIDE).astype(np.int64)
-        middle = around + (np.array(LEAST_SIDE) - 1) / 2
-        off_m = self.surface.middles_m(LEAST_SIDE, around) - origin_m
-        return plane_m + off_m - middle @ self.surface.steps_m[:2]
-
-    def subimages(self, side: Side) -> int:
-        """Return how many subimages of a size hold a pixel."""
-        if self.surface.is_plane:
-            shape = self.surface.plane.shape
-            return math.prod(-(-n // s) for n, s in zip(shape, side, strict=True))
-        return int((self.surface.counts(side) > 0).sum())
-
-    def padded_pixels(self, side: Side, width: int) -> float:
-        """Return the mean pixel count of a subimage after padding to whole work-items.
-
-        On a plane these are all its pixels; elsewhere groups of blocks of `width` pixels.
+        Without a size of roots every subimage is one.
         """
-        if self.surface.is_plane:
-            return float(math.prod(side))
-        padded = self._padded(side, width)
-        return float(padded.sum() / (padded > 0).sum())
-
-    def most_padded_pixels(self, side: Side, root: Side, width: int) -> int:
-        """Return the largest padded pixel count of all leaves of a root together."""
-        return int(within_roots(np.add, self._padded(side, width), side, root).max())
-
-    def _padded(self, side: Side, width: int) -> NDArray[np.int64]:
-        size = STACK * width
-        return -(-self.surface.counts(side) // size) * size
-
-    def extents(
-        self, side: Side, root: Side | None = None, *, most: bool = False
-    ) -> NDArray[np.float64]:
-        """Return the extents of subimages of a size, [axes].
-
-        Their relief is the largest in each root, of this model's size unless given: its mean over
-        the roots, or the largest.
-        """
-        if self.surface.is_plane:
-            return self.surface.extents(side)
-        root = root or self.root or side
-        mean_m, largest_m = self.from_cache(
-            ("relief", side, root), lambda: _mean_and_max(self._relief_m(side, root))
-        )
-        return self.surface.extents(side, largest_m if most else mean_m)
-
-    def _relief_m(self, side: Side, root: Side) -> NDArray[np.float64]:
-        """Largest relief of the subimages of a size in every root, [down, across]."""
-        if root == side:
-            return self.surface.relief_m(side)
-        # Half as large a root, already known in most cases, leaves two values to compare.
-        axis = 0 if root[0] // side[0] > root[1] // side[1] else 1
-        half = (root[0] // 2, root[1]) if axis == 0 else (root[0], root[1] // 2)
-        if root[axis] % 2 or half[axis] % side[axis]:
-            return self.surface.relief_m(side, root)
-        of_half = self.from_cache(("reliefs", side, half), lambda: self._relief_m(side, half))
-        return np.maximum.reduceat(of_half, np.arange(0, of_half.shape[axis], 2), axis=axis)
+        return self.subimages.extents(side, self.root or side, most=most)
 
     def half_range_extents_m(self, sides: Sequence[Side]) -> NDArray[np.float64]:
         """Return the largest differences in range between pixels and subimages' centres, [sizes].
@@ -261,7 +199,7 @@ class VisibilityModel:
         The sides of subimages project onto the line of sight; within near subimages ranges bend.
         """
         steps_m = self.surface.steps_m
-        boxes = np.stack([self.extents(side, root=side, most=True) for side in sides])
+        boxes = np.stack([self.subimages.extents(side, side, most=True) for side in sides])
         corners = np.array(list(product((-0.5, 0.5), repeat=len(steps_m))))
         radius_m = np.linalg.norm((boxes[:, None] * corners) @ steps_m, axis=-1).max(axis=1)
         bend_m = radius_m**2 / (2 * np.maximum(self.nearest_m, radius_m))
@@ -334,7 +272,7 @@ class VisibilityModel:
     def visible_share(self, side: Side, *, most: bool = False) -> float:
         """Fraction of channels whose beam touches a subimage: mean over the points, or maximum."""
         count = np.count_nonzero(self.visible(side), axis=1)
-        return _over_points(count / np.count_nonzero(self.on_track), most)
+        return over_points(count / np.count_nonzero(self.on_track), most)
 
     @property
     @cached
@@ -419,7 +357,7 @@ class VisibilityModel:
         if not self.track.is_sheet:
             return 1.0
         rates = density * np.tensordot(self.extents(side, most=most), self.rates_across, 1)
-        cycles = _over_points(rates @ self._spacing_across, most)
+        cycles = over_points(rates @ self._spacing_across, most)
         if beam_density:
             cycles += beam_density * self.beam_phase_cycles_across(most=most)
         return cycles + taps
@@ -428,13 +366,13 @@ class VisibilityModel:
     def _spacing_across(self) -> NDArray[np.float64]:
         """Weights of the samples of a line across a sheet in integrals over it."""
         line = self.track.line_across(0.5)
-        return np.where(line.on_track, _spacing(line.samples), 0.0)
+        return np.where(line.on_track, trapezoidal_weights(line.samples), 0.0)
 
     def beam_phase_cycles_across(self, *, most: bool = False) -> float:
         """Return the cycles that the beam's weights count for across a sheet; 0 without one."""
         if not self.track.is_sheet:
             return 0.0
-        return _over_points(self.beam_rates_across @ self._spacing_across, most)
+        return over_points(self.beam_rates_across @ self._spacing_across, most)
 
     def beam_phase_cycles(self, visible: NDArray[np.bool_], *, most: bool = False) -> float:
         """Return the cycles that the beam's weights count for along the visible aperture."""
@@ -447,7 +385,7 @@ class VisibilityModel:
 
         The mean over the sample points, or the maximum; `rates` is [points, samples].
         """
-        return _over_points(np.where(visible, rates, 0.0) @ self.spacing, most)
+        return over_points(np.where(visible, rates, 0.0) @ self.spacing, most)
 
     def subimage_phase_cycles(
         self, side: Side, visible: NDArray[np.bool_], *, most: bool = False
@@ -471,25 +409,25 @@ class VisibilityModel:
         mean over the inner sample points. With a root of 0 rows, at the points themselves.
         """
         extents = self.extents(root, most=True) if any(root) else self.surface.extents(root)
-        rates = self._rates(extents, self.points_m[_INNER], _SEARCH_STEP)
-        return self._visible_spacing(sides) @ rates.reshape(len(rates), -1).T
+        rates = self._rates(extents, self.points_m[INNER_POINTS], _SEARCH_STEP)
+        return self._visibletrapezoidal_weights(sides) @ rates.reshape(len(rates), -1).T
 
     def phase_cycles_across_root(self, root: Side) -> NDArray[np.float64] | None:
         """Estimate the phase across a sheet as `phase_cycles_in_root`, [axes]; None without one."""
         if not self.track.is_sheet:
             return None
         extents = self.extents(root, most=True) if any(root) else self.surface.extents(root)
-        rates = self._sheet_rates(extents, self.points_m[_INNER], _SEARCH_STEP).across
+        rates = self._sheet_rates(extents, self.points_m[INNER_POINTS], _SEARCH_STEP).across
         line = self.track.line_across(0.5)
-        spacing = (line.on_track * _spacing(line.samples))[::_SEARCH_STEP]
-        weights = _spacing(line.samples[::_SEARCH_STEP]) * (spacing > 0)
+        spacing = (line.on_track * trapezoidal_weights(line.samples))[::_SEARCH_STEP]
+        weights = trapezoidal_weights(line.samples[::_SEARCH_STEP]) * (spacing > 0)
         return (rates @ weights).mean(axis=1)
 
     @cached
-    def _visible_spacing(self, sides: tuple[Side, ...]) -> NDArray[np.float64]:
+    def _visibletrapezoidal_weights(self, sides: tuple[Side, ...]) -> NDArray[np.float64]:
         """Weights of track samples at inner points, 0 where a size is invisible, [sizes, n]."""
-        visible = self.visible_by_size(sides)[:, _INNER, ::_SEARCH_STEP]
-        spacing = _spacing(self.track.samples[::_SEARCH_STEP]) / len(_INNER)
+        visible = self.visible_by_size(sides)[:, INNER_POINTS, ::_SEARCH_STEP]
+        spacing = trapezoidal_weights(self.track.samples[::_SEARCH_STEP]) / len(INNER_POINTS)
         return (visible * spacing).reshape(len(sides), -1)
 
     def _rates(
@@ -525,23 +463,3 @@ class VisibilityModel:
                 every,
             ),
         )
-
-
-def mean_over_points(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return means over the grid of values at the sample points, [..., points]."""
-    return values @ _POINT_WEIGHTS
-
-
-def _over_points(values: NDArray[np.float64], most: bool) -> float:
-    """Return the largest of values at the sample points, or their mean over the grid."""
-    return float(values.max() if most else mean_over_points(values))
-
-
-def _mean_and_max(values: NDArray[np.float64]) -> tuple[float, float]:
-    return float(values.sum()) / values.size, float(values.max())
-
-
-def _spacing(samples: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the weights of samples in an integral over them (trapezoidal rule)."""
-    halves = np.diff(samples) / 2
-    return np.concatenate([halves, [0.0]]) + np.concatenate([[0.0], halves])
