@@ -18,7 +18,7 @@ def cached(function: Callable[..., Any]) -> Callable[..., Any]:
 
     @functools.wraps(function)
     def from_cache(model: VisibilityModel, *arguments: Hashable, **options: Hashable) -> Any:
-        key = (function.__qualname__, model.limits, model.root, arguments, *options.items())
+        key = (function, model.limits, model.root, arguments, *options.items())
         return model.from_cache(key, lambda: function(model, *arguments, **options))
 
     return from_cache
@@ -29,6 +29,6 @@ def shared(function: Callable[[VisibilityModel], Any]) -> Callable[[VisibilityMo
 
     @functools.wraps(function)
     def from_cache(model: VisibilityModel) -> Any:
-        return model.from_cache(function.__qualname__, lambda: function(model))
+        return model.from_cache(function, lambda: function(model))
 
     return from_cache

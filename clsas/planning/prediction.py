@@ -34,6 +34,7 @@ from clsas.planning.channels import peak_density, range_window_m, references
 from clsas.planning.costs import Costs
 from clsas.planning.exact_image import Exact
 from clsas.planning.memory import BufferSizes, batches_within
+from clsas.planning.range_extents import half_line_lengths
 from clsas.planning.visibility_model import VisibilityModel
 from clsas.signal import interpolation
 from clsas.signal.interpolation import PHASES, Interpolator, Resampling, Upsampler
@@ -130,7 +131,9 @@ def predicted_plan(
     lines = _upsampled(model, candidate, other_errors)
     if model.track is not None and model.track.is_dense:
         lines = _trimmed(model, candidate, lines)
-    half_lengths = model.half_lengths(sides, candidate.align, candidate.final, lines.resampling)
+    half_lengths = half_line_lengths(
+        model, sides, candidate.align, candidate.final, lines.resampling
+    )
     channels = candidate.aperture.predicted_channels(model, sides)
     levels = [Level.of(half, device.info.width) for half in half_lengths]
     errors, half_precision = _with_arithmetic(model, candidate, lines, channels, conditions)

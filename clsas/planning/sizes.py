@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from clsas.opencl.device import Device
 from clsas.planning.caching import cached
 from clsas.planning.errors import leaf_error, root_error
+from clsas.planning.range_extents import half_range_extents_m
 from clsas.planning.sample_points import mean_over_points
 from clsas.planning.subimages import Side
 from clsas.planning.visibility_model import VisibilityModel
@@ -162,7 +163,7 @@ def all_sizes(model: VisibilityModel, most: Side, device: Device) -> Sizes:
             [model.subimages.padded_pixels(side, device.info.width) for side in pairs]
         ),
         visible_share=share,
-        half_range_extent_m=model.half_range_extents_m(pairs),
+        half_range_extent_m=half_range_extents_m(model, pairs),
         beam_cycles=beam_cycles,
         leaf_error=leaf_error(model, sides, device),
         beam_cycles_across=across,

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import copy
-import math
-from collections.abc import Callable, Hashable, Sequence
-from itertools import product
+from collections.abc import Callable, Hashable
 from typing import Any
 
 import numpy as np
@@ -29,7 +27,6 @@ from clsas.planning.sample_points import (
 )
 from clsas.planning.subimages import SMALL, Side, Subimages
 from clsas.signal.ambiguity import Ambiguity, ambiguity
-from clsas.signal.interpolation import Interpolator, Resampling
 from clsas.signal.spectrum import cycles_per_m_at, measure_spectrum
 from clsas.sonar.beam import BeamWindow
 from clsas.sonar.visibility import Visibility
@@ -37,6 +34,7 @@ from clsas.sonar.visibility import Visibility
 _DENSE = 65  # points along either side, for the least distance of the grid; half: 0.05 dB
 _NEAREST_CHANNELS = 4096  # of a dense aperture, for that distance
 _MOST_OUTSIDE = 1e-6  # share of power above the highest frequency; half or twice: no change
+_AMBIGUITY = "ambiguity"  # key of what mean tracks of all shapes have in common
 _SEARCH_STEP = 8  # the search uses every eighth sample of the track; a fourth chose the same trees
 
 
@@ -160,8 +158,7 @@ class VisibilityModel:
         if track is None:
             return None
         model = copy.copy(self)
-        kept = VisibilityModel.ambiguity.fget.__qualname__  # type: ignore[attr-defined]
-        model._cache = {key: self._cache[key] for key in (kept,) if key in self._cache}
+        model._cache = {key: self._cache[key] for key in (_AMBIGUITY,) if key in self._cache}
         model._put_track(track)
         model.shape = shape
         return model
@@ -181,10 +178,11 @@ class VisibilityModel:
         return self._with(root=root)
 
     @property
-    @shared
     def ambiguity(self) -> Ambiguity:
         """Errors that the lines themselves leave open."""
-        return ambiguity(self.lines, self.grid, self.spectrum, self.beam, self.channels_along)
+        given = self.lines, self.grid, self.spectrum, self.beam, self.channels_along
+        found: Ambiguity = self.from_cache(_AMBIGUITY, lambda: ambiguity(*given))
+        return found
 
     def extents(self, side: Side, *, most: bool = False) -> NDArray[np.float64]:
         """Return the extents of subimages of a size in roots of the model's: see `Subimages`.
@@ -192,49 +190,6 @@ class VisibilityModel:
         Without a size of roots every subimage is one.
         """
         return self.subimages.extents(side, self.root or side, most=most)
-
-    def half_range_extents_m(self, sides: Sequence[Side]) -> NDArray[np.float64]:
-        """Return the largest differences in range between pixels and subimages' centres, [sizes].
-
-        The sides of subimages project onto the line of sight; within near subimages ranges bend.
-        """
-        steps_m = self.surface.steps_m
-        boxes = np.stack([self.subimages.extents(side, side, most=True) for side in sides])
-        corners = np.array(list(product((-0.5, 0.5), repeat=len(steps_m))))
-        radius_m = np.linalg.norm((boxes[:, None] * corners) @ steps_m, axis=-1).max(axis=1)
-        bend_m = radius_m**2 / (2 * np.maximum(self.nearest_m, radius_m))
-        return np.minimum(boxes @ self._range_slopes_m / 2 + bend_m, radius_m)
-
-    @property
-    @cached
-    def _range_slopes_m(self) -> NDArray[np.float64]:
-        """Largest change of range per row, column and metre of relief, [axes]."""
-        visible = self.visible(SMALL)
-        slopes = np.abs(self.sight @ self.surface.steps_m.T)
-        if self.track.is_sheet:
-            edges = [self.track.line_along(across) for across in (0.0, 1.0)]
-            sight = self.points_m[:, None] - np.concatenate([each.sampled_m[0] for each in edges])
-            sight /= np.maximum(np.linalg.norm(sight, axis=-1, keepdims=True), 1e-9)
-            more = np.abs(sight @ self.surface.steps_m.T)[:, np.tile(self.on_track, 2)]
-            return 1.02 * np.maximum(slopes[visible].max(axis=0), more.max(axis=(0, 1)))
-        slopes = slopes[visible] if visible.any() else slopes.reshape(-1, slopes.shape[-1])
-        return 1.02 * slopes.max(axis=0)
-
-    def half_lengths(
-        self, sides: Sequence[Side], align: Interpolator, final: Interpolator, to: Resampling
-    ) -> tuple[int, ...]:
-        """Return the samples that the lines of each stage hold on either side of a centre.
-
-        `to` is the resampling of the lines before the first stage.
-        """
-        samples_per_m = to.samples_per_m(self.lines)
-        return tuple(
-            math.ceil(extent_m * samples_per_m)
-            + (len(sides) - 1 - level) * (align.taps // 2 + 1)
-            + final.taps // 2
-            + 1
-            for level, extent_m in enumerate(self.half_range_extents_m(sides))
-        )
 
     # What is visible through the beam.
 
@@ -410,7 +365,7 @@ class VisibilityModel:
         """
         extents = self.extents(root, most=True) if any(root) else self.surface.extents(root)
         rates = self._rates(extents, self.points_m[INNER_POINTS], _SEARCH_STEP)
-        return self._visibletrapezoidal_weights(sides) @ rates.reshape(len(rates), -1).T
+        return self._visible_spacing(sides) @ rates.reshape(len(rates), -1).T
 
     def phase_cycles_across_root(self, root: Side) -> NDArray[np.float64] | None:
         """Estimate the phase across a sheet as `phase_cycles_in_root`, [axes]; None without one."""
@@ -424,7 +379,7 @@ class VisibilityModel:
         return (rates @ weights).mean(axis=1)
 
     @cached
-    def _visibletrapezoidal_weights(self, sides: tuple[Side, ...]) -> NDArray[np.float64]:
+    def _visible_spacing(self, sides: tuple[Side, ...]) -> NDArray[np.float64]:
         """Weights of track samples at inner points, 0 where a size is invisible, [sizes, n]."""
         visible = self.visible_by_size(sides)[:, INNER_POINTS, ::_SEARCH_STEP]
         spacing = trapezoidal_weights(self.track.samples[::_SEARCH_STEP]) / len(INNER_POINTS)
