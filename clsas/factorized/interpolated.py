@@ -27,6 +27,7 @@ from clsas.factorized.dense_channels import (
 from clsas.factorized.estimates import StageChannels
 from clsas.factorized.fields import CONFIG, RangeFilter
 from clsas.factorized.filters import edges_gain
+from clsas.factorized.tracks import MeanTrack
 from clsas.factorized.tree import VirtualChannels
 from clsas.signal.interpolation import Gain, Interpolator
 from clsas.sonar.beam import BeamWindow
@@ -40,8 +41,8 @@ BEAM_MARGIN = 1 / 16
 _Cycles = Annotated[float, Field(ge=-0.5, le=0.5)]
 
 
-class VisiblePhases(Protocol):
-    """Visibility and phases of subimages, as a `VisibilityModel` of the planner predicts them."""
+class VisibleChannels(Protocol):
+    """Channels whose beams touch subimages, as a `VisibilityModel` of the planner predicts them."""
 
     @property
     def lines(self) -> RangeLines:
@@ -51,14 +52,26 @@ class VisiblePhases(Protocol):
     def beam(self) -> BeamWindow | None:
         """The beam."""
 
-    def beam_phase_cycles(self, visible: NDArray[np.bool_], *, most: bool = False) -> float:
-        """Return the cycles that a beam's weights count for, their mean or maximum; 0 without."""
+    @property
+    def track(self) -> MeanTrack:
+        """The mean track."""
 
     def visible(self, side: tuple[int, int]) -> NDArray[np.bool_]:
         """Return which track samples touch a subimage with their beam."""
 
     def visible_share(self, side: tuple[int, int]) -> float:
         """Return the mean fraction of channels whose beam touches a subimage."""
+
+
+class VisiblePhases(Protocol):
+    """Phases of subimages, as `AperturePhases` of the planner predict them."""
+
+    @property
+    def model(self) -> VisibleChannels:
+        """What is visible."""
+
+    def beam_phase_cycles(self, visible: NDArray[np.bool_], *, most: bool = False) -> float:
+        """Return the cycles that a beam's weights count for, their mean or maximum; 0 without."""
 
     def subimage_phase_cycles(
         self, side: tuple[int, int], visible: NDArray[np.bool_], *, most: bool = False
@@ -78,10 +91,6 @@ class VisiblePhases(Protocol):
         most: bool = False,
     ) -> float:
         """Return the number of rows of virtual channels across a sheet; 1 without one."""
-
-    @property
-    def strips(self) -> int:
-        """Number of curves that make the mean track."""
 
 
 class _Overhang(NamedTuple):
@@ -261,42 +270,43 @@ class InterpolatedAperture:
         return nodes
 
     def predicted_channels(
-        self, model: VisiblePhases, sides: tuple[tuple[int, int], ...]
+        self, phases: VisiblePhases, sides: tuple[tuple[int, int], ...]
     ) -> list[StageChannels]:
         """Predict the virtual channels of subimages, stage by stage."""
+        model, strips = phases.model, phases.model.track.strips
         taps, density = self.filter.taps, 2 * self.filter.upsampling
         found: list[StageChannels] = []
-        everywhere_seen, bands = np.ones_like(model.visible(sides[0])), model.strips
+        everywhere_seen, bands = np.ones_like(model.visible(sides[0])), strips
         used = model.lines.channels * model.visible_share(sides[0])
         before: _Overhang | None = None
         for level, (oversampling, side) in enumerate(zip(self.oversampling, sides, strict=True)):
             seen = model.visible(side)
             beam_cycles = self.beam_cycles if level == len(sides) - 1 else 0.0
             dense = density * oversampling, density * beam_cycles
-            turns = oversampling * model.subimage_phase_cycles(side, seen)
-            turns += beam_cycles * model.beam_phase_cycles(seen)
-            past = _Overhang.after(before, density * turns, model.rows(side, 0, *dense), taps)
+            turns = oversampling * phases.subimage_phase_cycles(side, seen)
+            turns += beam_cycles * phases.beam_phase_cycles(seen)
+            past = _Overhang.after(before, density * turns, phases.rows(side, 0, *dense), taps)
             if before is not None:
                 parent, above = sides[level - 1], self.oversampling[level - 1]
-                seen_turns = above * model.subimage_phase_cycles(parent, seen)
-                columns = model.virtual_channels(before.taps_along, density, seen_turns)
-                rows = model.rows(parent, before.taps_across, density * above)
+                seen_turns = above * phases.subimage_phase_cycles(parent, seen)
+                columns = phases.virtual_channels(before.taps_along, density, seen_turns)
+                rows = phases.rows(parent, before.taps_across, density * above)
                 used = min(found[-1].count, columns * rows)
             rows, most_rows = (
-                model.rows(side, past.taps_across, *dense, most=most) for most in (False, True)
+                phases.rows(side, past.taps_across, *dense, most=most) for most in (False, True)
             )
             everywhere, most = (
                 most_rows
                 * (
-                    dense[0] * model.subimage_phase_cycles(side, where, most=True)
-                    + dense[1] * model.beam_phase_cycles(where, most=True)
-                    + model.strips * (past.taps_along + 2)
+                    dense[0] * phases.subimage_phase_cycles(side, where, most=True)
+                    + dense[1] * phases.beam_phase_cycles(where, most=True)
+                    + strips * (past.taps_along + 2)
                 )
                 for where in (everywhere_seen, seen)
             )
             if model.beam is not None:
                 most *= 1 + BEAM_MARGIN
-            count = rows * model.virtual_channels(past.taps_along, density, turns)
+            count = rows * phases.virtual_channels(past.taps_along, density, turns)
             summed = taps**self.dimensions * used / count
             if self.dimensions == 2 and level == 0:
                 bands = math.ceil(most_rows) + 2

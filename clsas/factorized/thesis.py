@@ -99,10 +99,10 @@ class NearestBeams:
         return nodes
 
     def predicted_channels(
-        self, model: VisiblePhases, sides: tuple[tuple[int, int], ...]
+        self, phases: VisiblePhases, sides: tuple[tuple[int, int], ...]
     ) -> list[StageChannels]:
         """Return the beams of a subimage, stage by stage."""
-        found, channels = [], model.lines.channels
+        found, channels = [], phases.model.lines.channels
         for factor in self.factors:
             used, channels = channels, math.ceil(channels / factor)
             found.append(StageChannels(used, channels, factor, channels, channels))

@@ -122,7 +122,7 @@ def sweeps_once(model: VisibilityModel) -> bool:
     if model.beam is None:
         return True
     strip = model.track.strip_of(model.track.samples)
-    return all(_sweeps_once(model, strip == each) for each in range(model.strips))
+    return all(_sweeps_once(model, strip == each) for each in range(model.track.strips))
 
 
 def _sweeps_once(model: VisibilityModel, of_strip: NDArray[np.bool_]) -> bool:

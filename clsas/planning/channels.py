@@ -69,7 +69,7 @@ def peak_density(model: VisibilityModel) -> float:
     rows = math.ceil(2 * math.sqrt(len(place))) if model.track.is_sheet else 1
     some = min(max(_NEIGHBOURS, rows), len(place) - 1)
     closest = float((place[some:] - place[:-some]).min())
-    length = model.strips if model.strips > 1 else float(place[-1] - place[0])
+    length = model.track.strips if model.track.strips > 1 else float(place[-1] - place[0])
     average = length * some / (len(place) - 1)
     return average / closest if closest > 0 else np.inf
 

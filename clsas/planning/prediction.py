@@ -30,6 +30,7 @@ from clsas.factorized.thesis import NearestBeams
 from clsas.opencl import phases
 from clsas.opencl.buffers import padded_length
 from clsas.opencl.device import Device
+from clsas.planning.aperture_phases import AperturePhases
 from clsas.planning.channels import peak_density, range_window_m, references
 from clsas.planning.costs import Costs
 from clsas.planning.exact_image import Exact
@@ -134,7 +135,7 @@ def predicted_plan(
     half_lengths = half_line_lengths(
         model, sides, candidate.align, candidate.final, lines.resampling
     )
-    channels = candidate.aperture.predicted_channels(model, sides)
+    channels = candidate.aperture.predicted_channels(AperturePhases(model), sides)
     levels = [Level.of(half, device.info.width) for half in half_lengths]
     errors, half_precision = _with_arithmetic(model, candidate, lines, channels, conditions)
     stages, work = _stages(
@@ -157,7 +158,7 @@ def predicted_plan(
     batches = batches_within(sizes, roots, device, conditions.memory_bytes)
     # A stage of a sector takes the host as long for each strip as a batch does.
     sectors = 1 + max(roots - batches.at_once, 0) // batches.prepared
-    launched = -(-roots // batches.at_once) + sectors * (model.strips - 1)
+    launched = -(-roots // batches.at_once) + sectors * (model.track.strips - 1)
     work += Work(batch=float(launched * len(sides)))
     errors = errors.times(candidate.margin)
     image = Factorization(

@@ -32,6 +32,7 @@ from clsas.factorized.filters import (
 )
 from clsas.opencl.buffers import GUARD
 from clsas.opencl.device import Device
+from clsas.planning.aperture_phases import AperturePhases
 from clsas.planning.channels import references
 from clsas.planning.costs import Costs
 from clsas.planning.sizes import Division, Sizes, all_sizes
@@ -87,7 +88,7 @@ class Options:
     stages : int64 [options]
         Never increasing.
     density, ends : float64 [options, 1, 1]
-        Virtual channels per cycle, and those besides; see `VisibilityModel.virtual_channels`.
+        Virtual channels per cycle, and those besides; see `AperturePhases.virtual_channels`.
     channel_s : float64 [options, sizes]
         Each channel of all subimages of a size, in stages after the first.
     subimages_s : float64 [sizes]
@@ -217,7 +218,7 @@ def all_options(
         choices,
         np.array(stages),
         density[:, None, None],
-        np.array(model.virtual_channels(aperture_taps, 0.0, 0.0))[:, None, None],
+        np.array(AperturePhases(model).virtual_channels(aperture_taps, 0.0, 0.0))[:, None, None],
         channel_s=np.asarray(costs.seconds(combining(counts, samples, taps, given=False))),
         subimages_s=np.asarray(costs.seconds(Work(subimage=counts))),
         leaves_s=np.where(leaf, np.array([leaves_s[c.final_taps] for c in choices]), np.inf),

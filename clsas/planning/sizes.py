@@ -11,6 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsas.opencl.device import Device
+from clsas.planning import phase_rates
+from clsas.planning.aperture_phases import AperturePhases
 from clsas.planning.caching import cached
 from clsas.planning.errors import leaf_error, root_error
 from clsas.planning.range_extents import half_range_extents_m
@@ -90,9 +92,9 @@ class Sizes:
             extents = np.stack(
                 [subimages.extents(side, root if any(root) else side) for side in pairs]
             )
-        cycles = self.model.phase_cycles_in_root(root, self.pairs)[index] @ extents.T
+        cycles = phase_rates.cycles_in_root(self.model, root, self.pairs)[index] @ extents.T
         smaller = self.divides[np.ix_(index, index)].T & (index[:, None] != index)
-        of_axes = self.model.phase_cycles_across_root(root)
+        of_axes = phase_rates.cycles_across_root(self.model, root)
         across = None if of_axes is None else extents @ of_axes
         return Division(index, cycles, np.where(smaller, 0.0, np.inf), across)
 
@@ -152,9 +154,9 @@ def all_sizes(model: VisibilityModel, most: Side, device: Device) -> Sizes:
     share = mean_over_points(visible.sum(axis=-1)) / np.count_nonzero(model.on_track)
     beam_cycles, across = np.zeros(len(sides)), 0.0
     if model.beam is not None:
-        rates = model.beam_rates * model.spacing
+        rates = phase_rates.of_beam_along(model) * model.spacing
         beam_cycles = mean_over_points(np.einsum("nps,ps->np", visible, rates))
-        across = model.beam_phase_cycles_across()
+        across = AperturePhases(model).beam_phase_cycles_across()
     return Sizes(
         model,
         sides,

@@ -22,6 +22,7 @@ from clsas.factorized.beam_directions import interpolated_directions
 from clsas.factorized.dense_channels import strip_channels
 from clsas.factorized.tracks import MeanTrack
 from clsas.factorized.tree import interpolated_channels
+from clsas.planning import phase_rates
 from clsas.planning.caching import cached
 from clsas.planning.channels import carriers
 from clsas.planning.sample_pixels import SAMPLED_PIXELS, SPREAD_POINTS, mean_over_relief, pixels_m
@@ -153,13 +154,13 @@ class _Line:
     ----------
     track : MeanTrack
     rates : float64 [axes, points, samples]
-        See `VisibilityModel.rates`.
+        See `clsas.planning.phase_rates`.
     channels : float64 [channels]
         Aperture coordinates of channels, ascending.
     along : float64 [samples, 3] or None
         Unit directions of the beam at `track.samples`.
     beam_rates : float64 [points, samples]
-        See `VisibilityModel.beam_rates`.
+        The beam's: see there.
     """
 
     track: MeanTrack
@@ -175,17 +176,23 @@ def _line(model: VisibilityModel, place: _Place) -> _Line:
     directions = model.directions
     if kind == "track":
         channels = np.sort(model.track.coordinate)
-        return _Line(model.track, model.rates, channels, model.along, model.beam_rates)
+        return _Line(
+            model.track,
+            phase_rates.along(model),
+            channels,
+            model.along,
+            phase_rates.of_beam_along(model),
+        )
     evenly = np.linspace(0, 1, 4 * _SAMPLED_PLACES)
     if kind == "along":
         line = model.track.line_along(at)
         places = line.samples, np.full(line.samples.shape, at)
-        rates, beam_rates = model.rates, model.beam_rates
+        rates, beam_rates = phase_rates.along(model), phase_rates.of_beam_along(model)
     else:
         line = model.track.line_across(at)
         places = np.full(line.samples.shape, at), line.samples
-        rates = model.rates_across
-        beam_rates = 0.0 if directions is None else model.beam_rates_across
+        rates = phase_rates.across(model)
+        beam_rates = 0.0 if directions is None else phase_rates.of_beam_across(model)
     along = None if directions is None else directions.at(*places)
     return _Line(line, rates, evenly, along, beam_rates)
 

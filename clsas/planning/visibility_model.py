@@ -12,14 +12,11 @@ from scipy.spatial import KDTree
 
 from clsas.core.grid import Grid
 from clsas.core.lines import RangeLines, some_channels
-from clsas.factorized.aperture import cycles_per_extent
-from clsas.factorized.beam_directions import BeamDirections, beam_rate
+from clsas.factorized.beam_directions import BeamDirections
 from clsas.factorized.dense_apertures import Shape, mean_track_of, simplest_track
-from clsas.factorized.dense_channels import SheetRates, sheet_beam_rates, sheet_rates
 from clsas.factorized.surface import LEAST_SIDE, surface_of
 from clsas.planning.caching import cached, shared
 from clsas.planning.sample_points import (
-    INNER_POINTS,
     over_points,
     points_at_m,
     sample_points_m,
@@ -35,7 +32,6 @@ _DENSE = 65  # points along either side, for the least distance of the grid; hal
 _NEAREST_CHANNELS = 4096  # of a dense aperture, for that distance
 _MOST_OUTSIDE = 1e-6  # share of power above the highest frequency; half or twice: no change
 _AMBIGUITY = "ambiguity"  # key of what mean tracks of all shapes have in common
-_SEARCH_STEP = 8  # the search uses every eighth sample of the track; a fourth chose the same trees
 
 
 class VisibilityModel:
@@ -191,8 +187,6 @@ class VisibilityModel:
         """
         return self.subimages.extents(side, self.root or side, most=most)
 
-    # What is visible through the beam.
-
     @cached
     def visible(self, side: Side) -> NDArray[np.bool_]:
         """Return which track samples touch a subimage with their beam, bool [points, samples]."""
@@ -234,187 +228,6 @@ class VisibilityModel:
     def visible_track_ends(self) -> float:
         """Mean number of the track's ends whose beam touches a sample point."""
         if self.track.is_dense:
-            return 2.0 * self.strips
+            return 2.0 * self.track.strips
         ends = np.flatnonzero(self.on_track)[[0, -1]]
         return float(self.visible(SMALL)[:, ends].sum(axis=1).mean())
-
-    # Phases along the aperture.
-
-    @property
-    @cached
-    def rates(self) -> NDArray[np.float64]:
-        """Cycles per row, column and metre of relief, and per unit of the track's parameter.
-
-        float64 [axes, points, samples]; the largest within roots of the model's size, if it has
-        any.
-        """
-        return self._rates(self._root_extents, self.points_m)
-
-    @property
-    @cached
-    def rates_across(self) -> NDArray[np.float64]:
-        """The same per unit of the coordinate across a sheet, at the samples of a line across."""
-        return self._sheet_rates(self._root_extents, self.points_m).across
-
-    @property
-    @cached
-    def beam_rates(self) -> NDArray[np.float64]:
-        """Change of the beam's weights along the track as a phase rate, [points, samples].
-
-        The largest within roots of the model's size, if it has any: see `beam_rate`.
-        """
-        if self.beam is None:
-            return np.zeros(self.distance_m.shape)
-        if self.track.is_sheet:
-            return self._sheet_beam_rates.along
-        sides_m = self._root_extents[:, None] * self.surface.steps_m
-        return beam_rate(self.beam, self.track, self.along, self.points_m, sides_m)
-
-    @property
-    @cached
-    def beam_rates_across(self) -> NDArray[np.float64]:
-        """The same across a sheet, at the samples of a line across."""
-        return self._sheet_beam_rates.across
-
-    @property
-    @cached
-    def _sheet_beam_rates(self) -> SheetRates:
-        assert self.beam is not None
-        assert self.directions is not None
-        sides_m = self._root_extents[:, None] * self.surface.steps_m
-        return sheet_beam_rates(self.beam, self.track, self.directions, self.points_m, sides_m)
-
-    @property
-    def _root_extents(self) -> NDArray[np.float64]:
-        if self.root is None:
-            return np.zeros(len(self.surface.steps_m))
-        return self.extents(self.root, most=True)
-
-    @property
-    def strips(self) -> int:
-        """Number of curves that make the mean track."""
-        return int(self.track.strips)
-
-    def rows(
-        self,
-        side: Side,
-        taps: float,
-        density: float,
-        beam_density: float = 0.0,
-        *,
-        most: bool = False,
-    ) -> float:
-        """Return the number of rows of virtual channels across a sheet; 1 without one.
-
-        They are as many per cycle of the phase as `density`, and per cycle of the beam's weights as
-        `beam_density`.
-        """
-        if not self.track.is_sheet:
-            return 1.0
-        rates = density * np.tensordot(self.extents(side, most=most), self.rates_across, 1)
-        cycles = over_points(rates @ self._spacing_across, most)
-        if beam_density:
-            cycles += beam_density * self.beam_phase_cycles_across(most=most)
-        return cycles + taps
-
-    @property
-    def _spacing_across(self) -> NDArray[np.float64]:
-        """Weights of the samples of a line across a sheet in integrals over it."""
-        line = self.track.line_across(0.5)
-        return np.where(line.on_track, trapezoidal_weights(line.samples), 0.0)
-
-    def beam_phase_cycles_across(self, *, most: bool = False) -> float:
-        """Return the cycles that the beam's weights count for across a sheet; 0 without one."""
-        if not self.track.is_sheet:
-            return 0.0
-        return over_points(self.beam_rates_across @ self._spacing_across, most)
-
-    def beam_phase_cycles(self, visible: NDArray[np.bool_], *, most: bool = False) -> float:
-        """Return the cycles that the beam's weights count for along the visible aperture."""
-        return self.visible_phase_cycles(self.beam_rates, visible, most=most)
-
-    def visible_phase_cycles(
-        self, rates: NDArray[np.float64], visible: NDArray[np.bool_], *, most: bool = False
-    ) -> float:
-        """Phase accumulated along the visible part of the aperture, cycles.
-
-        The mean over the sample points, or the maximum; `rates` is [points, samples].
-        """
-        return over_points(np.where(visible, rates, 0.0) @ self.spacing, most)
-
-    def subimage_phase_cycles(
-        self, side: Side, visible: NDArray[np.bool_], *, most: bool = False
-    ) -> float:
-        """Return `visible_phase_cycles` of the fastest phase in subimages of a size."""
-        rates = np.tensordot(self.extents(side, most=most), self.rates, 1)
-        return self.visible_phase_cycles(rates, visible, most=most)
-
-    def virtual_channels(self, taps: Any, density: float, phase_cycles: Any) -> Any:
-        """Return the number of virtual channels of a subimage, from its phase in cycles.
-
-        All may be arrays. `taps` and `density`, virtual channels per cycle, are the aperture
-        filter's. The filter extends beyond the track's ends.
-        """
-        return density * phase_cycles + self.strips + self.visible_track_ends * (taps / 2 - 0.5)
-
-    def phase_cycles_in_root(self, root: Side, sides: tuple[Side, ...]) -> NDArray[np.float64]:
-        """Estimate the phase per row, column and metre of relief in a root, cycles [sizes, axes].
-
-        Accumulated along the part of the aperture where a subimage of each size is visible; the
-        mean over the inner sample points. With a root of 0 rows, at the points themselves.
-        """
-        extents = self.extents(root, most=True) if any(root) else self.surface.extents(root)
-        rates = self._rates(extents, self.points_m[INNER_POINTS], _SEARCH_STEP)
-        return self._visible_spacing(sides) @ rates.reshape(len(rates), -1).T
-
-    def phase_cycles_across_root(self, root: Side) -> NDArray[np.float64] | None:
-        """Estimate the phase across a sheet as `phase_cycles_in_root`, [axes]; None without one."""
-        if not self.track.is_sheet:
-            return None
-        extents = self.extents(root, most=True) if any(root) else self.surface.extents(root)
-        rates = self._sheet_rates(extents, self.points_m[INNER_POINTS], _SEARCH_STEP).across
-        line = self.track.line_across(0.5)
-        spacing = (line.on_track * trapezoidal_weights(line.samples))[::_SEARCH_STEP]
-        weights = trapezoidal_weights(line.samples[::_SEARCH_STEP]) * (spacing > 0)
-        return (rates @ weights).mean(axis=1)
-
-    @cached
-    def _visible_spacing(self, sides: tuple[Side, ...]) -> NDArray[np.float64]:
-        """Weights of track samples at inner points, 0 where a size is invisible, [sizes, n]."""
-        visible = self.visible_by_size(sides)[:, INNER_POINTS, ::_SEARCH_STEP]
-        spacing = trapezoidal_weights(self.track.samples[::_SEARCH_STEP]) / len(INNER_POINTS)
-        return (visible * spacing).reshape(len(sides), -1)
-
-    def _rates(
-        self, extents: NDArray[np.float64], centres_m: NDArray[np.float64], every: int = 1
-    ) -> NDArray[np.float64]:
-        if self.track.is_sheet:
-            return self._sheet_rates(extents, centres_m, every).along
-        return cycles_per_extent(
-            self.track,
-            self.surface,
-            centres_m,
-            extents,
-            self.highest_cycles_per_m,
-            self.nearest_m,
-            None if self.track.is_dense else self.limits,
-            self.along,
-            every,
-        )
-
-    def _sheet_rates(
-        self, extents: NDArray[np.float64], centres_m: NDArray[np.float64], every: int = 1
-    ) -> SheetRates:
-        key = "sheet rates", tuple(extents), centres_m.tobytes(), every
-        return self.from_cache(
-            key,
-            lambda: sheet_rates(
-                self.track,
-                self.surface,
-                centres_m,
-                extents,
-                self.highest_cycles_per_m,
-                self.nearest_m,
-                every,
-            ),
-        )

@@ -7,6 +7,7 @@ from factorizing import BEAMS, around, over
 
 from clsas.opencl.device import open_device
 from clsas.planning import search
+from clsas.planning.aperture_phases import AperturePhases
 from clsas.planning.costs import Costs
 from clsas.planning.search import Allowed
 from clsas.planning.sizes import all_sizes
@@ -53,7 +54,9 @@ def cost_of(tree, view, filters_db, most, leaf_pixels, beam_cycles, device, cost
     taps_past_ends = choice.aperture_taps * (search.OVERHANG if len(path) > 1 else 1)
 
     def channels(phase_cycles):
-        return view.virtual_channels(taps_past_ends, 2 * choice.oversampling, phase_cycles)
+        return AperturePhases(view).virtual_channels(
+            taps_past_ends, 2 * choice.oversampling, phase_cycles
+        )
 
     total = options.roots_s[0, path[0]]
     for parent, child in pairwise(path):

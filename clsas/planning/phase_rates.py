@@ -1,0 +1,142 @@
+"""Phase rates along the aperture and across a sheet, of subimages and of the beam's weights."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsas.factorized.aperture import cycles_per_extent
+from clsas.factorized.beam_directions import beam_rate
+from clsas.factorized.dense_channels import SheetRates, sheet_beam_rates, sheet_rates
+from clsas.planning.caching import cached
+from clsas.planning.sample_points import INNER_POINTS, trapezoidal_weights
+from clsas.planning.subimages import Side
+from clsas.planning.visibility_model import VisibilityModel
+
+_SEARCH_STEP = 8  # the search uses every eighth sample of the track; a fourth chose the same trees
+
+
+@cached
+def along(model: VisibilityModel) -> NDArray[np.float64]:
+    """Return cycles per row, column and metre of relief, and per unit of the track's parameter.
+
+    float64 [axes, points, samples]; the largest within roots of the model's size, if it has any.
+    """
+    return _along(model, _root_extents(model), model.points_m)
+
+
+@cached
+def across(model: VisibilityModel) -> NDArray[np.float64]:
+    """Return the same per unit of the coordinate across a sheet, at samples of a line across."""
+    return _of_sheet(model, _root_extents(model), model.points_m).across
+
+
+@cached
+def of_beam_along(model: VisibilityModel) -> NDArray[np.float64]:
+    """Return the change of the beam's weights along the track as a phase rate, [points, samples].
+
+    The largest within roots of the model's size, if it has any: see `beam_rate`.
+    """
+    if model.beam is None:
+        return np.zeros(model.distance_m.shape)
+    if model.track.is_sheet:
+        return _of_beam_on_sheet(model).along
+    sides_m = _root_extents(model)[:, None] * model.surface.steps_m
+    return beam_rate(model.beam, model.track, model.along, model.points_m, sides_m)
+
+
+@cached
+def of_beam_across(model: VisibilityModel) -> NDArray[np.float64]:
+    """Return the same across a sheet, at the samples of a line across."""
+    return _of_beam_on_sheet(model).across
+
+
+def cycles_in_root(
+    model: VisibilityModel, root: Side, sides: tuple[Side, ...]
+) -> NDArray[np.float64]:
+    """Estimate the phase per row, column and metre of relief in a root, cycles [sizes, axes].
+
+    Accumulated along the part of the aperture where a subimage of each size is visible; the mean
+    over the inner sample points. With a root of 0 rows, at the points themselves.
+    """
+    rates = _along(model, _extents_of(model, root), model.points_m[INNER_POINTS], _SEARCH_STEP)
+    return _visible_spacing(model, sides) @ rates.reshape(len(rates), -1).T
+
+
+def cycles_across_root(model: VisibilityModel, root: Side) -> NDArray[np.float64] | None:
+    """Estimate the phase across a sheet as `cycles_in_root`, [axes]; None without one."""
+    if not model.track.is_sheet:
+        return None
+    points_m = model.points_m[INNER_POINTS]
+    rates = _of_sheet(model, _extents_of(model, root), points_m, _SEARCH_STEP).across
+    line = model.track.line_across(0.5)
+    spacing = (line.on_track * trapezoidal_weights(line.samples))[::_SEARCH_STEP]
+    weights = trapezoidal_weights(line.samples[::_SEARCH_STEP]) * (spacing > 0)
+    return (rates @ weights).mean(axis=1)
+
+
+@cached
+def _visible_spacing(model: VisibilityModel, sides: tuple[Side, ...]) -> NDArray[np.float64]:
+    """Weights of track samples at inner points, 0 where a size is invisible, [sizes, n]."""
+    visible = model.visible_by_size(sides)[:, INNER_POINTS, ::_SEARCH_STEP]
+    spacing = trapezoidal_weights(model.track.samples[::_SEARCH_STEP]) / len(INNER_POINTS)
+    return (visible * spacing).reshape(len(sides), -1)
+
+
+def _extents_of(model: VisibilityModel, root: Side) -> NDArray[np.float64]:
+    return model.extents(root, most=True) if any(root) else model.surface.extents(root)
+
+
+def _root_extents(model: VisibilityModel) -> NDArray[np.float64]:
+    return _extents_of(model, model.root or (0, 0))
+
+
+def _along(
+    model: VisibilityModel,
+    extents: NDArray[np.float64],
+    centres_m: NDArray[np.float64],
+    every: int = 1,
+) -> NDArray[np.float64]:
+    if model.track.is_sheet:
+        return _of_sheet(model, extents, centres_m, every).along
+    return cycles_per_extent(
+        model.track,
+        model.surface,
+        centres_m,
+        extents,
+        model.highest_cycles_per_m,
+        model.nearest_m,
+        None if model.track.is_dense else model.limits,
+        model.along,
+        every,
+    )
+
+
+def _of_sheet(
+    model: VisibilityModel,
+    extents: NDArray[np.float64],
+    centres_m: NDArray[np.float64],
+    every: int = 1,
+) -> SheetRates:
+    def find() -> SheetRates:
+        return sheet_rates(
+            model.track,
+            model.surface,
+            centres_m,
+            extents,
+            model.highest_cycles_per_m,
+            model.nearest_m,
+            every,
+        )
+
+    key = "sheet rates", tuple(extents), centres_m.tobytes(), every
+    found: SheetRates = model.from_cache(key, find)
+    return found
+
+
+@cached
+def _of_beam_on_sheet(model: VisibilityModel) -> SheetRates:
+    assert model.beam is not None
+    assert model.directions is not None
+    sides_m = _root_extents(model)[:, None] * model.surface.steps_m
+    return sheet_beam_rates(model.beam, model.track, model.directions, model.points_m, sides_m)
