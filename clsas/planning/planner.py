@@ -157,7 +157,7 @@ def plan(
     if memory_bytes is not None:
         memory_bytes = validate.count("memory_bytes", memory_bytes)
     scene = Model(lines, grid, beam) if full_model else simplify(lines, grid, beam, tolerance_db)
-    model = VisibilityModel(
+    model = VisibilityModel.of(
         scene.lines, scene.grid, scene.beam, OUTSIDE * power(tolerance_db or 0.0)
     )
     rest_db = tolerance_db

@@ -239,7 +239,7 @@ def _built(device: Device, side: int) -> tuple[_Images, float]:
     lines, grid = scene(_CHANNELS, _LARGER * side)
     exact = exact_image(device, lines, square(side))
     points = exact_image(device, lines, with_relief(square(3 * side // 4)))
-    model = VisibilityModel(lines, grid, None, OUTSIDE * power(_TOLERANCE_DB))
+    model = VisibilityModel.of(lines, grid, None, OUTSIDE * power(_TOLERANCE_DB))
     room = device.info.memory_bytes // 2
     competing = expect(model, _TOLERANCE_DB, device)
     conditions = Conditions(_TOLERANCE_DB, competing, device.for_stages(), _PLANNED_WITH, room)

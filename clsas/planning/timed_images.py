@@ -154,7 +154,7 @@ def exact_image(
     device: Device, lines: RangeLines, grid: Grid, beam: BeamWindow | None = None
 ) -> TimedImage:
     """Return an exact image, to be timed."""
-    expected = expect(VisibilityModel(lines, grid, beam), EXACT_DB, device)
+    expected = expect(VisibilityModel.of(lines, grid, beam), EXACT_DB, device)
     form = partial(form_exactly, lines, grid, device=device, accuracy_db=EXACT_DB, beam=beam)
     return TimedImage(form, expected, expected.tiled)
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Callable, Hashable
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -14,7 +14,8 @@ from clsas.core.grid import Grid
 from clsas.core.lines import RangeLines, some_channels
 from clsas.factorized.beam_directions import BeamDirections
 from clsas.factorized.dense_apertures import Shape, mean_track_of, simplest_track
-from clsas.factorized.surface import LEAST_SIDE, surface_of
+from clsas.factorized.surface import LEAST_SIDE, Surface, surface_of
+from clsas.factorized.tracks import MeanTrack
 from clsas.planning.caching import cached, shared
 from clsas.planning.sample_points import (
     over_points,
@@ -24,7 +25,7 @@ from clsas.planning.sample_points import (
 )
 from clsas.planning.subimages import SMALL, Side, Subimages
 from clsas.signal.ambiguity import Ambiguity, ambiguity
-from clsas.signal.spectrum import cycles_per_m_at, measure_spectrum
+from clsas.signal.spectrum import Spectrum, cycles_per_m_at, measure_spectrum
 from clsas.sonar.beam import BeamWindow
 from clsas.sonar.visibility import Visibility
 
@@ -34,11 +35,11 @@ _MOST_OUTSIDE = 1e-6  # share of power above the highest frequency; half or twic
 _AMBIGUITY = "ambiguity"  # key of what mean tracks of all shapes have in common
 
 
+@dataclass(frozen=True, eq=False)
 class VisibilityModel:
-    """Geometry between track and grid, sampled at 25 grid points.
+    """Geometry between track and grid, sampled at 25 grid points: what a beam touches.
 
-    Errors and costs of candidates are evaluated on these samples. `outside` is the share of the
-    lines' power that may lie above `highest_cycles_per_m`.
+    Errors and costs of candidates are evaluated on these samples.
 
     Attributes
     ----------
@@ -48,99 +49,80 @@ class VisibilityModel:
         Of the lines, with the weight that frequencies have in the image.
     highest_cycles_per_m, rms_cycles_per_m : float
         Phase per metre of range, cycles: at the band's edge, and rms about the band's centre.
-    track : MeanTrack or None
-        None if all channels lie at one place. The attributes below are then missing.
     channels_along : float64 [channels, 3] or None
         Unit directions of the track at the channels, with a beam.
-    surface : Surface
-        Positions of the grid's pixels.
-    subimages : Subimages
-        Of every size, on the surface.
-    points_m : float64 [points, 3]
-        Sample points all over the grid, also near its corners.
-    track_m : float64 [samples, 3]
-        Positions at `track.samples`.
-    directions : BeamDirections or None
-        Unit directions of the beam anywhere on the track, with a beam.
-    along : float64 [samples, 3] or None
-        Those at `track.samples`.
-    spacing : float64 [samples]
-        Weight of each sample in integrals over the track's parameter.
-    on_track : bool [samples]
-        False past the track's ends.
-    distance_m, sight : float64 [points, samples], [points, samples, 3]
-        Distance and unit vector from every track sample to every point.
-    nearest_m : float
-        Lower bound of the distance between pixels and channels.
     limits : (low, high) or None
         Sines of the aspect angle between which channels are used for a subimage.
     shape : str
         Shape of the mean track: see `clsas.factorized.dense_apertures`.
+    track : MeanTrack or None
+        None if all channels lie at one place. There is nothing of the following then.
+    subimages : Subimages
+        Of every size, on the grid's surface.
+    points_m : float64 [points, 3]
+        Sample points all over the grid, also near its corners.
+    nearest_m : float
+        Lower bound of the distance between pixels and channels.
     root : (rows, columns) or None
-        Size of the roots within which `rates` holds; None for the sample points alone.
+        Size of the roots in which reliefs and phase rates are the largest; None for the subimages
+        and the sample points alone.
     """
 
-    limits: tuple[float, float] | None
-    root: Side | None
-    shape: Shape = "track"
-    along: Any
-    directions: BeamDirections | None
+    lines: RangeLines
+    grid: Grid
+    beam: BeamWindow | None
+    spectrum: Spectrum
+    highest_cycles_per_m: float
+    rms_cycles_per_m: float
     channels_along: Any
+    limits: tuple[float, float] | None
+    shape: Shape
+    track: Any
+    subimages: Any = None
+    points_m: Any = None
+    nearest_m: float = 0.0
+    root: Side | None = None
+    _cache: dict[Hashable, Any] = field(default_factory=dict)
 
-    def __init__(
-        self,
+    @classmethod
+    def of(
+        cls,
         lines: RangeLines,
         grid: Grid,
         beam: BeamWindow | None,
         outside: float = _MOST_OUTSIDE,
-    ) -> None:
-        self.lines, self.grid, self.beam = lines, grid, beam
-        self._cache: dict[Hashable, Any] = {}
-        self.spectrum = measure_spectrum(lines, grid)
-        outside = min(outside, _MOST_OUTSIDE)
-        occupied = self.spectrum.frequency[np.cumsum(self.spectrum.share) < 1 - outside]
+    ) -> VisibilityModel:
+        """Return the model with the simplest mean track.
+
+        `outside` is the share of the lines' power that may lie above `highest_cycles_per_m`.
+        """
+        spectrum = measure_spectrum(lines, grid)
+        occupied = spectrum.frequency[np.cumsum(spectrum.share) < 1 - min(outside, _MOST_OUTSIDE)]
         half_band = (occupied[-1] if len(occupied) else 0.5) / lines.range_step_m
-        centre = cycles_per_m_at(lines, self.spectrum.centre)
-        self.highest_cycles_per_m = float(abs(centre) + half_band)
-        mean_square = self.spectrum.share @ self.spectrum.frequency**2
-        self.rms_cycles_per_m = float(np.sqrt(mean_square)) / lines.range_step_m
-        self.limits, self.root = None if beam is None else beam.limits, None
-        self.channels_along = None if beam is None else beam.directions(lines)
-        self.shape, track = simplest_track(lines)
-        self._put_track(track)
-
-    def _put_track(self, track: Any) -> None:
-        """Set what follows from the mean track."""
-        self.track, self.along, self.directions, beam = track, None, None, self.beam
-        if track is None:
-            return
-        self.surface = surface_of(self.grid)
-        self.subimages = Subimages(self.surface)
-        self.points_m = sample_points_m(self.surface)
-        self.track_m, _ = self.track.sampled_m
-        self.spacing = trapezoidal_weights(self.track.samples)
-        sight = self.points_m[:, None] - self.track_m
-        self.distance_m = np.maximum(np.linalg.norm(sight, axis=-1), 1e-9)
-        self.sight = sight / self.distance_m[..., None]
-        self.on_track = self.track.on_track
-        if not hasattr(self, "nearest_m"):
-            self.nearest_m = self._nearest_m()
-        if beam is not None:
-            self.directions = BeamDirections.of(beam, self.channels_along, self.track)
-            self.along = self.directions.at(self.track.samples)
-
-    def _nearest_m(self) -> float:
-        """Lower bound of the distance between pixels and channels."""
-        dense_m = points_at_m(self.surface, np.linspace(0, 1, _DENSE))
-        # Pixels between the dense points may be closer; half a step bounds by how much.
-        steps_m = np.linalg.norm(self.surface.steps_m[:2], axis=1)
-        step_m = steps_m @ (np.array(self.surface.plane.shape) - 1) / (_DENSE - 1)
-        between_m = (step_m + self.surface.relief_m(LEAST_SIDE).max()) / 2
-        centres_m = self.lines.phase_centres_m
-        if self.track.is_dense:
-            centres_m = centres_m[some_channels(len(centres_m), _NEAREST_CHANNELS)]
-        nearest_m = KDTree(dense_m).query(centres_m)[0].min() - between_m
-        return max(float(nearest_m), 1e-9)
+        centre = cycles_per_m_at(lines, spectrum.centre)
+        mean_square = spectrum.share @ spectrum.frequency**2
+        shape, track = simplest_track(lines)
+        model = cls(
+            lines,
+            grid,
+            beam,
+            spectrum,
+            highest_cycles_per_m=float(abs(centre) + half_band),
+            rms_cycles_per_m=float(np.sqrt(mean_square)) / lines.range_step_m,
+            channels_along=None if beam is None else beam.directions(lines),
+            limits=None if beam is None else beam.limits,
+            shape=shape,
+            track=track,
+        )
+        if track is None:  # nothing is sampled, so that an image of one channel costs no more
+            return model
+        surface = surface_of(grid)
+        return replace(
+            model,
+            subimages=Subimages(surface),
+            points_m=sample_points_m(surface),
+            nearest_m=_nearest_m(lines, surface, track),
+        )
 
     def from_cache(self, key: Hashable, find: Callable[[], Any]) -> Any:
         """Return the value cached under a key; `find` computes it the first time."""
@@ -153,25 +135,18 @@ class VisibilityModel:
         track = mean_track_of(self.lines, shape)
         if track is None:
             return None
-        model = copy.copy(self)
-        model._cache = {key: self._cache[key] for key in (_AMBIGUITY,) if key in self._cache}
-        model._put_track(track)
-        model.shape = shape
-        return model
-
-    def _with(self, **changes: Any) -> VisibilityModel:
-        """Return this model with other limits or another root."""
-        model = copy.copy(self)
-        vars(model).update(changes)
-        return model
+        kept: dict[Hashable, Any] = {
+            key: self._cache[key] for key in (_AMBIGUITY,) if key in self._cache
+        }
+        return replace(self, shape=shape, track=track, _cache=kept)
 
     def with_limits(self, low: float, high: float) -> VisibilityModel:
         """Return this model with a narrower beam: sines of the aspect angle where it ends."""
-        return self._with(limits=(low, high))
+        return replace(self, limits=(low, high))
 
     def within(self, root: Side) -> VisibilityModel:
         """Return this model with the phase rates of subimages in roots of a size."""
-        return self._with(root=root)
+        return replace(self, root=root)
 
     @property
     def ambiguity(self) -> Ambiguity:
@@ -180,12 +155,63 @@ class VisibilityModel:
         found: Ambiguity = self.from_cache(_AMBIGUITY, lambda: ambiguity(*given))
         return found
 
+    @property
+    def surface(self) -> Surface:
+        """Positions of the grid's pixels."""
+        found: Surface = self.subimages.surface
+        return found
+
+    @property
+    @shared
+    def track_m(self) -> NDArray[np.float64]:
+        """Positions at `track.samples`, [samples, 3]."""
+        return self.track.sampled_m[0]
+
+    @property
+    @shared
+    def on_track(self) -> NDArray[np.bool_]:
+        """False for samples past the track's ends."""
+        return self.track.on_track
+
+    @property
+    @shared
+    def spacing(self) -> NDArray[np.float64]:
+        """Weight of each sample in integrals over the track's parameter."""
+        return trapezoidal_weights(self.track.samples)
+
+    @property
+    @shared
+    def distance_m(self) -> NDArray[np.float64]:
+        """Distance from every track sample to every point, [points, samples]."""
+        return np.maximum(np.linalg.norm(self.points_m[:, None] - self.track_m, axis=-1), 1e-9)
+
+    @property
+    @shared
+    def sight(self) -> NDArray[np.float64]:
+        """Unit vector from every track sample to every point, [points, samples, 3]."""
+        return (self.points_m[:, None] - self.track_m) / self.distance_m[..., None]
+
+    @property
+    @shared
+    def directions(self) -> BeamDirections | None:
+        """Unit directions of the beam anywhere on the track; None without a beam."""
+        if self.beam is None:
+            return None
+        return BeamDirections.of(self.beam, self.channels_along, self.track)
+
+    @property
+    @shared
+    def along(self) -> NDArray[np.float64] | None:
+        """Those at `track.samples`, [samples, 3]."""
+        return None if self.directions is None else self.directions.at(self.track.samples)
+
     def extents(self, side: Side, *, most: bool = False) -> NDArray[np.float64]:
         """Return the extents of subimages of a size in roots of the model's: see `Subimages`.
 
         Without a size of roots every subimage is one.
         """
-        return self.subimages.extents(side, self.root or side, most=most)
+        found: NDArray[np.float64] = self.subimages.extents(side, self.root or side, most=most)
+        return found
 
     @cached
     def visible(self, side: Side) -> NDArray[np.bool_]:
@@ -231,3 +257,17 @@ class VisibilityModel:
             return 2.0 * self.track.strips
         ends = np.flatnonzero(self.on_track)[[0, -1]]
         return float(self.visible(SMALL)[:, ends].sum(axis=1).mean())
+
+
+def _nearest_m(lines: RangeLines, surface: Surface, track: MeanTrack) -> float:
+    """Lower bound of the distance between pixels and channels."""
+    dense_m = points_at_m(surface, np.linspace(0, 1, _DENSE))
+    # Pixels between the dense points may be closer; half a step bounds by how much.
+    steps_m = np.linalg.norm(surface.steps_m[:2], axis=1)
+    step_m = steps_m @ (np.array(surface.plane.shape) - 1) / (_DENSE - 1)
+    between_m = (step_m + surface.relief_m(LEAST_SIDE).max()) / 2
+    centres_m = lines.phase_centres_m
+    if track.is_dense:
+        centres_m = centres_m[some_channels(len(centres_m), _NEAREST_CHANNELS)]
+    nearest_m = KDTree(dense_m).query(centres_m)[0].min() - between_m
+    return max(float(nearest_m), 1e-9)

@@ -75,7 +75,7 @@ def _prepared(
     described = (cases.EXACT_CASES | cases.FACTORIZED_CASES)[case]
     lines, grid, beam = described.lines(), described.grid, described.beam
     if case in cases.EXACT_CASES:
-        work = expect(VisibilityModel(lines, grid, beam), asked_db, device).work
+        work = expect(VisibilityModel.of(lines, grid, beam), asked_db, device).work
         form = partial(form_exactly, lines, grid, beam=beam, accuracy_db=asked_db, device=device)
         return "", float(known.costs.seconds(work)), form
     chosen = plan(lines, grid, tolerance_db=asked_db, beam=beam, device=device, costs=known.costs)

@@ -289,7 +289,7 @@ def test_next_to_nothing_of_a_beam_is_left_out(beam_deg, share):
     grid = around(0, 40, pixel_m=(0.03, 0.3), shape=(50, 60))
     lines, _ = over(grid, along_x(200, 0.014))
     beam = BeamWindow(beam_deg, "hann")
-    low, high = trimmed(VisibilityModel(lines, grid, beam), share).limits
+    low, high = trimmed(VisibilityModel.of(lines, grid, beam), share).limits
     sine = sines(grid.positions_m().reshape(-1, 3), lines.phase_centres_m, beam.directions(lines))
     weights = beam.weights(sine) ** 2
     left_out = weights[(sine < low) | (sine > high)].sum() / weights.sum()
@@ -447,7 +447,7 @@ def test_the_highest_frequency_leaves_out_as_little_as_is_allowed():
     noisy = dataclasses.replace(lines, samples=lines.samples + floor)
     highest, bin_m = [], 1 / (256 * lines.range_step_m)
     for outside in (1e-6, 1e-9, 1e-11):
-        view = VisibilityModel(noisy, grid, None, outside)
+        view = VisibilityModel.of(noisy, grid, None, outside)
         cycles_per_m, share = frequencies(view)
         assert share[cycles_per_m > view.highest_cycles_per_m + bin_m].sum() <= outside
         highest.append(view.highest_cycles_per_m)

@@ -36,7 +36,7 @@ def everything_tried(*arguments):
 @pytest.fixture(scope="module", params=[None, BEAMS[0]], ids=["wide", "beam"])
 def view(request):
     grid = around(0, 40, shape=(500, 700))
-    return VisibilityModel(over(grid)[0], grid, request.param)
+    return VisibilityModel.of(over(grid)[0], grid, request.param)
 
 
 def cost_of(tree, view, filters_db, most, leaf_pixels, beam_cycles, device, costs, allowed):
