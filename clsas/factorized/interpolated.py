@@ -68,7 +68,7 @@ class VisiblePhases(Protocol):
 
     @property
     def model(self) -> VisibleChannels:
-        """What is visible."""
+        """Visibility of the same subimages."""
 
     def beam_phase_cycles(self, visible: NDArray[np.bool_], *, most: bool = False) -> float:
         """Return the cycles that a beam's weights count for, their mean or maximum; 0 without."""
