@@ -16,8 +16,10 @@ from clsas.signal.spectrum import Spectrum
 
 ALIGN_TAPS = APERTURE_TAPS = (4, 6, 8)
 _FINAL_TAPS = (2, 4, 6, 8)
-UPSAMPLING_SHARE = 0.03
-"""Share of an image's error power that filters for upsampling may add."""
+UPSAMPLING_SHARES = 0.03, 0.2
+"""Share of an image's error power that filters for upsampling may add, and that the longest may.
+
+FFTs in their place take more time than other filters that make up for the error."""
 _MOST_GAIN = 3.0  # limits the gain at band edges, where lines have little power
 # Weight of pixels near the corners of a subimage: those with `_CORNERS_FROM` of the highest phase
 # rate or more. Half: 1.5 % faster and 1 dB less error on average, but corners err more. Twice:

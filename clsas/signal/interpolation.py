@@ -376,10 +376,13 @@ class Upsampler:
         return Resampling(0, period, upsampled, shift, -beyond, last + beyond + 1)
 
 
-def upsampler(spectrum: Spectrum, step: int, gain: Gain, most_db: float) -> Upsampler | None:
-    """Return the shortest filters that upsample by PHASES / step with an error up to `most_db`.
+def upsampler(
+    spectrum: Spectrum, step: int, gain: Gain, wanted_db: float, most_db: float | None = None
+) -> Upsampler | None:
+    """Return the shortest filters that upsample by PHASES / step with an error up to `wanted_db`.
 
-    None if no filter is accurate enough, because the lines fill the whole sampled band.
+    If there are none, because the lines fill nearly the whole sampled band, return the longest,
+    provided that they err by no more than `most_db` (by default `wanted_db`). Otherwise None.
 
     Notes
     -----
@@ -388,6 +391,7 @@ def upsampler(spectrum: Spectrum, step: int, gain: Gain, most_db: float) -> Upsa
     exact enough: rounding adds less than 1e-15 of the power, whatever their condition, since their
     errors lie where lines hold next to nothing.
     """
+    most_db = wanted_db if most_db is None else most_db
     aim = gain(spectrum.frequency)
     weight = spectrum.power + _NOISE_FLOOR
     # cos(2 pi f x) at multiples of 1/PHASES samples. Sines cancel between positive and negative f.
@@ -405,7 +409,7 @@ def upsampler(spectrum: Spectrum, step: int, gain: Gain, most_db: float) -> Upsa
         residual = np.maximum(wanted - np.einsum("pt,tp->p", coefficients, right), 0.0)
         total = (residual.sum() + residual[1:-1].sum()) / PHASES / (spectrum.power @ aim**2)
         error_db = 10 * np.log10(max(float(total), 1e-30))
-        if error_db <= most_db:
+        if error_db <= (most_db if taps == UPSAMPLING_TAPS[-1] else wanted_db):
             # The filters of the second half mirror those of the first.
             coefficients = np.concatenate([coefficients, coefficients[-2:0:-1, ::-1]])
             return Upsampler(step, coefficients, error_db)

@@ -10,7 +10,7 @@ from clsas.opencl import upsampling as module
 from clsas.opencl.buffers import MARGIN, padded_length
 from clsas.opencl.device import open_device
 from clsas.opencl.upsampling import upsample
-from clsas.signal.interpolation import PHASES, upsampler
+from clsas.signal.interpolation import PHASES, UPSAMPLING_TAPS, upsampler
 
 
 def noise(channels, length):
@@ -106,6 +106,16 @@ def test_lines_that_come_in_parts(platform, monkeypatch):
 def test_no_short_filter_upsamples_a_full_band():
     assert upsampler(flat(1.0), 20, even, -50) is None
     assert upsampler(flat(0.8), 20, even, -50).taps < upsampler(flat(0.9), 20, even, -50).taps
+
+
+def test_the_longest_filter_serves_where_it_nearly_suffices():
+    found = upsampler(flat(0.92), 20, even, -60, -50)
+    assert found.taps == max(UPSAMPLING_TAPS)
+    assert -60 < found.error_db <= -50
+    assert upsampler(flat(0.92), 20, even, -60) is None
+    assert upsampler(flat(0.92), 20, even, -60, found.error_db - 0.1) is None
+    short = upsampler(flat(0.8), 20, even, -50, -20)
+    assert short.taps == upsampler(flat(0.8), 20, even, -50).taps
 
 
 def test_turning_is_exact_far_along_a_line(platform):

@@ -24,17 +24,30 @@ from factorizing import (
 )
 
 from clsas.core.grid import Grid
+from clsas.core.image_error import relative_error_db
+from clsas.exact.backprojection import backproject
 from clsas.factorized.plan import Plan
-from clsas.planning import fastest, planner
+from clsas.planning import fastest, planner, timed_images
 from clsas.planning.beam_coverage import trimmed
 from clsas.planning.channels import frequencies
 from clsas.planning.costs import Costs
+from clsas.planning.factorize import factorize
 from clsas.planning.planner import plan
 from clsas.planning.visibility_model import VisibilityModel
 from clsas.sonar.beam import BeamWindow
 from clsas.sonar.visibility import sines
 
 # What is chosen
+
+
+def test_lines_that_nearly_fill_the_sampled_band_are_upsampled_by_filters(monkeypatch):
+    """FFTs in their place take several times as long, and lines of half precision need filters."""
+    monkeypatch.setattr(timed_images, "_BAND", 0.92)
+    lines, grid = timed_images.scene(300, 128)
+    chosen = plan(lines, grid, tolerance_db=-45, costs=EXACT_IS_SLOW)
+    assert chosen.factorization.upsampler is not None
+    image, exact = factorize(lines, grid, chosen), backproject(lines, grid, accuracy_db=-80)
+    assert relative_error_db(image, exact) < -45
 
 
 def test_a_small_image_is_backprojected():
