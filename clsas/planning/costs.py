@@ -68,16 +68,16 @@ class Costs:
 
 
 _AVX2 = Costs(
-    call_ns=8.8e6,
-    upsampled_sample_ns=17.0,
+    call_ns=9.2e6,
+    upsampled_sample_ns=20.0,
     filtered_sample_ns=1.8,
-    reference_ns=113.0,
-    batch_ns=6.8e5,
-    subimage_ns=1490.0,
+    reference_ns=122.0,
+    batch_ns=8.0e5,
+    subimage_ns=1450.0,
     line_ns=24.0,
-    sample_ns=0.113,
-    sample_tap_ns=0.022,
-    single_sample_ns=0.23,
+    sample_ns=0.05,
+    sample_tap_ns=0.0235,
+    single_sample_ns=0.2,
     given_sample_ns=0.01,
     leaf_channel_ns=5.0,
     leaf_ns=0.69,
@@ -85,7 +85,7 @@ _AVX2 = Costs(
     leaf_gathered_ns=0.85,
     group_ns=234.0,
     part_ns=50.0,
-    pixel_ns=0.7,
+    pixel_ns=0.57,
     point_ns=1.7,
     beam_ns=0.4,
 )

@@ -28,6 +28,7 @@ _CARRIER_HZ, _SAMPLE_RATE_HZ, _BAND = 120e3, 37.5e3, 0.8
 _NEAREST_M, _TRACK_M, _PIXEL_M = 40.0, 20.0, 0.02
 _MARGIN_M = 1.0  # of ranges, to either side
 _RELIEF_M = 0.5  # of dunes as long as a quarter of the grid: no accuracy lets it be left out
+_REPEATED = 0.1  # relative difference of times that are the same
 EXACT_DB = -50.0
 """Accuracy of the exact images."""
 
@@ -93,6 +94,12 @@ class TimedImage:
     def scatter(self) -> float:
         """Repeatability: log ratio of the best times of even and odd runs."""
         return math.log(min(self.seconds[::2]) / min(self.seconds[1::2]))
+
+    @property
+    def repeats(self) -> bool:
+        """True if all kernels take the same time in the two shortest of several runs."""
+        shortest_s, next_s = sorted(sum(each.values()) for each in self.kernels)[:2]
+        return next_s < (1 + _REPEATED) * shortest_s
 
     @property
     def is_weighted(self) -> bool:

@@ -1,5 +1,6 @@
 import dataclasses
 import errno
+import itertools
 import json
 
 import numpy as np
@@ -175,3 +176,27 @@ def test_a_device_is_measured(platform):
         found = scaling.measure(platform)
     assert not times  # of the measurement's own kernels
     assert all(1e-3 < factor < 1e3 for factor in vars(found).values())
+
+
+def test_images_whose_times_do_not_repeat_are_timed_for_longer(platform, monkeypatch):
+    """Runs take 20 ms. Kernels of pixels off the plane take longer from run to run."""
+    clock = itertools.count()  # ticks of a microsecond
+    runs = {"Exact": 0, "Exact off the plane": 0, "Plan": 0}
+
+    def run(image, device):
+        for _ in range(20_000):
+            next(clock)
+        name = type(image.expected).__name__ + " off the plane" * (not image.tiled)
+        runs[name] += 1
+        image.seconds.append(0.02)
+        times = dict.fromkeys(("upsample_lines", "stage", "backproject_tiles"), 0.005)
+        image.kernels.append(times if image.tiled else {"backproject_points": 0.01 * runs[name]})
+
+    monkeypatch.setattr(scaling.TimedImage, "run", run)
+    monkeypatch.setattr(scaling.time, "perf_counter", lambda: 1e-6 * next(clock))
+    scaling.measure(platform)
+    assert runs == {
+        "Exact": pytest.approx(6, abs=1),
+        "Exact off the plane": pytest.approx(6 + 15, abs=2),
+        "Plan": pytest.approx(6, abs=1),
+    }
