@@ -16,10 +16,11 @@ from clsas.signal.spectrum import Spectrum
 
 ALIGN_TAPS = APERTURE_TAPS = (4, 6, 8)
 _FINAL_TAPS = (2, 4, 6, 8)
-UPSAMPLING_SHARES = 0.03, 0.2
-"""Share of an image's error power that filters for upsampling may add, and that the longest may.
-
-FFTs in their place take more time than other filters that make up for the error."""
+UPSAMPLING_SHARE = 0.03
+"""Share of an image's error power that filters for upsampling may add."""
+LONGEST_UPSAMPLING_SHARE = 0.2
+"""The same for the longest filter, where no other is accurate enough. Past it FFTs upsample lines:
+that takes more time than tighter filters elsewhere, and rules out half precision."""
 _MOST_GAIN = 3.0  # limits the gain at band edges, where lines have little power
 # Weight of pixels near the corners of a subimage: those with `_CORNERS_FROM` of the highest phase
 # rate or more. Half: 1.5 % faster and 1 dB less error on average, but corners err more. Twice:

@@ -23,7 +23,7 @@ from clsas.factorized.estimates import (
     upsampling,
 )
 from clsas.factorized.factorization import ExactImage, Factorization
-from clsas.factorized.filters import UPSAMPLING_SHARES
+from clsas.factorized.filters import LONGEST_UPSAMPLING_SHARE, UPSAMPLING_SHARE
 from clsas.factorized.interpolated import InterpolatedAperture
 from clsas.factorized.plan import Plan, Prediction, Stage
 from clsas.factorized.thesis import NearestBeams
@@ -263,8 +263,10 @@ def _upsampled(model: VisibilityModel, candidate: Candidate, other_errors: Error
         range_filters=stages * power(align_db) + power(final.scatter_db),
     )
     if gain is not None:
-        limits_db = (in_db(share * errors.total) for share in UPSAMPLING_SHARES)
-        upsampler = interpolation.upsampler(model.spectrum, step, gain, *limits_db)
+        wanted_db, most_db = (
+            in_db(share * errors.total) for share in (UPSAMPLING_SHARE, LONGEST_UPSAMPLING_SHARE)
+        )
+        upsampler = interpolation.upsampler(model.spectrum, step, gain, wanted_db, most_db)
         if upsampler is not None:
             resampling = upsampler.resampling(samples, align.taps // 2, model.spectrum)
             errors = replace(errors, upsampling=power(upsampler.error_db))

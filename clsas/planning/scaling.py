@@ -1,4 +1,4 @@
-"""Costs of a device that nobody calibrated: defaults, scaled by a measurement of 0.3 s.
+"""Costs of a device that nobody calibrated: defaults, scaled by a measurement of 0.3 to 0.6 s.
 
 Devices differ mostly in how fast they run each of the kernels, and hosts in how fast they are.
 Costs of one kernel keep the proportions that they have by default. So three small images, formed
@@ -143,14 +143,14 @@ def _scaled_once(device: Device, path: Path) -> KnownCosts:
     except OSError as error:
         validate.warn(
             f"costs measured on {device.info.label} cannot be stored, so that every process "
-            f"measures them anew, for {_BUDGET_S:g} s: {error}"
+            f"measures them anew, for {_BUDGET_S:g} to {2 * _BUDGET_S:g} s: {error}"
         )
         return KnownCosts(costs, "scaled")
     return stored.load(device)
 
 
 def measure(device: Device) -> Scale:
-    """Measure how fast a device and its host are, in 0.3 s and the time to build kernels.
+    """Measure how fast a device and its host are, in 0.3 to 0.6 s and the time to build kernels.
 
     Images are larger on fast devices. They take turns, and the fastest run of each counts. Those
     whose two fastest runs differ have as much time again: a scheduler that keeps the threads of a
@@ -161,13 +161,15 @@ def measure(device: Device) -> Scale:
     start = time.perf_counter()
     side = _LEAST_PIXELS
     images, building_s = _built(device, side)
+    images.exact.run(device)  # the first run was of buffers that nothing had touched
     if images.exact.in_pixels < _LEAST_KERNEL_S:
         larger = side * math.sqrt(_KERNEL_S / max(images.exact.in_pixels, _LEAST_S))
         images, again_s = _built(device, 64 * round(min(larger, _MOST_PIXELS) / 64))
         building_s += again_s
     end_s = start + building_s + _BUDGET_S
     _take_turns(images.timed, device, end_s)
-    _take_turns([image for image in images.timed if not image.repeats], device, end_s + _BUDGET_S)
+    end_s = max(end_s, time.perf_counter()) + _BUDGET_S
+    _take_turns([image for image in images.timed if not image.repeats], device, end_s)
     info = device.info
     found = images.scale(stored.defaults(device), images.transform_s(info.width))
     small = _SMALL.get(info.width) if info.kind == "cpu" else None

@@ -26,7 +26,7 @@ from clsas.factorized.estimates import (
 from clsas.factorized.filters import (
     ALIGN_TAPS,
     APERTURE_TAPS,
-    UPSAMPLING_SHARES,
+    LONGEST_UPSAMPLING_SHARE,
     FilterRates,
     choose,
 )
@@ -199,8 +199,8 @@ def all_options(
     roots = combining(counts * sizes.visible_share * channels, samples, taps, given=True)
     batches = np.maximum(counts / LEAST_BATCH, 1.0) * np.array(stages)[:, None]
     roots += Work(reference=counts * references(model), subimage=counts, batch=batches)
-    limits_db = (filters_db + in_db(share) for share in UPSAMPLING_SHARES)
-    filtered = upsampler(model.spectrum, PHASES // 2, np.ones_like, *limits_db) is not None
+    most_db = filters_db + in_db(LONGEST_UPSAMPLING_SHARE)
+    filtered = upsampler(model.spectrum, PHASES // 2, np.ones_like, most_db) is not None
     roots += upsampling(model.lines.samples.size * rate, filtered=filtered)
     tiled, weighted = model.surface.is_plane, model.beam is not None
     pixels = sizes.padded_pixels

@@ -97,7 +97,7 @@ class TimedImage:
 
     @property
     def repeats(self) -> bool:
-        """True if all kernels take the same time in the two shortest of several runs."""
+        """True if the kernels together take the same time in the two shortest of several runs."""
         shortest_s, next_s = sorted(sum(each.values()) for each in self.kernels)[:2]
         return next_s < (1 + _REPEATED) * shortest_s
 

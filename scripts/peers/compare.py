@@ -163,7 +163,7 @@ def peers_scaling(
         for size in sizes:
             print(f"{track}, {size} x {size} pixels", file=sys.stderr, flush=True)
             found.append(measure(scenes.TRACKS[track](size), codes, best))
-        print(f"\n{track}: median of 3, and error\n")
+        print(f"\n{track}: median of 3 (one that takes over a minute is formed once), and error\n")
         rows = []
         for several in zip(*found, strict=True):
             method = several[0].method
