@@ -58,7 +58,7 @@ def devices(as_json: bool) -> None:
 def _origin(known: KnownCosts) -> str:
     """Return where costs come from, and how old they are."""
     if known.source == "default":
-        return "defaults, until the first plan with a tolerance measures the device in 0.3 s"
+        return "defaults, until the first plan with a tolerance measures the device in 0.3 to 0.6 s"
     how = {"scaled": "defaults, scaled by a short measurement", "calibrated": "calibrated"}
     days = (datetime.now(UTC) - datetime.fromisoformat(known.measured)).days
     age = "today" if days < 1 else f"{days} day{'s' * (days > 1)} ago"

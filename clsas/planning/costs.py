@@ -89,9 +89,8 @@ _AVX2 = Costs(
     point_ns=1.7,
     beam_ns=0.4,
 )
-"""Fitted to processor times of kernels and host, over 2 cores of Zen 4 with PoCL 3.0, of 20 images
-of the benchmarks: predicted times of kernels are 0.79 to 1.06 of theirs. Other work on the machine
-hardly matters."""
+"""Fitted to processor times of kernels and host, over 2 cores of Zen 4 with PoCL 3.0, of images
+of the benchmarks at several tolerances. Other work on the machine hardly matters."""
 
 
 @dataclass(frozen=True)

@@ -102,8 +102,8 @@ def plan(
         Device memory that may be used. By default half of the device's, or as much as plain
         backprojection takes.
     costs : Costs, optional
-        Costs in place of those stored for the device. Where none are stored, a measurement of 0.3 s
-        scales the defaults, and is stored, before the first search for a factorization.
+        Costs in place of those stored for the device. Where none are stored, a measurement of 0.3
+        to 0.6 s scales the defaults, and is stored, before the first search for a factorization.
     taps : (range, aperture), optional
         For study, with a tolerance: numbers of taps, 4, 6 or 8, in place of the fastest.
     depth : int, optional

@@ -116,8 +116,9 @@ _SMALL = {
 }
 """Times of these images relative to those of large ones, by lanes of a CPU: lines fit a cache, but
 buffers are touched for the first time. Geometric means over the cases of `scripts/bench
-predictions` on PoCL with AVX-512 and on Intel's runtime with AVX-512; for 8 lanes, processor times
-on Zen 4 over those that the default costs predict."""
+predictions` on PoCL with AVX-512 and on Intel's runtime with AVX-512; for 8 lanes, PoCL on a
+virtual Zen 4, whose scheduler slows short kernels by up to two: stages and leaves count halfway
+between that and the kernels' processor times."""
 
 
 def scaled(device: Device) -> KnownCosts:
@@ -259,7 +260,7 @@ def _built(device: Device, side: int) -> tuple[_Images, float]:
     resampling = interpolation.resampling(lines.length, found.factorization.final, model.spectrum)
     images = _Images(exact, points, factorized, lines, resampling)
     for image in images.timed:
-        image.run(device)  # this builds the kernels, whose own times count
+        image.run(device)  # the first run builds the kernels, and their times leave that out
     return images, sum(image.seconds[0] for image in images.timed)
 
 
