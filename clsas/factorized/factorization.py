@@ -82,6 +82,9 @@ class Factorization:
         With a beam: sines of the aspect angle between which its weights matter.
     roots_at_once, roots_prepared : int
         Roots that are formed together, and whose geometry is prepared together.
+    stretch : float
+        By how much faster ranges grow along the line of sight than those from the mean track,
+        relative to these; the mean over all channels.
     """
 
     sides: Annotated[tuple[Size, ...], Field(min_length=1)]
@@ -99,6 +102,7 @@ class Factorization:
     limits: tuple[Annotated[float, Field(ge=-3.0, lt=math.inf)], Number] | None
     roots_at_once: Whole
     roots_prepared: Whole
+    stretch: Annotated[float, Field(ge=-0.5, le=1.0)] = 0.0
     method: Literal["factorized"] = "factorized"
 
     __repr__ = reprs.of_fields

@@ -106,7 +106,7 @@ class Geometry:
     ramps : bool
         True if the first stage turns the phase of channels along their lines.
     samples_per_m, cycles_per_m : float
-        Samples and phase of the upsampled lines per metre of range.
+        Samples and phase of the upsampled lines per metre of range from the mean track.
 
     Raises
     ------
@@ -119,8 +119,8 @@ class Geometry:
         image, beam = chosen.factorization, chosen.beam
         self.factorization, self.beam = image, beam
         self.kept: dict[Hashable, Any] = {}
-        self.samples_per_m = image.resampling.samples_per_m(lines)
-        self.cycles_per_m = image.resampling.cycles_per_m(lines)
+        self.samples_per_m = image.resampling.samples_per_m(lines) * (1 + image.stretch)
+        self.cycles_per_m = image.resampling.cycles_per_m(lines) * (1 + image.stretch)
         self.division = Division(surface, image.sides)
         track = chosen.kept.get("track") or mean_track_of(lines, image.aperture.shape)
         if track is None:
@@ -372,14 +372,15 @@ class Geometry:
         return lines.tx_m[channels], lines.rx_m[channels], moving, lines.sound_speed_m_s
 
     def _ramp(self, sector: Sector) -> NDArray[np.float64]:
-        """Return cycles per sample by which channels' phases grow faster than their stand-ins'."""
+        """Return cycles per sample by which channels' phases grow faster than the mean of all."""
         virtual_m = self.track.positions_m(sector.coordinate, sector.across)
         tx_m, rx_m, velocity, speed = self._antennas(sector)
         plane = self.surface.plane
         stretch = stretches(
             tx_m, rx_m, velocity, speed, self.drift, plane, sector.root_m, virtual_m
         )
-        return stretch * self.cycles_per_m / self.samples_per_m
+        more = (stretch - self.factorization.stretch) / (1 + self.factorization.stretch)
+        return more * self.cycles_per_m / self.samples_per_m
 
 
 def _doubled(side: tuple[int, int]) -> list[tuple[int, int]]:

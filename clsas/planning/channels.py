@@ -3,21 +3,25 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from clsas.core.geometry import pairwise_range_m
-from clsas.core.lines import fastest
+from clsas.core.lines import SAMPLED_CHANNELS, fastest, some_channels
 from clsas.factorized import aperture
-from clsas.planning.caching import shared
+from clsas.factorized.tracks import MeanTrack
+from clsas.planning.caching import cached, shared
+from clsas.planning.sample_pixels import SPREAD_POINTS
 from clsas.planning.subimages import Side
 from clsas.planning.visibility_model import VisibilityModel
 from clsas.signal.spectrum import cycles_per_m_at
 
 _NEIGHBOURS = 64  # channels over which density is measured; half or twice: no change
 _SHEET_REFERENCES = 2.0  # that each channel of a sheet counts as, measured with 54 000 channels
+_WORST_CHANNELS = 32  # of those sampled: loud, or far from the mean track
 _LEAST_FREQUENCY = 1e-3  # of the highest: virtual channels sample a phase that hardly turns
 
 
@@ -40,16 +44,16 @@ def carriers(model: VisibilityModel, count: int) -> NDArray[np.float64]:
     return np.interp(index, np.arange(len(share)), cycles_per_m)
 
 
-def track_error_m(model: VisibilityModel, channels: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Distances of some channels from the mean track, [channels].
+@shared
+def track_error_m(model: VisibilityModel) -> NDArray[np.float64]:
+    """Distances of the channels from the mean track, [channels].
 
     The motion of receivers that differs from the mean is added, as it acts at the median range.
     """
-    away_m = model.track.some(channels).offsets_m(model.lines.phase_centres_m[channels])
-    error_m = np.linalg.norm(away_m, axis=1)
+    error_m = np.linalg.norm(model.track.offsets_m(model.lines.phase_centres_m), axis=1)
     drift = own_drift(model)
     if drift is not None:
-        error_m += np.linalg.norm(drift[channels], axis=1) * np.median(model.distance_m)
+        error_m += np.linalg.norm(drift, axis=1) * np.median(model.distance_m)
     return error_m
 
 
@@ -72,6 +76,83 @@ def peak_density(model: VisibilityModel) -> float:
     length = model.track.strips if model.track.strips > 1 else float(place[-1] - place[0])
     average = length * some / (len(place) - 1)
     return average / closest if closest > 0 else np.inf
+
+
+@dataclass(frozen=True, eq=False)
+class SampledChannels:
+    """Sampled channels whose beam touches subimages of a size at some sample points.
+
+    Attributes
+    ----------
+    model : VisibilityModel
+    points : int64 [points]
+        The sample points that any channel touches.
+    index : int64 [n]
+        The channels.
+    weight : float64 [points, n]
+        Power of all the channels that each stands for; 0 where its beam misses the subimage.
+    part : MeanTrack
+        The mean track with these channels.
+    """
+
+    model: VisibilityModel
+    points: NDArray[np.int64]
+    index: NDArray[np.int64]
+    weight: NDArray[np.float64]
+    part: MeanTrack
+
+    @property
+    def phase_centres_m(self) -> NDArray[np.float64]:
+        """Middles between transmitters and receivers, [n, 3]."""
+        return self.model.lines.phase_centres_m[self.index]
+
+    @property
+    def antennas(self) -> tuple[Any, Any, Any, float]:
+        """Positions of transmitters and receivers, velocities of receivers, and sound speed."""
+        lines = self.model.lines
+        velocity = lines.rx_velocity_m_s
+        moving = velocity if velocity is None else velocity[self.index]
+        return lines.tx_m[self.index], lines.rx_m[self.index], moving, lines.sound_speed_m_s
+
+    def virtual_m(self, centres_m: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return where the channels appear on the track, from some points: [points, n, 3]."""
+        drifts = own_drift(self.model)
+        own = drifts if drifts is None else drifts[self.index]
+        places = self.part.apparent_places(centres_m, self.phase_centres_m, own)
+        return self.model.track.positions_m(*places)
+
+
+@cached
+def sampled_channels(model: VisibilityModel, side: Side) -> SampledChannels:
+    """Sample channels that touch subimages of a size at the `SPREAD_POINTS`."""
+    track, points = model.track, np.array(SPREAD_POINTS)
+    visible = model.visible(side)[points]
+    candidates = np.flatnonzero(np.interp(track.coordinate, track.samples, visible.any(axis=0)))
+    index, weight = _some_of(model, candidates)
+    part = track.some(index)
+    seen = np.stack([np.interp(part.coordinate, track.samples, each) for each in visible]) > 0
+    touched = seen.any(axis=1)
+    return SampledChannels(model, points[touched], index, weight * seen[touched], part)
+
+
+def _some_of(
+    model: VisibilityModel, candidates: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Sample channels, with the power that each stands for.
+
+    Those whose distance from the mean track and power are large are among them: a loud channel, or
+    a few where a track turns sharply, may err more than all others together.
+    """
+    power = model.channel_power
+    if len(candidates) <= SAMPLED_CHANNELS:
+        return candidates, power[candidates]
+    error = track_error_m(model)[candidates] ** 2 * power[candidates]
+    by_error = candidates[np.argsort(error, kind="stable")]
+    others, worst = np.split(by_error, [-_WORST_CHANNELS])
+    others.sort()
+    some = others[some_channels(len(others), SAMPLED_CHANNELS - _WORST_CHANNELS)]
+    scale = power[others].sum() / max(power[some].sum(), 1e-300)
+    return np.concatenate([some, worst]), np.concatenate([scale * power[some], power[worst]])
 
 
 def range_window_m(model: VisibilityModel, root: Side) -> tuple[float, float]:

@@ -12,16 +12,17 @@ from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
 from clsas.core.geometry import pairwise_range_m
-from clsas.core.lines import SAMPLED_CHANNELS, some_channels, wavelength_m
+from clsas.core.lines import wavelength_m
 from clsas.exact.layout import ROUNDING
 from clsas.exact.tiles import BLOCKS
 from clsas.factorized.aperture import drift, stretches
 from clsas.factorized.thesis import stage_errors_m
 from clsas.opencl.device import Device
 from clsas.planning.caching import cached
-from clsas.planning.channels import own_drift, track_error_m
-from clsas.planning.sample_pixels import SPREAD_POINTS, mean_over_relief, pixels_m
+from clsas.planning.channels import SampledChannels, sampled_channels
+from clsas.planning.sample_pixels import mean_over_relief, pixels_m
 from clsas.planning.spacing_errors import bias_error, filter_error, spacing_error
+from clsas.planning.stretches import stretch_of
 from clsas.planning.subimages import Side
 from clsas.planning.visibility_model import VisibilityModel
 from clsas.signal.interpolation import Interpolator
@@ -30,8 +31,6 @@ from clsas.sonar.visibility import sines
 # Rms error of a phase in the stages over the phase across a root, from float32: measured. With half
 # of it images at -60 dB are up to 3 % faster; with twice of it measured errors fall by 0.1 dB.
 _FLOAT32 = 4.5e-8
-_DENSE_CHANNELS = 2048  # of a dense aperture, from which channels are sampled
-_FARTHEST_CHANNELS = 32  # of those sampled: far from the mean track, where it turns sharply
 
 
 @dataclass(frozen=True)
@@ -115,75 +114,74 @@ def root_error(model: VisibilityModel, side: Side) -> float:
 
 
 def _mean_track_error(model: VisibilityModel, side: Side, extents: NDArray[np.float64]) -> float:
-    """Return the error power of channels that are replaced by places on the mean track.
+    """Return the error power of channels that are replaced by positions on the mean track.
 
-    For sampled channels, roots and pixels: the change in range from a root's centre to a pixel,
-    less the same change for the place on the mean track, stretched as the first stage does. This
-    covers track errors, separate transmitters and receivers, and motion during flight. With a beam
-    it adds the difference between the weights of the two.
+    This covers track errors, separate transmitters and receivers, and motion during flight. With a
+    beam it adds the difference between the weights of the two.
     """
-    lines, track = model.lines, model.track
-    points = np.array(SPREAD_POINTS)
-    visible = model.visible(side)[points]
-    candidates = np.flatnonzero(np.interp(track.coordinate, track.samples, visible.any(axis=0)))
-    if track.is_dense:
-        candidates = candidates[some_channels(len(candidates), _DENSE_CHANNELS)]
-    index, counts = _sampled_channels(model, candidates)
-    part = track.some(index)
-    tx_m, rx_m, middle_m = (each[index] for each in (lines.tx_m, lines.rx_m, lines.phase_centres_m))
-    velocity, drifts = lines.rx_velocity_m_s, own_drift(model)
-    moving = velocity if velocity is None else velocity[index]
-    own = drifts if drifts is None else drifts[index]
-    antennas = tx_m, rx_m, moving, lines.sound_speed_m_s
-    visible = np.stack([np.interp(part.coordinate, track.samples, each) for each in visible]) > 0
-    touched = visible.any(axis=1)
-    points, visible = points[touched], visible[touched]
-    if not points.size:
+    channels = sampled_channels(model, side)
+    if not channels.points.size:
         return 0.0
     # [points, pixels, channels]; the first pixel is the centre of a root.
-    offsets_m = np.stack([pixels_m(model, extents, point)[0] for point in points])
-    points_m = model.points_m[points, None] + offsets_m
-    centres_m, all_m = points_m[:, 0], points_m.reshape(-1, 3)
-    range_m = pairwise_range_m(all_m, *antennas).reshape(*points_m.shape[:2], -1)
-    virtual_m = track.positions_m(*part.apparent_places(centres_m, middle_m, own))
-    virtual_range_m = np.stack([cdist(*each) for each in zip(points_m, virtual_m, strict=True)])
-    virtual_range_m -= (points_m @ drift(lines))[..., None]
-    change_m, virtual_change_m = (each[:, 1:] - each[:, :1] for each in (range_m, virtual_range_m))
-    stretch = stretches(*antennas, drift(lines), model.surface.plane, centres_m, virtual_m)[:, None]
-    stretched_m = virtual_change_m * stretch
-    residual_m = change_m - virtual_change_m - stretched_m
-    wrong = (2 * np.pi * model.highest_cycles_per_m * residual_m) ** 2
-    # Lines are stretched by turning their phase; their envelope stays.
-    wrong += (2 * np.pi * model.rms_cycles_per_m * stretched_m) ** 2
+    offsets_m = np.stack([pixels_m(model, extents, point)[0] for point in channels.points])
+    points_m = model.points_m[channels.points, None] + offsets_m
+    virtual_m = channels.virtual_m(points_m[:, 0])
+    wrong = _phase_error(model, channels, points_m, virtual_m)
     weights = np.ones_like(wrong)
     if model.beam is not None and model.directions is not None:
-        directions = model.directions.at(part.coordinate, part.across)
-        virtual = [sines(*each, directions) for each in zip(points_m, virtual_m, strict=True)]
-        channels = [sines(each, middle_m, model.channels_along[index]) for each in points_m]
-        weights, of_virtual = (
-            model.beam.weights(np.stack(each).swapaxes(1, 2)[:, 1:], wavelength_m(lines))
-            for each in (channels, virtual)
-        )
+        weights, of_virtual = _weights(model, channels, points_m, virtual_m)
         wrong = weights**2 * wrong + (weights - of_virtual) ** 2
-    counts = counts * visible[:, None]
+    counts = channels.weight[:, None]
     return float(np.sum(counts * wrong) / max(np.sum(counts * weights**2), 1e-30))
 
 
-def _sampled_channels(
-    model: VisibilityModel, candidates: NDArray[np.int64]
-) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Sample channels, those farthest from the mean track among them; return their weights too.
+def _phase_error(
+    model: VisibilityModel,
+    channels: SampledChannels,
+    points_m: NDArray[np.float64],
+    virtual_m: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """Return the error power of pixels' phases and envelopes, [points, pixels - 1, channels].
 
-    Where a track turns sharply, a few channels may be much farther off than all others.
+    The range from a channel changes between the centre of a root, the first pixel, and another
+    pixel. The error is what that change differs by from the one for the virtual position, stretched
+    as the first stage does.
     """
-    if len(candidates) <= SAMPLED_CHANNELS:
-        return candidates, np.ones(len(candidates))
-    by_distance = candidates[np.argsort(track_error_m(model, candidates), kind="stable")]
-    others, farthest = np.split(by_distance, [-_FARTHEST_CHANNELS])
-    others.sort()
-    some = others[some_channels(len(others), SAMPLED_CHANNELS - _FARTHEST_CHANNELS)]
-    counts = np.repeat([len(others) / len(some), 1.0], [len(some), _FARTHEST_CHANNELS])
-    return np.concatenate([some, farthest]), counts
+    along, stretch = drift(model.lines), stretch_of(model)
+    range_m = pairwise_range_m(points_m.reshape(-1, 3), *channels.antennas)
+    range_m = range_m.reshape(*points_m.shape[:2], -1)
+    virtual_range_m = np.stack([cdist(*each) for each in zip(points_m, virtual_m, strict=True)])
+    virtual_range_m -= (points_m @ along)[..., None]
+    change_m, virtual_change_m = (each[:, 1:] - each[:, :1] for each in (range_m, virtual_range_m))
+    of_channels = stretches(
+        *channels.antennas, along, model.surface.plane, points_m[:, 0], virtual_m
+    )[:, None]
+    residual_m = change_m - virtual_change_m * (1 + of_channels)
+    # A line's phase follows its channel's stretch, its envelope the mean of all.
+    envelope_m = virtual_change_m * (of_channels - stretch.mean)
+    wrong = (2 * np.pi * model.highest_cycles_per_m * residual_m) ** 2
+    wrong += (2 * np.pi * model.rms_cycles_per_m * envelope_m) ** 2
+    return wrong
+
+
+def _weights(
+    model: VisibilityModel,
+    channels: SampledChannels,
+    points_m: NDArray[np.float64],
+    virtual_m: NDArray[np.float64],
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the beam's weights of channels and of their virtual positions, as `_phase_error`."""
+    assert model.beam is not None
+    assert model.directions is not None
+    part, along = channels.part, model.channels_along[channels.index]
+    directions = model.directions.at(part.coordinate, part.across)
+    virtual = [sines(*each, directions) for each in zip(points_m, virtual_m, strict=True)]
+    real = [sines(each, channels.phase_centres_m, along) for each in points_m]
+    weights, of_virtual = (
+        model.beam.weights(np.stack(each).swapaxes(1, 2)[:, 1:], wavelength_m(model.lines))
+        for each in (real, virtual)
+    )
+    return weights, of_virtual
 
 
 def nearest_errors(

@@ -31,6 +31,7 @@ from clsas.planning.prediction import (
 from clsas.planning.search import Allowed, Tree, search
 from clsas.planning.sizes import largest_root, root_limits
 from clsas.planning.spacing_errors import spacing_error
+from clsas.planning.stretches import aligned_spectrum
 from clsas.planning.visibility_model import VisibilityModel
 
 # Shares of the allowed error power. `scripts/bench sensitivity` measured what half and twice do.
@@ -221,14 +222,15 @@ def _filters(problem: _Problem, trial: _Trial, tree: Tree) -> Filters | None:
     if filters_db is None:
         return None
     model, stages = problem.model, len(tree.sides)
-    choice = tree.filters(model.spectrum, filters_db)
+    spectrum = aligned_spectrum(model)
+    choice = tree.filters(spectrum, filters_db)
     if choice is None:
         return None
     key = choice, stages, filters_db
     if key not in problem.designs:
         cycles_per_m, share = frequencies(model)
         steering = steering_spectrum(cycles_per_m / model.highest_cycles_per_m, share)
-        problem.designs[key] = choice.design(model.spectrum, steering, stages, filters_db)
+        problem.designs[key] = choice.design(spectrum, steering, stages, filters_db)
     return problem.designs[key]
 
 
@@ -315,7 +317,10 @@ def _more_accurate(problem: _Problem, trial: _Trial, errors: Errors, found: Plan
     if any(excess) and max(trial.oversampling) < _MOST_OVERSAMPLING:
         return replace(trial, oversampling=_denser(trial.oversampling, excess, share))
     too_much = power(-margin_db(problem.model)) * (power(found.predicted_error_db) - allowed)
-    return replace(trial, reserved=trial.reserved + _OVERSHOOT * too_much + _LEAST_STEP * allowed)
+    # Some errors fall together with those of filters, which keep half of what they have at least.
+    left = _MOST_SPENT * allowed - trial.reserved - errors.roots
+    step = min(_OVERSHOOT * too_much, left / 2)
+    return replace(trial, reserved=trial.reserved + step + _LEAST_STEP * allowed)
 
 
 def _denser(

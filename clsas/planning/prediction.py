@@ -36,6 +36,7 @@ from clsas.planning.costs import Costs
 from clsas.planning.exact_image import Exact
 from clsas.planning.memory import BufferSizes, batches_within
 from clsas.planning.range_extents import half_line_lengths
+from clsas.planning.stretches import stretch_of, uncompensated
 from clsas.planning.visibility_model import VisibilityModel
 from clsas.signal import interpolation
 from clsas.signal.interpolation import PHASES, Interpolator, Resampling, Upsampler
@@ -174,6 +175,7 @@ def predicted_plan(
         most_channels=sizes.most_channels,
         highest_cycles_per_m=model.highest_cycles_per_m,
         closest_m=model.nearest_m,
+        stretch=stretch_of(model).mean if candidate.aperture.aligns_phases else 0.0,
         limits=model.limits,
         roots_at_once=batches.at_once,
         roots_prepared=batches.prepared,
@@ -258,10 +260,10 @@ def _upsampled(model: VisibilityModel, candidate: Candidate, other_errors: Error
     step = max(int(PHASES / align.upsampling), 1)
     gain = aperture.lines_gain(align, final, PHASES / step)
     align_db = align.error_db if gain is None else align.scatter_db
-    errors = replace(
-        other_errors,
-        range_filters=stages * power(align_db) + power(final.scatter_db),
-    )
+    in_range = stages * power(align_db) + power(final.scatter_db)
+    if gain is not None:
+        in_range += uncompensated(model, align, final, stages, PHASES / step, gain)
+    errors = replace(other_errors, range_filters=in_range)
     if gain is not None:
         wanted_db, most_db = (
             in_db(share * errors.total) for share in (UPSAMPLING_SHARE, LONGEST_UPSAMPLING_SHARE)

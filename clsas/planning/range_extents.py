@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsas.planning.caching import cached
+from clsas.planning.stretches import stretch_of
 from clsas.planning.subimages import SMALL, Side
 from clsas.planning.visibility_model import VisibilityModel
 from clsas.signal.interpolation import Interpolator, Resampling
@@ -54,7 +55,7 @@ def half_line_lengths(
 
     `to` is the resampling of the lines before the first stage.
     """
-    samples_per_m = to.samples_per_m(model.lines)
+    samples_per_m = to.samples_per_m(model.lines) * (1 + max(stretch_of(model).mean, 0.0))
     return tuple(
         math.ceil(extent_m * samples_per_m)
         + (len(sides) - 1 - level) * (align.taps // 2 + 1)

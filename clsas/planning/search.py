@@ -36,6 +36,7 @@ from clsas.planning.aperture_phases import AperturePhases
 from clsas.planning.channels import references
 from clsas.planning.costs import Costs
 from clsas.planning.sizes import Division, Sizes, all_sizes
+from clsas.planning.stretches import aligned_spectrum
 from clsas.planning.subimages import Side
 from clsas.planning.visibility_model import VisibilityModel
 from clsas.signal.interpolation import PHASES, upsampler
@@ -184,9 +185,10 @@ def all_options(
     """Return all choices of filters that err by no more than `filters_db`; None without any."""
     model, counts, channels = sizes.model, sizes.counts, sizes.model.lines.channels
     choices, stages, dimensions = [], [], 1 + model.track.is_sheet
+    aligned = aligned_spectrum(model)
     most_first = sorted(allowed.stages, reverse=True)
     for number, align, aperture in product(most_first, allowed.align_taps, allowed.aperture_taps):
-        choice = choose(model.spectrum, align, aperture, number, filters_db, dimensions)
+        choice = choose(aligned, align, aperture, number, filters_db, dimensions)
         if choice is not None:
             choices.append(choice)
             stages.append(number)

@@ -25,7 +25,7 @@ from clsas.planning.sample_points import (
 )
 from clsas.planning.subimages import SMALL, Side, Subimages
 from clsas.signal.ambiguity import Ambiguity, ambiguity
-from clsas.signal.spectrum import Spectrum, cycles_per_m_at, measure_spectrum
+from clsas.signal.spectrum import Spectrum, cycles_per_m_at, line_energy, measure_spectrum
 from clsas.sonar.beam import BeamWindow
 from clsas.sonar.visibility import Visibility
 
@@ -47,6 +47,8 @@ class VisibilityModel:
         What is imaged.
     spectrum : Spectrum
         Of the lines, with the weight that frequencies have in the image.
+    channel_power : float64 [channels]
+        Energy of each line over the mean of all.
     highest_cycles_per_m, rms_cycles_per_m : float
         Phase per metre of range, cycles: at the band's edge, and rms about the band's centre.
     channels_along : float64 [channels, 3] or None
@@ -72,6 +74,7 @@ class VisibilityModel:
     grid: Grid
     beam: BeamWindow | None
     spectrum: Spectrum
+    channel_power: NDArray[np.float64]
     highest_cycles_per_m: float
     rms_cycles_per_m: float
     channels_along: Any
@@ -96,7 +99,8 @@ class VisibilityModel:
 
         `outside` is the share of the lines' power that may lie above `highest_cycles_per_m`.
         """
-        spectrum = measure_spectrum(lines, grid)
+        energy = line_energy(lines.samples)
+        spectrum = measure_spectrum(lines, grid, energy)
         occupied = spectrum.frequency[np.cumsum(spectrum.share) < 1 - min(outside, _MOST_OUTSIDE)]
         half_band = (occupied[-1] if len(occupied) else 0.5) / lines.range_step_m
         centre = cycles_per_m_at(lines, spectrum.centre)
@@ -113,6 +117,7 @@ class VisibilityModel:
             limits=None if beam is None else beam.limits,
             shape=shape,
             track=track,
+            channel_power=energy / max(float(energy.mean()), 1e-300) if energy.any() else 1 + energy,
         )
         if track is None:  # nothing is sampled, so that an image of one channel costs no more
             return model

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, overload
 
 import numpy as np
@@ -78,13 +78,46 @@ class Spectrum:
         """Share of the power of the lines at every distance, float64 [n]; sums to 1."""
         return self.power if self.line_power is None else self.line_power
 
+    @property
+    def bin_width(self) -> float:
+        """Distance between frequencies, cycles per sample."""
+        return float(self.frequency[1] - self.frequency[0])
 
-def measure_spectrum(lines: RangeLines, grid: Grid | None = None) -> Spectrum:
+    def shifted(self, shares: NDArray[np.float64]) -> Spectrum:
+        """Return the spectrum of lines of which parts are shifted to either side.
+
+        Its frequencies may exceed half a cycle per sample.
+
+        Parameters
+        ----------
+        shares : float64 [2 n + 1]
+            Share of the power that is shifted by -n, ..., n times `bin_width`.
+        """
+        most = len(shares) // 2
+
+        def widened(power: NDArray[np.float64]) -> NDArray[np.float64]:
+            both_sides = np.convolve(np.concatenate([power[::-1], power]) / 2, shares)
+            below, above = np.split(both_sides, 2)
+            return below[::-1] + above
+
+        more = self.frequency[-1] + self.bin_width * np.arange(1, most + 1)
+        return replace(
+            self,
+            frequency=np.concatenate([self.frequency, more]),
+            power=widened(self.power),
+            line_power=None if self.line_power is None else widened(self.line_power),
+        )
+
+
+def measure_spectrum(
+    lines: RangeLines, grid: Grid | None = None, energy: NDArray[np.float64] | None = None
+) -> Spectrum:
     """Mean power spectrum of the lines, about the middle of their occupied band.
 
     With a grid, frequencies that add up coherently in its image weigh as much as they do there.
+    `energy` is the `line_energy` of the lines, if it is known.
     """
-    frequency, power, faded = _mean_power(*_sampled_lines(lines, MEASURED_CHANNELS))
+    frequency, power, faded = _mean_power(*_sampled_lines(lines, MEASURED_CHANNELS, energy))
     centre, width, left_out = _occupied_band(frequency, faded)
     distance = _distance(frequency, centre)
     share = _histogram(distance, power)
@@ -139,6 +172,25 @@ def _occupied_band(
     return float((middle + 0.5) % 1.0 - 0.5), float(bins[first] / count), max(left_out, 0.0)
 
 
+def shares_of_bins(
+    position: NDArray[np.float64], share: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return the shares that lie at -n, ..., n, [2 n + 1]; between two of these they are divided.
+
+    Parameters
+    ----------
+    position, share : float64 [...]
+        Any positions, in bins, and the share at each.
+    """
+    most = int(np.ceil(np.abs(position).max()))
+    from_first = position.ravel() + most
+    lower = np.minimum(from_first.astype(np.int64), max(2 * most - 1, 0))
+    above = share.ravel() * (from_first - lower)
+    count = 2 * most + 1
+    found: Any = np.bincount(lower, share.ravel() - above, count)
+    return (found + np.bincount(lower + 1, above, count + 1)[:count]) / share.sum()
+
+
 def _histogram(distance: NDArray[np.float64], power: NDArray[np.float64]) -> NDArray[np.float64]:
     """Power at the `frequency` of a `Spectrum`, shared between the two nearest bins.
 
@@ -177,7 +229,7 @@ def _distance(frequency: NDArray[np.float64], centre: float) -> NDArray[np.float
 
 
 def _sampled_lines(
-    lines: RangeLines, most_channels: int
+    lines: RangeLines, most_channels: int, energy: NDArray[np.float64] | None = None
 ) -> tuple[NDArray[np.complex64], NDArray[np.float32]]:
     """Lines of channels spread evenly and of the loudest, and a factor for each.
 
@@ -186,7 +238,7 @@ def _sampled_lines(
     some = some_channels(lines.channels, most_channels)
     if len(some) == lines.channels:
         return lines.samples, np.ones(lines.channels, np.float32)
-    energy = _energy(lines.samples)
+    energy = line_energy(lines.samples) if energy is None else energy
     loudest = np.argpartition(energy, -_LOUDEST)[-_LOUDEST:]
     even = np.setdiff1d(some, loudest)
     rest, held = energy.sum() - energy[loudest].sum(), energy[even].sum()
@@ -195,8 +247,8 @@ def _sampled_lines(
     return lines.samples[np.append(even, loudest)], factor
 
 
-def _energy(samples: NDArray[np.complex64]) -> NDArray[np.float64]:
-    """Energy of every line, in another unit if squares would overflow or underflow float32."""
+def line_energy(samples: NDArray[np.complex64]) -> NDArray[np.float64]:
+    """Return the energy of every line, in another unit if squares would leave float32's range."""
     parts = samples.view(np.float32)
     with np.errstate(over="ignore"):
         energy = np.einsum("ij,ij->i", parts, parts)

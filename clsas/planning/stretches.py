@@ -1,0 +1,109 @@
+"""Stretch of lines: how much faster ranges grow for the channels than for the mean track.
+
+Where transmitter and receiver lie apart, or receivers move, the range of a channel grows along the
+line of sight by another factor than the range from the mean track. The mean of that factor is a
+constant of the image. The first stage makes up for deviations from it by turning the phase along
+each line. That shifts the band of the line, so later range filters must pass a wider band.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsas.factorized.aperture import drift, stretches
+from clsas.factorized.filters import Gain
+from clsas.planning.caching import cached
+from clsas.planning.channels import sampled_channels
+from clsas.planning.subimages import SMALL
+from clsas.planning.visibility_model import VisibilityModel
+from clsas.signal.interpolation import Interpolator
+from clsas.signal.spectrum import Spectrum, cycles_per_m_at, shares_of_bins
+
+_LEAST_BINS = 1 / 32  # of the lines' spectrum: smaller shifts widen no band; twice: the same
+_MOST_CYCLES = 8.0  # per sample, far beyond what any filter passes
+_BOUNDS = -0.5, 1.0  # of the mean stretch
+
+
+@dataclass(frozen=True, eq=False)
+class Stretch:
+    """Stretch of an image's lines, and the shifts of their band.
+
+    Attributes
+    ----------
+    mean : float
+        Mean over channels and sample points, weighted by power; 0 for channels on the mean track.
+    shares : float64 [2 n + 1] or None
+        Share of the power that is shifted by -n, ..., n bins of the lines' spectrum; None where
+        shifts are negligible.
+    """
+
+    mean: float = 0.0
+    shares: NDArray[np.float64] | None = None
+
+
+@cached
+def stretch_of(model: VisibilityModel) -> Stretch:
+    """Return the stretch of lines as seen from the sample points."""
+    channels = sampled_channels(model, SMALL)
+    if not channels.points.size:
+        return Stretch()
+    centres_m = model.points_m[channels.points]
+    virtual_m = channels.virtual_m(centres_m)
+    along = drift(model.lines)
+    found = stretches(*channels.antennas, along, model.surface.plane, centres_m, virtual_m)
+    share = channels.weight / max(channels.weight.sum(), 1e-300)
+    mean = float(np.clip(np.sum(share * found), *_BOUNDS))
+    cycles = cycles_per_m_at(model.lines, model.spectrum.centre) * model.lines.range_step_m
+    shift = np.clip((found - mean) * cycles, -_MOST_CYCLES, _MOST_CYCLES)
+    bins = shift / model.spectrum.bin_width
+    if np.abs(bins).max() < _LEAST_BINS:
+        return Stretch(mean)
+    return Stretch(mean, shares_of_bins(bins, share))
+
+
+@cached
+def aligned_spectrum(model: VisibilityModel) -> Spectrum:
+    """Return the spectrum of the lines after the first stage has turned their phases."""
+    shares = stretch_of(model).shares
+    return model.spectrum if shares is None else model.spectrum.shifted(shares)
+
+
+def uncompensated(
+    model: VisibilityModel,
+    align: Interpolator,
+    final: Interpolator,
+    stages: int,
+    ratio: float,
+    gain: Gain,
+) -> float:
+    """Return the error power of a gain that is made for lines whose band is not shifted.
+
+    The gain makes up for the mean response of all range filters; of these only the first comes
+    before the shift.
+
+    Parameters
+    ----------
+    model : VisibilityModel
+    align, final : Interpolator
+    stages : int
+    ratio : float
+        Upsampled samples per sample.
+    gain : callable
+        As of `clsas.factorized.filters.edges_gain`.
+    """
+    shares, spectrum = stretch_of(model).shares, model.spectrum
+    if shares is None:
+        return 0.0
+    before = np.concatenate([-spectrum.frequency[::-1], spectrum.frequency])
+    most = len(shares) // 2
+    step = spectrum.bin_width
+    wide = np.concatenate([before[0] - step * np.arange(most, 0, -1), before])
+    wide = np.concatenate([wide, before[-1] + step * np.arange(1, most + 1)])
+    after = align.response(wide / ratio) ** (stages - 1) * final.response(wide / ratio)
+    shifted = np.lib.stride_tricks.sliding_window_view(after, len(shares))
+    of_all = (gain(np.abs(before)) * align.response(before / ratio))[:, None] * shifted
+    power = np.concatenate([spectrum.power[::-1], spectrum.power]) / 2
+    return float(power @ (of_all - 1) ** 2 @ shares)
