@@ -293,8 +293,9 @@ class Geometry:
         self, roots: NDArray[np.int64], root_m: NDArray[np.float64]
     ) -> NDArray[np.float64]:
         """Return the largest phase rates of subimages in some roots: see `cycles_per_extent`."""
-        boxes = self._boxes(roots, root_m)
-        return cycles_per_extent(self.track, *boxes, self.factorization.limits, self.along)
+        # On dense apertures virtual channels that no beam points at are formed, and used, too.
+        limits = None if self.track.is_dense else self.factorization.limits
+        return cycles_per_extent(self.track, *self._boxes(roots, root_m), limits, self.along)
 
     def sheet_rates(self, roots: NDArray[np.int64], root_m: NDArray[np.float64]) -> SheetRates:
         """Return the largest phase rates of subimages in some roots, along and across a sheet."""

@@ -147,9 +147,9 @@ def _some_of(
     if len(candidates) <= SAMPLED_CHANNELS:
         return candidates, power[candidates]
     error = track_error_m(model)[candidates] ** 2 * power[candidates]
-    by_error = candidates[np.argsort(error, kind="stable")]
-    others, worst = np.split(by_error, [-_WORST_CHANNELS])
-    others.sort()
+    is_worst = np.zeros(len(candidates), bool)
+    is_worst[np.argpartition(error, -_WORST_CHANNELS)[-_WORST_CHANNELS:]] = True
+    others, worst = candidates[~is_worst], candidates[is_worst]
     some = others[some_channels(len(others), SAMPLED_CHANNELS - _WORST_CHANNELS)]
     scale = power[others].sum() / max(power[some].sum(), 1e-300)
     return np.concatenate([some, worst]), np.concatenate([scale * power[some], power[worst]])

@@ -21,7 +21,13 @@ from clsas.opencl.device import Device
 from clsas.planning.caching import cached
 from clsas.planning.channels import SampledChannels, sampled_channels
 from clsas.planning.sample_pixels import mean_over_relief, pixels_m
-from clsas.planning.spacing_errors import bias_error, filter_error, spacing_error
+from clsas.planning.spacing_errors import (
+    SpacedStage,
+    Stages,
+    bias_error,
+    filter_error,
+    spacing_error,
+)
 from clsas.planning.stretches import stretch_of
 from clsas.planning.subimages import Side
 from clsas.planning.visibility_model import VisibilityModel
@@ -65,17 +71,28 @@ def other_errors(
     device: Device,
 ) -> Errors:
     """Return the errors of a tree; `model` is that within its roots, whose error is known."""
-    last = len(sides) - 1
-    stages = [
-        (side, aperture, denser, beam_cycles if level == last else 0.0)
-        for level, (side, denser) in enumerate(zip(sides, oversampling, strict=True))
-    ]
-    filters = sum(filter_error(model, *stage) for stage in stages)
+    stages = spaced_stages(sides, aperture, oversampling, beam_cycles)
+    each_stage = [stages[: level + 1] for level in range(len(stages))]
+    filters = sum(filter_error(model, to) for to in each_stage)
     return Errors(
         aperture=filters + bias_error(model, stages),
         roots=roots,
-        spacing=tuple(spacing_error(model, *stage) for stage in stages),
+        spacing=tuple(spacing_error(model, to) for to in each_stage),
         leaves=float(leaf_error(model, np.array([sides[-1]]), device)[0]),
+    )
+
+
+def spaced_stages(
+    sides: Sequence[Side],
+    aperture: Interpolator,
+    oversampling: tuple[float, ...],
+    beam_cycles: float | None,
+) -> Stages:
+    """Return the stages of a tree; only the last one's virtual channels follow the beam."""
+    last = len(sides) - 1
+    return tuple(
+        SpacedStage(side, aperture, denser, beam_cycles if level == last else 0.0)
+        for level, (side, denser) in enumerate(zip(sides, oversampling, strict=True))
     )
 
 

@@ -19,7 +19,7 @@ from clsas.factorized.plan import Plan
 from clsas.opencl import phases
 from clsas.planning.beam_coverage import trimmed
 from clsas.planning.channels import frequencies
-from clsas.planning.errors import Errors, other_errors, root_error
+from clsas.planning.errors import Errors, other_errors, root_error, spaced_stages
 from clsas.planning.prediction import (
     OUTSIDE,
     Candidate,
@@ -299,9 +299,9 @@ def _more_accurate(problem: _Problem, trial: _Trial, errors: Errors, found: Plan
     beam_cycles = trial.beam_cycles
     if excess[-1] and beam_cycles > 0:
         within = problem.model.within(found.sides[0])
-        without_beam = spacing_error(
-            within, last, found.factorization.aperture.filter, trial.oversampling[-1], None
-        )
+        aperture = found.factorization.aperture.filter
+        stages = spaced_stages(found.sides, aperture, trial.oversampling, None)
+        without_beam = spacing_error(within, stages)
         if 2 * without_beam < errors.spacing[-1]:  # most of it is the beam's
             if beam_cycles >= _MOST_BEAM_CYCLES:
                 return None  # no virtual channels follow a step

@@ -195,11 +195,12 @@ def exact_plan(model: VisibilityModel, conditions: Conditions, reason: str) -> P
 def margin_db(model: VisibilityModel) -> float:
     """Return the margin of predicted errors, dB, which covers the scatter of measured ones.
 
-    Errors scatter more if few channels see a pixel: they depend on the positions of these between
-    virtual channels, and relative to a step of the beam. They also scatter more if the lines'
-    power lies at few frequencies.
+    Errors scatter more if few channels see a pixel, or a few hold most of the power: they depend on
+    the positions of these between virtual channels, and relative to a step of the beam. They also
+    scatter more if the lines' power lies at few frequencies.
     """
-    channels = model.lines.channels * model.visible_share((16, 16))
+    power = model.channel_power
+    channels = power.sum() ** 2 / (power @ power) * model.visible_share((16, 16))
     few = _FEW_CHANNELS[model.beam is not None and model.beam.jumps]
     return MARGIN_DB + in_db(model.spectrum.scatter * (1 + few / max(channels, 1.0)))
 

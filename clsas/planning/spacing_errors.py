@@ -21,7 +21,7 @@ from clsas.core.lines import wavelength_m
 from clsas.factorized.beam_directions import interpolated_directions
 from clsas.factorized.dense_channels import strip_channels
 from clsas.factorized.tracks import MeanTrack
-from clsas.factorized.tree import interpolated_channels
+from clsas.factorized.tree import VirtualChannels, interpolated_channels
 from clsas.planning import phase_rates
 from clsas.planning.caching import cached
 from clsas.planning.channels import carriers
@@ -33,26 +33,22 @@ from clsas.signal.interpolation import Interpolator
 _Pixels = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]
 
 _PLACES_OF_STRIP = 16  # more, for each strip after the first
+# Corners of roots in which subimages are sampled, by row and column of the sample points: at the
+# edges of the grid those that lie inside.
+_CORNERS = np.stack(np.meshgrid((1, -1, 1, 1, -1), (1, -1, -1, 1, -1), indexing="ij"), axis=-1)
 _SAMPLED_PLACES = 96  # along the visible aperture; half as many move the error by 3 dB at most
 
 
-@cached
-def spacing_error(
-    model: VisibilityModel,
-    side: Side,
-    aperture: Interpolator,
-    oversampling: float,
-    beam_cycles: float | None,
-) -> float:
-    """Error power that uneven spacing adds to that of the aperture's filter, for one stage.
+@dataclass(frozen=True)
+class SpacedStage:
+    """A stage, as far as its virtual channels depend on it.
 
-    Parameters
+    Attributes
     ----------
-    model : VisibilityModel
-        Within roots of the candidate's size.
     side : (rows, columns)
-        Size of the stage's subimages.
+        Size of its subimages.
     aperture : Interpolator
+        Filter along the aperture.
     oversampling : float
         Density of virtual channels over that which the filter asks for.
     beam_cycles : float or None
@@ -60,35 +56,46 @@ def spacing_error(
         weighted by the beam.
     """
 
+    side: Side
+    aperture: Interpolator
+    oversampling: float
+    beam_cycles: float | None
+
+
+Stages = tuple[SpacedStage, ...]
+"""A stage, the last, and those before it."""
+
+
+@cached
+def spacing_error(model: VisibilityModel, stages: Stages) -> float:
+    """Error power that uneven spacing adds to that of the aperture's filter, in the last stage.
+
+    `model` is that within roots of the candidate's size.
+    """
+
     def excess(error: float) -> float:
-        return max(error - power(aperture.error_db), 0.0)
+        return max(error - power(stages[-1].aperture.error_db), 0.0)
 
-    return _over_places(model, side, aperture, oversampling, beam_cycles, excess)
+    return _over_places(model, stages, excess)
 
 
-def filter_error(
-    model: VisibilityModel,
-    side: Side,
-    aperture: Interpolator,
-    oversampling: float,
-    beam_cycles: float | None,
-) -> float:
-    """Error power of the aperture's filter itself, for one stage: see `spacing_error`.
+def filter_error(model: VisibilityModel, stages: Stages) -> float:
+    """Error power of the aperture's filter itself, in the last stage: see `spacing_error`.
 
     On a sheet virtual channels are as dense everywhere as the largest phase rate of any line along
     it and across it asks for. Elsewhere the filter errs by less than at its worst.
     """
-    worst = power(aperture.error_db)
+    worst = power(stages[-1].aperture.error_db)
     if not model.track.is_sheet:
         return worst
 
     def least(error: float) -> float:
         return min(error, worst)
 
-    return _over_places(model, side, aperture, oversampling, beam_cycles, least)
+    return _over_places(model, stages, least)
 
 
-def bias_error(model: VisibilityModel, stages: Sequence[Stage]) -> float:
+def bias_error(model: VisibilityModel, stages: Stages) -> float:
     """Error power by which biases of interpolations on a sheet add up beyond their own powers.
 
     Filters of few taps attenuate steering functions by a mean that all interpolations, along and
@@ -96,30 +103,26 @@ def bias_error(model: VisibilityModel, stages: Sequence[Stage]) -> float:
     """
     if not model.track.is_sheet:
         return 0.0
-    biases = np.array([_bias(model, places, stage) for stage in stages for places in _DIMENSIONS])
+    each_stage = [stages[: level + 1] for level in range(len(stages))]
+    biases = np.array([_bias(model, places, to) for to in each_stage for places in _DIMENSIONS])
     return float(max(biases.sum() ** 2 - biases @ biases, 0.0))
 
 
-def _bias(model: VisibilityModel, places: tuple[_Place, ...], stage: Stage) -> float:
-    extents = tuple(model.surface.extents(stage[0]))
-    return float(np.mean([_interpolated(model, each, *stage, extents).bias for each in places]))
+def _bias(model: VisibilityModel, places: tuple[_Place, ...], stages: Stages) -> float:
+    extents = tuple(model.surface.extents(stages[-1].side))
+    return float(np.mean([_interpolated(model, each, stages, extents).bias for each in places]))
 
 
 def _over_places(
-    model: VisibilityModel,
-    side: Side,
-    aperture: Interpolator,
-    oversampling: float,
-    beam_cycles: float | None,
-    part: Callable[[float], float],
+    model: VisibilityModel, stages: Stages, part: Callable[[float], float]
 ) -> float:
     """Return a part of the error of interpolating along the track, or along and across a sheet."""
 
     def error(place: _Place, extents: NDArray[np.float64]) -> float:
-        given = place, side, aperture, oversampling, beam_cycles, tuple(extents)
-        return part(_interpolated(model, *given).error)
+        return part(_interpolated(model, place, stages, tuple(extents)).error)
 
     def mean(places: tuple[_Place, ...]) -> float:
+        side = stages[-1].side
         found = [mean_over_relief(model, side, functools.partial(error, each)) for each in places]
         return sum(found) / len(found)
 
@@ -134,10 +137,6 @@ _TRACK: _Place = ("track", 0.0)
 _LINES_ALONG: tuple[_Place, ...] = (("along", 0.25),)
 _LINES_ACROSS: tuple[_Place, ...] = (("across", 0.2), ("across", 0.7))
 _DIMENSIONS = (_LINES_ALONG, _LINES_ACROSS)
-
-Stage = tuple[Side, Interpolator, float, float | None]
-"""What `spacing_error` takes of a stage, beside the model."""
-
 
 class _Interpolated(NamedTuple):
     """Steering functions between virtual channels: their error power, and their mean error."""
@@ -169,6 +168,16 @@ class _Line:
     along: NDArray[np.float64] | None
     beam_rates: Any
 
+    def past_ends(self, coordinate: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Return which aperture coordinates lie past the ends of the curve, or of their strip."""
+        strip = self.track.strip_of(self.channels)
+        first, last = (
+            np.searchsorted(strip, np.arange(self.track.strips), side) for side in ("left", "right")
+        )
+        of_strip = self.track.strip_of(coordinate)
+        past: NDArray[np.bool_] = coordinate < self.channels[first][of_strip]
+        return past | (coordinate > self.channels[last - 1][of_strip])
+
 
 @cached
 def _line(model: VisibilityModel, place: _Place) -> _Line:
@@ -199,28 +208,19 @@ def _line(model: VisibilityModel, place: _Place) -> _Line:
 
 @cached
 def _interpolated(
-    model: VisibilityModel,
-    line_at: _Place,
-    side: Side,
-    aperture: Interpolator,
-    oversampling: float,
-    beam_cycles: float | None,
-    extents: tuple[float, ...],
+    model: VisibilityModel, line_at: _Place, stages: Stages, extents: tuple[float, ...]
 ) -> _Interpolated:
-    """Errors of interpolated steering functions of subimages of some extents.
+    """Errors of interpolated steering functions of the last stage's subimages of some extents.
 
     The error is 1, as large as the image, if no beam touches a subimage.
     """
-    weighted = model.beam is not None and beam_cycles is not None
+    weighted = model.beam is not None and stages[-1].beam_cycles is not None
     line = _line(model, line_at)
-    samples = _samples(model, line_at, side, weighted, extents)
+    samples = _samples(model, line_at, stages[-1].side, weighted, extents)
     if samples is None:
         return _Interpolated(1.0, 0.0)
-    rates = oversampling * np.tensordot(extents, line.rates[:, samples.points], 1)
-    if weighted:
-        rates = rates + beam_cycles * line.beam_rates[samples.points]
-    interpolated = strip_channels if line.track.others else interpolated_channels
-    nodes = interpolated(line.track, rates, samples.coordinate, aperture)
+    at = _with_ends(model, line, samples, stages[:-1])
+    nodes = _virtual_channels(line, samples.points, stages[-1], extents, at.coordinate)
     of_nodes = _steering(model, line, samples.pixels, weighted, nodes.coordinate)
     # One sparse matrix interpolates at all aperture coordinates of all subimages.
     index = nodes.base[..., None] + np.arange(nodes.taps)
@@ -229,13 +229,74 @@ def _interpolated(
     rows = np.arange(0, weights.size + 1, nodes.taps)
     of_nodes = of_nodes.reshape(-1, of_nodes.shape[-1])
     interpolate = csr_array((weights, index.ravel(), rows), shape=(len(rows) - 1, len(of_nodes)))
-    wrong = (interpolate @ of_nodes).reshape(samples.exact.shape) - samples.exact
-    error, bias, total = (
-        samples.count @ np.einsum("nsp,nsp->n", *each, dtype=np.float64)
-        for each in ((wrong, wrong), (wrong, samples.exact), (samples.exact, samples.exact))
+    exact = samples.exact
+    if len(stages) > 1:
+        exact = _steering(model, line, samples.pixels, weighted, at.coordinate)
+    wrong = (interpolate @ of_nodes).reshape(exact.shape) - exact
+    error, bias = (
+        samples.count @ np.einsum("ns,nsp,nsp->n", at.share, *each, dtype=np.float64)
+        for each in ((wrong, wrong), (wrong, exact))
     )
+    total = samples.count @ np.einsum("nsp,nsp->n", samples.exact, samples.exact, dtype=np.float64)
     total = max(total, 1e-30)
     return _Interpolated(float(error / total), float(bias / total))
+
+
+def _virtual_channels(
+    line: _Line,
+    points: NDArray[np.int64],
+    stage: SpacedStage,
+    extents: Sequence[float],
+    coordinate: NDArray[np.float64],
+) -> VirtualChannels:
+    """Return a stage's virtual channels for channels at aperture coordinates, [n, places]."""
+    rates = stage.oversampling * np.tensordot(extents, line.rates[:, points], 1)
+    if stage.beam_cycles:
+        rates = rates + stage.beam_cycles * line.beam_rates[points]
+    interpolated = strip_channels if line.track.others else interpolated_channels
+    return interpolated(line.track, rates, coordinate, stage.aperture)
+
+
+@dataclass(frozen=True, eq=False)
+class _Places:
+    """Places along the aperture from which a stage interpolates, [n, places] each.
+
+    Attributes
+    ----------
+    coordinate : float64
+        Aperture coordinates, ascending.
+    share : float64
+        Power, in units of a sampled channel.
+    """
+
+    coordinate: NDArray[np.float64]
+    share: NDArray[np.float64]
+
+
+def _with_ends(
+    model: VisibilityModel, line: _Line, samples: _Samples, before: Stages
+) -> _Places:
+    """Return sampled channels, and the virtual channels past the aperture's ends of stages before.
+
+    Filters extend past the ends, farther with every stage. What virtual channels hold there must be
+    interpolated too, though it may lie where phases turn faster than they do on the track.
+    """
+    of_channels = samples.coordinate
+    at = _Places(of_channels, np.ones(of_channels.shape))
+    for stage in before:
+        extents = model.extents(stage.side)
+        nodes = _virtual_channels(line, samples.points, stage, tuple(extents), at.coordinate)
+        index = nodes.base[..., None] + np.arange(nodes.taps)
+        index += nodes.coordinate.shape[1] * np.arange(len(index))[:, None, None]
+        share = at.share[..., None] * nodes.weights**2
+        held = np.bincount(index.ravel(), share.ravel(), nodes.coordinate.size)
+        held = held.reshape(nodes.coordinate.shape) * line.past_ends(nodes.coordinate)
+        some = held.any(axis=0)
+        coordinate = np.concatenate([of_channels, nodes.coordinate[:, some]], axis=1)
+        share = np.concatenate([np.ones(of_channels.shape), held[:, some]], axis=1)
+        order = np.argsort(coordinate, axis=1, kind="stable")
+        at = _Places(*(np.take_along_axis(each, order, axis=1) for each in (coordinate, share)))
+    return at
 
 
 @dataclass(frozen=True, eq=False)
@@ -297,8 +358,23 @@ def _samples(
     found = [pixels_m(model, np.array(extents), point) for point in points.tolist()]
     offsets_m = np.stack([each_m for each_m, _ in found])
     chosen = np.stack([cycles_per_m[(share * SAMPLED_PIXELS).astype(int)] for _, share in found])
-    pixels = model.points_m[points], offsets_m, chosen
+    centres_m = model.points_m[points] + _within_roots_m(model, extents)[points]
+    pixels = centres_m, offsets_m, chosen
     return _Samples(points, count, place, pixels, _steering(model, line, pixels, weighted, place))
+
+
+def _within_roots_m(
+    model: VisibilityModel, extents: tuple[float, ...]
+) -> NDArray[np.float64]:
+    """Return where in roots about the sample points subimages are sampled, [points, 3].
+
+    Phases turn fastest in a corner, for which the spacing is made. Where a beam selects channels
+    they are those of the sample point itself.
+    """
+    if model.root is None or not (model.limits is None or model.track.is_dense):
+        return np.zeros((len(model.points_m), 3))
+    spare = np.maximum(model.extents(model.root, most=True) - extents, 0.0)[:2]
+    return (_CORNERS.reshape(-1, 2) * spare / 2) @ model.surface.steps_m[:2]
 
 
 def _visible_channels(

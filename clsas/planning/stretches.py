@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from clsas.factorized.aperture import drift, stretches
 from clsas.factorized.filters import Gain
-from clsas.planning.caching import cached
 from clsas.planning.channels import sampled_channels
 from clsas.planning.subimages import SMALL
 from clsas.planning.visibility_model import VisibilityModel
@@ -44,9 +43,13 @@ class Stretch:
     shares: NDArray[np.float64] | None = None
 
 
-@cached
 def stretch_of(model: VisibilityModel) -> Stretch:
-    """Return the stretch of lines as seen from the sample points."""
+    """Return the stretch of lines as seen from the sample points, whatever the roots."""
+    found: Stretch = model.from_cache(("stretch", model.limits), lambda: _stretch_of(model))
+    return found
+
+
+def _stretch_of(model: VisibilityModel) -> Stretch:
     channels = sampled_channels(model, SMALL)
     if not channels.points.size:
         return Stretch()
@@ -64,7 +67,6 @@ def stretch_of(model: VisibilityModel) -> Stretch:
     return Stretch(mean, shares_of_bins(bins, share))
 
 
-@cached
 def aligned_spectrum(model: VisibilityModel) -> Spectrum:
     """Return the spectrum of the lines after the first stage has turned their phases."""
     shares = stretch_of(model).shares
