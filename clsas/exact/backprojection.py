@@ -13,12 +13,12 @@ from clsas.exact.decision import decide
 from clsas.exact.preparation import Preparation
 from clsas.exact.run import execute
 from clsas.opencl.device import Device, open_device
-from clsas.signal.ambiguity import ambiguity
+from clsas.signal.ambiguity import BEST_DB, ambiguity
 from clsas.signal.spectrum import measure_spectrum
 from clsas.sonar.beam import BeamWindow
 from clsas.sonar.simplify import simplify
 
-BEST_ACCURACY_DB = -85.0
+BEST_ACCURACY_DB = BEST_DB
 """The best accuracy that may be asked for; float32 allows no better."""
 ACCURACY_DB = -60.0
 """The accuracy of exact images by default."""

@@ -86,6 +86,7 @@ def decide(
         Of estimated groups, in which they look samples up: see `Groups.windows`.
     """
     fixed = taps is not None and upsampling is not None
+    accuracy_db = left_open.of_passed_db(accuracy_db)
     geometry_error = GEOMETRY_ERROR if fixed else allowed(accuracy_db)
     phase_terms = phases.TERMS[-1]
     if not fixed:

@@ -71,7 +71,8 @@ class Preparation:
     @property
     def predicted_error_db(self) -> float:
         """Relative rms error, dB, of interpolation, ambiguous lines and effects left out."""
-        error = power(self.interpolator.error_db) + self.ambiguity.error_power
+        of_passed = power(self.interpolator.error_db)
+        error = of_passed / self.ambiguity.brightness + self.ambiguity.error_power
         return in_db(error + self.left_out_error)
 
     def warn_of_ambiguity(self) -> None:

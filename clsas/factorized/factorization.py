@@ -22,6 +22,7 @@ from clsas.factorized.fields import (
 )
 from clsas.factorized.interpolated import InterpolatedAperture
 from clsas.factorized.thesis import NearestBeams
+from clsas.opencl.phases import TERMS
 from clsas.signal.interpolation import PHASES
 
 
@@ -82,6 +83,8 @@ class Factorization:
         With a beam: sines of the aspect angle between which its weights matter.
     roots_at_once, roots_prepared : int
         Roots that are formed together, and whose geometry is prepared together.
+    phase_terms : int
+        Terms of the polynomials for sine and cosine of pixels' phases.
     stretch : float
         By how much faster ranges grow along the line of sight than those from the mean track,
         relative to these; the mean over all channels.
@@ -102,6 +105,7 @@ class Factorization:
     limits: tuple[Annotated[float, Field(ge=-3.0, lt=math.inf)], Number] | None
     roots_at_once: Whole
     roots_prepared: Whole
+    phase_terms: Annotated[int, Field(ge=TERMS[0], le=TERMS[-1])] = TERMS[-1]
     stretch: Annotated[float, Field(ge=-0.5, le=1.0)] = 0.0
     method: Literal["factorized"] = "factorized"
 

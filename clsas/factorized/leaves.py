@@ -61,7 +61,7 @@ class Leaves:
         self.arguments: dict[str, Any] = {
             "cycles_per_sample": geometry.cycles_per_m / geometry.samples_per_m,
             "filter": filter_table(device, geometry.factorization.final.coefficients / gain),
-            "phase_polynomials": phase_polynomials(device, geometry.plan.phase_terms),
+            "phase_polynomials": phase_polynomials(device, geometry.factorization.phase_terms),
             "line_pitch": level.pitch,
             **self.beam.arguments,
         }
@@ -97,7 +97,7 @@ class Leaves:
             "OVERWRITE": 1,
             "ALIGNED": int(self.aligned),
             "HALF": int(self.half_precision),
-            "PHASE_TERMS": chosen.phase_terms,
+            "PHASE_TERMS": self.factorization.phase_terms,
         } | lookup_options(self.device, layout, self.lines, self.geometry.samples_per_m, taps)
 
     def fill(self, slot: Slot, sector: Sector) -> None:

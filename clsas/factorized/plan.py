@@ -28,7 +28,6 @@ from clsas.factorized.fields import (
     StoredWork,
     explained,
 )
-from clsas.opencl import phases
 from clsas.sonar.simplify import EFFECTS
 
 VERSION = 4
@@ -216,12 +215,6 @@ class Plan:
     def errors(self) -> ErrorBudget:
         """Contributions to the predicted error."""
         return self.prediction.errors
-
-    @property
-    def phase_terms(self) -> int:
-        """Terms of the polynomials for sine and cosine of pixels' phases."""
-        error_db = self.predicted_error_db if self.tolerance_db is None else self.tolerance_db
-        return phases.terms_within(error_db, phases.FACTORIZED_SHARE)
 
     def __repr__(self) -> str:
         """Return the request, the prediction and the sides of the subimages."""

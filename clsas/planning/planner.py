@@ -160,10 +160,11 @@ def plan(
     model = VisibilityModel.of(
         scene.lines, scene.grid, scene.beam, OUTSIDE * power(tolerance_db or 0.0)
     )
-    rest_db = tolerance_db
+    rest_db = of_passed_db = tolerance_db
     if tolerance_db is not None:
         model.ambiguity.warn("tolerance_db", tolerance_db)
         rest_db = model.ambiguity.rest_db(tolerance_db, scene.error)
+        of_passed_db = model.ambiguity.of_passed_db(rest_db)
     exact = expect(model, ACCURACY_DB if rest_db is None else rest_db - MARGIN_DB, device)
     # Exact imaging divides itself to fit a device.
     exact_fits = memory_bytes is None or exact.memory_bytes <= memory_bytes
@@ -171,10 +172,13 @@ def plan(
     if searched and known.source == "default":
         known = scaling.scaled(device)
     room = device.info.memory_bytes // 2 if memory_bytes is None else memory_bytes
-    conditions = Conditions(rest_db, exact, device.for_stages(), known.costs, room)
+    conditions = Conditions(of_passed_db, exact, device.for_stages(), known.costs, room)
     found = _chosen(model, stages, conditions, exact_fits, allowed)
+    errors = found.errors
+    if not found.is_exact:
+        errors = errors.times(1 / model.ambiguity.brightness)
     errors = replace(
-        found.errors,
+        errors,
         line_ends=model.ambiguity.ends,
         aliasing=model.ambiguity.aliasing,
         left_out=scene.error,

@@ -138,7 +138,9 @@ def predicted_plan(
     )
     channels = candidate.aperture.predicted_channels(AperturePhases(model), sides)
     levels = [Level.of(half, device.info.width) for half in half_lengths]
-    errors, half_precision = _with_arithmetic(model, candidate, lines, channels, conditions)
+    errors, phase_terms, half_precision = _with_arithmetic(
+        model, candidate, lines, channels, conditions
+    )
     stages, work = _stages(
         model, candidate, lines, levels, channels, conditions, half_precision=half_precision
     )
@@ -175,6 +177,7 @@ def predicted_plan(
         most_channels=sizes.most_channels,
         highest_cycles_per_m=model.highest_cycles_per_m,
         closest_m=model.nearest_m,
+        phase_terms=phase_terms,
         stretch=stretch_of(model).mean if candidate.aperture.aligns_phases else 0.0,
         limits=model.limits,
         roots_at_once=batches.at_once,
@@ -374,23 +377,26 @@ def _with_arithmetic(
     lines: _Lines,
     channels: Sequence[StageChannels],
     conditions: Conditions,
-) -> tuple[ErrorBudget, bool]:
-    """Add the errors of polynomials and rounding; return whether lines have half precision."""
+) -> tuple[ErrorBudget, int, bool]:
+    """Add the errors of polynomials and rounding.
+
+    Return also how many terms polynomials have, and whether lines have half precision.
+    """
     tolerance_db, errors = conditions.tolerance_db, lines.errors
     if tolerance_db is None:
-        return errors, False
+        return errors, phases.terms_within(errors.total_db, phases.FACTORIZED_SHARE), False
     terms = phases.terms_within(tolerance_db, phases.FACTORIZED_SHARE)
     errors = replace(errors, phases=phases.error(terms) ** 2)
     if lines.upsampler is None or not conditions.device.info.half_precision:
-        return errors, False
+        return errors, terms, False
     if _looked_up_singly(model, candidate, lines, conditions.device):
-        return errors, False
+        return errors, terms, False
     # Each row of a sheet is read and written for about twice as many bands as it has taps.
     bands = 2 * candidate.aperture.filter.taps if candidate.aperture.dimensions == 2 else 0
     rounding = _half_rounding(model, [stage.summed for stage in channels], bands)
     if rounding > _ROUNDING_SHARE * power(tolerance_db):
-        return errors, False
-    return replace(errors, half_precision=rounding), True
+        return errors, terms, False
+    return replace(errors, half_precision=rounding), terms, True
 
 
 def _looked_up_singly(

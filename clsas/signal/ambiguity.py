@@ -17,10 +17,15 @@ from clsas.core.decibels import in_db, power
 from clsas.core.geometry import pairwise_range_m
 from clsas.core.grid import Grid
 from clsas.core.lines import RangeLines, some_channels
+from clsas.signal.brightness import brightness
 from clsas.signal.spectrum import NEEDED_OVERSAMPLING, Spectrum
 from clsas.sonar.beam import BeamWindow
 from clsas.sonar.visibility import sines
 
+BEST_DB = -85.0
+"""Least relative rms error that single precision leaves of an image."""
+
+_CLOSE_DB = 0.5  # of an error that just cannot be reached
 _AT_END = 0.03  # error near an end over its power; measured on noise in 40 to 90 % of the band
 _END = 4  # samples whose mean power is that of an end: the taps on one side of a filter
 _NEAR_END = 5  # samples around an end within which interpolators differ: half of 8 taps, and one
@@ -45,16 +50,26 @@ class Ambiguity:
         From edges of the band that alias, if it fills the whole sampled band.
     oversampling : float
         Sample rate over the width of the occupied band.
+    brightness : float
+        Power of the image over that of what its beam passes: see `clsas.signal.brightness`.
     """
 
     ends: float = 0.0
     aliasing: float = 0.0
     oversampling: float = np.inf
+    brightness: float = 1.0
 
     @property
     def error_power(self) -> float:
         """Total relative error power."""
         return self.ends + self.aliasing
+
+    def of_passed_db(self, requested_db: float) -> float:
+        """Return an error relative to what the beam passes that keeps `requested_db` of the image.
+
+        It is never below `BEST_DB`, for which `warn` warns.
+        """
+        return max(requested_db + in_db(self.brightness), min(requested_db, BEST_DB))
 
     def rest_db(self, requested_db: float, other_error: float = 0.0) -> float:
         """Error left for all other causes, dB, so that the whole image keeps `requested_db`.
@@ -75,6 +90,14 @@ class Ambiguity:
             found_db = in_db(allowed + error_power)
             return f"the error may be {found_db:.0f} dB in place of {name} {requested_db:.3g} dB"
 
+        if requested_db + in_db(self.brightness) < BEST_DB - _CLOSE_DB:
+            dark_db = -in_db(self.brightness)
+            validate.warn(
+                f"the image is {dark_db:.0f} dB darker than what the beam passes, since most echoes "
+                "come from where the beam hardly covers the grid: the error may be "
+                f"{BEST_DB + dark_db:.0f} dB in place of {name} {requested_db:.3g} dB; use a wider "
+                "beam, or a grid that it covers"
+            )
         if self.ends > _MOST * allowed:
             validate.warn(
                 "lines do not fade towards ends that the grid reaches, or their guard band is thin "
@@ -103,8 +126,12 @@ def ambiguity(
 
     `along` holds the track's unit directions for a beam, [channels, 3].
     """
-    ends = ends_error(lines, grid, spectrum, beam, along)
-    return Ambiguity(ends, spectrum.aliasing, spectrum.oversampling)
+    return Ambiguity(
+        ends_error(lines, grid, spectrum, beam, along),
+        spectrum.aliasing,
+        spectrum.oversampling,
+        brightness(lines, grid, spectrum, beam, along),
+    )
 
 
 def ends_error(
