@@ -113,9 +113,7 @@ def _bias(model: VisibilityModel, places: tuple[_Place, ...], stages: Stages) ->
     return float(np.mean([_interpolated(model, each, stages, extents).bias for each in places]))
 
 
-def _over_places(
-    model: VisibilityModel, stages: Stages, part: Callable[[float], float]
-) -> float:
+def _over_places(model: VisibilityModel, stages: Stages, part: Callable[[float], float]) -> float:
     """Return a part of the error of interpolating along the track, or along and across a sheet."""
 
     def error(place: _Place, extents: NDArray[np.float64]) -> float:
@@ -137,6 +135,7 @@ _TRACK: _Place = ("track", 0.0)
 _LINES_ALONG: tuple[_Place, ...] = (("along", 0.25),)
 _LINES_ACROSS: tuple[_Place, ...] = (("across", 0.2), ("across", 0.7))
 _DIMENSIONS = (_LINES_ALONG, _LINES_ACROSS)
+
 
 class _Interpolated(NamedTuple):
     """Steering functions between virtual channels: their error power, and their mean error."""
@@ -273,9 +272,7 @@ class _Places:
     share: NDArray[np.float64]
 
 
-def _with_ends(
-    model: VisibilityModel, line: _Line, samples: _Samples, before: Stages
-) -> _Places:
+def _with_ends(model: VisibilityModel, line: _Line, samples: _Samples, before: Stages) -> _Places:
     """Return sampled channels, and the virtual channels past the aperture's ends of stages before.
 
     Filters extend past the ends, farther with every stage. What virtual channels hold there must be
@@ -363,9 +360,7 @@ def _samples(
     return _Samples(points, count, place, pixels, _steering(model, line, pixels, weighted, place))
 
 
-def _within_roots_m(
-    model: VisibilityModel, extents: tuple[float, ...]
-) -> NDArray[np.float64]:
+def _within_roots_m(model: VisibilityModel, extents: tuple[float, ...]) -> NDArray[np.float64]:
     """Return where in roots about the sample points subimages are sampled, [points, 3].
 
     Phases turn fastest in a corner, for which the spacing is made. Where a beam selects channels

@@ -117,7 +117,9 @@ class VisibilityModel:
             limits=None if beam is None else beam.limits,
             shape=shape,
             track=track,
-            channel_power=energy / max(float(energy.mean()), 1e-300) if energy.any() else 1 + energy,
+            channel_power=energy / max(float(energy.mean()), 1e-300)
+            if energy.any()
+            else 1 + energy,
         )
         if track is None:  # nothing is sampled, so that an image of one channel costs no more
             return model

@@ -87,7 +87,9 @@ def _of_groups(
     turns = spectrum.centre * between
     line = np.arange(len(channels))
     values = (1 - between) * part.samples[line, index]
-    values = values + between * part.samples[line, index + 1] * np.exp(-2j * np.pi * spectrum.centre)
+    values = values + between * part.samples[line, index + 1] * np.exp(
+        -2j * np.pi * spectrum.centre
+    )
     turns += part.carrier_cycles_per_m * range_m
     values *= np.exp(2j * np.pi * (turns - np.rint(turns)))
     values *= inside * _weights(lines, channels, points_m, beam, along)

@@ -1,0 +1,130 @@
+"""Factorized images of scenes whose bands, motions, channels or coverage are uneven."""
+
+import numpy as np
+import pytest
+from cases import along_x, lines_over
+from factorizing import EXACT_IS_SLOW, around, over
+
+from clsas import plan
+from clsas.core.grid import Grid
+from clsas.core.image_error import relative_error_db
+from clsas.core.lines import RangeLines
+from clsas.core.validate import ClsasWarning
+from clsas.exact.backprojection import backproject
+from clsas.planning.factorize import factorize
+from clsas.sonar.beam import BeamWindow
+
+pytestmark = pytest.mark.slow
+
+TRACK = along_x(300, 0.04)
+GRID = around(0, 43, pixel_m=(0.02, 0.02), z=-15)
+
+
+def assert_kept(lines, grid, tolerance_db, beam=None, *, factorized=True):
+    """The image keeps the tolerance, and its prediction."""
+    exact = backproject(lines, grid, accuracy_db=-75, beam=beam)
+    chosen = plan(lines, grid, tolerance_db=tolerance_db, beam=beam, costs=EXACT_IS_SLOW)
+    assert chosen.is_exact != factorized
+    error_db = relative_error_db(factorize(lines, grid, chosen), exact)
+    assert error_db <= chosen.predicted_error_db <= tolerance_db
+
+
+@pytest.mark.parametrize("tolerance_db", [-20, -40])
+@pytest.mark.parametrize("band", [0.005, 0.02, 0.2])
+def test_narrow_bands_of_receivers_apart_from_the_transmitter(band, tolerance_db):
+    """Ranges of such a receiver grow by another factor than those from the mean track."""
+    lines, _ = over(GRID, TRACK, TRACK + [0, 0, 10.0], carrier_hz=100e3, band=band)
+    assert_kept(lines, GRID, tolerance_db)
+
+
+@pytest.mark.parametrize("tolerance_db", [-20, -40])
+@pytest.mark.parametrize("band", [0.005, 0.1])
+def test_receivers_whose_velocity_changes(band, tolerance_db):
+    velocity = np.random.default_rng(0).normal(0, 5 / np.sqrt(3), TRACK.shape)
+    lines, _ = over(GRID, TRACK, carrier_hz=100e3, band=band, velocity=velocity)
+    assert_kept(lines, GRID, tolerance_db)
+
+
+@pytest.mark.parametrize("tolerance_db", [-20, -40])
+@pytest.mark.parametrize("band", [0.005, 0.1])
+def test_a_raster_of_receivers_above_the_transmitters(band, tolerance_db):
+    row, column = np.mgrid[0:20, 0:40]
+    tx_m = 0.1 * np.stack([column - 19.5, 0 * row, row], axis=-1).reshape(-1, 3)
+    lines, _ = over(GRID, tx_m, tx_m + [0, 0, 10.0], carrier_hz=100e3, band=band)
+    assert_kept(lines, GRID, tolerance_db)
+
+
+def headings():
+    """Three passes on headings 60 degrees apart, and their directions."""
+    x_m, tx_m, along = np.linspace(-1.55, 1.55, 312), [], []
+    for number, heading in enumerate(np.radians([0, 60, 120])):
+        ahead = np.array([np.cos(heading), np.sin(heading), 0])
+        aside = np.array([np.sin(heading), -np.cos(heading), 0])
+        tx_m.append(x_m[:, None] * ahead + 0.26 * (number + 1) * aside)
+        along.append(np.tile(ahead, (312, 1)))
+    return np.concatenate(tx_m), np.concatenate(along)
+
+
+@pytest.mark.parametrize("tolerance_db", [-30, -50])
+@pytest.mark.parametrize("beam", ["none", "hann"])
+@pytest.mark.parametrize("x_m", [0.0, 3.0])
+def test_a_beam_that_sees_parts_of_passes(x_m, beam, tolerance_db):
+    """At 3 m the first pass leads over the grid, and its beam sees nothing of it."""
+    tx_m, along = headings()
+    grid = Grid.oriented([x_m - 1, -1, -2], [0, 0.005, 0], [0.005, 0, 0], (400, 400))
+    lines = lines_over(grid, tx_m, carrier_hz=30e3, step_m=0.06, occupied=0.7)
+    window = BeamWindow(40.0, "hann", along=along) if beam == "hann" else None
+    assert_kept(lines, grid, tolerance_db, window)
+
+
+@pytest.mark.parametrize("louder_db", [20, 40])
+@pytest.mark.parametrize("off_wavelengths", [0.5, 2.0])
+def test_a_loud_channel_off_the_mean_track(off_wavelengths, louder_db):
+    """The error of each channel counts with its power."""
+    track = along_x(400, 0.035)
+    track[173, 1:] += off_wavelengths * 0.05 * np.array([1.0, 0.7])
+    grid = around(0, 11.5, pixel_m=(0.01, 0.01))
+    lines, _ = over(grid, track, carrier_hz=30e3, band=0.3)
+    samples = lines.samples.copy()
+    samples[173] *= 10 ** (louder_db / 20)
+    loud = RangeLines(samples, lines.first_range_m, lines.range_step_m, track, track, 30e3, 1500.0)
+    assert_kept(loud, grid, -30)
+
+
+def bright_where_coverage_ends(x_m, *, seabed=0):
+    """Echoes of points about x_m, which only the ends of the track look at, and of a seabed."""
+    random = np.random.default_rng(7)
+    track, cycles_per_m, step_m = along_x(300, 0.02), 2 * 30e3 / 1500, 0.06
+    near = random.uniform([x_m - 0.3, 8.3, 0], [x_m + 0.3, 10.7, 0], (40, 3))
+    anywhere = random.uniform([-6, 8, 0], [6, 11, 0], (seabed, 3))
+    amplitude = random.normal(size=(40 + seabed, 2)) @ [1, 1j]
+    amplitude[40:] *= 0.1
+    points_m = np.concatenate([near, anywhere])
+    range_m = np.linalg.norm(points_m - track[:, None], axis=2)
+    amplitude = amplitude * np.exp(-2j * np.pi * (cycles_per_m * range_m % 1))
+    at_m = 4.0 + step_m * np.arange(200)
+    away = (at_m[:, None, None] - range_m) * 10
+    samples = np.einsum("rcp,cp->cr", np.sinc(away) * np.exp(-(away**2) / 128), amplitude)
+    grid = Grid.plane((-6, 6, 640), (8, 11, 160))
+    return RangeLines(samples, 4.0, step_m, track, track, 30e3, 1500.0), grid
+
+
+BEAM = BeamWindow(20.0, "hann", along=[1, 0, 0])
+
+
+@pytest.mark.parametrize("tolerance_db", [-25, -50])
+@pytest.mark.parametrize(("x_m", "seabed"), [(4.0, 0), (4.4, 0), (4.8, 0), (4.4, 300)])
+def test_bright_points_where_coverage_ends(x_m, seabed, tolerance_db):
+    """Most of what the beam passes cancels, and errors do not."""
+    lines, grid = bright_where_coverage_ends(x_m, seabed=seabed)
+    exact = backproject(lines, grid, accuracy_db=-65, beam=BEAM)
+    chosen = plan(lines, grid, tolerance_db=tolerance_db, beam=BEAM, costs=EXACT_IS_SLOW)
+    assert not chosen.is_exact
+    error_db = relative_error_db(factorize(lines, grid, chosen), exact)
+    assert error_db <= chosen.predicted_error_db <= tolerance_db
+
+
+def test_a_dark_image_beyond_single_precision_warns():
+    lines, grid = bright_where_coverage_ends(4.8)
+    with pytest.warns(ClsasWarning, match=r"1\d dB darker than what the beam passes.*-7\d dB"):
+        backproject(lines, grid, accuracy_db=-85, beam=BEAM)
