@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from clsas.factorized.aperture import drift, stretches
 from clsas.factorized.filters import Gain
-from clsas.planning.channels import sampled_channels
+from clsas.planning.channels import SampledChannels, sampled_channels
 from clsas.planning.subimages import SMALL
 from clsas.planning.visibility_model import VisibilityModel
 from clsas.signal.interpolation import Interpolator
@@ -50,7 +50,7 @@ def stretch_of(model: VisibilityModel) -> Stretch:
 
 
 def _stretch_of(model: VisibilityModel) -> Stretch:
-    channels = sampled_channels(model, SMALL)
+    channels: SampledChannels = sampled_channels(model, SMALL)
     if not channels.points.size:
         return Stretch()
     centres_m = model.points_m[channels.points]

@@ -93,8 +93,8 @@ class Ambiguity:
         if requested_db + in_db(self.brightness) < BEST_DB - _CLOSE_DB:
             dark_db = -in_db(self.brightness)
             validate.warn(
-                f"the image is {dark_db:.0f} dB darker than what the beam passes, since most echoes "
-                "come from where the beam hardly covers the grid: the error may be "
+                f"the image is {dark_db:.0f} dB darker than what the beam passes, since most "
+                "echoes come from where the beam hardly covers the grid: the error may be "
                 f"{BEST_DB + dark_db:.0f} dB in place of {name} {requested_db:.3g} dB; use a wider "
                 "beam, or a grid that it covers"
             )

@@ -43,9 +43,10 @@ def brightness(
 
     Notes
     -----
-    Sums z_i = w_i s_i(rho_i) exp(j 2 k rho_i) over groups of neighbouring channels keep what arrives
-    from about the direction of a pixel. Their power over that of all z_i is the brightness, averaged
-    over pixels and groups. Groups themselves add up incoherently, as they do for a seabed.
+    With z_i = w_i s_i(rho_i) exp(j 2 k rho_i), sums of z_i over groups of neighbouring channels
+    keep what arrives from about the direction of a pixel. Their power, averaged over pixels and
+    groups, over that of all z_i is the brightness. It takes the groups as incoherent, as they are
+    for echoes of a seabed; coherent ones make images brighter still.
     """
     if beam is None or along is None or beam.normalise or lines.channels < 2 * _GROUP:
         return 1.0
