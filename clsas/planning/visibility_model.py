@@ -25,7 +25,7 @@ from clsas.planning.sample_points import (
 )
 from clsas.planning.subimages import SMALL, Side, Subimages
 from clsas.signal.ambiguity import Ambiguity, ambiguity
-from clsas.signal.spectrum import Spectrum, cycles_per_m_at, measure_spectrum
+from clsas.signal.spectrum import Spectrum, band_wavelength_m, cycles_per_m_at, measure_spectrum
 from clsas.sonar.beam import BeamWindow
 from clsas.sonar.visibility import Visibility
 
@@ -101,7 +101,7 @@ class VisibilityModel:
         half_band = (occupied[-1] if len(occupied) else 0.5) / lines.range_step_m
         centre = cycles_per_m_at(lines, spectrum.centre)
         mean_square = spectrum.share @ spectrum.frequency**2
-        shape, track = simplest_track(lines)
+        shape, track = simplest_track(lines, band_wavelength_m(lines, spectrum.centre))
         model = cls(
             lines,
             grid,
@@ -132,7 +132,8 @@ class VisibilityModel:
 
     def with_shape(self, shape: Shape) -> VisibilityModel | None:
         """Return this model with a mean track of another shape; None if channels have none."""
-        track = mean_track_of(self.lines, shape)
+        wavelength_m = band_wavelength_m(self.lines, self.spectrum.centre)
+        track = mean_track_of(self.lines, shape, wavelength_m)
         if track is None:
             return None
         kept: dict[Hashable, Any] = {
