@@ -197,7 +197,7 @@ def margin_db(model: VisibilityModel) -> float:
     virtual channels, and relative to a step of the beam. They also scatter more if the lines'
     power lies at few frequencies.
     """
-    channels = model.lines.channels * model.visible_share((16, 16))
+    channels = model.lines.channels * model.visible_share(model.small)
     few = _FEW_CHANNELS[model.beam is not None and model.beam.jumps]
     return MARGIN_DB + in_db(model.spectrum.scatter * (1 + few / max(channels, 1.0)))
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -206,6 +207,12 @@ class VisibilityModel:
         """Those at `track.samples`, [samples, 3]."""
         return None if self.directions is None else self.directions.at(self.track.samples)
 
+    @property
+    def small(self) -> Side:
+        """Rows and columns of subimages that stand for a pixel; they divide the model's roots."""
+        rows, columns = self.root or SMALL
+        return math.gcd(rows, SMALL[0]), math.gcd(columns, SMALL[1])
+
     def extents(self, side: Side, *, most: bool = False) -> NDArray[np.float64]:
         """Return the extents of subimages of a size in roots of the model's: see `Subimages`.
 
@@ -257,7 +264,7 @@ class VisibilityModel:
         if self.track.is_dense:
             return 2.0 * self.track.strips
         ends = np.flatnonzero(self.on_track)[[0, -1]]
-        return float(self.visible(SMALL)[:, ends].sum(axis=1).mean())
+        return float(self.visible(self.small)[:, ends].sum(axis=1).mean())
 
 
 def _nearest_m(lines: RangeLines, surface: Surface, track: MeanTrack) -> float:
