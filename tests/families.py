@@ -71,6 +71,7 @@ class Family:
 
     band: tuple[float, float] = (0.08, 0.6)  # of the carrier, between which it is drawn
     on_carrier: float = 0.2  # probability
+    spacing: tuple[float, float] = (0.3, 3.0)  # of channels, wavelengths
     aperture: tuple[str, ...] = ("straight", "jittered", "curved")
     antennas: tuple[str, ...] = ("monostatic",)
     velocity: tuple[str, ...] = ("none",)
@@ -84,6 +85,7 @@ DENSE = ("ring", "arc", "helix", "raster", "planar", "headings", "star")
 EVERY_APERTURE = ("straight", "jittered", "curved", *DENSE)
 APART = ("beside", "fixed tx", "fixed rx", "array")
 BEAMS = ("hann", "hamming", "tukey", "rectangular")
+CLOSE = (0.2, 1.0)  # so that many channels see a pixel through a beam
 
 FAMILIES = {
     "plain": Family(),
@@ -94,20 +96,27 @@ FAMILIES = {
     "rings": Family(on_carrier=0.6, aperture=("ring", "arc", "helix")),
     "dense": Family(aperture=DENSE),
     "dense, narrow, apart": Family(band=(0.005, 0.1), aperture=DENSE, antennas=APART),
-    "headings with beam": Family(aperture=("headings", "star", "curved"), beam=BEAMS),
-    "dense with beam": Family(aperture=("ring", "arc", "helix", "raster", "planar"), beam=BEAMS),
-    "beams": Family(aperture=("straight", "jittered"), beam=BEAMS),
+    "headings with beam": Family(
+        aperture=("headings", "star", "curved"), beam=BEAMS, spacing=CLOSE
+    ),
+    "dense with beam": Family(
+        aperture=("ring", "arc", "helix", "raster", "planar"), beam=BEAMS, spacing=CLOSE
+    ),
+    "beams": Family(aperture=("straight", "jittered"), beam=BEAMS, spacing=CLOSE),
     "beam's edge": Family(
-        aperture=("straight", "jittered"), beam=BEAMS, echoes=("points at the edge",)
+        aperture=("straight", "jittered"), beam=BEAMS, spacing=CLOSE, echoes=("points at the edge",)
     ),
     "dark under a beam": Family(
-        aperture=("straight", "jittered", "headings"), beam=BEAMS, echoes=("points outside",)
+        aperture=("straight", "jittered", "headings"),
+        beam=BEAMS,
+        spacing=CLOSE,
+        echoes=("points outside",),
     ),
     "gains": Family(gains=("loud off the track", "log-normal", "40 dB")),
     "gains, dense": Family(aperture=DENSE, gains=("loud off the track", "log-normal", "40 dB")),
     "reliefs and points": Family(grid=("relief", "points")),
     "reliefs and points with beam": Family(
-        aperture=EVERY_APERTURE, beam=BEAMS, grid=("relief", "points")
+        aperture=EVERY_APERTURE, beam=BEAMS, spacing=CLOSE, grid=("relief", "points")
     ),
     "anything": Family(
         band=(0.005, 1.9),
@@ -176,7 +185,7 @@ class _Draw:
 
     def aperture(self, shape: str) -> tuple[Floats, Floats]:
         """Return positions and the direction of the platform there, [channels, 3] each."""
-        n, spacing_m = self.channels, self.wave_m * self.between(0.3, 4)
+        n, spacing_m = self.channels, self.wave_m * self.between(*self.family.spacing)
         self.looks_inside = shape in ("ring", "helix", "star", "headings")
         self.depth_m = 0.0
         make: Callable = getattr(self, "_" + shape)
@@ -292,9 +301,8 @@ class _Draw:
         """Return transmitters and receivers."""
         if kind == "monostatic":
             return centre_m, centre_m
-        apart_m = self.direction() * self.range_m * self.rng.uniform(0.03, 0.25)
-        if kind == "near":
-            apart_m *= 0.02
+        near, far = (0.001, 0.01) if kind == "near" else (0.01, 0.25)
+        apart_m = self.direction() * self.range_m * self.between(near, far)
         if kind == "array":
             starts = np.arange(len(centre_m)) // 8 * 8
             return centre_m[starts] + apart_m, centre_m
