@@ -9,6 +9,7 @@ from clsas.core.grid import Grid
 from clsas.trials.dense_cases import helix as positions_on_helix
 
 CARRIER = 30e3
+WAVELENGTH = 1500.0 / CARRIER
 
 
 def helix():

@@ -348,7 +348,10 @@ def some_channels(count: int, most: int = SAMPLED_CHANNELS) -> NDArray[np.int64]
 
 
 def wavelength_m(lines: RangeLines) -> float:
-    """Return the wavelength of the carrier, metres; infinite without a carrier."""
+    """Return the wavelength of the carrier, for elements' patterns; infinite without a carrier.
+
+    Lengths are compared with `clsas.signal.spectrum.band_wavelength_m`, which every line has.
+    """
     return lines.sound_speed_m_s / lines.carrier_hz if lines.carrier_hz else math.inf
 
 

@@ -24,7 +24,7 @@ CLOSE_ENOUGH = 0.01
 """Distance of phase centres from the mean track that needs no better one, wavelengths rms."""
 
 
-def mean_track(lines: RangeLines) -> MeanTrack | None:
+def mean_track(lines: RangeLines, wavelength_m: float) -> MeanTrack | None:
     """Return a curve along the phase centres of lines, or None if they all coincide.
 
     Channels may be in any order. Three orders are tried: as given, along the principal axis, and
@@ -36,7 +36,7 @@ def mean_track(lines: RangeLines) -> MeanTrack | None:
     if along[-1] == 0:
         return None
     position_m, along = centres_m[order], along / along[-1]
-    close_m = CLOSE_ENOUGH * lines.sound_speed_m_s / max(lines.carrier_hz, 1.0)
+    close_m = CLOSE_ENOUGH * wavelength_m
     best, best_m, intervals = None, np.inf, 1
     while intervals <= min(_MOST_INTERVALS, max(lines.channels // _CHANNELS_PER_KNOT, 1)):
         spline = _fit(along, position_m, intervals)

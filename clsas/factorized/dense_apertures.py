@@ -19,7 +19,7 @@ from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
-from clsas.core.lines import RangeLines, some_channels, wavelength_m
+from clsas.core.lines import RangeLines, some_channels
 from clsas.factorized.aperture import mean_track
 from clsas.factorized.tracks import APART, STRIP_SAMPLES, MeanTrack
 
@@ -47,14 +47,14 @@ _CHANNELS_PER_TERM = 4
 _RIDGE = 1e-10  # of the normal equations, where no channel determines a coefficient
 
 
-def mean_track_of(lines: RangeLines, shape: Shape) -> MeanTrack | None:
+def mean_track_of(lines: RangeLines, shape: Shape, wavelength_m: float) -> MeanTrack | None:
     """Return the mean track of some shape, None if channels have none such.
 
-    Equal geometry gives equal tracks: a plan holds the shape only.
+    Equal geometry and an equal wavelength (see `clsas.signal.spectrum.band_wavelength_m`) give
+    equal tracks: a plan holds the shape only.
     """
-    if shape == "track":
-        return mean_track(lines)
-    return strips(lines) if shape == "strips" else sheet(lines)
+    of_shape = {"track": mean_track, "strips": strips, "sheet": sheet}
+    return of_shape[shape](lines, wavelength_m)
 
 
 def shapes_after(shape: Shape) -> tuple[Shape, ...]:
@@ -66,17 +66,17 @@ def shapes_after(shape: Shape) -> tuple[Shape, ...]:
     return order[order.index(shape) + 1 :]
 
 
-def simplest_track(lines: RangeLines) -> tuple[Shape, MeanTrack | None]:
+def simplest_track(lines: RangeLines, wavelength_m: float) -> tuple[Shape, MeanTrack | None]:
     """Return a mean track and its shape: one curve, unless channels are far from any."""
-    if not _follows_one_curve(lines):
+    if not _follows_one_curve(lines, wavelength_m):
         for shape in DENSE_SHAPES:
-            track = mean_track_of(lines, shape)
+            track = mean_track_of(lines, shape, wavelength_m)
             if track is not None:
                 return shape, track
-    return "track", mean_track(lines)
+    return "track", mean_track(lines, wavelength_m)
 
 
-def strips(lines: RangeLines) -> MeanTrack | None:
+def strips(lines: RangeLines, wavelength_m: float) -> MeanTrack | None:
     """Return a track with a curve for each pass, whatever the order of the channels.
 
     None for a single pass, and where passes are short.
@@ -87,7 +87,7 @@ def strips(lines: RangeLines) -> MeanTrack | None:
         return None
     tracks, coordinate = [], np.empty(lines.channels)
     for number, channels in enumerate(passes):
-        track = mean_track(bare.select(channels))
+        track = mean_track(bare.select(channels), wavelength_m)
         if track is None:
             return None
         tracks.append(track)
@@ -133,7 +133,7 @@ def _passes(found: list[NDArray[np.int64]]) -> list[NDArray[np.int64]] | None:
     return found if 1 < len(found) <= _MOST_STRIPS and not short else None
 
 
-def sheet(lines: RangeLines) -> MeanTrack | None:
+def sheet(lines: RangeLines, wavelength_m: float) -> MeanTrack | None:
     """Return the smooth sheet nearest to the phase centres, None if they lie on a line.
 
     A plane, or a ring around the middle, is bent until it follows the channels. Every channel is
@@ -152,7 +152,7 @@ def sheet(lines: RangeLines) -> MeanTrack | None:
     surface = min(ranked)[2]
     along, across = surface.coordinates(centres_m - middle_m)
     found = _smoothest(
-        (along[some], across[some]), some_m, surface.closed, _SHEET_CLOSE * wavelength_m(lines)
+        (along[some], across[some]), some_m, surface.closed, _SHEET_CLOSE * wavelength_m
     )
     if found is None:
         return None
@@ -229,7 +229,7 @@ def _smoothest(
     return None if best is None else (best, best_rms)
 
 
-def _follows_one_curve(lines: RangeLines) -> bool:
+def _follows_one_curve(lines: RangeLines, wavelength_m: float) -> bool:
     """Return whether one smooth curve may serve: False if channels are far from any.
 
     A sample of the channels decides, so that no curve is fitted to a hundred thousand in vain.
@@ -237,11 +237,11 @@ def _follows_one_curve(lines: RangeLines) -> bool:
     some = some_channels(lines.channels, _SCREENED)
     if len(some) == lines.channels:
         return True
-    track = mean_track(lines.without_samples().select(some))
+    track = mean_track(lines.without_samples().select(some), wavelength_m)
     if track is None:
         return True
     off_m = track.offsets_m(lines.phase_centres_m[some])
-    return bool(np.sqrt(np.mean(off_m**2)) < _FAR_OFF * wavelength_m(lines))
+    return bool(np.sqrt(np.mean(off_m**2)) < _FAR_OFF * wavelength_m)
 
 
 @dataclass(frozen=True, eq=False)

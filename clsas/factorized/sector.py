@@ -30,6 +30,7 @@ from clsas.factorized.surface import Surface
 from clsas.factorized.tracks import MeanTrack
 from clsas.factorized.tree import ChannelRanges, Division, VirtualChannels
 from clsas.opencl.buffers import MARGIN
+from clsas.signal.spectrum import band_wavelength_m
 
 _ON_TRACK = 1e-4  # wavelengths; closer, channels lie on the mean track
 _SHAPES = {"strips": "several passes", "sheet": "a sheet"}
@@ -122,7 +123,8 @@ class Geometry:
         self.samples_per_m = image.resampling.samples_per_m(lines) * (1 + image.stretch)
         self.cycles_per_m = image.resampling.cycles_per_m(lines) * (1 + image.stretch)
         self.division = Division(surface, image.sides)
-        track = chosen.kept.get("track") or mean_track_of(lines, image.aperture.shape)
+        wavelength_m = band_wavelength_m(lines, image.resampling.centre_cycles_per_sample)
+        track = chosen.kept.get("track") or mean_track_of(lines, image.aperture.shape, wavelength_m)
         if track is None:
             raise ValueError(
                 "lines must have channels at more than one place for a plan that divides"
@@ -143,7 +145,6 @@ class Geometry:
         self._seen = Division(surface, (image.sides[0], self._together(), image.sides[-1]))
         # On the track itself there is nothing to align.
         off_m = np.abs(self.track.offsets_m(self.phase_centres_m)).max()
-        wavelength_m = lines.sound_speed_m_s / max(lines.carrier_hz, 1.0)
         self._on_sheet = off_m <= _ON_TRACK * wavelength_m
         if own is not None:
             off_m += np.linalg.norm(own, axis=1).max() * np.abs(lines.last_range_m).max()

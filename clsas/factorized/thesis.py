@@ -23,6 +23,7 @@ from clsas.factorized.interpolated import VisiblePhases
 from clsas.factorized.surface import surface_of
 from clsas.factorized.tree import Division, VirtualChannels
 from clsas.signal.interpolation import Gain, Interpolator
+from clsas.signal.spectrum import band_wavelength_m
 
 if TYPE_CHECKING:
     from clsas.factorized.plan import Plan
@@ -224,7 +225,9 @@ def plan_errors_m(
     [42] and [43] applied to every channel: in each stage its line is shifted so that the range of
     the subimage's centre is right for the mean of its neighbours, which then stands for it.
     """
-    track, image = mean_track(lines), plan.factorization
+    image = plan.factorization
+    wavelength_m = band_wavelength_m(lines, image.resampling.centre_cycles_per_sample)
+    track = mean_track(lines, wavelength_m)
     if track is None or not isinstance(image.aperture, NearestBeams) or not grid.is_planar:
         raise ValueError("plan must be one of stages, for lines and a plane that it was made for")
     order = np.argsort(track.coordinate, kind="stable")

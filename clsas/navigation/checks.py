@@ -8,10 +8,9 @@ from clsas.core import validate
 from clsas.core.lines import RangeLines
 from clsas.core.pings import Transmissions
 from clsas.signal.readout import Readout
-from clsas.signal.spectrum import cycles_per_m_at
+from clsas.signal.spectrum import LEAST_CYCLES, band_wavelength_m, cycles_per_m_at
 
 _REMEDY = "lines.without_still_pings() drops them"
-_LEAST_CYCLES = 0.02  # per sample, from lines about 0 Hz to those with a carrier
 
 
 def mean_wavelength_m(readout: Readout) -> float:
@@ -22,13 +21,13 @@ def mean_wavelength_m(readout: Readout) -> float:
     ValueError
         If the lines tell no wavelength.
     """
-    cycles_per_m = abs(cycles_per_m_at(readout.lines, readout.spectrum.centre))
-    if not cycles_per_m * readout.lines.range_step_m > _LEAST_CYCLES:
+    lines, centre = readout.lines, readout.spectrum.centre
+    if not abs(cycles_per_m_at(lines, centre)) * lines.range_step_m > LEAST_CYCLES:
         raise ValueError(
             "carrier_hz must be that of the lines, or their samples must hold the carrier still; "
-            f"got {readout.lines.carrier_hz:g} Hz, and samples about 0 Hz"
+            f"got {lines.carrier_hz:g} Hz, and samples about 0 Hz"
         )
-    return 2 / cycles_per_m
+    return band_wavelength_m(lines, centre)
 
 
 def check_navigation(lines: RangeLines, least_pings: int, purpose: str, *, may_stand: bool) -> None:

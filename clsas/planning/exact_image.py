@@ -14,7 +14,6 @@ from clsas.exact.tiles import STACK, Tiles
 from clsas.factorized.estimates import Work, backprojecting, upsampling
 from clsas.opencl.buffers import beam_buffers, pixel_buffers, total_bytes
 from clsas.opencl.device import Device
-from clsas.planning.subimages import SMALL
 from clsas.planning.visibility_model import VisibilityModel
 
 _LARGE = (64, 64)  # rows and columns of a subimage that holds any part of an exact image
@@ -91,7 +90,7 @@ def expect(model: VisibilityModel, accuracy_db: float, device: Device) -> Exact:
         largest = max((decision, *others), key=lambda each: each.resampling.length)
     share = most = 1.0
     if beam is not None and model.track is not None:
-        share, most = model.visible_share(SMALL), model.visible_share(_LARGE, most=True)
+        share, most = model.visible_share(model.small), model.visible_share(_LARGE, most=True)
     blocks = blocks_of(
         device,
         lines,

@@ -203,7 +203,7 @@ def margin_db(model: VisibilityModel) -> float:
     scatter more if the lines' power lies at few frequencies.
     """
     power = model.channel_power
-    channels = power.sum() ** 2 / (power @ power) * model.visible_share((16, 16))
+    channels = power.sum() ** 2 / (power @ power) * model.visible_share(model.small)
     few = _FEW_CHANNELS[model.beam is not None and model.beam.jumps]
     return MARGIN_DB + in_db(model.spectrum.scatter * (1 + few / max(channels, 1.0)))
 

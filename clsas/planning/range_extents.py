@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from clsas.planning.caching import cached
 from clsas.planning.stretches import stretch_of
-from clsas.planning.subimages import SMALL, Side
+from clsas.planning.subimages import Side
 from clsas.planning.visibility_model import VisibilityModel
 from clsas.signal.interpolation import Interpolator, Resampling
 
@@ -32,7 +32,7 @@ def half_range_extents_m(model: VisibilityModel, sides: Sequence[Side]) -> NDArr
 @cached
 def _range_slopes(model: VisibilityModel) -> NDArray[np.float64]:
     """Largest change of range per row, column and metre of relief, [axes]."""
-    visible = model.visible(SMALL)
+    visible = model.visible(model.small)
     slopes = np.abs(model.sight @ model.surface.steps_m.T)
     if model.track.is_sheet:
         edges = [model.track.line_along(across) for across in (0.0, 1.0)]

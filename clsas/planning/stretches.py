@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from clsas.factorized.aperture import drift, stretches
 from clsas.factorized.filters import Gain
 from clsas.planning.channels import SampledChannels, sampled_channels
-from clsas.planning.subimages import SMALL
 from clsas.planning.visibility_model import VisibilityModel
 from clsas.signal.interpolation import Interpolator
 from clsas.signal.spectrum import Spectrum, cycles_per_m_at, shares_of_bins
@@ -50,7 +49,7 @@ def stretch_of(model: VisibilityModel) -> Stretch:
 
 
 def _stretch_of(model: VisibilityModel) -> Stretch:
-    channels: SampledChannels = sampled_channels(model, SMALL)
+    channels: SampledChannels = sampled_channels(model, model.small)
     if not channels.points.size:
         return Stretch()
     centres_m = model.points_m[channels.points]

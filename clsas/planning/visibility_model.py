@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -25,7 +26,13 @@ from clsas.planning.sample_points import (
 )
 from clsas.planning.subimages import SMALL, Side, Subimages
 from clsas.signal.ambiguity import Ambiguity, ambiguity
-from clsas.signal.spectrum import Spectrum, cycles_per_m_at, line_energy, measure_spectrum
+from clsas.signal.spectrum import (
+    Spectrum,
+    band_wavelength_m,
+    cycles_per_m_at,
+    line_energy,
+    measure_spectrum,
+)
 from clsas.sonar.beam import BeamWindow
 from clsas.sonar.visibility import Visibility
 
@@ -105,7 +112,7 @@ class VisibilityModel:
         half_band = (occupied[-1] if len(occupied) else 0.5) / lines.range_step_m
         centre = cycles_per_m_at(lines, spectrum.centre)
         mean_square = spectrum.share @ spectrum.frequency**2
-        shape, track = simplest_track(lines)
+        shape, track = simplest_track(lines, band_wavelength_m(lines, spectrum.centre))
         model = cls(
             lines,
             grid,
@@ -139,7 +146,8 @@ class VisibilityModel:
 
     def with_shape(self, shape: Shape) -> VisibilityModel | None:
         """Return this model with a mean track of another shape; None if channels have none."""
-        track = mean_track_of(self.lines, shape)
+        wavelength_m = band_wavelength_m(self.lines, self.spectrum.centre)
+        track = mean_track_of(self.lines, shape, wavelength_m)
         if track is None:
             return None
         kept: dict[Hashable, Any] = {
@@ -212,6 +220,12 @@ class VisibilityModel:
         """Those at `track.samples`, [samples, 3]."""
         return None if self.directions is None else self.directions.at(self.track.samples)
 
+    @property
+    def small(self) -> Side:
+        """Rows and columns of subimages that stand for a pixel; they divide the model's roots."""
+        rows, columns = self.root or SMALL
+        return math.gcd(rows, SMALL[0]), math.gcd(columns, SMALL[1])
+
     def extents(self, side: Side, *, most: bool = False) -> NDArray[np.float64]:
         """Return the extents of subimages of a size in roots of the model's: see `Subimages`.
 
@@ -263,7 +277,7 @@ class VisibilityModel:
         if self.track.is_dense:
             return 2.0 * self.track.strips
         ends = np.flatnonzero(self.on_track)[[0, -1]]
-        return float(self.visible(SMALL)[:, ends].sum(axis=1).mean())
+        return float(self.visible(self.small)[:, ends].sum(axis=1).mean())
 
 
 def _nearest_m(lines: RangeLines, surface: Surface, track: MeanTrack) -> float:

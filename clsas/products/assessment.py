@@ -30,11 +30,11 @@ from clsas.products.effects import (
     SWAY,
     ErrorWithout,
     Survey,
-    band_wavelength_m,
     errors_without,
     track_errors_m,
 )
 from clsas.signal.compression import Window
+from clsas.signal.spectrum import band_wavelength_m, measure_spectrum
 from clsas.simulation.scenes import PointTargets
 from clsas.simulation.simulator import simulate_lines
 from clsas.sonar.beam import BeamWindow
@@ -125,7 +125,7 @@ def assess(
     modelled[SINGLE] = not full.half_precision
     return Assessment(
         tolerance_db=tolerance_db,
-        wavelength_m=band_wavelength_m(lines),
+        wavelength_m=band_wavelength_m(lines, measure_spectrum(lines).centre),
         channels=lines.channels,
         pixels=grid.shape,
         device=device.info.label,

@@ -13,7 +13,7 @@ from clsas.core.grid import Grid
 from clsas.core.lines import RangeLines, some_channels, wavelength_m
 from clsas.factorized.surface import surface_of
 from clsas.signal.ambiguity import ends_error
-from clsas.signal.spectrum import cycles_per_m_at, measure_spectrum
+from clsas.signal.spectrum import band_wavelength_m, cycles_per_m_at, measure_spectrum
 from clsas.sonar.beam import BeamWindow
 from clsas.sonar.simplify import APART, MOTION, RELIEF
 from clsas.sonar.system import Sonar, element_pattern
@@ -165,12 +165,6 @@ def _ranges_without(sample: _Sample, lines: RangeLines) -> dict[str, NDArray[np.
     return ranges_m
 
 
-def band_wavelength_m(lines: RangeLines) -> float:
-    """Return the wavelength at the middle of the lines' band, metres."""
-    centre = measure_spectrum(lines).centre
-    return 2 / max(abs(cycles_per_m_at(lines, centre)), 1e-30)
-
-
 def track_errors_m(lines: RangeLines) -> NDArray[np.float64]:
     """Return the distances of channels from a straight track, [channels, 3], metres.
 
@@ -250,7 +244,7 @@ class _Sample:
         beside = np.concatenate([-away, away]) / lines.range_step_m
         return cls(
             some, part, points_m, flat_m, range_m, inside, weights, centre + beside,
-            band_wavelength_m(lines),
+            band_wavelength_m(lines, spectrum.centre),
         )  # fmt: skip
 
     def error_of_ranges(

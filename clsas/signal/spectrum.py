@@ -19,6 +19,8 @@ MEASURED_CHANNELS = 256
 0.05 dB; with half as many, filters depend a little on the order of channels."""
 FEW_CHANNELS = 32
 """Channels sampled for a quick estimate of the power outside a band."""
+LEAST_CYCLES = 0.02
+"""Cycles per sample at the middle of a band, up to which lines tell nothing of their carrier."""
 NEEDED_OVERSAMPLING = 1.05
 """Sample rate over occupied bandwidth above which a guard band separates the band's edges."""
 _FREQUENCIES = 128  # bins; with half as many measured errors move by 0.2 dB, with twice by 0.1 dB
@@ -347,6 +349,24 @@ def _largest_part(samples: NDArray[np.complex64]) -> np.float32:
     """Largest real or imaginary part. Magnitudes might overflow."""
     parts = samples.view(samples.real.dtype)
     return max(parts.max(initial=0.0), -parts.min(initial=0.0))
+
+
+def band_wavelength_m(lines: RangeLines, centre: float) -> float:
+    """Return the wavelength in the middle of the band that lines occupy, metres.
+
+    Lengths are compared with it, whether the carrier was mixed out or not. Lines about 0 Hz tell
+    nothing of their carrier: the wavelength is then that of the highest frequency sampled.
+
+    Parameters
+    ----------
+    lines : RangeLines
+    centre : float
+        Middle of the band, cycles per sample: `Spectrum.centre`, or that of a plan's lines.
+    """
+    cycles_per_m = abs(cycles_per_m_at(lines, centre))
+    if cycles_per_m * lines.range_step_m <= LEAST_CYCLES:
+        cycles_per_m = 0.5 / lines.range_step_m
+    return 2 / cycles_per_m
 
 
 @overload

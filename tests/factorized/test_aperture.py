@@ -56,13 +56,13 @@ TRACKS = {
 @pytest.mark.parametrize("name", TRACKS)
 def test_the_track_follows_a_smooth_path(name):
     lines = lines_of(TRACKS[name])
-    track = mean_track(lines)
+    track = mean_track(lines, WAVELENGTH)
     assert distance_m(track, TRACKS[name]).max() < 0.05 * WAVELENGTH
 
 
 @pytest.mark.parametrize("name", TRACKS)
 def test_places_rise_along_a_path(name):
-    place = mean_track(lines_of(TRACKS[name])).coordinate
+    place = mean_track(lines_of(TRACKS[name]), WAVELENGTH).coordinate
     steps = np.diff(place)
     assert (steps > 0).all() or (steps < 0).all()
     assert np.ptp(place) == pytest.approx(1, abs=0.01)
@@ -72,7 +72,7 @@ def test_places_rise_along_a_path(name):
 def test_the_order_of_channels_does_not_matter(name):
     centres_m = TRACKS[name]
     order = np.random.default_rng(2).permutation(len(centres_m))
-    track = mean_track(lines_of(centres_m[order]))
+    track = mean_track(lines_of(centres_m[order]), WAVELENGTH)
     assert distance_m(track, centres_m[order]).max() < 0.05 * WAVELENGTH
     steps = np.diff(track.coordinate[np.argsort(order)])
     if name == "circle":  # which may begin anywhere
@@ -82,7 +82,7 @@ def test_the_order_of_channels_does_not_matter(name):
 
 def test_the_track_of_pings_of_many_receivers_is_straight():
     lines = lines_of(*pings())
-    track = mean_track(lines)
+    track = mean_track(lines, WAVELENGTH)
     assert distance_m(track, lines.phase_centres_m).max() < 0.01 * WAVELENGTH
     x = lines.phase_centres_m[:, 0]
     order = np.argsort(x)
@@ -93,25 +93,25 @@ def test_the_track_does_not_follow_jitter():
     """Errors of navigation, different from channel to channel, are no part of a smooth path."""
     rng = np.random.default_rng(3)
     lines = lines_of(TRACKS["straight"] + rng.normal(0, 0.01, (300, 3)) * [0, 1, 1])
-    tangent = mean_track(lines).tangents_m(np.linspace(0, 1, 100))
+    tangent = mean_track(lines, WAVELENGTH).tangents_m(np.linspace(0, 1, 100))
     tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
     assert tangent[:, 0].min() > 0.99
 
 
 @pytest.mark.parametrize("channels", [1, 2, 40])
 def test_channels_at_one_place_have_no_track(channels):
-    assert mean_track(lines_of(np.tile([1.0, 2, 3], (channels, 1)))) is None
+    assert mean_track(lines_of(np.tile([1.0, 2, 3], (channels, 1))), WAVELENGTH) is None
 
 
 @pytest.mark.parametrize("channels", [2, 3, 4, 5])
 def test_a_few_channels_have_a_track(channels):
     centres_m = along_x(channels, 0.3)
-    track = mean_track(lines_of(centres_m))
+    track = mean_track(lines_of(centres_m), WAVELENGTH)
     assert distance_m(track, centres_m).max() < 1e-9
 
 
 def test_beyond_its_ends_a_track_is_straight():
-    track = mean_track(lines_of(TRACKS["arc"]))
+    track = mean_track(lines_of(TRACKS["arc"]), WAVELENGTH)
     for end, beyond in ((0.0, -0.5), (1.0, 1.5)):
         at_m, far_m = track.positions_m(np.array([end, beyond]))
         np.testing.assert_allclose(
@@ -120,14 +120,14 @@ def test_beyond_its_ends_a_track_is_straight():
 
 
 def test_the_tangent_is_the_derivative():
-    track, place = mean_track(lines_of(TRACKS["arc"])), np.linspace(0.01, 0.99, 50)
+    track, place = mean_track(lines_of(TRACKS["arc"]), WAVELENGTH), np.linspace(0.01, 0.99, 50)
     slope = (track.positions_m(place + 1e-6) - track.positions_m(place - 1e-6)) / 2e-6
     np.testing.assert_allclose(track.tangents_m(place), slope, rtol=1e-5, atol=1e-4)
 
 
 def test_a_channel_off_the_track_is_seen_in_its_direction():
     centres_m = along_x(200, 0.03) + np.random.default_rng(4).normal(0, 0.05, (200, 3)) * [0, 1, 1]
-    track = mean_track(lines_of(centres_m))
+    track = mean_track(lines_of(centres_m), WAVELENGTH)
     points_m = np.array([[0.5, 40, -5], [30, 30, -5], [-20, 25, 3]])
     places = track.apparent_coordinates(points_m, centres_m)
     for point_m, place in zip(points_m, places, strict=True):
@@ -141,7 +141,7 @@ def test_a_channel_off_the_track_is_seen_in_its_direction():
 
 
 def test_on_a_straight_track_channels_are_seen_where_they_are():
-    track = mean_track(lines_of(TRACKS["straight"]))
+    track = mean_track(lines_of(TRACKS["straight"]), WAVELENGTH)
     places = track.apparent_coordinates(np.array([[0.0, 10, 0], [5, 3, 1]]), TRACKS["straight"])
     np.testing.assert_allclose(places, np.tile(track.coordinate, (2, 1)), atol=1e-9)
 
@@ -161,7 +161,7 @@ def test_ranges_grow_as_those_of_places_do_once_stretched(speed):
     rx = tx + rng.normal(0, 0.1, 3)
     velocity = speed * rng.normal(0, 1, (200, 3)) if speed else None
     lines = lines_of(tx, rx, velocity=velocity)
-    track = mean_track(lines)
+    track = mean_track(lines, WAVELENGTH)
     point_m = np.array([[3.0, 40.0, -8.0]])
     place = track.apparent_coordinates(point_m, lines.phase_centres_m, own_drift(lines))
     virtual_m = track.positions_m(place)
@@ -192,7 +192,7 @@ def test_no_phase_turns_faster_than_its_bound(seed):
     rng = np.random.default_rng(seed)
     turn = np.linspace(-1, 1, 200)
     bends = rng.normal(size=(3, 3)) * [[4], [1], [0.5]]
-    track = mean_track(lines_of(np.stack([turn, turn**2, turn**3], axis=1) @ bends))
+    track = mean_track(lines_of(np.stack([turn, turn**2, turn**3], axis=1) @ bends), WAVELENGTH)
     steps = rng.normal(0, 0.01, (2, 3))
     grid = Grid.oriented(rng.normal([0, 25, 0], 3), *steps, (64, 64))
     side, inside = (64, 64), (16, 8)
@@ -222,7 +222,7 @@ def test_no_phase_turns_faster_than_its_bound(seed):
 
 
 def test_rates_about_many_places_are_those_about_each():
-    track = mean_track(lines_of(along_x(300, 0.02)))
+    track = mean_track(lines_of(along_x(300, 0.02)), WAVELENGTH)
     surface = surface_of(Grid.plane((-1, 1, 40), (3, 5, 40)))
     centres_m = np.random.default_rng(2).uniform((-3, 2, -1), (3, 9, 1), (300, 3))
     others = surface, np.array([16.0, 8.0]), 160.0, 0.1
@@ -234,7 +234,7 @@ def test_rates_about_many_places_are_those_about_each():
 
 
 def test_turns_are_the_integral_of_rates():
-    track = mean_track(lines_of(TRACKS["straight"]))
+    track = mean_track(lines_of(TRACKS["straight"]), WAVELENGTH)
     place = track.samples
     cycles = cumulative_cycles(track, np.full((1, len(place)), 7.0))[0]
     np.testing.assert_allclose(np.diff(cycles), 7 * np.diff(place), rtol=1e-9)
@@ -245,7 +245,7 @@ def test_turns_are_the_integral_of_rates():
 
 
 def test_turns_are_the_integral_of_their_rate():
-    track = mean_track(lines_of(TRACKS["straight"]))
+    track = mean_track(lines_of(TRACKS["straight"]), WAVELENGTH)
     rate = np.stack([np.ones_like(track.samples), np.abs(track.samples - 0.5)])
     cycles = cumulative_cycles(track, rate)[:, np.abs(track.samples - 0.5) <= 0.5]
     assert np.ptp(cycles, axis=1) == pytest.approx([1.0, 0.25], rel=1e-3)
@@ -253,6 +253,6 @@ def test_turns_are_the_integral_of_their_rate():
 
 def test_bistatic_channels_are_where_their_middles_are():
     tx = TRACKS["straight"]
-    track = mean_track(lines_of(tx, beside(tx, 0.4, 0.1, -0.1)))
+    track = mean_track(lines_of(tx, beside(tx, 0.4, 0.1, -0.1)), WAVELENGTH)
     middle_m = beside(tx, 0.2, 0.05, -0.05)
     assert np.linalg.norm(track.positions_m(track.coordinate) - middle_m, axis=1).max() < 1e-6

@@ -2,7 +2,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from dense import TRACKS, scene, to_and_fro, turning
+from dense import TRACKS, WAVELENGTH, scene, to_and_fro, turning
 
 from clsas.factorized.aperture import mean_track
 from clsas.factorized.beam_directions import BeamDirections, beam_rate
@@ -23,7 +23,11 @@ def test_a_beam_on_a_target_stays_there_past_the_ends(turns):
     """Positions go on straight ahead there; headings that stood still would lose the target."""
     tx_m = TRACKS["helix"]() if turns == "helix" else TRACKS["helix"]()[:180] * [1, 1, 0]
     lines = lines_at(tx_m)
-    track = mean_track_of(lines, "sheet") if turns == "helix" else mean_track(lines)
+    track = (
+        mean_track_of(lines, "sheet", WAVELENGTH)
+        if turns == "helix"
+        else mean_track(lines, WAVELENGTH)
+    )
     found = BeamDirections.of(BeamWindow(20, "hann"), turning(tx_m), track)
     sight = -track.positions_m(PAST_THE_ENDS) * [1, 1, 0]
     sine = np.einsum("pi,pi->p", sight, found.at(PAST_THE_ENDS))
@@ -32,7 +36,7 @@ def test_a_beam_on_a_target_stays_there_past_the_ends(turns):
 
 @pytest.mark.parametrize("squint_deg", [0.0, 5.0])
 def test_a_scan_to_and_fro_has_one_heading_without_a_squint(squint_deg):
-    track = mean_track_of(lines_at(TRACKS["raster"]()), "sheet")
+    track = mean_track_of(lines_at(TRACKS["raster"]()), "sheet", WAVELENGTH)
     beam = BeamWindow(20, "hann", squint_deg=squint_deg)
     along = BeamDirections.of(beam, to_and_fro(), track).at(track.coordinate, track.across)
     assert (np.ptp(along @ [1.0, 0.0, 0.0]) < 1e-6) == (squint_deg == 0)
@@ -41,7 +45,7 @@ def test_a_scan_to_and_fro_has_one_heading_without_a_squint(squint_deg):
 def test_rates_hold_all_over_a_box():
     """Around the middle of a circle weights change at the corners of a box, not in its middle."""
     tx_m = TRACKS["helix"]()[:180] * [1, 1, 0]
-    track = mean_track(lines_at(tx_m))
+    track = mean_track(lines_at(tx_m), WAVELENGTH)
     beam = BeamWindow(20, "hann")
     along = BeamDirections.of(beam, turning(tx_m), track).along
     sides_m = np.diag([0.2, 0.2, 0.0])[:2]

@@ -3,7 +3,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from dense import TRACKS, scene
+from dense import TRACKS, WAVELENGTH, scene
 
 from clsas.factorized import dense_apertures
 from clsas.factorized.dense_apertures import mean_track_of, sheet, simplest_track, strips
@@ -33,7 +33,7 @@ def lines_at(tx_m):
 )
 def test_a_sheet_follows_its_channels(name, off_m):
     lines = lines_at(TRACKS[name]())
-    found = sheet(lines)
+    found = sheet(lines, WAVELENGTH)
     assert found.is_sheet
     assert np.abs(found.offsets_m(lines.phase_centres_m)).max() < off_m
     for coordinate in (found.coordinate, found.across):
@@ -41,20 +41,20 @@ def test_a_sheet_follows_its_channels(name, off_m):
 
 
 def test_a_closed_ring_meets_at_its_cut():
-    found = sheet(lines_at(TRACKS["helix"]()))
+    found = sheet(lines_at(TRACKS["helix"]()), WAVELENGTH)
     ends_m = found.positions_m(np.array([0.0, 1.0]), np.array([0.3, 0.3]))
     np.testing.assert_allclose(ends_m[0], ends_m[1], atol=1e-5)
 
 
 def test_channels_on_a_line_have_no_sheet():
     tx_m = np.linspace([0, 0, 0], [5, 1, 0], 400)
-    assert sheet(lines_at(tx_m)) is None
-    assert strips(lines_at(tx_m)) is None
+    assert sheet(lines_at(tx_m), WAVELENGTH) is None
+    assert strips(lines_at(tx_m), WAVELENGTH) is None
 
 
 def test_each_pass_has_a_strip():
     tx_m = TRACKS["passes"]()
-    found = strips(lines_at(tx_m))
+    found = strips(lines_at(tx_m), WAVELENGTH)
     assert found.strips == 8
     np.testing.assert_array_equal(found.strip_of(found.coordinate), np.repeat(np.arange(8), 200))
     assert np.abs(found.offsets_m(tx_m)).max() < 1e-9
@@ -70,7 +70,7 @@ def test_passes_are_found_in_any_order_of_their_channels(order):
         "random": np.random.default_rng(2).permutation(1600),
         "backwards": np.arange(1600)[::-1],
     }[order]
-    found = strips(lines_at(tx_m[given]))
+    found = strips(lines_at(tx_m[given]), WAVELENGTH)
     assert found.strips == 8
     in_passes = found.strip_of(found.coordinate)[np.argsort(given)].reshape(8, 200)
     assert (in_passes == in_passes[:, :1]).all()
@@ -81,21 +81,21 @@ def test_passes_are_found_in_any_order_of_their_channels(order):
 @pytest.mark.parametrize("name", ["helix", "raster", "spiral", "planar"])
 def test_channels_beside_each_other_are_no_passes(name):
     tx_m = np.random.default_rng(2).permutation(TRACKS[name]())
-    assert strips(lines_at(tx_m)) is None
-    assert sheet(lines_at(tx_m)).is_sheet
+    assert strips(lines_at(tx_m), WAVELENGTH) is None
+    assert sheet(lines_at(tx_m), WAVELENGTH).is_sheet
 
 
 def test_short_passes_have_none():
     tx_m = TRACKS["passes"]().reshape(8, 200, 3)[:, :20].reshape(-1, 3)
-    assert strips(lines_at(tx_m)) is None
+    assert strips(lines_at(tx_m), WAVELENGTH) is None
 
 
 def test_only_channels_far_from_any_curve_begin_with_another_shape(monkeypatch):
     tx_m = np.linspace([0, 0, 0], [50, 0, 0], 4000)
-    assert simplest_track(lines_at(tx_m))[0] == "track"
-    assert simplest_track(lines_at(20 * TRACKS["planar"]()))[0] == "sheet"
+    assert simplest_track(lines_at(tx_m), WAVELENGTH)[0] == "track"
+    assert simplest_track(lines_at(20 * TRACKS["planar"]()), WAVELENGTH)[0] == "sheet"
     monkeypatch.setattr(dense_apertures, "_SCREENED", 10000)
-    assert simplest_track(lines_at(20 * TRACKS["planar"]()))[0] == "track"
+    assert simplest_track(lines_at(20 * TRACKS["planar"]()), WAVELENGTH)[0] == "track"
 
 
 def test_places_on_a_sheet_lie_in_the_direction_of_channels():
@@ -103,7 +103,7 @@ def test_places_on_a_sheet_lie_in_the_direction_of_channels():
     tx_m = TRACKS["planar"]()
     tx_m[:, 2] += np.random.default_rng(1).normal(0, 0.05, len(tx_m))
     lines = lines_at(tx_m)
-    found, point_m = sheet(lines), np.array([[0.4, -0.7, 0.0]])
+    found, point_m = sheet(lines, WAVELENGTH), np.array([[0.4, -0.7, 0.0]])
     along, across = found.apparent_places(point_m, tx_m)
     place_m = found.positions_m(along[0], across[0])
     seen, given = (
@@ -117,7 +117,7 @@ def test_places_on_a_sheet_lie_in_the_direction_of_channels():
 @pytest.mark.parametrize("name", ["helix", "planar", "spiral"])
 def test_weights_interpolate_smooth_functions_on_a_sheet(name):
     """Over two stages: from channels to virtual ones, and from these to fewer."""
-    track = mean_track_of(lines_at(TRACKS[name]()), "sheet")
+    track = mean_track_of(lines_at(TRACKS[name]()), "sheet", WAVELENGTH)
     aperture = interpolation.design(6, 2.0, FLAT)
     samples = [line.samples.size for line in (track.line_along(0.5), track.line_across(0.5))]
     rates = [SheetRates(*(np.full((1, n), cycles) for n in samples)) for cycles in (12.0, 6.0)]

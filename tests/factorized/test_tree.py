@@ -3,7 +3,19 @@ import importlib
 import numpy as np
 import pytest
 from cases import along_x, thesis_lines
-from factorizing import BEAMS, EXACT_IS_SLOW, arc, around, made, near, over, straight, swaying
+from factorizing import (
+    BEAMS,
+    CARRIER,
+    EXACT_IS_SLOW,
+    SPEED,
+    arc,
+    around,
+    made,
+    near,
+    over,
+    straight,
+    swaying,
+)
 
 from clsas.core.grid import Grid
 from clsas.core.image_error import relative_error_db
@@ -20,6 +32,7 @@ from clsas.signal.spectrum import Spectrum
 from clsas.sonar.beam import BeamWindow
 from clsas.sonar.visibility import Visibility
 
+WAVELENGTH = SPEED / CARRIER
 FLAT = Spectrum(0.0, (np.arange(64) + 0.5) / 128, np.full(64, 1 / 64))
 
 
@@ -70,7 +83,7 @@ def interpolation_error_db(case, side, aperture, root=(128, 128)):
     """Of steering functions of pixels in subimages of a size, anywhere in a root; float64."""
     lines, grid = made(case)
     rng = np.random.default_rng(0)
-    track, centres_m = mean_track(lines), lines.phase_centres_m
+    track, centres_m = mean_track(lines, WAVELENGTH), lines.phase_centres_m
     surface = surface_of(grid)
     division = Division(surface, (root, side))
     cycles_per_m = lines.carrier_cycles_per_m
@@ -118,7 +131,7 @@ def any_nodes(shuffled=False):
     lines, grid = made(swaying)
     if shuffled:
         lines = lines.select(np.random.default_rng(0).permutation(lines.channels))
-    track = mean_track(lines)
+    track = mean_track(lines, WAVELENGTH)
     surface, side = surface_of(grid), (64, 64)
     middle_m = surface.middles_m(side, np.array([[0, 0], [64, 64]]))
     extents, cycles_per_m = surface.extents(side), lines.carrier_cycles_per_m
@@ -213,7 +226,7 @@ def test_subimages_beyond_the_grid_are_not_missed(shape, everything, monkeypatch
 
 def test_places_from_where_leaves_are_seen_hold_all_that_weigh():
     lines, grid = made(near)
-    beam, track = BEAMS[0], mean_track(lines)
+    beam, track = BEAMS[0], mean_track(lines, WAVELENGTH)
     along = BeamDirections.of(beam, beam.directions(lines), track).along
     division = Division(surface_of(grid), ((16, 16),))
     corners = division.roots[:, None]
@@ -240,7 +253,7 @@ def test_boxes_are_seen_from_where_they_are_and_from_hardly_more(beam, range_m):
     place = np.linspace(0, 1, 300)
     track_m = np.stack([80 * place - 40, 0.3 * np.sin(9 * place), 0 * place], axis=1)
     lines = thesis_lines(Grid.plane((-1, 1, 4), (29, 30, 4)), track_m)
-    track = mean_track(lines)
+    track = mean_track(lines, WAVELENGTH)
     along = BeamDirections.of(beam, beam.directions(lines), track).along
     random = np.random.default_rng(1)
     centres_m = random.uniform((-70, 0.7 * range_m, -1), (70, 1.3 * range_m, 1), (300, 3))
@@ -265,7 +278,7 @@ def test_boxes_are_seen_from_where_they_are_and_from_hardly_more(beam, range_m):
 
 def test_directions_between_channels_are_of_length_one():
     lines, _ = made(arc)
-    track = mean_track(lines)
+    track = mean_track(lines, WAVELENGTH)
     along = BeamDirections.of(BEAMS[0], BEAMS[0].directions(lines), track).at(
         np.linspace(-1, 2, 50)
     )

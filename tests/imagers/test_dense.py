@@ -5,6 +5,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from cases import lines_over
 from dense import TRACKS, headings, scene, to_and_fro, turning
 from factorizing import EXACT_IS_SLOW, peak_device_bytes
 
@@ -76,6 +77,31 @@ def test_so_it_does_off_the_plane_and_with_separate_or_moving_receivers(name, ki
     if not chosen.is_exact:
         image = factorize(*scene(name, kind), chosen)
         assert_keeps(chosen, relative_error_db(image, exact(name, kind)))
+
+
+def on_carrier(name):
+    """Ten rings, or a helix of ten turns, around a small grid; lines keep their carrier of 20 kHz.
+
+    In air, and sampled at 100 kHz, as recordings of microphones are.
+    """
+    turn = np.arange(900) / 90
+    up = np.floor(turn) if name == "rings" else turn
+    angle = 2 * np.pi * turn
+    tx = np.stack([0.83 * np.cos(angle), 0.83 * np.sin(angle), 0.5 + 0.02 * up], axis=1)
+    grid = Grid.plane((-0.11, 0.11, 48), (-0.11, 0.11, 48))
+    band = {"occupied": 0.02, "centre": 0.2, "speed": 348.9}
+    return lines_over(grid, tx, carrier_hz=0.0, step_m=348.9 / 2e5, **band), grid
+
+
+@pytest.mark.parametrize("tolerance_db", [-50, -60])
+@pytest.mark.parametrize("name", ["rings", "helix"])
+def test_rings_and_helices_keep_their_tolerance_on_their_carrier(name, tolerance_db):
+    lines, grid = on_carrier(name)
+    chosen = plan(lines, grid, tolerance_db=tolerance_db, costs=EXACT_IS_SLOW)
+    assert not chosen.is_exact
+    exact_image = backproject(lines, grid, accuracy_db=-85)
+    error_db = relative_error_db(factorize(lines, grid, chosen), exact_image)
+    assert error_db <= chosen.predicted_error_db
 
 
 @pytest.mark.parametrize("name", ["helix", "passes"])

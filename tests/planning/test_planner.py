@@ -5,7 +5,7 @@ import sys
 
 import numpy as np
 import pytest
-from cases import along_x
+from cases import along_x, lines_over
 from factorizing import (
     BEAMS,
     EXACT_IS_SLOW,
@@ -48,6 +48,21 @@ def test_lines_that_nearly_fill_the_sampled_band_are_upsampled_by_filters(monkey
     assert chosen.factorization.upsampler is not None
     image, exact = factorize(lines, grid, chosen), backproject(lines, grid, accuracy_db=-80)
     assert relative_error_db(image, exact) < -45
+
+
+@pytest.mark.parametrize(("seed", "tolerance_db"), [(1, -20), (14, -20), (32, -50)])
+def test_roots_may_be_smaller_than_subimages_that_stand_for_a_pixel(seed, tolerance_db):
+    """Points scattered off their plane, under a beam, need roots of few columns."""
+    rng = np.random.default_rng(seed)
+    wave_m, count = 1500 / 3.4e6, int(rng.integers(150, 2000))
+    tx = along_x(130, wave_m * 10 ** rng.uniform(-0.5, 0.5))
+    tx[:, 1] = wave_m * rng.uniform(0, 5) * np.abs(np.arange(130) / 11 % 2 - 1)
+    spread_m = wave_m * np.array([0.3, 1, 10 ** rng.uniform(-1, 1.5)])
+    grid = Grid.points(np.array([0, 0.488, -0.29]) + rng.normal(size=(count, 3)) * spread_m)
+    lines = lines_over(grid, tx, carrier_hz=3.4e6, step_m=8e-4)
+    beam = BeamWindow(64, "tukey", along=[1, 0, 0])
+    chosen = plan(lines, grid, tolerance_db=tolerance_db, beam=beam, costs=EXACT_IS_SLOW)
+    assert chosen.predicted_error_db <= tolerance_db
 
 
 def test_a_small_image_is_backprojected():

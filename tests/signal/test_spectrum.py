@@ -5,7 +5,7 @@ from cases import noise
 from clsas.core.grid import Grid
 from clsas.core.lines import RangeLines
 from clsas.exact.reference import ideal
-from clsas.signal.spectrum import measure_spectrum
+from clsas.signal.spectrum import band_wavelength_m, measure_spectrum
 
 
 def lines_of(samples):
@@ -23,6 +23,22 @@ def test_the_spectrum_is_measured_about_its_centre(centre, occupied):
     level = spectrum.power[inside]
     assert level.sum() > 0.97
     assert level[1:-2].std() < 0.2 * level.mean()
+
+
+@pytest.mark.parametrize("mixed_hz", [0.0, 1.0, 20e3, 30e3])
+def test_the_wavelength_is_that_of_the_band_whatever_was_mixed_out(mixed_hz):
+    """30 kHz, sampled at 75 kHz."""
+    range_m = 10.0 + 0.01 * np.arange(500)
+    turns = np.exp(-4j * np.pi * mixed_hz / 1500.0 * range_m)
+    samples = noise(20, 500, occupied=0.2, centre=0.4) * turns
+    lines = RangeLines(samples, 10.0, 0.01, [0, 0, 0], [0, 0, 0], mixed_hz, 1500.0)
+    found_m = band_wavelength_m(lines, measure_spectrum(lines).centre)
+    assert found_m == pytest.approx(1500 / 30e3, rel=0.02)
+
+
+def test_lines_about_0_hz_have_the_wavelength_of_the_highest_frequency_sampled():
+    lines = RangeLines(np.ones((1, 50), complex), 10.0, 0.01, [0, 0, 0], [0, 0, 0], 0.0, 1500.0)
+    assert band_wavelength_m(lines, 1e-4) == pytest.approx(0.04)
 
 
 def test_lines_of_zeros_have_a_spectrum():
