@@ -31,11 +31,12 @@ from clsas.opencl import phases
 from clsas.opencl.buffers import padded_length
 from clsas.opencl.device import Device
 from clsas.planning.aperture_phases import AperturePhases
+from clsas.planning.caching import cached
 from clsas.planning.channels import peak_density, range_window_m, references
 from clsas.planning.costs import Costs
 from clsas.planning.exact_image import Exact
 from clsas.planning.memory import BufferSizes, batches_within
-from clsas.planning.range_extents import half_line_lengths
+from clsas.planning.range_extents import half_line_lengths, half_range_extents_m
 from clsas.planning.stretches import stretch_of, uncompensated
 from clsas.planning.visibility_model import VisibilityModel
 from clsas.signal import interpolation
@@ -50,6 +51,7 @@ OUTSIDE = 0.1
 _ROUNDING_SHARE = 0.1  # of an image's error power, for half precision; half or twice: the same
 _MOST_CHUNKS = 16  # in a sum rounded to half precision; more lose what is added
 _FEW_CHANNELS = 7.0, 30.0  # per pixel, that double the scatter of errors; the latter with steps
+_FEW_CELLS = 10.0  # of an image, that double the scatter of errors; half or twice: 0.5 dB at 60
 _ROOM = 1.06  # of buffers, over the predicted virtual channels; twice the spare room: 2 % slower
 
 
@@ -200,12 +202,25 @@ def margin_db(model: VisibilityModel) -> float:
 
     Errors scatter more if few channels see a pixel, or a few hold most of the power: they depend on
     the positions of these between virtual channels, and relative to a step of the beam. They also
-    scatter more if the lines' power lies at few frequencies.
+    scatter more if the lines' power lies at few frequencies, or the image has few resolution cells.
     """
     power = model.channel_power
     channels = power.sum() ** 2 / (power @ power) * model.visible_share(model.small)
     few = _FEW_CHANNELS[model.beam is not None and model.beam.jumps]
-    return MARGIN_DB + in_db(model.spectrum.scatter * (1 + few / max(channels, 1.0)))
+    factor = (1 + few / max(channels, 1.0)) * (1 + _FEW_CELLS / _resolution_cells(model))
+    return MARGIN_DB + in_db(model.spectrum.scatter * factor)
+
+
+@cached
+def _resolution_cells(model: VisibilityModel) -> float:
+    """Return the number of resolution cells of an image, roughly; at least 1."""
+    height, width = model.surface.plane.shape
+    side, phases = (height, width), AperturePhases(replace(model, root=None))
+    visible = model.visible(model.small)
+    cells = phases.rows(side, 1, 1.0) * (1 + phases.subimage_phase_cycles(side, visible))
+    extent_m = 2 * float(half_range_extents_m(model, [side])[0])
+    in_range = extent_m / model.lines.range_step_m / model.spectrum.oversampling
+    return max(cells * (1 + in_range), 1.0)
 
 
 def band_of(model: VisibilityModel, outside: float) -> tuple[float, float]:
