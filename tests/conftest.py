@@ -37,6 +37,14 @@ def device(request):
     return variant(*request.param)
 
 
+def pytest_sessionstart(session):
+    """Say how to repeat the order of tests; pytest-randomly's own line is not shown with -q."""
+    seed = session.config.getoption("randomly_seed", None)
+    reporter = session.config.pluginmanager.get_plugin("terminalreporter")
+    if seed is not None and reporter:  # processes of pytest-xdist have no reporter
+        reporter.write_line(f"random order: repeat it with --randomly-seed={seed}")
+
+
 def pytest_collection_modifyitems(config, items):
     """Leave out cases that are not worth repeating on another device; repeated ones are slow."""
     kept, left_out = [], []
