@@ -19,6 +19,8 @@ from clsas.factorized.estimates import Work
 from clsas.factorized.plan import CostSource
 from clsas.opencl.device import Device, DeviceInfo
 
+_MOST_NS = 1e15  # arbitrary: eleven days for one unit; times of any image stay finite
+
 
 @dataclass(frozen=True)
 class Costs:
@@ -52,7 +54,7 @@ class Costs:
     def __post_init__(self) -> None:
         """Check every cost."""
         for field in fields(self):
-            validate.number(field.name, getattr(self, field.name), "ns", least=0.0)
+            validate.number(field.name, getattr(self, field.name), "ns", least=0.0, most=_MOST_NS)
 
     def times(self, factors: Mapping[str, float]) -> Costs:
         """Return these costs with some of them multiplied by factors, by name."""
@@ -195,7 +197,8 @@ def _tables() -> dict[str, Any]:
 
 def _known(table: dict[str, Any]) -> KnownCosts:
     """Return costs from their stored table; raises an error if it is not one of `save`."""
-    costs = {field.name: float(table["costs"][field.name]) for field in fields(Costs)}
+    names = [field.name for field in fields(Costs)]
+    costs = {name: validate.number(name, table["costs"][name], "ns") for name in names}
     if table["source"] not in ("scaled", "calibrated") or not table["measured"]:
         raise ValueError("costs must be scaled or calibrated, at a time")
     return KnownCosts(Costs(**costs), table["source"], table["measured"])
