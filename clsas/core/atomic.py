@@ -11,10 +11,13 @@ import errno
 import fcntl
 import os
 import shutil
+import stat
 import uuid
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+
+from clsas.core.reading import check_ordinary
 
 _PATTERN = ".clsas-*.part"
 
@@ -23,18 +26,34 @@ _PATTERN = ".clsas-*.part"
 def replacing(path: str | os.PathLike) -> Iterator[Path]:
     """Yield an empty temporary file to write; rename it to `path` on success, else remove it.
 
+    A symbolic link stays, and the file that it leads to is replaced. The new file has the mode of
+    the one before and, where that is permitted, its owner and group.
+
     Raises
     ------
+    ValueError
+        If `path` is a device, a pipe or a socket.
     OSError
         If the folder of `path` does not exist or cannot be written, if `path` is a folder, or on a
         full disk. The error names `path`, not the temporary file.
     """
-    path = Path(path)
+    given = path = Path(path)
+    if given.is_symlink():
+        path = Path(os.path.realpath(given))
     if not path.parent.is_dir():
-        raise FileNotFoundError(f"cannot write {path}: there is no folder {path.parent}")
+        raise FileNotFoundError(f"cannot write {given}: there is no folder {path.parent}")
     if path.is_dir():
-        raise IsADirectoryError(f"cannot write {path}: it is a folder")
+        raise IsADirectoryError(f"cannot write {given}: it is a folder")
+    before = None
+    with suppress(FileNotFoundError):
+        check_ordinary(given)
+        before = path.stat()
     with _temporary(path, _make_file) as (temporary, descriptor):
+        if before is not None:
+            # Before there is anything to read in it.
+            with suppress(PermissionError):
+                os.fchown(descriptor, before.st_uid, before.st_gid)
+            os.fchmod(descriptor, stat.S_IMODE(before.st_mode))
         yield temporary
         os.fsync(descriptor)
         os.replace(temporary, path)
