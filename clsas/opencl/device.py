@@ -14,6 +14,7 @@ from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from textwrap import indent
 from typing import Any
 
 import numpy as np
@@ -186,7 +187,7 @@ class Device:
         except cl.RuntimeError as error:
             raise DeviceError(
                 f"{self.info.label} could not build {name}.cl with "
-                f"{' '.join(definitions)}:\n{error}"
+                f"{' '.join(definitions)}:\n{indent(str(error), '  ', lambda line: True)}"
             ) from error
         # Not Program.all_kernels: PyOpenCL never releases what that returns.
         return Kernel(name, parameters, cl.Kernel(program, name))
