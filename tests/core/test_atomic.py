@@ -9,7 +9,7 @@ import sys
 
 import pytest
 
-from clsas.core.atomic import creating, replacing
+from clsas.core.atomic import creating, locked, replacing
 
 
 @pytest.mark.parametrize("names", [None, "the temporary one"])
@@ -35,7 +35,7 @@ def killed_in(statement, folder):
     program = f"""
 import os, signal
 from pathlib import Path
-from clsas.core.atomic import creating, replacing, staging
+from clsas.core.atomic import creating, locked, replacing, staging
 path = Path({str(folder / "a.h5")!r})
 with {statement} as part:
     (part / "x" if part.is_dir() else part).write_text("half")
@@ -182,3 +182,59 @@ def test_a_loop_of_links_is_refused(tmp_path):
     with pytest.raises(OSError, match="levels of symbolic links"), replacing(loop):
         pytest.fail("there is nothing to write")
     assert loop.is_symlink()
+
+
+def test_a_folder_is_locked_once_at_a_time(tmp_path):
+    with locked(tmp_path):
+        for _ in range(2):
+            with (
+                pytest.raises(BlockingIOError, match="at work in this folder") as caught,
+                locked(tmp_path),
+            ):
+                pytest.fail("two have the lock")
+            assert caught.value.filename == str(tmp_path)
+    assert not list(tmp_path.iterdir())
+    with locked(tmp_path):
+        pass
+
+
+def test_a_killed_process_leaves_no_lock(tmp_path):
+    program = f"""
+import os, signal
+from pathlib import Path
+from clsas.core.atomic import locked
+with locked(Path({str(tmp_path)!r})):
+    os.kill(os.getpid(), signal.SIGKILL)
+"""
+    done = subprocess.run([sys.executable, "-c", program], check=False)
+    assert done.returncode == -signal.SIGKILL
+    assert len(list(tmp_path.iterdir())) == 1
+    with locked(tmp_path):
+        pass
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_lock_whose_file_was_removed_meanwhile_is_taken_anew(tmp_path, monkeypatch):
+    import fcntl
+
+    flock, calls = fcntl.flock, []
+
+    def raced(descriptor, operation):
+        if not calls:
+            (tmp_path / ".clsas.lock").unlink()
+        calls.append(operation)
+        flock(descriptor, operation)
+
+    monkeypatch.setattr(fcntl, "flock", raced)
+    with locked(tmp_path), pytest.raises(BlockingIOError), locked(tmp_path):
+        pytest.fail("two have the lock")
+    assert len(calls) == 3
+
+
+def test_a_folder_that_cannot_be_written_needs_no_lock(tmp_path, monkeypatch):
+    def refused(*_):
+        raise PermissionError(errno.EACCES, "Permission denied")
+
+    monkeypatch.setattr(os, "open", refused)
+    with locked(tmp_path):
+        assert not list(tmp_path.iterdir())
