@@ -371,7 +371,8 @@ def test_bad_arguments(scene, tmp_path):
 
 def test_two_runs_in_one_folder_are_refused(plain, tmp_path, monkeypatch):
     """The second would continue from the lines of the first, and record them as its own."""
-    other, image = recording(), steps_module.RUN["image"]
+    other = clsas.load(plain.parent / "lines.h5").weighted(np.full(260, 2.0))
+    image = steps_module.RUN["image"]
     messages = []
 
     def image_beside(job):
@@ -391,14 +392,14 @@ def test_two_runs_in_one_folder_are_refused(plain, tmp_path, monkeypatch):
 
 
 def test_a_recording_that_changes_while_it_is_processed_is_refused(plain, tmp_path, monkeypatch):
-    changing = tmp_path / "changing.h5"
-    clsas.save(changing, recording())
+    changing, lines = tmp_path / "changing.h5", clsas.load(plain.parent / "lines.h5")
+    clsas.save(changing, lines)
     from clsas.processing import chain
 
     open_device = chain.open_device
 
     def open_late(device):
-        clsas.save(changing, recording(1e-3))
+        clsas.save(changing, lines.weighted(np.full(260, 2.0)))
         return open_device(device)
 
     monkeypatch.setattr(chain, "open_device", open_late)
