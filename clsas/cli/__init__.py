@@ -89,6 +89,13 @@ class _Commands(click.Group):
         with formatter.section("Commands"):
             formatter.write_dl([(name, what) for name, (_, what) in _COMMANDS.items()])
 
+    def make_context(self, *arguments: Any, **options: Any) -> click.Context:
+        try:
+            return super().make_context(*arguments, **options)
+        except click.ClickException as error:  # an option that the group does not have
+            error.message = _printable(error.message)  # type: ignore[misc]
+            raise
+
     def invoke(self, ctx: click.Context) -> Any:
         import pyopencl
 
@@ -147,13 +154,13 @@ def _showing(others: Callable[..., None]) -> Callable[..., None]:
         if issubclass(category, clsas.ClsasWarning):
             click.echo(f"Warning: {_printable(str(message))}", err=True)
         else:
-            others(message, category, *where, **options)
+            others(_printable(str(message)), category, *where, **options)
 
     return show
 
 
 def _printable(text: str) -> str:
-    """Return a message without control characters."""
+    """Return a message whose text may have come from outside."""
     from clsas.core import validate  # imports NumPy, which is slow
 
     return validate.printable(text)

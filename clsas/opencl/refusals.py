@@ -6,6 +6,7 @@ import functools
 import os
 import tempfile
 from pathlib import Path
+from textwrap import indent
 
 import pyopencl as cl
 
@@ -42,7 +43,7 @@ def not_built(what: str, platform: str, error: cl.Error) -> DeviceError:
     """Return the error that says why a driver of a platform could not build something."""
     if platform == POCL and (why := _cache_problem()):
         return DeviceError(f"{what}: {why}")
-    return DeviceError(f"{what}:\n{error}")
+    return DeviceError(f"{what}:\n{indent(str(error), '  ', lambda line: True)}")
 
 
 def _platforms() -> list[cl.Platform]:

@@ -818,6 +818,34 @@ def test_messages_hold_no_control_characters(tmp_path):
         assert stderr.count("Error: ") == 1
 
 
+BAD = "\x1b[31mred\nError: gone\nWarning: fine.h5"
+
+
+def test_names_of_files_reach_no_terminal(made, tmp_path):
+    """Neither do escape sequences in them, nor lines that look like clsas's own."""
+    for name in ("lines.h5", "image.h5", "scene.toml"):
+        shutil.copy(made[0] / name, tmp_path / f"{name}{BAD}")
+    (tmp_path / f"text{BAD}").write_text("no scene")
+    out, grid = tmp_path / f"out{BAD}", ["--x", "-1:1:8", "--y", "19:21:8"]
+    lines, image, text = (tmp_path / f"{name}{BAD}" for name in ("lines.h5", "image.h5", "text"))
+    for args, code in (
+        (["image", lines, *grid, "--exact", "-o", out], 0),
+        (["convert", lines, out], 0),
+        (["quality", image, "--reference", image], 0),
+        (["simulate", tmp_path / f"scene.toml{BAD}", "-o", out], 0),
+        (["simulate", text, "-o", tmp_path / "echoes.h5"], 1),
+        (["compress", image, "-o", tmp_path / "new.h5"], 1),
+        (["image", tmp_path / f"none{BAD}", *grid, "-o", tmp_path / "new.h5"], 2),
+        ([f"--{BAD}"], 2),
+        ([f"none{BAD}"], 2),
+    ):
+        stdout, stderr = run(*args, code=code)
+        assert "\x1b" not in stdout + stderr
+        assert r"\x1b[31mred\nError: gone\nWarning: fine.h5" in stdout + stderr
+        assert len(re.findall("^Error: ", stdout + stderr, re.MULTILINE)) == (code > 0)
+        assert not re.findall("^Warning: fine", stdout + stderr, re.MULTILINE)
+
+
 def test_warnings_of_others_are_not_shown_as_clsas_own(monkeypatch, tmp_path):
     def warn(*_, **__):
         warnings.warn("of another library", DeprecationWarning, stacklevel=1)

@@ -391,3 +391,18 @@ def test_damaged_bytes_never_become_data(tmp_path):
         except FileFormatError:
             found += 1
     assert found > 200
+
+
+def test_saving_keeps_links_modes_and_what_is_no_file(tmp_path):
+    grid = Grid.plane((0, 1, 2), (0, 1, 2))
+    private, link, pipe = (tmp_path / f"{name}.h5" for name in ("private", "link", "pipe"))
+    private.touch(mode=0o600)
+    link.symlink_to(private)
+    os.mkfifo(pipe)
+    save(link, grid)
+    assert link.is_symlink()
+    assert private.stat().st_mode & 0o777 == 0o600
+    assert load(private).shape == grid.shape
+    with pytest.raises(ValueError, match=r"pipe\.h5 must be an ordinary file, got a pipe"):
+        save(pipe, grid)
+    assert pipe.is_fifo()

@@ -119,14 +119,14 @@ def test_a_cache_that_pocl_cannot_write_is_named(monkeypatch, no_folder):
                 assert "environment variable POCL_CACHE_DIR" in str(error)
                 assert "pip install" not in str(error)
             other = refusals.not_built("image.cl", "NVIDIA CUDA", ValueError("a log"))
-            assert str(other) == "image.cl:\na log"
+            assert str(other) == "image.cl:\n  a log"
 
 
 def test_with_a_cache_the_error_is_another(monkeypatch, tmp_path):
     monkeypatch.setenv("POCL_CACHE_DIR", str(tmp_path / "made" / "anew"))
     assert "pip install" in str(refusals.no_device())
     said = str(refusals.not_built("image.cl", refusals.POCL, ValueError("a log")))
-    assert said == "image.cl:\na log"
+    assert said == "image.cl:\n  a log"
 
 
 @pytest.mark.slow
