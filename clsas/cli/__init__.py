@@ -83,7 +83,7 @@ class _Commands(click.Group):
         if cmd_name not in _COMMANDS:
             return None
         module, _ = _COMMANDS[cmd_name]
-        return getattr(importlib.import_module(f"clsas.cli.{module}"), cmd_name.replace("-", "_"))
+        return getattr(_imported(f"clsas.cli.{module}"), cmd_name.replace("-", "_"))
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         with formatter.section("Commands"):
@@ -95,10 +95,17 @@ class _Commands(click.Group):
         except click.ClickException as error:  # an option that the group does not have
             error.message = _printable(error.message)  # type: ignore[misc]
             raise
+        except KeyboardInterrupt as interrupt:
+            raise _interrupted() from interrupt
 
     def invoke(self, ctx: click.Context) -> Any:
-        import pyopencl
+        try:
+            return self._invoke(ctx)
+        except KeyboardInterrupt as interrupt:
+            raise _interrupted() from interrupt
 
+    def _invoke(self, ctx: click.Context) -> Any:
+        pyopencl = _imported("pyopencl")
         # Errors of users, and limits of their machines.
         errors = (
             ValueError,
@@ -120,9 +127,6 @@ class _Commands(click.Group):
                 raise
             except BrokenPipeError:
                 raise  # click handles this: the reader of our output has left
-            except KeyboardInterrupt:
-                click.echo("Interrupted", err=True)
-                ctx.exit(130)
             except errors as error:
                 if ctx.params.get("traceback"):
                     raise
@@ -145,6 +149,19 @@ def main(traceback: bool) -> None:
                      clsas image lines.h5 --scene scene.toml -o image.h5 --picture image.png
                      clsas quality image.h5 --near 0,42.5
     """
+
+
+def _imported(name: str) -> Any:
+    """Import a module; Ctrl-C waits, which some extension modules would answer by aborting."""
+    from clsas.core.threads import uninterrupted  # imports NumPy, which is slow
+
+    with uninterrupted():
+        return importlib.import_module(name)
+
+
+def _interrupted() -> click.exceptions.Exit:
+    click.echo("Interrupted", err=True)
+    return click.exceptions.Exit(130)
 
 
 def _showing(others: Callable[..., None]) -> Callable[..., None]:

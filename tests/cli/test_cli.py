@@ -744,6 +744,31 @@ def test_ctrl_c_ends_with_130_and_leaves_no_file(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["scene.toml"]
 
 
+INTERRUPTED_IMPORT = """
+import signal, sys
+
+class Interrupting:
+    def find_spec(self, name, path, target=None):
+        if name == sys.argv[1]:
+            sys.meta_path.remove(self)
+            signal.raise_signal(signal.SIGINT)
+
+signal.signal(signal.SIGINT, signal.default_int_handler)
+sys.meta_path.insert(0, Interrupting())
+from clsas.__main__ import run
+sys.argv[1:] = ["devices"]
+run()
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("module", ["click", "clsas.cli", "numpy", "pyopencl", "clsas.cli.machine"])
+def test_ctrl_c_while_modules_are_imported_ends_with_130(module):
+    command = [sys.executable, "-c", INTERRUPTED_IMPORT.replace("sys.argv[1]", repr(module))]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert (done.returncode, done.stdout, done.stderr) == (130, "", "Interrupted\n")
+
+
 @pytest.mark.slow
 def test_progress_is_shown_on_a_terminal(made, tmp_path):
     ours, theirs = pty.openpty()
