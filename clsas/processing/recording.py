@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -56,6 +56,10 @@ class Recording:
         digest = file_digest(path)
         of_both = step_digest("recording", options, digest)
         return cls({"file": str(path), "digest": digest}, of_both, path, None, options)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Pickle without lines that were read: they are read again from their file."""
+        return {field.name: getattr(self, field.name) for field in fields(self)}
 
     def read(self) -> RangeLines:
         """Return the lines; those of echoes are compressed.

@@ -301,6 +301,23 @@ def test_lines_and_echoes_in_memory(scene, tmp_path):
         _ = clsas.process(scene, lines=lines, steps=("calibrate",)).image
 
 
+@pytest.mark.parametrize("steps", [("image",), ("calibrate", "image")])
+def test_a_pickled_processing_holds_no_lines_of_files(scene, steps):
+    choose(scene, *steps)
+    found = clsas.process(scene)
+    samples = found.lines.samples
+    pickled = pickle.dumps(found)
+    assert len(pickled) < samples.nbytes / 10
+    np.testing.assert_array_equal(pickle.loads(pickled).lines.samples, samples)
+
+
+def test_a_pickled_processing_holds_lines_given_in_memory(scene):
+    choose(scene, "image")
+    lines = clsas.load(scene.parent / "lines.h5")
+    read = pickle.loads(pickle.dumps(clsas.process(scene, lines=lines)))
+    np.testing.assert_array_equal(read.lines.samples, lines.samples)
+
+
 def test_mosaic_continues(scene):
     pytest.importorskip("zarr")
     scene.write_text(scene.read_text() + "[mosaic]\npatches = [2, 2]\n")
