@@ -90,23 +90,14 @@ class _Commands(click.Group):
             formatter.write_dl([(name, what) for name, (_, what) in _COMMANDS.items()])
 
     def invoke(self, ctx: click.Context) -> Any:
-        import pyopencl
-
-        # Errors of users, and limits of their machines.
-        errors = (
-            ValueError,
-            TypeError,
-            clsas.DeviceError,
-            pyopencl.Error,
-            OSError,
-            ImportError,
-            MemoryError,
-        )
         with warnings.catch_warnings():
-            warnings.simplefilter("always", clsas.ClsasWarning)
-            warnings.simplefilter("ignore", pyopencl.CompilerWarning)
             warnings.showwarning = _showing(warnings.showwarning)
             try:
+                # Both imports take some tenths of a second, in which Ctrl-C may come.
+                import pyopencl
+
+                warnings.simplefilter("always", clsas.ClsasWarning)
+                warnings.simplefilter("ignore", pyopencl.CompilerWarning)
                 return super().invoke(ctx)
             except click.ClickException as error:
                 error.message = _printable(error.message)  # type: ignore[misc]
@@ -116,10 +107,18 @@ class _Commands(click.Group):
             except KeyboardInterrupt:
                 click.echo("Interrupted", err=True)
                 ctx.exit(130)
-            except errors as error:
+            except _errors() as error:
                 if ctx.params.get("traceback"):
                     raise
                 raise click.ClickException(_message(error)) from error
+
+
+def _errors() -> tuple[type[Exception], ...]:
+    """Return errors of users, and limits of their machines."""
+    import pyopencl
+
+    ours = ValueError, TypeError, clsas.DeviceError, OSError, ImportError, MemoryError
+    return *ours, pyopencl.Error
 
 
 @click.group(

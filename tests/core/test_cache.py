@@ -173,7 +173,7 @@ def test_a_cache_of_the_administrator_can_be_read(shared, monkeypatch):
     os.seteuid(OTHER)
     try:
         assert cache.trusted_cache() == shared / "cache"
-        with pytest.raises(PermissionError, match="you cannot write to it.*CLSAS_CACHE"):
+        with pytest.raises(PermissionError, match=r"you cannot write to it.*CLSAS_CACHE"):
             cache.private_folder()
     finally:
         os.seteuid(0)
