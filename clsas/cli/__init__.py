@@ -9,6 +9,7 @@ from __future__ import annotations
 import importlib
 import warnings
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from typing import Any
 
 import click
@@ -83,7 +84,9 @@ class _Commands(click.Group):
         if cmd_name not in _COMMANDS:
             return None
         module, _ = _COMMANDS[cmd_name]
-        return getattr(_imported(f"clsas.cli.{module}"), cmd_name.replace("-", "_"))
+        with _importing():
+            imported = importlib.import_module(f"clsas.cli.{module}")
+        return getattr(imported, cmd_name.replace("-", "_"))
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         with formatter.section("Commands"):
@@ -99,38 +102,33 @@ class _Commands(click.Group):
             raise _interrupted() from interrupt
 
     def invoke(self, ctx: click.Context) -> Any:
-        try:
-            return self._invoke(ctx)
-        except KeyboardInterrupt as interrupt:
-            raise _interrupted() from interrupt
-
-    def _invoke(self, ctx: click.Context) -> Any:
-        pyopencl = _imported("pyopencl")
-        # Errors of users, and limits of their machines.
-        errors = (
-            ValueError,
-            TypeError,
-            clsas.DeviceError,
-            pyopencl.Error,
-            OSError,
-            ImportError,
-            MemoryError,
-        )
         with warnings.catch_warnings():
-            warnings.simplefilter("always", clsas.ClsasWarning)
-            warnings.simplefilter("ignore", pyopencl.CompilerWarning)
             warnings.showwarning = _showing(warnings.showwarning)
             try:
+                with _importing():
+                    import pyopencl
+                warnings.simplefilter("always", clsas.ClsasWarning)
+                warnings.simplefilter("ignore", pyopencl.CompilerWarning)
                 return super().invoke(ctx)
             except click.ClickException as error:
                 error.message = _printable(error.message)  # type: ignore[misc]
                 raise
             except BrokenPipeError:
                 raise  # click handles this: the reader of our output has left
-            except errors as error:
+            except KeyboardInterrupt as interrupt:
+                raise _interrupted() from interrupt
+            except _errors() as error:
                 if ctx.params.get("traceback"):
                     raise
                 raise click.ClickException(_message(error)) from error
+
+
+def _errors() -> tuple[type[Exception], ...]:
+    """Return errors of users, and limits of their machines."""
+    import pyopencl
+
+    ours = ValueError, TypeError, clsas.DeviceError, OSError, ImportError, MemoryError
+    return *ours, pyopencl.Error
 
 
 @click.group(
@@ -151,12 +149,11 @@ def main(traceback: bool) -> None:
     """
 
 
-def _imported(name: str) -> Any:
-    """Import a module; Ctrl-C waits, which some extension modules would answer by aborting."""
+def _importing() -> AbstractContextManager[None]:
+    """Let Ctrl-C wait for imports: some extension modules would answer it by aborting."""
     from clsas.core.threads import uninterrupted  # imports NumPy, which is slow
 
-    with uninterrupted():
-        return importlib.import_module(name)
+    return uninterrupted()
 
 
 def _interrupted() -> click.exceptions.Exit:

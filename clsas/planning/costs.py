@@ -12,8 +12,8 @@ from typing import Any, get_args
 import numpy as np
 
 from clsas.core import reading, validate
-from clsas.core.atomic import make_folders, replacing
-from clsas.core.cache import cache_folder
+from clsas.core.atomic import replacing
+from clsas.core.cache import cache_folder, private_folder, trusted_cache
 from clsas.core.version import __version__
 from clsas.factorized.estimates import Work
 from clsas.factorized.plan import CostSource
@@ -140,7 +140,8 @@ def load(device: Device | DeviceInfo) -> KnownCosts:
     Warns
     -----
     ClsasWarning
-        If the file of costs cannot be read, or holds something else.
+        If the file of costs cannot be read or holds something else, or others can write to the
+        cache folder.
     """
     info = device.info if isinstance(device, Device) else device
     default = KnownCosts(defaults(info), "default")
@@ -160,16 +161,15 @@ def save(device: Device, costs: Costs, source: CostSource = "calibrated") -> Pat
     Raises
     ------
     OSError
-        If the user's cache folder cannot be written.
+        If the user's cache folder cannot be written, or others can write to it.
     """
-    file = path()
+    file = private_folder() / path().name
     try:
         stored = _tables()
     except (OSError, ValueError):
         stored = {}  # whoever reads the file is warned
     measured = datetime.now(UTC).isoformat(timespec="seconds")
     stored[key(device.info)] = {"source": source, "measured": measured, "costs": asdict(costs)}
-    make_folders(file.parent)
     with replacing(file) as temporary:
         temporary.write_text(json.dumps(stored, indent=1))
     return file
@@ -187,7 +187,7 @@ def key(info: DeviceInfo) -> str:
 def _tables() -> dict[str, Any]:
     """Return the stored tables by key; raises OSError or ValueError if the file has none."""
     try:
-        stored = reading.parse_json(reading.read_bytes(path()))
+        stored = reading.parse_json(reading.read_bytes(trusted_cache() / path().name))
     except (FileNotFoundError, NotADirectoryError):
         return {}
     if not isinstance(stored, dict):

@@ -1,3 +1,4 @@
+import builtins
 import dataclasses
 import json
 import os
@@ -726,6 +727,20 @@ def test_expected_resolution_of_a_plain_aperture():
     azimuth_m, range_m = demo.expected_resolution_m(sonar, track, np.array([0, 1000.0, 0]))
     assert azimuth_m == pytest.approx(0.8859 * 0.015 * 1000 / (2 * 10.01), rel=1e-3)
     assert range_m == pytest.approx(0.8859 * 1500 / (2 * 5e3), rel=0.02)
+
+
+def test_ctrl_c_while_a_command_is_loaded_ends_with_130(monkeypatch):
+    load = builtins.__import__
+
+    def interrupted(name, *rest):
+        if name == "pyopencl":
+            raise KeyboardInterrupt
+        return load(name, *rest)
+
+    monkeypatch.setattr(builtins, "__import__", interrupted)
+    result = CliRunner().invoke(cli.main, ["devices"])
+    assert result.exit_code == 130
+    assert result.stderr == "Interrupted\n"
 
 
 @pytest.mark.slow
