@@ -1,5 +1,11 @@
 """The devices that tests run on, and what they allocate there."""
 
+import os
+import signal
+import sys
+import warnings
+
+import numpy as np
 import pytest
 from variants import DEFAULT, EVERY_VARIANT, OTHERS, OWN, is_repeated, variant
 
@@ -7,6 +13,7 @@ from clsas.opencl.device import Device, list_devices
 from clsas.planning import costs
 
 _ALL = OWN | OTHERS
+_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGPIPE)
 
 
 @pytest.fixture(autouse=True, scope="session")
@@ -23,6 +30,37 @@ def stored_costs(tmp_path_factory):
                 device = variant(*way)
                 costs.save(device, costs.defaults(device))
         yield
+
+
+@pytest.fixture(autouse=True)
+def left_as_found():
+    """Fail a test that changes what later tests of its process depend on."""
+    before = _shared_state()
+    yield
+    after = _shared_state()
+    changed = {name: after[name] for name in after if after[name] != before.get(name, after[name])}
+    assert changed == {}, "the test leaves this changed"
+
+
+def _shared_state():
+    """State of a process that tests could change, by name."""
+    umask = os.umask(0o077)
+    os.umask(umask)
+    found = {
+        "environment": {k: v for k, v in os.environ.items() if k != "PYTEST_CURRENT_TEST"},
+        "working directory": os.getcwd(),
+        "mask of modes": umask,
+        "folders of modules": list(sys.path),
+        "handlers of signals": [signal.getsignal(each) for each in _SIGNALS],
+        "display of warnings": warnings.showwarning,
+        "floating-point errors": np.geterr(),
+        "printing of arrays": np.get_printoptions(),
+    }
+    if matplotlib := sys.modules.get("matplotlib"):
+        found["Matplotlib's settings"] = dict.copy(matplotlib.rcParams)  # asks for no backend
+    if pyplot := sys.modules.get("matplotlib.pyplot"):
+        found["figures"] = pyplot.get_fignums()
+    return found
 
 
 @pytest.fixture(params=OWN.values(), ids=OWN.keys(), scope="session")

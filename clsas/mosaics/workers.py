@@ -17,6 +17,7 @@ from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import Any
 
+from dask import config
 from distributed import Client, Nanny, Scheduler, Security, SpecCluster, Worker
 from distributed.system import MEMORY_LIMIT
 
@@ -32,11 +33,11 @@ class _NoPages:
 
 
 class _Scheduler(_NoPages, Scheduler):
-    os.environ[_SAFE_PATH] = "1"
+    pass
 
 
 class _Worker(_NoPages, Worker):
-    os.environ[_SAFE_PATH] = "1"
+    pass
 
 
 @contextmanager
@@ -57,7 +58,7 @@ def local_client(workers: int) -> Iterator[Client]:
     opened = ExitStack()
     try:
         with uninterrupted():
-            opened.enter_context(_only_installed_modules())
+            opened.enter_context(_environment_of_workers())
             with _deaf_to_ctrl_c():
                 cluster = opened.enter_context(_cluster(workers, folder))
             client = opened.enter_context(Client(cluster))
@@ -113,20 +114,25 @@ def _deaf_to_ctrl_c() -> Iterator[None]:
 
 
 @contextmanager
-def _only_installed_modules() -> Iterator[None]:
+def _environment_of_workers() -> Iterator[None]:
     """Let processes that are started import nothing from the working directory.
 
     `python -c`, as which workers start, looks there first, and others may be able to write to it.
+    Afterwards this process has the variables that it had before. Dask sets its workers' variables
+    here, too, such as OMP_NUM_THREADS = 1.
     """
-    before = os.environ.get(_SAFE_PATH)
+    of_dask = config.get("distributed.nanny.pre-spawn-environ")
+    names = (_SAFE_PATH, "PYTHONHASHSEED", "__DASK_PARENT_PID", *of_dask)
+    before = {name: os.environ.get(name) for name in names}
     os.environ[_SAFE_PATH] = "1"
     try:
         yield
     finally:
-        if before is None:
-            del os.environ[_SAFE_PATH]
-        else:
-            os.environ[_SAFE_PATH] = before
+        for name, value in before.items():
+            if value is None:
+                os.environ.pop(name, None)
+            else:
+                os.environ[name] = value
 
 
 def _certificate() -> Security:
