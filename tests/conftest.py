@@ -12,6 +12,7 @@ from variants import DEFAULT, EVERY_VARIANT, OTHERS, OWN, is_repeated, variant
 from clsas.opencl.device import Device, list_devices
 from clsas.planning import costs
 
+os.environ["MPLBACKEND"] = "agg"  # before Matplotlib is imported: figures open no windows
 _ALL = OWN | OTHERS
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGPIPE)
 

@@ -223,7 +223,6 @@ def test_an_image_is_drawn_into_axes_of_ones_own():
 def test_an_image_alone_is_drawn_into_a_figure_of_pyplot():
     from matplotlib import pyplot
 
-    pyplot.switch_backend("agg")
     axes = SPECKLE.plot()
     try:
         assert axes.figure.number in pyplot.get_fignums()
