@@ -33,6 +33,13 @@ def stored_costs(tmp_path_factory):
         yield
 
 
+@pytest.fixture(autouse=True, scope="session")
+def heeded_ctrl_c():
+    """Heed Ctrl-C also where a shell started the tests in the background, which ignores it."""
+    if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
 @pytest.fixture(autouse=True)
 def left_as_found():
     """Fail a test that changes what later tests of its process depend on."""
