@@ -1,12 +1,20 @@
 """The devices that tests run on, and what they allocate there."""
 
+import os
+import signal
+import sys
+import warnings
+
+import numpy as np
 import pytest
 from variants import DEFAULT, EVERY_VARIANT, OTHERS, OWN, is_repeated, variant
 
 from clsas.opencl.device import Device, list_devices
 from clsas.planning import costs
 
+os.environ["MPLBACKEND"] = "agg"  # before Matplotlib is imported: figures open no windows
 _ALL = OWN | OTHERS
+_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGPIPE)
 
 
 @pytest.fixture(autouse=True, scope="session")
@@ -25,6 +33,44 @@ def stored_costs(tmp_path_factory):
         yield
 
 
+@pytest.fixture(autouse=True, scope="session")
+def heeded_ctrl_c():
+    """Heed Ctrl-C also where a shell started the tests in the background, which ignores it."""
+    if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+@pytest.fixture(autouse=True)
+def left_as_found():
+    """Fail a test that changes what later tests of its process depend on."""
+    before = _shared_state()
+    yield
+    after = _shared_state()
+    changed = {name: after[name] for name in after if after[name] != before.get(name, after[name])}
+    assert changed == {}, "the test leaves this changed"
+
+
+def _shared_state():
+    """State of a process that tests could change, by name."""
+    umask = os.umask(0o077)
+    os.umask(umask)
+    found = {
+        "environment": {k: v for k, v in os.environ.items() if k != "PYTEST_CURRENT_TEST"},
+        "working directory": os.getcwd(),
+        "mask of modes": umask,
+        "folders of modules": list(sys.path),
+        "handlers of signals": [signal.getsignal(each) for each in _SIGNALS],
+        "display of warnings": warnings.showwarning,
+        "floating-point errors": np.geterr(),
+        "printing of arrays": np.get_printoptions(),
+    }
+    if matplotlib := sys.modules.get("matplotlib"):
+        found["Matplotlib's settings"] = dict.copy(matplotlib.rcParams)  # asks for no backend
+    if pyplot := sys.modules.get("matplotlib.pyplot"):
+        found["figures"] = pyplot.get_fignums()
+    return found
+
+
 @pytest.fixture(params=OWN.values(), ids=OWN.keys(), scope="session")
 def platform(request):
     """Every platform's first device, as it is used."""
@@ -35,6 +81,14 @@ def platform(request):
 def device(request):
     """Every platform's first device, and a CPU also with other vector widths."""
     return variant(*request.param)
+
+
+def pytest_sessionstart(session):
+    """Say how to repeat the order of tests; pytest-randomly's own line is not shown with -q."""
+    seed = session.config.getoption("randomly_seed", None)
+    reporter = session.config.pluginmanager.get_plugin("terminalreporter")
+    if seed is not None and reporter:  # processes of pytest-xdist have no reporter
+        reporter.write_line(f"random order: repeat it with --randomly-seed={seed}")
 
 
 def pytest_collection_modifyitems(config, items):

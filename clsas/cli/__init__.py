@@ -9,6 +9,7 @@ from __future__ import annotations
 import importlib
 import warnings
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from typing import Any
 
 import click
@@ -83,43 +84,51 @@ class _Commands(click.Group):
         if cmd_name not in _COMMANDS:
             return None
         module, _ = _COMMANDS[cmd_name]
-        return getattr(importlib.import_module(f"clsas.cli.{module}"), cmd_name.replace("-", "_"))
+        with _importing():
+            imported = importlib.import_module(f"clsas.cli.{module}")
+        return getattr(imported, cmd_name.replace("-", "_"))
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         with formatter.section("Commands"):
             formatter.write_dl([(name, what) for name, (_, what) in _COMMANDS.items()])
 
-    def invoke(self, ctx: click.Context) -> Any:
-        import pyopencl
+    def make_context(self, *arguments: Any, **options: Any) -> click.Context:
+        try:
+            return super().make_context(*arguments, **options)
+        except click.ClickException as error:  # an option that the group does not have
+            error.message = _printable(error.message)  # type: ignore[misc]
+            raise
+        except KeyboardInterrupt as interrupt:
+            raise _interrupted() from interrupt
 
-        # Errors of users, and limits of their machines.
-        errors = (
-            ValueError,
-            TypeError,
-            clsas.DeviceError,
-            pyopencl.Error,
-            OSError,
-            ImportError,
-            MemoryError,
-        )
+    def invoke(self, ctx: click.Context) -> Any:
         with warnings.catch_warnings():
-            warnings.simplefilter("always", clsas.ClsasWarning)
-            warnings.simplefilter("ignore", pyopencl.CompilerWarning)
             warnings.showwarning = _showing(warnings.showwarning)
             try:
+                with _importing():
+                    import pyopencl
+                warnings.simplefilter("always", clsas.ClsasWarning)
+                warnings.simplefilter("ignore", pyopencl.CompilerWarning)
                 return super().invoke(ctx)
             except click.ClickException as error:
                 error.message = _printable(error.message)  # type: ignore[misc]
                 raise
             except BrokenPipeError:
                 raise  # click handles this: the reader of our output has left
-            except KeyboardInterrupt:
-                click.echo("Interrupted", err=True)
-                ctx.exit(130)
-            except errors as error:
+            except KeyboardInterrupt as interrupt:
+                raise _interrupted() from interrupt
+            except _errors() as error:
                 if ctx.params.get("traceback"):
                     raise
                 raise click.ClickException(_message(error)) from error
+
+
+def _errors() -> tuple[type[Exception], ...]:
+    """Return errors of users, and limits of their machines."""
+    import pyopencl
+
+    ours = ValueError, TypeError, clsas.DeviceError, OSError, ImportError, MemoryError
+    return *ours, pyopencl.Error
 
 
 @click.group(
@@ -140,6 +149,18 @@ def main(traceback: bool) -> None:
     """
 
 
+def _importing() -> AbstractContextManager[None]:
+    """Let Ctrl-C wait for imports: some extension modules would answer it by aborting."""
+    from clsas.core.threads import uninterrupted  # imports NumPy, which is slow
+
+    return uninterrupted()
+
+
+def _interrupted() -> click.exceptions.Exit:
+    click.echo("Interrupted", err=True)
+    return click.exceptions.Exit(130)
+
+
 def _showing(others: Callable[..., None]) -> Callable[..., None]:
     """Return a function that shows clsas's warnings as messages and others as Python does."""
 
@@ -147,13 +168,13 @@ def _showing(others: Callable[..., None]) -> Callable[..., None]:
         if issubclass(category, clsas.ClsasWarning):
             click.echo(f"Warning: {_printable(str(message))}", err=True)
         else:
-            others(message, category, *where, **options)
+            others(_printable(str(message)), category, *where, **options)
 
     return show
 
 
 def _printable(text: str) -> str:
-    """Return a message without control characters."""
+    """Return a message whose text may have come from outside."""
     from clsas.core import validate  # imports NumPy, which is slow
 
     return validate.printable(text)

@@ -23,7 +23,7 @@ from clsas.cli.inputs import (
     read_request,
     warn_of_sampling,
 )
-from clsas.cli.outputs import progress_bar, report
+from clsas.cli.outputs import printable, progress_bar, report, say, warn
 from clsas.cli.parameters import HDF5
 from clsas.core import validate
 from clsas.core.image import holds_any
@@ -127,8 +127,9 @@ def image(
     planned = "" if planned_s is None else f", planned in {planned_s:.2f} s"
     report(
         as_json,
-        f"{output}: {' x '.join(map(str, grid.shape))} pixels from {lines.channels} lines in "
-        f"{seconds:.2f} s{planned} on {opened.info.label} ({formed.summary})" + _table(kernels),
+        f"{printable(output)}: {' x '.join(map(str, grid.shape))} pixels from "
+        f"{lines.channels} lines in {seconds:.2f} s{planned} on {opened.info.label} "
+        f"({formed.summary})" + _table(kernels),
         file=output, picture=picture, shape=grid.shape, channels=lines.channels,
         device=opened.info.label, driver=opened.info.driver,
         **({} if planned_s is None else {"plan_seconds": planned_s}), **formed.results,
@@ -284,15 +285,14 @@ def plan(
         request = DEFAULT_REQUEST
     chosen = clsas.plan(lines, grid, **request, beam=beam, device=device)
     _warn_of_error(chosen)
-    click.echo(chosen.to_json(filters=filters) if as_json else chosen.describe())
+    say(chosen.to_json(filters=filters) if as_json else chosen.describe())
 
 
 def _warn_of_error(chosen: clsas.Plan) -> None:
     """Warn if the error of the thesis's method may be as large as the image."""
     if chosen.tolerance_db is None and chosen.predicted_error_db > WORST_TOLERANCE_DB:
-        click.echo(
-            f"Warning: with these stages the error may be as large as "
+        warn(
+            "with these stages the error may be as large as "
             f"{chosen.predicted_error_db:.0f} dB, too large for an image to be of use: sum fewer "
-            "lines (QR), or divide more (QI)",
-            err=True,
+            "lines (QR), or divide more (QI)"
         )

@@ -9,6 +9,7 @@ from typing import Any
 import click
 
 import clsas
+from clsas.cli.outputs import warn
 from clsas.cli.parameters import keep_apart, need_matplotlib, written_to
 from clsas.core import validate
 from clsas.files import scene_files as config
@@ -145,4 +146,4 @@ def warn_of_sampling(scene: SceneFile, grid: clsas.Grid | None = None) -> None:
     if scene.sonar is None or scene.track is None or grid is None:
         return
     for finding in clsas.check_sampling(scene.sonar, scene.track, grid):
-        click.echo(f"Warning: {finding.message}", err=True)
+        warn(finding.message)

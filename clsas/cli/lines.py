@@ -13,7 +13,7 @@ import click
 import clsas
 from clsas.cli import options
 from clsas.cli.inputs import load, read_levels, read_scene, warn_of_sampling
-from clsas.cli.outputs import progress_bar, report
+from clsas.cli.outputs import printable, progress_bar, report
 from clsas.cli.parameters import HDF5, INPUT, Output
 from clsas.core import validate
 from clsas.core.conditioning import STATISTICS, high_passed, tapered_ends
@@ -49,7 +49,8 @@ def simulate(scene_file: Path, output: Path, picture: Path | None, as_json: bool
         plot.save(plot.geometry(echoes, scene.grid), picture)
     report(
         as_json,
-        f"{output}: {echoes.channels} channels of {echoes.length} samples in {seconds:.2f} s",
+        f"{printable(output)}: {echoes.channels} channels of {echoes.length} samples in "
+        f"{seconds:.2f} s",
         file=output, picture=picture, channels=echoes.channels, length=echoes.length,
         seconds=seconds,
     )  # fmt: skip
@@ -103,7 +104,7 @@ def compress(
         plot.save(plot.range_lines(lines, **levels), picture)
     report(
         as_json,
-        f"{output}: {lines.channels} lines of {lines.length} samples, "
+        f"{printable(output)}: {lines.channels} lines of {lines.length} samples, "
         f"{1e3 * lines.range_step_m:.4g} mm apart, in {seconds:.2f} s",
         file=output, picture=picture, channels=lines.channels, length=lines.length,
         range_step_m=lines.range_step_m, seconds=seconds,
@@ -174,7 +175,7 @@ def convert(
     seconds = time.perf_counter() - start
     report(
         as_json,
-        f"{output}: {obj!r} in {seconds:.2f} s",
+        f"{printable(output)}: {obj!r} in {seconds:.2f} s",
         file=output, kind=type(obj).__name__, seconds=seconds,
     )  # fmt: skip
 

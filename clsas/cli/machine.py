@@ -11,7 +11,7 @@ import click
 
 import clsas
 from clsas.cli import options
-from clsas.cli.outputs import print_json, progress_bar, report
+from clsas.cli.outputs import print_json, printable, progress_bar, report, say
 from clsas.cli.parameters import File, need_matplotlib
 from clsas.opencl.device import choose, open_device
 from clsas.trials import demo as demonstration
@@ -44,7 +44,7 @@ def devices(as_json: bool) -> None:
         return
     for info in found:
         in_stages = "" if info.stage_width == info.width else f" ({info.stage_width} in stages)"
-        click.echo(
+        say(
             f"{info.index}  {info.label}\n"
             f"   driver {info.driver}\n"
             f"   {info.kind.upper()}, {info.compute_units} compute units, "
@@ -52,7 +52,7 @@ def devices(as_json: bool) -> None:
             f"buffer), {'fp64' if info.fp64 else 'no fp64'}, vectors of {info.width}{in_stages}\n"
             f"   costs: {_origin(known[info.index])}"
         )
-    click.echo(f"Used: {used.index} ({reason})\nCosts are stored in {costs.path()}")
+    say(f"Used: {used.index} ({reason})\nCosts are stored in {printable(costs.path())}")
 
 
 def _origin(known: KnownCosts) -> str:
@@ -84,7 +84,8 @@ def calibrate(device: str | None, as_json: bool) -> None:
     parts = "".join(f"\n{getattr(found, part.name):>12.4g}  {part.name}" for part in fields(found))
     report(
         as_json,
-        f"{opened.info.label}, {'' if stored else 'not '}stored in {costs.path()}{parts}",
+        f"{opened.info.label}, {'' if stored else 'not '}stored in "
+        f"{printable(costs.path())}{parts}",
         device=opened.info.label, driver=opened.info.driver, file=costs.path(), stored=stored,
         costs=found,
     )  # fmt: skip
@@ -104,7 +105,7 @@ def demo(out: Path, device: str | None, as_json: bool) -> None:
     Example:  clsas demo --out my-demo
     """
     need_matplotlib()
-    say = (lambda line: None) if as_json else click.echo
-    results = demonstration.run(out, device=device, say=say, progress=progress_bar)
+    tell = (lambda line: None) if as_json else say
+    results = demonstration.run(out, device=device, say=tell, progress=progress_bar)
     if as_json:
         print_json(results)

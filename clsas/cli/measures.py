@@ -12,7 +12,7 @@ import click
 import clsas
 from clsas.cli import options
 from clsas.cli.inputs import load, read_beam, read_grid
-from clsas.cli.outputs import json_able, print_json, progress_bar, report
+from clsas.cli.outputs import json_able, print_json, printable, progress_bar, report, say
 from clsas.cli.parameters import HDF5, INPUT, POSITION, STAGES, Output
 from clsas.core import validate
 from clsas.files.scene_files import SceneFile
@@ -70,7 +70,7 @@ def quality(
         results["relative_error_db"] = error
         results["dark_error_db"], results["dark_level_db"] = dark_error, level
         text.append(
-            f"error relative to {reference}: {error:.1f} dB; its darkest tenth is at "
+            f"error relative to {printable(reference)}: {error:.1f} dB; its darkest tenth is at "
             f"{level:.1f} dB, with an error of {dark_error:.1f} dB relative to that level"
         )
     if near is not None:
@@ -229,7 +229,7 @@ def bench(
         for key, value in result.items():
             parts = value.items() if isinstance(value, dict) else [("", value)]
             text = ", ".join(f"{part} {_plain(item)}".strip() for part, item in parts)
-            click.echo(f"{key:>26}  " + text.replace("\n", "\n" + 28 * " "))
+            say(f"{key:>26}  " + text.replace("\n", "\n" + 28 * " "))
 
 
 def _case(name: str) -> Any:

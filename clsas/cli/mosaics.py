@@ -23,7 +23,7 @@ from clsas.cli.inputs import (
     read_scene,
     warn_of_sampling,
 )
-from clsas.cli.outputs import progress_bar, report
+from clsas.cli.outputs import printable, progress_bar, report, say
 from clsas.cli.parameters import COUNTS, INPUT, File, Store, keep_apart
 from clsas.core.extras import install_command
 from clsas.core.threads import uninterrupted
@@ -150,7 +150,9 @@ def mosaic(
     done = f"{new} formed in {seconds:.2f} s ({rate / 1e6:.3g} Mpixel/s)" if new else "none to form"
     words[0] += f", {done}" + (f", {before} finished before" if before else "")
     figures |= {"formed": new, "before": before, "seconds": seconds, "pixels_per_s": rate}
-    report(as_json, f"{output}: {''.join(words)}", file=output, picture=picture, **figures)
+    report(
+        as_json, f"{printable(output)}: {''.join(words)}", file=output, picture=picture, **figures
+    )
 
 
 def _check_combination(
@@ -236,7 +238,7 @@ def _described_flags(flagged: dict[tuple[int, int], tuple[str, ...]]) -> list[st
     """Return one line for every kind of defect, with the patches that have it."""
     alike: dict[str, list[str]] = {}
     for (row, column), flags in flagged.items():
-        alike.setdefault("; ".join(flags), []).append(f"{row},{column}")
+        alike.setdefault(printable("; ".join(flags)), []).append(f"{row},{column}")
     lines = []
     for words, patches in alike.items():
         more = f" and {len(patches) - _LISTED} more" if len(patches) > _LISTED else ""
@@ -268,8 +270,8 @@ def _verify(path: Path, as_json: bool) -> None:
     report(
         as_json,
         "\n".join(
-            [f"{path}: {finished} patches match their checksums, {summary}"]
-            + [f"  patch {index}: {reason}" for index, reason in damaged.items()]
+            [f"{printable(path)}: {finished} patches match their checksums, {summary}"]
+            + [f"  patch {index}: {printable(reason)}" for index, reason in damaged.items()]
         ),
         file=path, finished=finished, damaged=damaged,
     )  # fmt: skip
@@ -294,7 +296,7 @@ def _simulated(
     keep_apart("--picture", picture, "the simulated range lines", path)
     if path.exists():
         if not quiet:
-            click.echo(f"{path}: range lines, simulated before", err=True)
+            say(f"{printable(path)}: range lines, simulated before", err=True)
         return path
     sonar, track, targets = described.need("sonar", "track", "targets")
     with progress_bar("simulating") as progress:
@@ -302,7 +304,7 @@ def _simulated(
     with progress_bar("compressing") as progress:
         clsas.save(path, clsas.compress(echoes, **described.compress, progress=progress))
     if not quiet:
-        click.echo(f"{path}: range lines, simulated from {scene}", err=True)
+        say(f"{printable(path)}: range lines, simulated from {printable(scene)}", err=True)
     return path
 
 
@@ -342,14 +344,15 @@ def _cluster(workers: int | None, scheduler: str | None) -> Iterator[Any]:
 def _patch_progress(name: str, total: int, done: int) -> Iterator[Callable[[clsas.Patch], None]]:
     """Yield a function that prints a line for a patch and, on a terminal, moves a progress bar."""
     columns = (
-        TextColumn(name), BarColumn(), TextColumn("{task.completed}/{task.total}"),
+        TextColumn("{task.description}", markup=False), BarColumn(),
+        TextColumn("{task.completed}/{task.total}"),
         TaskProgressColumn(), TimeRemainingColumn(),
     )  # fmt: skip
     console = Console(stderr=True, soft_wrap=True, highlight=False)
     with Progress(
         *columns, console=console, transient=True, disable=not console.is_terminal
     ) as bar:
-        task = bar.add_task(name, total=total, completed=done)
+        task = bar.add_task(printable(name), total=total, completed=done)
 
         def tell(patch: clsas.Patch) -> None:
             record = patch.record
@@ -359,7 +362,7 @@ def _patch_progress(name: str, total: int, done: int) -> Iterator[Callable[[clsa
             elif record.predicted_error_db is not None:
                 parts.append(f"predicted error {record.predicted_error_db:.1f} dB")
             line = f"patch {patch.row},{patch.column}: {', '.join((*parts, *record.flags))}"
-            console.print(line, markup=False)
+            console.print(printable(line), markup=False)
             bar.advance(task)
 
         yield tell

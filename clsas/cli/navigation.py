@@ -12,7 +12,7 @@ import numpy as np
 import clsas
 from clsas.cli import options
 from clsas.cli.inputs import load, read_beam, read_grid
-from clsas.cli.outputs import progress_bar, report
+from clsas.cli.outputs import printable, progress_bar, report
 from clsas.cli.parameters import INPUT, POSITION, RANGE
 from clsas.core import validate
 from clsas.navigation.autofocus import UNKNOWNS as FOCUSED
@@ -80,8 +80,8 @@ def known_points(
     seen = ", ".join(map(str, results["seen"]))
     report(
         as_json,
-        f"{output}: {found.describe()}\n  seen in {seen} channels; ± holds noise and errors that "
-        "change along the track, but no displacement or bend of the whole track",
+        f"{printable(output)}: {found.describe()}\n  seen in {seen} channels; ± holds noise and "
+        "errors that change along the track, but no displacement or bend of the whole track",
         file=output,
         **results,
     )
@@ -171,8 +171,8 @@ def navigate(
     shape = "unknown" if np.isnan(shape_m) else f"{1e3 * shape_m:.3g} mm or less"
     report(
         as_json,
-        f"{output}: {results['pings']} pings, {results['overlap']} overlapping phase centres or "
-        f"more, median coherence {results['coherence']:.2f}\n"
+        f"{printable(output)}: {results['pings']} pings, {results['overlap']} overlapping phase "
+        f"centres or more, median coherence {results['coherence']:.2f}\n"
         f"  corrected by {1e3 * results['sway_rms_m']:.3g} mm of sway, "
         f"{np.degrees(results['yaw_rms_rad']):.3g} degrees of yaw and "
         f"{1e3 * results['surge_rms_m']:.3g} mm of surge, rms\n"
@@ -229,8 +229,8 @@ def focus(
     steps = "".join(f"\n  {name}: {value:.4g}" for name, value in found.sharpness)
     report(
         as_json,
-        f"{output}: {lines.channels} lines, {how}; sharpness {found.sharpness_before:.4g} to "
-        f"{found.sharpness_after:.4g}{steps}",
+        f"{printable(output)}: {lines.channels} lines, {how}; sharpness "
+        f"{found.sharpness_before:.4g} to {found.sharpness_after:.4g}{steps}",
         file=output,
         **results,
     )  # fmt: skip

@@ -20,6 +20,7 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
+from clsas.core import validate
 from clsas.core.json_types import json_able
 
 
@@ -57,7 +58,25 @@ def report(as_json: bool, text: str, **results: Any) -> None:
     if as_json:
         print_json(results)
     else:
-        click.echo(text)
+        say(text)
+
+
+def say(text: str, *, err: bool = False) -> None:
+    """Print a text that may contain names and words from outside, to standard error if `err`.
+
+    Control characters are escaped. Names within it need `printable`, so that they cannot add lines.
+    """
+    click.echo(validate.escaped(text), err=err)
+
+
+def printable(name: object) -> str:
+    """Return the name of a file, or words of one, for a text that is printed."""
+    return validate.printable(str(name))
+
+
+def warn(message: str) -> None:
+    """Print a warning."""
+    say(f"Warning: {printable(message)}", err=True)
 
 
 def print_json(results: Any, indent: int | None = 2) -> None:

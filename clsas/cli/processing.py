@@ -10,7 +10,7 @@ import click
 import clsas
 from clsas.cli import options
 from clsas.cli.inputs import read_scene
-from clsas.cli.outputs import report, step_bar
+from clsas.cli.outputs import printable, report, step_bar
 from clsas.cli.parameters import INPUT, keep_apart
 from clsas.files.process_tables import STEPS
 from clsas.processing.record import StepRecord
@@ -61,10 +61,10 @@ def process(
             described, lines=lines_path, output=folder, steps=steps or None, device=device,
             progress=progress,
         )  # fmt: skip
-    rows = [f"  {_row(step, step.name in found.repeated)}" for step in found.steps]
+    rows = [f"  {printable(_row(step, step.name in found.repeated))}" for step in found.steps]
     report(
         as_json,
-        "\n".join([f"{found.folder}:", *rows]),
+        "\n".join([f"{printable(found.folder)}:", *rows]),
         folder=found.folder,
         repeated=found.repeated,
         steps={step.name: _figures(step) for step in found.steps},

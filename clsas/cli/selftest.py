@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import click
 
 from clsas.cli import options
-from clsas.cli.outputs import print_json, progress_bar
+from clsas.cli.outputs import print_json, printable, progress_bar, say
 from clsas.opencl.device import open_device
 
 if TYPE_CHECKING:
@@ -46,17 +46,17 @@ def selftest(ctx: click.Context, device: str | None, as_json: bool) -> None:
             }
         )
     else:
-        click.echo(f"{opened.info.label}, driver {opened.info.driver}; errors in dB")
-        click.echo(f"{'asked':>6} {'measured':>9} {'bound':>6}  verdict  case")
+        say(f"{opened.info.label}, driver {opened.info.driver}; errors in dB")
+        say(f"{'asked':>6} {'measured':>9} {'bound':>6}  verdict  case")
         for result in results:
             asked = "-" if result.asked_db is None else f"{result.asked_db:.0f}"
             measured = "-" if result.measured_db is None else f"{result.measured_db:.1f}"
-            failure = f": {result.failure}" if result.failure else ""
-            click.echo(
+            failure = f": {printable(result.failure)}" if result.failure else ""
+            say(
                 f"{asked:>6} {measured:>9} {result.bound_db:6.0f}  "
                 f"{_verdict(result):7}  {result.case}{failure}"
             )
-        click.echo(f"{len(results) - missed} of {len(results)} within bounds, {seconds:.0f} s")
+        say(f"{len(results) - missed} of {len(results)} within bounds, {seconds:.0f} s")
     if missed:
         ctx.exit(1)
 

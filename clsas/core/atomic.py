@@ -11,30 +11,50 @@ import errno
 import fcntl
 import os
 import shutil
+import stat
 import uuid
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
+from clsas.core.reading import check_ordinary
+
 _PATTERN = ".clsas-*.part"
+_LOCK = ".clsas.lock"
 
 
 @contextmanager
 def replacing(path: str | os.PathLike) -> Iterator[Path]:
     """Yield an empty temporary file to write; rename it to `path` on success, else remove it.
 
+    A symbolic link stays, and the file that it leads to is replaced. The new file has the mode of
+    the one before and, where that is permitted, its owner and group.
+
     Raises
     ------
+    ValueError
+        If `path` is a device, a pipe or a socket.
     OSError
         If the folder of `path` does not exist or cannot be written, if `path` is a folder, or on a
         full disk. The error names `path`, not the temporary file.
     """
-    path = Path(path)
+    given = path = Path(path)
+    if given.is_symlink():
+        path = Path(os.path.realpath(given))
     if not path.parent.is_dir():
-        raise FileNotFoundError(f"cannot write {path}: there is no folder {path.parent}")
+        raise FileNotFoundError(f"cannot write {given}: there is no folder {path.parent}")
     if path.is_dir():
-        raise IsADirectoryError(f"cannot write {path}: it is a folder")
+        raise IsADirectoryError(f"cannot write {given}: it is a folder")
+    before = None
+    with suppress(FileNotFoundError):
+        check_ordinary(given)
+        before = path.stat()
     with _temporary(path, _make_file) as (temporary, descriptor):
+        if before is not None:
+            # Before there is anything to read in it.
+            with suppress(PermissionError):
+                os.fchown(descriptor, before.st_uid, before.st_gid)
+            os.fchmod(descriptor, stat.S_IMODE(before.st_mode))
         yield temporary
         os.fsync(descriptor)
         os.replace(temporary, path)
@@ -67,6 +87,55 @@ def staging(folder: Path) -> Iterator[Path]:
     """Yield an empty temporary folder within a folder, for files to move from; then remove it."""
     with _temporary(folder / "staging", Path.mkdir) as (temporary, _):
         yield temporary
+
+
+@contextmanager
+def locked(folder: Path) -> Iterator[None]:
+    """Hold the lock of a folder, which one process can have at a time.
+
+    The lock is on a file that is removed at the end. A killed process leaves the file, but not the
+    lock. Where no file can be made, or the file system has no locks, nothing is locked.
+
+    Raises
+    ------
+    BlockingIOError
+        If the folder is locked already.
+    """
+    descriptor = _lock(folder)
+    try:
+        yield
+    finally:
+        if descriptor is not None:
+            (folder / _LOCK).unlink(missing_ok=True)
+            os.close(descriptor)
+
+
+def _lock(folder: Path) -> int | None:
+    """Return the locked file of a folder, or None where it cannot be made."""
+    path = folder / _LOCK
+    while True:
+        try:
+            descriptor = os.open(
+                path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK, 0o666
+            )
+        except OSError as error:
+            if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
+                return None
+            raise
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            os.close(descriptor)
+            raise BlockingIOError(
+                errno.EAGAIN, "another process of clsas is at work in this folder", str(folder)
+            ) from None
+        except OSError:  # some file systems have no locks
+            return descriptor
+        # The process that had the lock before may have removed the file in the meantime.
+        with suppress(FileNotFoundError):
+            if os.path.samestat(os.fstat(descriptor), os.stat(path)):
+                return descriptor
+        os.close(descriptor)
 
 
 def make_folders(path: Path) -> None:

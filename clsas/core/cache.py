@@ -1,13 +1,146 @@
-"""Folder of cached files, such as measured costs and simulated lines."""
+"""The cache folder: measured costs, simulated lines, and folders of worker processes.
+
+Worker processes import modules from their folder, and plans follow stored costs. Whoever can write
+to the cache folder therefore acts as its user, so it is used only if nobody else can.
+"""
 
 from __future__ import annotations
 
+import errno
 import os
+import pwd
+import stat
+from contextlib import suppress
 from pathlib import Path
 
 from platformdirs import user_cache_path
 
+_MODE = 0o700  # of folders that are made here
+
 
 def cache_folder() -> Path:
-    """Return the cache folder: that of the variable CLSAS_CACHE, or else the user's default."""
+    """Return the cache folder: that of the variable CLSAS_CACHE, or else the user's default.
+
+    It is not checked and may not exist: see `trusted_cache` and `private_folder`.
+    """
     return Path(os.environ.get("CLSAS_CACHE") or user_cache_path("clsas"))
+
+
+def trusted_cache() -> Path:
+    """Return the cache folder, which may not exist, after a check that nobody else can write to it.
+
+    Raises
+    ------
+    PermissionError
+        If another user can change what the folder holds, or this one cannot read it; the message
+        names the folder and CLSAS_CACHE.
+    """
+    folder = cache_folder()
+    _check(folder)
+    _check_access(folder, os.R_OK | os.X_OK, "read")
+    return folder
+
+
+def private_folder(*names: str) -> Path:
+    """Return the cache folder, or a folder in it, that only this user can write to; make it.
+
+    Parameters
+    ----------
+    *names : str
+        Path of the folder in the cache folder.
+
+    Raises
+    ------
+    PermissionError
+        If another user can change what the folder holds, or this one cannot write to it.
+    OSError
+        If it cannot be made.
+    """
+    folder = trusted_cache().joinpath(*names)
+    for each in reversed([folder, *folder.parents]):
+        if not each.is_dir():
+            with suppress(FileExistsError):  # another process of this user, or of somebody else
+                each.mkdir(_MODE)
+    _check(folder)
+    if not folder.is_dir():
+        raise NotADirectoryError(errno.ENOTDIR, "is not a folder", str(folder))
+    _check_access(folder, os.W_OK | os.X_OK, "write to")
+    return folder
+
+
+def _check(folder: Path) -> None:
+    """Raise PermissionError if another user can change what a folder holds, or can replace it."""
+    try:
+        real = Path(os.path.realpath(folder))
+        links = _links(Path(os.path.abspath(folder)), set())
+        reasons = (_exposure(each.parent, each) for each in links)
+        found = next(filter(None, reasons), None) or _exposure(real)
+    except PermissionError as error:
+        found = f"{error.filename} cannot be searched"
+    if found:
+        raise _refusal(folder, found)
+
+
+def _check_access(folder: Path, access: int, what: str) -> None:
+    """Raise PermissionError if this user has no such access to a folder, unless there is none."""
+    if folder.is_dir() and not os.access(folder, access, effective_ids=True):
+        raise _refusal(folder, f"you cannot {what} it")
+
+
+def _refusal(folder: Path, reason: str) -> PermissionError:
+    return PermissionError(
+        f"the cache folder {folder} is not used, since {reason}: set the environment variable "
+        "CLSAS_CACHE to a folder that belongs to you and that others cannot write to"
+    )
+
+
+def _links(path: Path, found: set[Path]) -> set[Path]:
+    """Return the symbolic links that a path leads through, each in its real folder."""
+    for each in (*reversed(path.parents), path):
+        if each.is_symlink():
+            link = Path(os.path.realpath(each.parent), each.name)
+            if link not in found:
+                found.add(link)
+                _links(link.parent / os.readlink(link), found)
+    return found
+
+
+def _exposure(folder: Path, link: Path | None = None) -> str | None:
+    """Return how another user could change a real folder's entries, or None if nobody can.
+
+    A folder's owner and, where its mode allows it, others can rename what is in it. So all folders
+    above count as well. A sticky one, such as /tmp, lets others only add entries, which are then
+    theirs: that is enough for folders above, and for one with a symbolic link.
+
+    Parameters
+    ----------
+    folder : Path
+        Without symbolic links.
+    link : Path, optional
+        A symbolic link in the folder, which leads to the cache.
+    """
+    # Whoever owns the root can do everything. It need not be user 0 in a container.
+    trusted = {0, os.geteuid(), os.lstat("/").st_uid}
+    is_closed = False  # others cannot get to what lies deeper
+    for each in (*reversed(folder.parents), folder, *([link] if link else ())):
+        try:
+            found = os.lstat(each)
+        except (FileNotFoundError, NotADirectoryError):
+            return None
+        if found.st_uid not in trusted:
+            return f"{each} belongs to {_user(found.st_uid)}"
+        if each == link:
+            continue
+        is_closed = is_closed or not found.st_mode & (stat.S_IXGRP | stat.S_IXOTH)
+        is_open = found.st_mode & (stat.S_IWGRP | stat.S_IWOTH) and not is_closed
+        lets_only_add = found.st_mode & stat.S_ISVTX and (link is not None or each != folder)
+        if is_open and not lets_only_add:
+            return f"other users can write to {each}"
+    return None
+
+
+def _user(number: int) -> str:
+    try:
+        return f"the user {pwd.getpwuid(number).pw_name}"
+    except KeyError:
+        return f"user {number}"

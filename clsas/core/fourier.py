@@ -73,7 +73,8 @@ def fourier_integral(
     half = np.diff(ends)[:, None] / 2
     u = ((ends[:-1, None] + half) + half * _NODES).ravel()
     values = (half * _WEIGHTS).ravel() * function(u)
+    # Threads of OpenMP would be missing in a process that is forked later, and waited for.
     result = finufft.nufft1d3(
-        2 * np.pi * u, values.astype(np.complex128), at.ravel(), isign=sign, eps=1e-13
+        2 * np.pi * u, values.astype(np.complex128), at.ravel(), isign=sign, eps=1e-13, nthreads=1
     )
     return np.reshape(result, at.shape)

@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import math
 import os
+import re
 import reprlib
 import sys
 import warnings
@@ -21,6 +22,7 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 _LONGEST = 100  # characters of a value in a message
 _LONGEST_LINE = 1000  # characters of a line of a message
+_BARE_BREAK = re.compile(r"\n(?!  )")
 # Largest parts of a value in a message; longer parts and deeper lists end in "...".
 _REPR = reprlib.Repr()
 _REPR.maxlevel = 4
@@ -177,16 +179,27 @@ def shown(value: object) -> str:
 
 
 def printable(text: str) -> str:
-    """Return a text with shortened lines and escaped control characters, except line feeds.
+    """Return a message as a terminal may show it: escaped, with shortened lines.
+
+    Line feeds are escaped too, unless an indented line follows. Whatever a name contains can then
+    not look like a line of its own.
+    """
+    return "\n".join(
+        line if len(line) <= _LONGEST_LINE else f"{line[: _LONGEST_LINE - 3]}..."
+        for line in _BARE_BREAK.sub(r"\\n", escaped(text)).split("\n")
+    )
+
+
+def escaped(text: str) -> str:
+    """Return a text with escaped control characters, except line feeds.
 
     Terminals obey control characters, and names of files may contain any.
     """
-    escaped = "".join(
-        c if c.isprintable() or c == "\n" else c.encode("unicode_escape").decode() for c in text
-    )
     return "\n".join(
-        line if len(line) <= _LONGEST_LINE else f"{line[: _LONGEST_LINE - 3]}..."
-        for line in escaped.split("\n")
+        line
+        if line.isprintable()
+        else "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in line)
+        for line in text.split("\n")
     )
 
 

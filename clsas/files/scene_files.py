@@ -117,7 +117,7 @@ def parse_scene(text: bytes, *, name: str, folder: Path) -> SceneFile:
         lines = [f"{name}: {line}" for line in mistakes[:_MOST_MISTAKES]]
         if len(mistakes) > _MOST_MISTAKES:
             lines.append(f"{name}: and {len(mistakes) - _MOST_MISTAKES} more mistakes")
-        raise ValueError("\n".join(lines)) from None
+        raise ValueError("\n  ".join(lines)) from None
     except RecursionError:
         raise ValueError(f"{name}: nested too deep") from None
     except (TypeError, ValueError) as error:

@@ -2,22 +2,29 @@
 
 A Dask scheduler runs any code that a client sends, and other users of the machine can connect to
 its port. Therefore every connection needs a certificate, which exists only in the memory of this
-run's processes. Dask's HTTP pages are switched off.
+run's processes. Dask's HTTP pages are switched off. Modules are imported from no folder that
+others can write to.
 """
 
 from __future__ import annotations
 
 import logging
+import os
 import signal
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
+from multiprocessing import resource_tracker
+from pathlib import Path
 from typing import Any
 
+from dask import config
 from distributed import Client, Nanny, Scheduler, Security, SpecCluster, Worker
 from distributed.system import MEMORY_LIMIT
 
-from clsas.core.cache import cache_folder
+from clsas.core.cache import private_folder
 from clsas.core.threads import uninterrupted
+
+_SAFE_PATH = "PYTHONSAFEPATH"
 
 
 class _NoPages:
@@ -44,31 +51,42 @@ def local_client(workers: int) -> Iterator[Client]:
     ChildProcessError
         If a worker ends during its start.
     OSError
-        If the cache folder cannot be written.
+        If the cache folder cannot be written, or others can write to it.
     """
+    # Scheduler and workers import modules from their folders.
+    folder = private_folder("workers")
+    opened = ExitStack()
+    try:
+        with uninterrupted():
+            opened.enter_context(_environment_of_workers())
+            with _deaf_to_ctrl_c():
+                cluster = opened.enter_context(_cluster(workers, folder))
+            client = opened.enter_context(Client(cluster))
+        yield client
+    finally:
+        with uninterrupted():
+            opened.close()
+
+
+def _cluster(workers: int, folder: Path) -> SpecCluster:
     security = _certificate()
-    # Workers import modules from their folder, so it must not be shared with others as /tmp is.
-    folder = cache_folder() / "workers"
-    folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     shared = {
         "host": "127.0.0.1",
         "protocol": "tls://",
         "security": security,
         "dashboard": False,
         "dashboard_address": None,
+        "local_directory": str(folder),
     }
     worker = {
         **shared,
         "worker_class": _Worker,
         "nthreads": 1,
         "memory_limit": MEMORY_LIMIT // workers,
-        "local_directory": str(folder),
         "silence_logs": logging.CRITICAL,
     }
-    # A terminal sends Ctrl-C to all processes. Only this one heeds it, and ends the others.
-    previous = signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
-        cluster = SpecCluster(
+        return SpecCluster(
             scheduler={"cls": _Scheduler, "options": {**shared, "port": 0}},
             workers={index: {"cls": Nanny, "options": worker} for index in range(workers)},
             security=security,
@@ -78,17 +96,43 @@ def local_client(workers: int) -> Iterator[Client]:
         raise ChildProcessError(
             f"a worker process ended while it started: {_cause(error)}"
         ) from error
-    finally:
-        signal.signal(signal.SIGINT, previous)
-    opened = ExitStack()
+
+
+@contextmanager
+def _deaf_to_ctrl_c() -> Iterator[None]:
+    """Let Ctrl-C, which a terminal sends to all processes, not reach those of a cluster.
+
+    Only this process heeds it, and ends the others. Processes inherit which signals are blocked
+    from the thread that starts them: that of the cluster, which inherits it from this one.
+    """
+    resource_tracker.ensure_running()  # else the first process does so, and unblocks Ctrl-C
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
-        with uninterrupted():
-            opened.enter_context(cluster)
-            client = opened.enter_context(Client(cluster))
-        yield client
+        yield
     finally:
-        with uninterrupted():
-            opened.close()
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+@contextmanager
+def _environment_of_workers() -> Iterator[None]:
+    """Let processes that are started import nothing from the working directory.
+
+    `python -c`, as which workers start, looks there first, and others may be able to write to it.
+    Afterwards this process has the variables that it had before. Dask sets its workers' variables
+    here, too, such as OMP_NUM_THREADS = 1.
+    """
+    of_dask = config.get("distributed.nanny.pre-spawn-environ")
+    names = (_SAFE_PATH, "PYTHONHASHSEED", "__DASK_PARENT_PID", *of_dask)
+    before = {name: os.environ.get(name) for name in names}
+    os.environ[_SAFE_PATH] = "1"
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                os.environ.pop(name, None)
+            else:
+                os.environ[name] = value
 
 
 def _certificate() -> Security:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -196,6 +197,14 @@ class _Passes:
         found = np.zeros((len(self.overlaps), 2))
         for ping in np.flatnonzero(self.coherent).tolist():
             pairs = overlap(corrected, here, ping, self.correlator.heard)
+            if not pairs.pairs:
+                sway_m, yaw_rad = self.moved[ping]
+                raise ValueError(
+                    f"lines must have pings that overlap once they are corrected, but {sway_m:.3g} "
+                    f"m of sway and {math.degrees(yaw_rad):.3g} degrees of yaw were found between "
+                    f"pings {ping} and {ping + 1}, and no phase centres overlap with these. Check "
+                    f"range_step_m, {self.lines.range_step_m:g} m, and range_m"
+                )
             found[ping] = surge(self.correlator, corrected, here, pairs, self.directions)
             self.progress.done(ping + 1, self.array.pings - 1)
         return found[:, 0], found[:, 1]

@@ -13,7 +13,6 @@ import warnings
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -21,8 +20,8 @@ import pyopencl as cl
 from numpy.typing import DTypeLike
 
 from clsas.core import reprs
-from clsas.core.extras import install_command
 from clsas.opencl.kernels import Kernel, kernel_parameters, kernel_source, whole_source
+from clsas.opencl.refusals import DeviceError, check_process, no_device, not_built
 
 ENVIRONMENT_VARIABLE = "CLSAS_DEVICE"
 KINDS = ("gpu", "cpu", "accelerator")
@@ -35,19 +34,6 @@ _ALIGNMENT = 4096  # bytes: of pages
 _MOST_KERNELS = 32
 
 _GROUP = 64  # work-items of a GPU's work-groups: two warps, or a wavefront
-
-_HOW_TO_GET_A_DEVICE = """\
-No OpenCL device was found. Any one of these gives one:
-  - a CPU driver from PyPI:  {command}
-  - the vendor's driver of your GPU or CPU, which installs an .icd file in /etc/OpenCL/vendors;
-    PyOpenCL's wheel looks there and in {folder}
-    (copy or write an .icd file there when the driver lives in your Python environment:
-    it is one line, the path of the driver's shared library).
-The environment variable OCL_ICD_VENDORS, where it is set, replaces these places."""
-
-
-class DeviceError(RuntimeError):
-    """No OpenCL device fits, or it refused to build a kernel."""
 
 
 @dataclass(frozen=True)
@@ -168,6 +154,7 @@ class Device:
         DeviceError
             If the driver's compiler refuses it; the message holds the compiler's log.
         """
+        check_process()
         key = (name, *sorted(options.items()))
         with self._lock:
             kernel = self._kernels.pop(key, None) or self._build(name, options)
@@ -184,10 +171,8 @@ class Device:
         try:
             program = _built(self.context, text, ["-cl-mad-enable", *definitions])
         except cl.RuntimeError as error:
-            raise DeviceError(
-                f"{self.info.label} could not build {name}.cl with "
-                f"{' '.join(definitions)}:\n{error}"
-            ) from error
+            what = f"{self.info.label} could not build {name}.cl with {' '.join(definitions)}"
+            raise not_built(what, self.info.platform, error) from error
         # Not Program.all_kernels: PyOpenCL never releases what that returns.
         return Kernel(name, parameters, cl.Kernel(program, name))
 
@@ -227,6 +212,7 @@ class Device:
         TypeError
             If an argument is missing, unknown, or does not fit its parameter.
         """
+        check_process()
         if local is None and self.info.width > 1:
             local = (1,) * len(size)
         elif local is None and self.info.kind == "gpu":
@@ -262,11 +248,13 @@ class Device:
 
     def finish(self) -> None:
         """Wait until the device has done all it was given."""
+        check_process()
         self.uploads.finish()
         self.queue.finish()
 
     def buffer(self, bytes_: int) -> cl.Buffer:
         """Return a read-write buffer of anything, to be kept until the device is done with it."""
+        check_process()
         flags, bytes_ = cl.mem_flags.READ_WRITE, max(int(bytes_), 4)
         if self.info.kind != "cpu":
             return cl.Buffer(self.context, flags, bytes_)
@@ -279,12 +267,14 @@ class Device:
 
         Both are to be kept, and the array left alone, until the device is done with them.
         """
+        check_process()
         how = cl.mem_flags.USE_HOST_PTR if self.info.kind == "cpu" else cl.mem_flags.COPY_HOST_PTR
         access = cl.mem_flags.READ_WRITE if array.flags.writeable else cl.mem_flags.READ_ONLY
         return cl.Buffer(self.context, access | how, hostbuf=array)
 
     def upload(self, array: np.ndarray) -> cl.Buffer:
         """Return a buffer that holds a copy of `array`; one of anything where that is empty."""
+        check_process()
         if not array.size:
             return self.buffer(0)
         flags = cl.mem_flags.READ_WRITE | cl.mem_flags.COPY_HOST_PTR
@@ -358,6 +348,7 @@ def _compiled_vectors(device: cl.Device) -> tuple[int, bool]:
 
 
 def _raw_devices() -> list[cl.Device]:
+    check_process()
     try:
         platforms = cl.get_platforms()
     except cl.LogicError:  # the loader found no driver at all
@@ -396,10 +387,7 @@ def choose(wish: str | int | None = None) -> tuple[DeviceInfo, str]:
     """
     devices = list_devices()
     if not devices:
-        folder = Path(cl.__file__).parent / ".libs"
-        raise DeviceError(
-            _HOW_TO_GET_A_DEVICE.format(folder=folder, command=install_command("pocl"))
-        )
+        raise no_device()
     source = ""
     if wish is None and os.environ.get(ENVIRONMENT_VARIABLE):
         wish = os.environ[ENVIRONMENT_VARIABLE]

@@ -12,12 +12,14 @@ from typing import Any, get_args
 import numpy as np
 
 from clsas.core import reading, validate
-from clsas.core.atomic import make_folders, replacing
-from clsas.core.cache import cache_folder
+from clsas.core.atomic import replacing
+from clsas.core.cache import cache_folder, private_folder, trusted_cache
 from clsas.core.version import __version__
 from clsas.factorized.estimates import Work
 from clsas.factorized.plan import CostSource
 from clsas.opencl.device import Device, DeviceInfo
+
+_MOST_NS = 1e15  # arbitrary: eleven days for one unit; times of any image stay finite
 
 
 @dataclass(frozen=True)
@@ -52,7 +54,7 @@ class Costs:
     def __post_init__(self) -> None:
         """Check every cost."""
         for field in fields(self):
-            validate.number(field.name, getattr(self, field.name), "ns", least=0.0)
+            validate.number(field.name, getattr(self, field.name), "ns", least=0.0, most=_MOST_NS)
 
     def times(self, factors: Mapping[str, float]) -> Costs:
         """Return these costs with some of them multiplied by factors, by name."""
@@ -138,7 +140,8 @@ def load(device: Device | DeviceInfo) -> KnownCosts:
     Warns
     -----
     ClsasWarning
-        If the file of costs cannot be read, or holds something else.
+        If the file of costs cannot be read or holds something else, or others can write to the
+        cache folder.
     """
     info = device.info if isinstance(device, Device) else device
     default = KnownCosts(defaults(info), "default")
@@ -158,16 +161,15 @@ def save(device: Device, costs: Costs, source: CostSource = "calibrated") -> Pat
     Raises
     ------
     OSError
-        If the user's cache folder cannot be written.
+        If the user's cache folder cannot be written, or others can write to it.
     """
-    file = path()
+    file = private_folder() / path().name
     try:
         stored = _tables()
     except (OSError, ValueError):
         stored = {}  # whoever reads the file is warned
     measured = datetime.now(UTC).isoformat(timespec="seconds")
     stored[key(device.info)] = {"source": source, "measured": measured, "costs": asdict(costs)}
-    make_folders(file.parent)
     with replacing(file) as temporary:
         temporary.write_text(json.dumps(stored, indent=1))
     return file
@@ -185,7 +187,7 @@ def key(info: DeviceInfo) -> str:
 def _tables() -> dict[str, Any]:
     """Return the stored tables by key; raises OSError or ValueError if the file has none."""
     try:
-        stored = reading.parse_json(reading.read_bytes(path()))
+        stored = reading.parse_json(reading.read_bytes(trusted_cache() / path().name))
     except (FileNotFoundError, NotADirectoryError):
         return {}
     if not isinstance(stored, dict):
@@ -195,7 +197,8 @@ def _tables() -> dict[str, Any]:
 
 def _known(table: dict[str, Any]) -> KnownCosts:
     """Return costs from their stored table; raises an error if it is not one of `save`."""
-    costs = {field.name: float(table["costs"][field.name]) for field in fields(Costs)}
+    names = [field.name for field in fields(Costs)]
+    costs = {name: validate.number(name, table["costs"][name], "ns") for name in names}
     if table["source"] not in ("scaled", "calibrated") or not table["measured"]:
         raise ValueError("costs must be scaled or calibrated, at a time")
     return KnownCosts(Costs(**costs), table["source"], table["measured"])

@@ -17,12 +17,11 @@ from clsas.core.image import Image
 from clsas.core.json_types import json_able
 from clsas.core.lines import RangeLines
 from clsas.core.validate import ClsasWarning
-from clsas.files.formats import load
 from clsas.files.hdf5 import save
 from clsas.files.process_tables import CORRECTIONS, STEPS, checked_steps
 from clsas.files.scene_files import SceneFile, read_scene
 from clsas.opencl.device import Device, open_device
-from clsas.processing.folders import checked_records, folder_of, made
+from clsas.processing.folders import check_folder, checked_records, folder_of, made
 from clsas.processing.record import StepRecord, file_digest, step_digest, write_records
 from clsas.processing.recording import Recording, loaded
 from clsas.processing.steps import RUN, TABLES, Job, Outcome, check_pictures, options_of
@@ -59,17 +58,20 @@ class Processed:
 
     @property
     def lines(self) -> RangeLines:
-        """The lines as far as these steps corrected them, read from the folder."""
+        """The lines as far as these steps corrected them, read from the folder.
+
+        Raises ValueError if they changed since.
+        """
         return self._lines()
 
     @property
     def image(self) -> Image:
-        """The image, read from the folder; raises KeyError without the step "image"."""
-        self["image"]
-        image = load(self.folder / "image.h5")
-        validate.instance("image.h5", image, Image)
-        assert isinstance(image, Image)  # for type checkers
-        return image
+        """The image, read from the folder.
+
+        Raises KeyError without the step "image", and ValueError if the image changed since.
+        """
+        record = self["image"]
+        return loaded(self.folder / record.result_file, record.files[record.result_file], Image)
 
 
 def process(
@@ -116,9 +118,11 @@ def process(
     TypeError, ValueError
         If an argument is of the wrong kind, the scene lacks what a step needs, the folder holds
         the results of another scene or files that clsas did not write and would replace, or a step
-        refuses the lines. What was finished before is kept.
+        refuses the lines, or the recording changes while it is processed. What was finished before
+        is kept.
     OSError
-        If a file cannot be read or written.
+        If a file cannot be read or written, or another process is at work in the folder
+        (BlockingIOError).
     DeviceError
         If there is no such device.
 
@@ -140,9 +144,10 @@ def process(
             validate.memory("[grid]", 16 * grid.size)  # two images
     recording = Recording.of(scene, lines)
     folder = folder_of(scene, output)
-    records = checked_records(scene, folder, recording, names)
+    check_folder(folder, recording)
     check_pictures()
     with made(folder):
+        records = checked_records(scene, folder, names)
         chain = _Chain(scene, folder, recording, open_device(device), records)
         for name in STEPS:
             if name in names:
@@ -179,7 +184,7 @@ class _Chain:
         self.repeated: list[str] = []
         self.digest = recording.digest
         self.corrections: tuple[str, ...] = ()
-        self.lines: Callable[[], RangeLines] = lambda: recording.lines
+        self.lines = recording.read
 
     def step(self, name: str, progress: Callable[[int, int], None] | None) -> None:
         """Run a step, unless it ran before with the same inputs."""
@@ -196,7 +201,8 @@ class _Chain:
         self.done.append(record)
         if name in CORRECTIONS:
             self.digest, self.corrections = digest, (*self.corrections, name)
-            self.lines = lambda: loaded(self.folder / f"{name}.h5")
+            file = record.result_file
+            self.lines = partial(loaded, self.folder / file, record.files[file], RangeLines)
         for message in messages:
             validate.warn(f"{name}: {message}")
 
@@ -235,7 +241,7 @@ class _Chain:
                 scene=self.scene,
                 folder=staged,
                 store=self.scene.mosaic.get("store") or self.folder / "mosaic.zarr",
-                given=lambda: self.recording.lines,
+                given=self.recording.read,
                 lines=lines,
                 corrections=self.corrections,
                 device=self.device,

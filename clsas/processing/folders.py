@@ -8,6 +8,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from clsas.core import validate
+from clsas.core.atomic import locked
 from clsas.files.scene_files import SceneFile
 from clsas.processing.record import StepRecord, read_records
 from clsas.processing.recording import Recording
@@ -25,19 +26,8 @@ def folder_of(scene: SceneFile, output: str | os.PathLike | None) -> Path:
     return Path(scene.name).with_suffix("")
 
 
-def checked_records(
-    scene: SceneFile, folder: Path, recording: Recording, names: tuple[str, ...]
-) -> dict[str, StepRecord]:
-    """Return the records of the folder; steps may replace nothing there but what these name.
-
-    Raises
-    ------
-    ValueError
-        If the folder cannot be made, is that of the recording, has the record of another scene, or
-        holds a file that a step writes and no record names.
-    OSError
-        If the record cannot be read.
-    """
+def check_folder(folder: Path, recording: Recording) -> None:
+    """Raise ValueError if the folder cannot be made or is that of the recording."""
     source = recording.described["file"]
     if source is not None and Path(source).parent.resolve() == folder.resolve():
         raise ValueError(f"output must not be the folder of the recording, got {str(folder)!r}")
@@ -47,6 +37,21 @@ def checked_records(
         raise ValueError(
             f"output {str(folder)!r} cannot be made: there is no folder {str(folder.parent)!r}"
         )
+
+
+def checked_records(
+    scene: SceneFile, folder: Path, names: tuple[str, ...]
+) -> dict[str, StepRecord]:
+    """Return the records of the folder; steps may replace nothing there but what these name.
+
+    Raises
+    ------
+    ValueError
+        If the folder has the record of another scene, or holds a file that a step writes and no
+        record names.
+    OSError
+        If the record cannot be read.
+    """
     records = read_records(folder, scene)
     own = {file for record in records.values() for file in record.files}
     for name in names:
@@ -61,13 +66,21 @@ def checked_records(
 
 @contextmanager
 def made(folder: Path) -> Iterator[None]:
-    """Make a folder if it is not there, and remove it again if nothing came into it."""
+    """Lock a folder, which is made if it is not there, and removed if nothing came into it.
+
+    Raises
+    ------
+    BlockingIOError
+        If another process has locked it.
+    """
     if folder.is_dir():
-        yield
+        with locked(folder):
+            yield
         return
-    folder.mkdir()
+    folder.mkdir(exist_ok=True)
     try:
-        yield
+        with locked(folder):
+            yield
     finally:
         with suppress(OSError):  # it is not empty
             folder.rmdir()

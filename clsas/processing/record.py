@@ -22,6 +22,7 @@ from clsas.core.atomic import replacing
 from clsas.core.json_types import json_able
 from clsas.core.lines import RangeLines
 from clsas.core.version import __version__
+from clsas.files.process_tables import CORRECTIONS
 from clsas.files.scene_files import SceneFile
 
 NAME = "process.json"
@@ -73,8 +74,15 @@ class StepRecord:
             self, self.name, f"{len(self.files)} files", reprs.quantity(self.seconds, "s")
         )
 
+    @property
+    def result_file(self) -> str:
+        """Name of the file with the step's lines or image, if it saves any."""
+        return f"{self.name}.h5"
+
     def is_intact(self, folder: Path) -> bool:
         """Return whether all files of the step are there, as they were written."""
+        if self.name in (*CORRECTIONS, "image") and self.result_file not in self.files:
+            return False
         try:
             return all(file_digest(folder / name) == each for name, each in self.files.items())
         except (OSError, ValueError):

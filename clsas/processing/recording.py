@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
-from dataclasses import dataclass
-from functools import cached_property, partial
+from dataclasses import dataclass, fields
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +31,8 @@ class Recording:
 
     described: dict[str, Any]
     digest: str
-    _read: Callable[[], RangeLines | Echoes]
+    _path: Path | None
+    _given: RangeLines | None
     _compression: dict[str, Any]
 
     @classmethod
@@ -45,7 +45,7 @@ class Recording:
             given = compress(given, **options)
         if isinstance(given, RangeLines):
             lines, digest = given, contents_digest(given)
-            return cls({"file": None, "digest": digest}, digest, lambda: lines, options)
+            return cls({"file": None, "digest": digest}, digest, None, lines, options)
         path = scene.process.get("lines") if given is None else validate.path("lines", given)
         if path is None:
             raise ValueError(
@@ -55,25 +55,46 @@ class Recording:
             raise ValueError(f"{scene.name}: [process] lines must be a file, there is no {path}")
         digest = file_digest(path)
         of_both = step_digest("recording", options, digest)
-        return cls({"file": str(path), "digest": digest}, of_both, partial(_any, path), options)
+        return cls({"file": str(path), "digest": digest}, of_both, path, None, options)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Pickle without lines that were read: they are read again from their file."""
+        return {field.name: getattr(self, field.name) for field in fields(self)}
+
+    def read(self) -> RangeLines:
+        """Return the lines; those of echoes are compressed.
+
+        Raises
+        ------
+        ValueError
+            If the file holds anything else, or changed since its digest was taken.
+        """
+        return self._lines
 
     @cached_property
-    def lines(self) -> RangeLines:
-        """The lines; those of echoes are compressed."""
-        read = self._read()
-        return compress(read, **self._compression) if isinstance(read, Echoes) else read
+    def _lines(self) -> RangeLines:
+        if self._path is None:
+            assert self._given is not None
+            return self._given
+        found: RangeLines | Echoes = loaded(
+            self._path, self.described["digest"], RangeLines, Echoes
+        )
+        return compress(found, **self._compression) if isinstance(found, Echoes) else found
 
 
-def _any(path: Path) -> RangeLines | Echoes:
+def loaded(path: Path, digest: str, *kinds: type) -> Any:
+    """Return the object in a file whose contents have a digest.
+
+    Raises
+    ------
+    ValueError
+        If the file holds an object of another type than `kinds`, or other contents.
+    """
     found = load(path)
-    if not isinstance(found, (RangeLines, Echoes)):
-        raise ValueError(f"{path} must hold RangeLines or Echoes, got {type(found).__name__}")
+    if not isinstance(found, kinds):
+        wanted = " or ".join(kind.__name__ for kind in kinds)
+        raise ValueError(f"{path} must hold {wanted}, got {type(found).__name__}")
+    # After reading, so that nothing can take its place in between.
+    if file_digest(path) != digest:
+        raise ValueError(f"{path} changed since its digest was recorded: process it again")
     return found
-
-
-def loaded(path: Path) -> RangeLines:
-    """Return the range lines in a file; raises ValueError if it holds anything else."""
-    lines = _any(path)
-    validate.instance(str(path), lines, RangeLines)
-    assert isinstance(lines, RangeLines)  # for type checkers
-    return lines

@@ -26,7 +26,7 @@ from clsas.products.recording_checks import (
 from clsas.products.track_checks import check_spacing, check_track
 from clsas.signal.compression import compress
 from clsas.signal.echoes import Echoes
-from clsas.signal.spectrum import Spectrum, cycles_per_m_at, measure_spectrum
+from clsas.signal.spectrum import Spectrum, measure_spectrum
 from clsas.sonar.beam import BeamWindow
 from clsas.sonar.sampling import Finding
 
@@ -154,14 +154,26 @@ class _Moving:
         middle_hz = lines.carrier_hz + spectrum.centre * rate_hz
         oversampling = max(spectrum.oversampling, 1.0)
         half_hz = rate_hz / oversampling / 2
+        band_hz = middle_hz - half_hz, middle_hz + half_hz
         return cls(
             lines,
             pings,
             spectrum,
-            band_hz=(middle_hz - half_hz, middle_hz + half_hz),
-            wavelength_m=2 / max(abs(cycles_per_m_at(lines, spectrum.centre)), 1e-30),
+            band_hz,
+            wavelength_m=lines.sound_speed_m_s / _mean_frequency_hz(*band_hz),
             cell_m=lines.range_step_m * oversampling,
         )
+
+
+def _mean_frequency_hz(low_hz: float, high_hz: float) -> float:
+    """Return the mean of the frequencies of a band, all counted as positive.
+
+    That is the middle of a band, unless it reaches below 0 Hz. Where the middle of such a band lies
+    is chance: it may be 0 Hz, where the wavelength is infinite.
+    """
+    if low_hz * high_hz >= 0:
+        return abs(low_hz + high_hz) / 2
+    return (low_hz**2 + high_hz**2) / (2 * (high_hz - low_hz))
 
 
 def _check_samples(moving: _Moving) -> list[Finding]:

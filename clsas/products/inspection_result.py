@@ -69,7 +69,8 @@ class Inspection:
     oversampling : float
         Sample rate over the width of that band.
     wavelength_m : float
-        Wavelength at the band's middle.
+        Wavelength at the mean frequency of the band: at its middle, unless the band reaches below
+        0 Hz.
     length : int
         Samples per channel.
     range_step_m : float

@@ -70,8 +70,7 @@ def _check_advance(pings: Transmissions, lines: RangeLines, wavelength_m: float)
     first_ping = lines.rx_m[: pings.starts[1]]
     array_m = float(np.linalg.norm(np.ptp(first_ping, axis=0))) / 2
     least_m = wavelength_m / _LEAST_PER_WAVELENGTH
-    # A band about 0 Hz has no wavelength to speak of.
-    if usual_m + array_m < least_m * receivers and wavelength_m < last_range_m:
+    if usual_m + array_m < least_m * receivers:
         of_array = ""
         if receivers > 1:
             of_array = f", and with its {receivers:g} receivers a ping is {array_m:.4g} m long"

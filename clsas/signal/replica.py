@@ -79,6 +79,6 @@ class Replica:
         cycles = frequency.ravel() / self.sample_rate_hz
         # The transform counts from the middle of the samples.
         middle = len(self.samples) // 2
-        values = finufft.nufft1d2(2 * np.pi * cycles, self.samples, isign=-1, eps=1e-13)
+        values = finufft.nufft1d2(2 * np.pi * cycles, self.samples, isign=-1, eps=1e-13, nthreads=1)
         values = values * np.exp(-2j * np.pi * cycles * middle) / self.sample_rate_hz
         return np.reshape(values, frequency.shape)

@@ -20,6 +20,8 @@ from clsas.simulation.scenes import Scene
 from clsas.sonar.system import PASSBAND, Sonar
 from clsas.sonar.track import Channels, Pointing, Track, channels
 
+_LEAST_BAND_HZ = 1e-6  # a pulse of twelve days: arbitrary, but its inverse must be a number
+
 
 def simulate(
     sonar: Sonar,
@@ -260,12 +262,16 @@ def simulate_lines(
     ClsasWarning
         If no point's range lies within a line.
     """
-    carrier = validate.number("carrier_hz", carrier_hz, "Hz", least=0.0)
-    band = validate.positive("bandwidth_hz", bandwidth_hz, "Hz")
+    carrier = validate.number("carrier_hz", carrier_hz, "Hz", least=0.0, most=validate.MOST_HZ)
+    band = validate.number(
+        "bandwidth_hz", bandwidth_hz, "Hz", least=_LEAST_BAND_HZ, most=validate.MOST_HZ
+    )
     check_compression(window=window, oversampling=oversampling)
     validate.progress(progress)
     parts = scene_parts(scene)
-    sound = validate.positive("sound_speed_m_s", sound_speed_m_s, "m/s")
+    sound = validate.number(
+        "sound_speed_m_s", sound_speed_m_s, "m/s", above=0.0, most=validate.MOST_M_S
+    )
     paths = Paths(parts, _channels(tx_m, rx_m, rx_velocity_m_s), sound)
     if (first_range_m is None) != (length is None):
         raise ValueError("first_range_m and length must be given together or not at all")
@@ -285,8 +291,10 @@ def simulate_lines(
         )
         length = validate.count("length", length)
         validate.memory("length", 8 * every * paths.channels * length)
-        nearest = 2 * first / sound
+        with np.errstate(over="ignore"):  # refused below
+            nearest = 2 * first / sound
         farthest = nearest + (length - 1) * step
+    validate.phase(carrier, sound, sound / 2 * float(np.abs([nearest, farthest]).max()))
 
     start = nearest - RINGING * step
     samples = record(

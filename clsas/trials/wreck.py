@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from clsas.core.cache import cache_folder
+from clsas.core.cache import private_folder
 from clsas.core.grid import Grid
 from clsas.core.image import Image
 from clsas.core.lines import RangeLines
@@ -45,10 +45,10 @@ def scene() -> SceneFile:
 def lines(progress: Callable[[int, int], None] | None = None) -> RangeLines:
     """Return the scene's range lines. The first call simulates them, which takes minutes.
 
-    Later calls read them from the cache (`clsas.core.cache.cache_folder`).
+    Later calls read them from the cache (`clsas.core.cache.private_folder`).
     """
     digest = simulation_digest(built_in_scene("wreck"), Path())
-    path = cache_folder() / f"wreck-{digest}.h5"
+    path = private_folder() / f"wreck-{digest}.h5"
     try:
         kept = load(path)
         if isinstance(kept, RangeLines):
@@ -59,7 +59,6 @@ def lines(progress: Callable[[int, int], None] | None = None) -> RangeLines:
     sonar, track, targets = described.need("sonar", "track", "targets")
     echoes = simulate(sonar, track, targets, **described.simulate, progress=progress)
     made = compress(echoes, **described.compress)
-    path.parent.mkdir(parents=True, exist_ok=True)
     save(path, made)
     return made
 

@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
-from clsas.core.cache import cache_folder
+from clsas.core.cache import private_folder
 
 Ask = Callable[..., dict]
 
@@ -30,7 +30,7 @@ def environment(name: str, *requirements: Sequence[str | Path]) -> Path:
 
     Each of the requirements are the arguments of one call of pip, one after the other.
     """
-    folder = cache_folder() / "peers" / name
+    folder = private_folder("peers") / name
     python = folder / "bin" / "python"
     if not (folder / "ready").exists():
         print(f"installing {name} in {folder}", file=sys.stderr)

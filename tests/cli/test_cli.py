@@ -1,3 +1,4 @@
+import builtins
 import dataclasses
 import json
 import os
@@ -728,6 +729,20 @@ def test_expected_resolution_of_a_plain_aperture():
     assert range_m == pytest.approx(0.8859 * 1500 / (2 * 5e3), rel=0.02)
 
 
+def test_ctrl_c_while_a_command_is_loaded_ends_with_130(monkeypatch):
+    load = builtins.__import__
+
+    def interrupted(name, *rest):
+        if name == "pyopencl":
+            raise KeyboardInterrupt
+        return load(name, *rest)
+
+    monkeypatch.setattr(builtins, "__import__", interrupted)
+    result = CliRunner().invoke(cli.main, ["devices"])
+    assert result.exit_code == 130
+    assert result.stderr == "Interrupted\n"
+
+
 @pytest.mark.slow
 def test_ctrl_c_ends_with_130_and_leaves_no_file(tmp_path):
     """Interrupted once the warning of a sparse array says that work begins."""
@@ -742,6 +757,31 @@ def test_ctrl_c_ends_with_130_and_leaves_no_file(tmp_path):
     assert stderr.splitlines()[-1] == "Interrupted"
     assert "Traceback" not in stderr
     assert [path.name for path in tmp_path.iterdir()] == ["scene.toml"]
+
+
+INTERRUPTED_IMPORT = """
+import signal, sys
+
+class Interrupting:
+    def find_spec(self, name, path, target=None):
+        if name == sys.argv[1]:
+            sys.meta_path.remove(self)
+            signal.raise_signal(signal.SIGINT)
+
+signal.signal(signal.SIGINT, signal.default_int_handler)
+sys.meta_path.insert(0, Interrupting())
+from clsas.__main__ import run
+sys.argv[1:] = ["devices"]
+run()
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("module", ["click", "clsas.cli", "numpy", "pyopencl", "clsas.cli.machine"])
+def test_ctrl_c_while_modules_are_imported_ends_with_130(module):
+    command = [sys.executable, "-c", INTERRUPTED_IMPORT.replace("sys.argv[1]", repr(module))]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert (done.returncode, done.stdout, done.stderr) == (130, "", "Interrupted\n")
 
 
 @pytest.mark.slow
@@ -816,6 +856,34 @@ def test_messages_hold_no_control_characters(tmp_path):
         _, stderr = run("simulate", given, "-o", tmp_path / "out.h5", code=code)
         assert "\x1b" not in stderr
         assert stderr.count("Error: ") == 1
+
+
+BAD = "\x1b[31mred\nError: gone\nWarning: fine.h5"
+
+
+def test_names_of_files_reach_no_terminal(made, tmp_path):
+    """Neither do escape sequences in them, nor lines that look like clsas's own."""
+    for name in ("lines.h5", "image.h5", "scene.toml"):
+        shutil.copy(made[0] / name, tmp_path / f"{name}{BAD}")
+    (tmp_path / f"text{BAD}").write_text("no scene")
+    out, grid = tmp_path / f"out{BAD}", ["--x", "-1:1:8", "--y", "19:21:8"]
+    lines, image, text = (tmp_path / f"{name}{BAD}" for name in ("lines.h5", "image.h5", "text"))
+    for args, code in (
+        (["image", lines, *grid, "--exact", "-o", out], 0),
+        (["convert", lines, out], 0),
+        (["quality", image, "--reference", image], 0),
+        (["simulate", tmp_path / f"scene.toml{BAD}", "-o", out], 0),
+        (["simulate", text, "-o", tmp_path / "echoes.h5"], 1),
+        (["compress", image, "-o", tmp_path / "new.h5"], 1),
+        (["image", tmp_path / f"none{BAD}", *grid, "-o", tmp_path / "new.h5"], 2),
+        ([f"--{BAD}"], 2),
+        ([f"none{BAD}"], 2),
+    ):
+        stdout, stderr = run(*args, code=code)
+        assert "\x1b" not in stdout + stderr
+        assert r"\x1b[31mred\nError: gone\nWarning: fine.h5" in stdout + stderr
+        assert len(re.findall("^Error: ", stdout + stderr, re.MULTILINE)) == (code > 0)
+        assert not re.findall("^Warning: fine", stdout + stderr, re.MULTILINE)
 
 
 def test_warnings_of_others_are_not_shown_as_clsas_own(monkeypatch, tmp_path):

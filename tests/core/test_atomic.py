@@ -3,12 +3,13 @@
 import errno
 import os
 import signal
+import stat
 import subprocess
 import sys
 
 import pytest
 
-from clsas.core.atomic import creating, replacing
+from clsas.core.atomic import creating, locked, replacing
 
 
 @pytest.mark.parametrize("names", [None, "the temporary one"])
@@ -34,7 +35,7 @@ def killed_in(statement, folder):
     program = f"""
 import os, signal
 from pathlib import Path
-from clsas.core.atomic import creating, replacing, staging
+from clsas.core.atomic import creating, locked, replacing, staging
 path = Path({str(folder / "a.h5")!r})
 with {statement} as part:
     (part / "x" if part.is_dir() else part).write_text("half")
@@ -118,3 +119,122 @@ def test_a_folder_that_another_made_meanwhile_stays(tmp_path):
         (tmp_path / "a" / "theirs").touch()
     assert [path.name for path in (tmp_path / "a").iterdir()] == ["theirs"]
     assert [path.name for path in tmp_path.iterdir()] == ["a"]
+
+
+def test_a_symbolic_link_stays_and_its_target_is_replaced(tmp_path):
+    (tmp_path / "disk").mkdir()
+    target = tmp_path / "disk" / "image.h5"
+    for before in (None, "before"):  # a link may lead to what is not there yet
+        if before is not None:
+            target.write_text(before)
+        link = tmp_path / f"link-{before}"
+        link.symlink_to("disk/image.h5")
+        with replacing(link) as part:
+            assert part.parent == target.parent
+            part.write_text("after")
+        assert link.is_symlink()
+        assert target.read_text() == "after"
+        target.unlink()
+
+
+@pytest.mark.parametrize("mode", [0o600, 0o640, 0o664])
+def test_the_mode_of_a_file_stays(tmp_path, mode):
+    path = tmp_path / "image.h5"
+    path.write_text("before")
+    path.chmod(mode)
+    with replacing(path) as part:
+        assert stat.S_IMODE(part.stat().st_mode) == mode  # while it is written, too
+        part.write_text("after")
+    assert stat.S_IMODE(path.stat().st_mode) == mode
+    assert path.read_text() == "after"
+
+
+def test_a_new_file_has_the_usual_mode(tmp_path):
+    (tmp_path / "usual").touch()
+    with replacing(tmp_path / "image.h5") as part:
+        part.write_text("new")
+    modes = {path.stat().st_mode for path in tmp_path.iterdir()}
+    assert len(modes) == 1
+
+
+@pytest.mark.parametrize("linked", [False, True])
+def test_pipes_and_devices_are_refused(tmp_path, linked):
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    for path, kind in ((pipe, "a pipe"), ("/dev/null", "a device")):
+        given = path
+        if linked:
+            given = tmp_path / f"link to {kind}"
+            given.symlink_to(path)
+        with (
+            pytest.raises(ValueError, match=f"must be an ordinary file, got {kind}"),
+            replacing(given),
+        ):
+            pytest.fail("there is nothing to write")
+    assert stat.S_ISFIFO(pipe.stat().st_mode)
+    assert stat.S_ISCHR(os.stat("/dev/null").st_mode)
+    assert not list(tmp_path.glob(".clsas-*"))
+
+
+def test_a_loop_of_links_is_refused(tmp_path):
+    loop = tmp_path / "loop"
+    loop.symlink_to("loop")
+    with pytest.raises(OSError, match="levels of symbolic links"), replacing(loop):
+        pytest.fail("there is nothing to write")
+    assert loop.is_symlink()
+
+
+def test_a_folder_is_locked_once_at_a_time(tmp_path):
+    with locked(tmp_path):
+        for _ in range(2):
+            with (
+                pytest.raises(BlockingIOError, match="at work in this folder") as caught,
+                locked(tmp_path),
+            ):
+                pytest.fail("two have the lock")
+            assert caught.value.filename == str(tmp_path)
+    assert not list(tmp_path.iterdir())
+    with locked(tmp_path):
+        pass
+
+
+def test_a_killed_process_leaves_no_lock(tmp_path):
+    program = f"""
+import os, signal
+from pathlib import Path
+from clsas.core.atomic import locked
+with locked(Path({str(tmp_path)!r})):
+    os.kill(os.getpid(), signal.SIGKILL)
+"""
+    done = subprocess.run([sys.executable, "-c", program], check=False)
+    assert done.returncode == -signal.SIGKILL
+    assert len(list(tmp_path.iterdir())) == 1
+    with locked(tmp_path):
+        pass
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_lock_whose_file_was_removed_meanwhile_is_taken_anew(tmp_path, monkeypatch):
+    import fcntl
+
+    flock, calls = fcntl.flock, []
+
+    def raced(descriptor, operation):
+        if not calls:
+            (tmp_path / ".clsas.lock").unlink()
+        calls.append(operation)
+        flock(descriptor, operation)
+
+    monkeypatch.setattr(fcntl, "flock", raced)
+    with locked(tmp_path), pytest.raises(BlockingIOError), locked(tmp_path):
+        pytest.fail("two have the lock")
+    assert len(calls) == 3
+
+
+def test_a_folder_that_cannot_be_written_needs_no_lock(tmp_path, monkeypatch):
+    def refused(*_):
+        raise PermissionError(errno.EACCES, "Permission denied")
+
+    monkeypatch.setattr(os, "open", refused)
+    with locked(tmp_path):
+        assert not list(tmp_path.iterdir())

@@ -218,12 +218,18 @@ def test_shown_survives_a_repr_that_raises():
     assert "Bad" in validate.shown(Bad())
 
 
-def test_printable_keeps_lines_and_text():
-    assert validate.printable("größer als 5 µs\nnext") == "größer als 5 µs\nnext"
+def test_printable_keeps_text_and_indented_lines():
+    assert validate.printable("größer als 5 µs\n  next") == "größer als 5 µs\n  next"
+    assert validate.printable("name\nError: none") == r"name\nError: none"
+    assert validate.printable("name\n\n  next\n") == "name\\n\n  next\\n"
     assert validate.printable("a\x1b]0;title\x07\r\u202e\udcff") == (
         r"a\x1b]0;title\x07\r\u202e\udcff"
     )
-    assert [len(line) for line in validate.printable("x" * 5000 + "\nb").split("\n")] == [1000, 1]
+    assert [len(line) for line in validate.printable("x" * 5000 + "\n  b").split("\n")] == [1000, 3]
+
+
+def test_escaped_keeps_the_lines_of_a_table():
+    assert validate.escaped("a\tb\x1b[2J\n\nµ\x9b") == "a\\tb\\x1b[2J\n\nµ\\x9b"
 
 
 def test_memory_heeds_the_limit_of_the_address_space():

@@ -17,37 +17,46 @@ from clsas.files.hdf5 import FileFormatError, load, read_geometry, read_samples,
 from clsas.signal.echoes import Echoes
 from clsas.sonar.system import Pulse
 
-RNG = np.random.default_rng(3)
-
-
-def noise(*shape):
-    return RNG.normal(size=shape)
-
-
-def complex_noise(*shape):
-    return (noise(*shape) + 1j * noise(*shape)).astype(np.complex64)
-
-
 PLANE = Grid.plane(x=(1e6, 1e6 + 0.7, 5), y=(40, 41 / 3, 3), z=-1 / 3)
-TX, RX = 1e7 + noise(4, 3), 1e7 + noise(4, 3)
-# -0, the smallest and the largest number are among the bits to be kept.
-SAMPLES = complex_noise(4, 6)
-SAMPLES[0, :3] = [complex(-0.0, 0.0), np.finfo(np.float32).smallest_subnormal, 3.4e38]
-OBJECTS = {
-    "plane": PLANE,
-    "oriented": Grid.oriented(noise(3), noise(3), noise(3), (2, 3)),
-    "height map": PLANE.with_height(noise(3, 5)),
-    "points": Grid.points(noise(2, 3, 4, 3)),
-    "image": Image(complex_noise(3, 5), PLANE),
-    "image of points": Image(complex_noise(7), Grid.points(noise(7, 3))),
-    "lines": RangeLines(SAMPLES, noise(4), 1 / 3, TX, RX, 1e6 / 3, 1500.1),
-    "moving lines": RangeLines(SAMPLES, 40, 0.1, TX, RX, 0, 1500, noise(4, 3)),
-    "echoes": Echoes(SAMPLES, 0.1, 1e5 / 3, 1e6, TX, RX, 1500, Pulse(1e6, 1e5 / 3, 1e-3, "down")),
-    "phase code": Echoes(
-        SAMPLES, noise(4), 1e5, 1e6, TX, RX, 1500, Pulse.phase_code(1e6, 1e-3), noise(4, 3)
-    ),
-    "passband without a pulse": Echoes(noise(4, 6).astype(np.float32), 0, 1e6, 2e5, TX, RX, 1500),
-}
+
+
+def complex_noise(random, *shape):
+    return (random.normal(size=shape) + 1j * random.normal(size=shape)).astype(np.complex64)
+
+
+def objects():
+    """One object of every kind, of noise."""
+    random = np.random.default_rng(3)
+
+    def noise(*shape):
+        return random.normal(size=shape)
+
+    tx_m, rx_m = 1e7 + noise(4, 3), 1e7 + noise(4, 3)
+    # -0, the smallest and the largest number are among the bits to be kept.
+    samples = complex_noise(random, 4, 6)
+    samples[0, :3] = [complex(-0.0, 0.0), np.finfo(np.float32).smallest_subnormal, 3.4e38]
+    return {
+        "plane": PLANE,
+        "oriented": Grid.oriented(noise(3), noise(3), noise(3), (2, 3)),
+        "height map": PLANE.with_height(noise(3, 5)),
+        "points": Grid.points(noise(2, 3, 4, 3)),
+        "image": Image(complex_noise(random, 3, 5), PLANE),
+        "image of points": Image(complex_noise(random, 7), Grid.points(noise(7, 3))),
+        "lines": RangeLines(samples, noise(4), 1 / 3, tx_m, rx_m, 1e6 / 3, 1500.1),
+        "moving lines": RangeLines(samples, 40, 0.1, tx_m, rx_m, 0, 1500, noise(4, 3)),
+        "echoes": Echoes(
+            samples, 0.1, 1e5 / 3, 1e6, tx_m, rx_m, 1500, Pulse(1e6, 1e5 / 3, 1e-3, "down")
+        ),
+        "phase code": Echoes(
+            samples, noise(4), 1e5, 1e6, tx_m, rx_m, 1500, Pulse.phase_code(1e6, 1e-3), noise(4, 3)
+        ),
+        "passband without a pulse": Echoes(
+            noise(4, 6).astype(np.float32), 0, 1e6, 2e5, tx_m, rx_m, 1500
+        ),
+    }
+
+
+OBJECTS = objects()
 EVERY_OBJECT = pytest.mark.parametrize("obj", OBJECTS.values(), ids=OBJECTS.keys())
 
 
@@ -136,11 +145,12 @@ def test_an_interrupted_save_leaves_nothing(error, exists, tmp_path, monkeypatch
 
 
 FULL_DISK = """
-import errno, resource, sys, test_hdf5 as t
+import dataclasses, errno, resource, sys, test_hdf5 as t
 resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, 10_000))
 for path in sys.argv[1:]:
     try:
-        t.save(path, t.RangeLines(t.complex_noise(4, 5000), 40, 0.1, t.TX, t.RX, 0, 1500))
+        samples = t.complex_noise(t.np.random.default_rng(0), 4, 5000)
+        t.save(path, dataclasses.replace(t.OBJECTS["lines"], samples=samples))
     except OSError as error:
         print(errno.errorcode[error.errno])
 """
@@ -370,13 +380,29 @@ def test_damaged_bytes_never_become_data(tmp_path):
     save(tmp_path / "whole.h5", OBJECTS["lines"])
     whole = (tmp_path / "whole.h5").read_bytes()
     path = tmp_path / "file.h5"
+    random = np.random.default_rng(0)
     found = 0
-    for position in RNG.integers(0, len(whole), 400):
+    for position in random.integers(0, len(whole), 400):
         damaged = bytearray(whole)
-        damaged[position] ^= 1 << RNG.integers(8)
+        damaged[position] ^= 1 << random.integers(8)
         path.write_bytes(damaged)
         try:
             assert digest(load(path)) == digest(OBJECTS["lines"])  # bytes that nothing uses
         except FileFormatError:
             found += 1
     assert found > 200
+
+
+def test_saving_keeps_links_modes_and_what_is_no_file(tmp_path):
+    grid = Grid.plane((0, 1, 2), (0, 1, 2))
+    private, link, pipe = (tmp_path / f"{name}.h5" for name in ("private", "link", "pipe"))
+    private.touch(mode=0o600)
+    link.symlink_to(private)
+    os.mkfifo(pipe)
+    save(link, grid)
+    assert link.is_symlink()
+    assert private.stat().st_mode & 0o777 == 0o600
+    assert load(private).shape == grid.shape
+    with pytest.raises(ValueError, match=r"pipe\.h5 must be an ordinary file, got a pipe"):
+        save(pipe, grid)
+    assert pipe.is_fifo()

@@ -12,32 +12,36 @@ from clsas.sonar.system import Pulse
 
 xarray = pytest.importorskip("xarray")
 
-RNG = np.random.default_rng(3)
-
-
-def noise(*shape):
-    return RNG.normal(size=shape)
-
-
-def complex_noise(*shape):
-    return (noise(*shape) + 1j * noise(*shape)).astype(np.complex64)
-
-
 PLANE = Grid.plane(x=(1e6, 1e6 + 0.7, 5), y=(40, 41 / 3, 3), z=-1 / 3)
-OBJECTS = {
-    "oriented": Grid.oriented(noise(3), noise(3), noise(3), (2, 3)),
-    "height map": PLANE.with_height(noise(3, 5)),
-    "points": Grid.points(noise(2, 3, 4, 3)),
-    "image": Image(complex_noise(3, 5), PLANE),
-    "image of points": Image(complex_noise(7), Grid.points(noise(7, 3))),
-    "moving lines": RangeLines(
-        complex_noise(4, 6), 40, 0.1, noise(4, 3), noise(4, 3), 0, 1500, noise(4, 3)
-    ),
-    "phase code": Echoes(
-        complex_noise(4, 6), noise(4), 1e5, 1e6, [0, 0, 0], [0, 0, 0], 1500,
-        Pulse.phase_code(1e6, 1e-3),
-    ),
-}  # fmt: skip
+
+
+def objects():
+    """One object of every kind, of noise."""
+    random = np.random.default_rng(3)
+
+    def noise(*shape):
+        return random.normal(size=shape)
+
+    def complex_noise(*shape):
+        return (noise(*shape) + 1j * noise(*shape)).astype(np.complex64)
+
+    return {
+        "oriented": Grid.oriented(noise(3), noise(3), noise(3), (2, 3)),
+        "height map": PLANE.with_height(noise(3, 5)),
+        "points": Grid.points(noise(2, 3, 4, 3)),
+        "image": Image(complex_noise(3, 5), PLANE),
+        "image of points": Image(complex_noise(7), Grid.points(noise(7, 3))),
+        "moving lines": RangeLines(
+            complex_noise(4, 6), 40, 0.1, noise(4, 3), noise(4, 3), 0, 1500, noise(4, 3)
+        ),
+        "phase code": Echoes(
+            complex_noise(4, 6), noise(4), 1e5, 1e6, [0, 0, 0], [0, 0, 0], 1500,
+            Pulse.phase_code(1e6, 1e-3),
+        ),
+    }  # fmt: skip
+
+
+OBJECTS = objects()
 
 
 def test_xarray_of_an_image():

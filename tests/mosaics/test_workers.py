@@ -2,7 +2,10 @@
 
 import importlib
 import os
+import signal
+import subprocess
 import sys
+import textwrap
 from pathlib import Path
 
 import pytest
@@ -99,3 +102,99 @@ def test_without_cryptography_it_says_what_to_install(tmp_path, monkeypatch):
     (said,) = run_with_workers(tmp_path)
     assert "need the package cryptography" in said
     assert "pip install 'clsas[mosaic]'" in said
+
+
+VICTIM = """
+import sys
+
+from clsas.mosaics.workers import local_client
+
+if __name__ == "__main__":
+    with local_client(1) as client:
+        look = "[*__import__('sys').path, __import__('h5py').__file__, __import__('zarr').__file__]"
+        print(*client.submit(eval, look).result(timeout=120), *sys.path, sep="\\n")
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root can give files to another user")
+def test_nothing_is_imported_that_another_user_planted(tmp_path):
+    """Neither from the folder that Dask makes where all can write, nor from that where one works.
+
+    The other user was there first, and made that folder.
+    """
+    other = 54321
+    private, shared = tmp_path / "private", tmp_path / "shared"
+    ran = tmp_path / "ran"
+    planted = shared / "dask-scratch-space"
+    for folder, mode in ((private, 0o700), (shared, 0o1777), (planted, 0o777)):
+        folder.mkdir()
+        folder.chmod(mode)
+    (private / "victim.py").write_text(textwrap.dedent(VICTIM))
+    for folder in (shared, planted):
+        for name in ("multiprocessing", "msgpack", "numpy", "h5py", "zarr", "clsas"):
+            module = folder / f"{name}.py"
+            module.write_text(f"open({str(ran)!r}, 'a').write({str(module)!r})\n")
+            os.chown(module, other, other)
+    os.chown(planted, other, other)
+    found = subprocess.run(
+        [sys.executable, private / "victim.py"],
+        env=os.environ | {"TMPDIR": str(shared), "CLSAS_CACHE": str(private / "cache")},
+        cwd=shared,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert not ran.exists(), ran.read_text()
+    assert found.returncode == 0, found.stderr
+    assert not [path for path in found.stdout.splitlines() if Path(path).is_relative_to(shared)]
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root can give a folder to another user")
+def test_a_folder_of_another_user_is_refused(tmp_path, monkeypatch):
+    for each in tmp_path.parents:
+        if not each.stat().st_mode & 0o001:
+            each.chmod(0o711)  # where others could get to
+    cache = tmp_path / "cache"
+    (cache / "workers").mkdir(parents=True)
+    os.chown(cache / "workers", 54321, 54321)
+    monkeypatch.setenv("CLSAS_CACHE", str(cache))
+    (said,) = run_with_workers(tmp_path)
+    assert f"{cache / 'workers'} belongs to user 54321" in said
+    assert "CLSAS_CACHE" in said
+
+
+def test_ctrl_c_while_workers_start_is_heeded_once_they_have(monkeypatch):
+    """So that none is left behind."""
+    from clsas.mosaics import workers
+
+    events = []
+
+    class Cluster:
+        def __init__(self, **_):
+            os.kill(os.getpid(), signal.SIGINT)
+            events.append("started")
+
+        def __enter__(self):
+            return self
+
+        def __exit__(self, *_):
+            events.append("ended")
+
+    monkeypatch.setattr(workers, "SpecCluster", Cluster)
+    monkeypatch.setattr(workers, "Client", lambda cluster: cluster)
+    with pytest.raises(KeyboardInterrupt), workers.local_client(1):
+        events.append("ran")
+    assert events == ["started", "ended", "ended"]  # the client, the cluster
+    assert signal.SIGINT not in signal.pthread_sigmask(signal.SIG_BLOCK, ())
+
+
+@pytest.mark.slow
+def test_workers_do_not_heed_ctrl_c_even_if_they_started_again():
+    from clsas.mosaics.workers import local_client
+
+    blocked = "__import__('signal').pthread_sigmask(0, ())"
+    with local_client(1) as client:
+        assert signal.SIGINT in client.submit(eval, blocked, pure=False).result(timeout=60)
+        client.restart()
+        assert signal.SIGINT in client.submit(eval, blocked, pure=False).result(timeout=60)

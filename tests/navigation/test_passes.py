@@ -74,3 +74,20 @@ def test_errors_that_persist_count_more():
     assert persistence(white) == pytest.approx(1, abs=0.3)
     assert 2.5 < persistence(kept) < 5
     assert persistence(white[:, :1]) == persistence(white[:3]) == 1
+
+
+def test_corrections_that_leave_no_overlap_are_refused():
+    """Here because the ranges are wrong: samples are 100 m apart, a swath of 80 km."""
+    pings, receivers = 12, 8
+    tx_m, rx_m = np.zeros((2, pings, receivers, 3))
+    tx_m[..., 0] = rx_m[..., 0] = 0.1 * np.arange(pings)[:, None]
+    rx_m[..., 0] += 0.05 * np.arange(receivers)
+    rng = np.random.default_rng(0)
+    at = np.stack([rng.uniform(-15, 15, 500), rng.uniform(25, 40, 500), np.zeros(500)], axis=1)
+    lines = clsas.simulate_lines(
+        tx_m.reshape(-1, 3), rx_m.reshape(-1, 3),
+        clsas.PointTargets(at, rng.standard_normal(500) + 1j * rng.standard_normal(500)),
+        carrier_hz=100e3, bandwidth_hz=20e3, first_range_m=25.0, length=800,
+    )  # fmt: skip
+    with pytest.raises(ValueError, match=r"no phase centres overlap .* Check range_step_m, 100 m"):
+        clsas.micronavigate(replace(lines, range_step_m=100.0))

@@ -1,6 +1,7 @@
 """The chain from a recording to a focused image: what runs, what is kept, what is written."""
 
 import json
+import pickle
 from dataclasses import replace
 
 import numpy as np
@@ -300,6 +301,23 @@ def test_lines_and_echoes_in_memory(scene, tmp_path):
         _ = clsas.process(scene, lines=lines, steps=("calibrate",)).image
 
 
+@pytest.mark.parametrize("steps", [("image",), ("calibrate", "image")])
+def test_a_pickled_processing_holds_no_lines_of_files(scene, steps):
+    choose(scene, *steps)
+    found = clsas.process(scene)
+    samples = found.lines.samples
+    pickled = pickle.dumps(found)
+    assert len(pickled) < samples.nbytes / 10
+    np.testing.assert_array_equal(pickle.loads(pickled).lines.samples, samples)
+
+
+def test_a_pickled_processing_holds_lines_given_in_memory(scene):
+    choose(scene, "image")
+    lines = clsas.load(scene.parent / "lines.h5")
+    read = pickle.loads(pickle.dumps(clsas.process(scene, lines=lines)))
+    np.testing.assert_array_equal(read.lines.samples, lines.samples)
+
+
 def test_mosaic_continues(scene):
     pytest.importorskip("zarr")
     scene.write_text(scene.read_text() + "[mosaic]\npatches = [2, 2]\n")
@@ -366,6 +384,81 @@ def test_bad_arguments(scene, tmp_path):
         clsas.process(scene, output=tmp_path / "no/such/folder")
     with pytest.raises(ValueError, match=r"output must be a folder, got the file '.*grid.h5'"):
         clsas.process(scene, output=tmp_path / "grid.h5")
+
+
+def test_two_runs_in_one_folder_are_refused(plain, tmp_path, monkeypatch):
+    """The second would continue from the lines of the first, and record them as its own."""
+    other = clsas.load(plain.parent / "lines.h5").weighted(np.full(260, 2.0))
+    image = steps_module.RUN["image"]
+    messages = []
+
+    def image_beside(job):
+        monkeypatch.setitem(steps_module.RUN, "image", image)
+        with pytest.raises(BlockingIOError, match="another process of clsas is at work") as caught:
+            clsas.process(plain, lines=other)
+        messages.append(CliRunner().invoke(main, ["process", str(plain)]).output)
+        assert caught.value.filename == str(plain.with_suffix(""))
+        return image(job)
+
+    monkeypatch.setitem(steps_module.RUN, "image", image_beside)
+    folder = clsas.process(plain).folder
+    assert messages == [f"Error: another process of clsas is at work in this folder: {folder}\n"]
+    assert ".clsas.lock" not in contents(folder)
+    assert clsas.process(plain).repeated == ()
+    assert clsas.process(plain, lines=other).repeated == ("image",)
+
+
+def test_a_recording_that_changes_while_it_is_processed_is_refused(plain, tmp_path, monkeypatch):
+    changing, lines = tmp_path / "changing.h5", clsas.load(plain.parent / "lines.h5")
+    clsas.save(changing, lines)
+    from clsas.processing import chain
+
+    open_device = chain.open_device
+
+    def open_late(device):
+        clsas.save(changing, lines.weighted(np.full(260, 2.0)))
+        return open_device(device)
+
+    monkeypatch.setattr(chain, "open_device", open_late)
+    with pytest.raises(ValueError, match=r"changing\.h5 changed since its digest was recorded"):
+        clsas.process(plain, lines=changing)
+    assert not plain.with_suffix("").exists()
+
+
+def test_results_that_changed_since_are_not_returned(scene):
+    choose(scene, "calibrate", "image")
+    found = clsas.process(scene)
+    lines, image = found.lines, found.image
+    clsas.save(found.folder / "calibrate.h5", lines.weighted(np.full(260, 2.0)))
+    clsas.save(found.folder / "image.h5", replace(image, pixels=2 * image.pixels))
+    with pytest.raises(ValueError, match=r"calibrate\.h5 changed since its digest was recorded"):
+        _ = found.lines
+    with pytest.raises(ValueError, match=r"image\.h5 changed since its digest was recorded"):
+        _ = found.image
+
+
+def test_a_processing_pickles(plain):
+    found = pickle.loads(pickle.dumps(clsas.process(plain)))
+    assert found["image"].files
+    assert found.lines.channels == 260
+    assert found.image.shape == (121, 161)
+
+
+def test_names_in_a_foreign_record_reach_no_terminal(plain):
+    bad = "\x1b[31mred\nError: gone"
+    path = clsas.process(plain).folder / "process.json"
+    record = json.loads(path.read_text())
+    (step,) = record["steps"]
+    step["files"][bad] = step["files"]["image.png"]
+    (path.parent / bad).write_bytes((path.parent / "image.png").read_bytes())
+    record["steps"].append(step | {"name": "focus", "digest": "0"})
+    path.write_text(json.dumps(record))
+    printed = CliRunner().invoke(main, ["process", str(plain)]).output
+    assert "unchanged" in printed
+    assert "Warning: the results of focus" in printed
+    assert printed.count(r"\x1b[31mred\nError: gone") == 2
+    assert "\x1b" not in printed
+    assert "\nError" not in printed
 
 
 @pytest.mark.slow

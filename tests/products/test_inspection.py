@@ -20,18 +20,18 @@ from clsas.products.recording_checks import Levels, check_levels, check_offset
 PINGS, ADVANCE_M = 200, 0.02
 GRID = clsas.Grid.plane((1.0, 3.0, 100), (18.0, 20.5, 120))
 BEAM = clsas.BeamWindow(20.0)
-RNG = np.random.default_rng(3)
 
 
 def scene():
-    count = 800
-    at = np.stack(
-        [RNG.uniform(-5, 9, count), RNG.uniform(18.0, 20.5, count), np.zeros(count)], axis=1
+    """Speckle, and twenty bright points in it."""
+    random, count = np.random.default_rng(3), 800
+    places_m = np.stack(
+        [random.uniform(-5, 9, count), random.uniform(18.0, 20.5, count), np.zeros(count)], axis=1
     )
-    level = 0.05 * (RNG.standard_normal((count, 2)) @ [1, 1j])
-    level[:20] = np.exp(2j * np.pi * RNG.random(20))
-    at[:20, 0] = RNG.uniform(0.5, 3.5, 20)
-    return clsas.PointTargets(at, level)
+    amplitudes = 0.05 * (random.standard_normal((count, 2)) @ [1, 1j])
+    amplitudes[:20] = np.exp(2j * np.pi * random.random(20))
+    places_m[:20, 0] = random.uniform(0.5, 3.5, 20)
+    return clsas.PointTargets(places_m, amplitudes)
 
 
 @pytest.fixture(scope="module")
@@ -373,8 +373,6 @@ def test_an_advance_too_small_for_any_aperture(lines):
         assert found.value == pytest.approx(2e-5)
         assert "less than 1/50 of the wavelength of 0.015" in found.message
         assert "not kilometres" in found.remedy
-    khz = clsas.inspect(replace(lines, carrier_hz=100.0))
-    assert "carrier_hz in Hz (not kHz)" in khz["advance"].remedy
     for slow in (0.02, 1.1 / 66):  # 0.4 mm, and 0.33 mm per ping
         assert "advance" not in clsas.inspect(moved(lines, lambda m, slow=slow: slow * m))
     # An array that overlaps itself almost wholly is slow, and no slip.
@@ -382,6 +380,30 @@ def test_an_advance_too_small_for_any_aperture(lines):
     tx_m = 1e-2 * array.tx_m
     slow_array = replace(array, tx_m=tx_m, rx_m=array.rx_m - array.tx_m + tx_m)
     assert "advance" not in clsas.inspect(slow_array)
+
+
+def in_khz(lines, middle_hz, share=1.0):
+    """Lines that give their carrier in kHz, their band or a share of it about a frequency."""
+    rate_hz = lines.sound_speed_m_s / (2 * lines.range_step_m)
+    spectrum = np.fft.fft(lines.samples, axis=1)
+    spectrum[:, np.abs(np.fft.fftfreq(lines.length, 1 / rate_hz)) > share * 15e3] = 0
+    narrow = replace(lines, samples=np.fft.ifft(spectrum, axis=1))
+    moved_hz = middle_hz + 100e3 - 100 - np.mean(clsas.inspect(narrow).band_hz)
+    turns = moved_hz / rate_hz * np.arange(lines.length)
+    return replace(lines, samples=narrow.samples * np.exp(2j * np.pi * turns), carrier_hz=100.0)
+
+
+@pytest.mark.parametrize("middle_hz", [0.0, 2.0, -40.0, 100.0, 300.0, -1000.0])
+def test_a_carrier_in_khz_is_found_wherever_the_band_is(lines, middle_hz):
+    """The middle of a band about 0 Hz is chance, and so would be the wavelength there."""
+    found = clsas.inspect(in_khz(lines, middle_hz))
+    assert np.mean(found.band_hz) == pytest.approx(middle_hz, abs=100)
+    assert names(found) == ["band"]
+    assert "carrier_hz in Hz (not kHz)" in found["band"].remedy
+    assert found.wavelength_m == pytest.approx(1500 / 7.5e3, rel=0.1)  # at half of 15 kHz
+    narrow = clsas.inspect(in_khz(lines, middle_hz, share=0.02))
+    assert {"advance", "band"} <= set(names(narrow))
+    assert "carrier_hz in Hz (not kHz)" in narrow["advance"].remedy
 
 
 def test_echoes_before_their_transmission(lines, five_points):

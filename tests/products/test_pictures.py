@@ -20,11 +20,10 @@ from clsas.products.tradeoff_result import Row, Tradeoff
 matplotlib = pytest.importorskip("matplotlib")
 
 GRID = Grid.plane(x=(-1, 1, 101), y=(40, 42, 81))
-RNG = np.random.default_rng(0)
 
 
 def speckle(grid):
-    return Image(RNG.normal(size=(*grid.shape, 2)) @ [1, 1j], grid)
+    return Image(np.random.default_rng(0).normal(size=(*grid.shape, 2)) @ [1, 1j], grid)
 
 
 SPECKLE = speckle(GRID)
@@ -224,7 +223,6 @@ def test_an_image_is_drawn_into_axes_of_ones_own():
 def test_an_image_alone_is_drawn_into_a_figure_of_pyplot():
     from matplotlib import pyplot
 
-    pyplot.switch_backend("agg")
     axes = SPECKLE.plot()
     try:
         assert axes.figure.number in pyplot.get_fignums()

@@ -1,0 +1,187 @@
+"""The cache folder is used only where no other user can write."""
+
+import os
+import stat
+from pathlib import Path
+
+import pytest
+
+from clsas.core import cache
+
+OTHER = 54321  # another user
+
+as_root = pytest.mark.skipif(os.geteuid() != 0, reason="only root can give folders to others")
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """The cache folder, which does not exist yet."""
+    monkeypatch.setenv("CLSAS_CACHE", str(tmp_path / "a" / "cache"))
+    return tmp_path / "a" / "cache"
+
+
+@pytest.fixture
+def shared(tmp_path):
+    """A folder to which everybody may add files, as /tmp is."""
+    path = tmp_path / "shared"
+    path.mkdir()
+    path.chmod(0o1777)
+    # pytest's own folder is closed to others, so that nothing in it would be exposed.
+    for each in path.parents:
+        if not each.stat().st_mode & stat.S_IXOTH:
+            each.chmod(0o711)
+    return path
+
+
+@pytest.mark.parametrize("umask", [0o000, 0o022, 0o077])
+def test_folders_are_made_for_their_user_alone(folder, umask):
+    before = os.umask(umask)
+    try:
+        assert cache.private_folder("workers", "one") == folder / "workers" / "one"
+    finally:
+        os.umask(before)
+    for each in ("..", ".", "workers", "workers/one"):
+        assert stat.S_IMODE((folder / each).stat().st_mode) == 0o700
+
+
+def test_a_folder_that_does_not_exist_is_trusted_and_not_made(folder):
+    assert cache.trusted_cache() == folder
+    assert not folder.parent.exists()
+
+
+def refused(path, monkeypatch, reason):
+    monkeypatch.setenv("CLSAS_CACHE", str(path))
+    for work in (cache.trusted_cache, cache.private_folder, lambda: cache.private_folder("a")):
+        with pytest.raises(PermissionError) as error:
+            work()
+        assert f"the cache folder {path}" in str(error.value)
+        assert reason in str(error.value)
+        assert "CLSAS_CACHE" in str(error.value)
+
+
+@pytest.mark.parametrize("mode", [0o777, 0o1777, 0o770, 0o733, 0o722])
+def test_a_folder_that_others_can_write_to_is_refused(shared, monkeypatch, mode):
+    (shared / "cache").mkdir()
+    (shared / "cache").chmod(mode)
+    if mode & 0o011:
+        refused(shared / "cache", monkeypatch, f"other users can write to {shared / 'cache'}")
+    else:
+        monkeypatch.setenv("CLSAS_CACHE", str(shared / "cache"))
+        assert cache.trusted_cache() == shared / "cache"  # nobody else can enter it
+
+
+def test_a_folder_in_one_that_others_can_write_to_is_refused(shared, monkeypatch):
+    """They could rename it and put theirs in its place, unless the outer one is sticky."""
+    shared.chmod(0o777)
+    (shared / "cache").mkdir(0o700)
+    refused(shared / "cache", monkeypatch, f"other users can write to {shared}")
+    shared.chmod(0o1777)
+    assert cache.private_folder() == shared / "cache"
+
+
+def test_what_lies_in_a_closed_folder_may_have_any_mode(shared, monkeypatch):
+    """As ~/.cache of mode 0775 in a home of mode 0700."""
+    shared.chmod(0o700)
+    (shared / "cache").mkdir()
+    (shared / "cache").chmod(0o775)
+    monkeypatch.setenv("CLSAS_CACHE", str(shared / "cache"))
+    assert cache.private_folder("workers") == shared / "cache" / "workers"
+
+
+@as_root
+@pytest.mark.parametrize("mode", [0o700, 0o755, 0o777])
+def test_a_folder_of_another_user_is_refused(shared, monkeypatch, mode):
+    (shared / "cache").mkdir()
+    (shared / "cache").chmod(mode)
+    os.chown(shared / "cache", OTHER, OTHER)
+    refused(shared / "cache", monkeypatch, f"{shared / 'cache'} belongs to user {OTHER}")
+
+
+@as_root
+def test_a_folder_in_one_of_another_user_is_refused(shared, monkeypatch):
+    os.chown(shared, OTHER, OTHER)
+    shared.chmod(0o755)
+    (shared / "cache").mkdir(0o700)
+    refused(shared / "cache", monkeypatch, f"{shared} belongs to user {OTHER}")
+
+
+@as_root
+def test_a_symbolic_link_of_another_user_is_refused(shared, tmp_path, monkeypatch):
+    """It could lead to another folder by the time that the cache is used."""
+    own = tmp_path / "own"
+    own.mkdir(0o700)
+    (shared / "link").symlink_to(own)
+    monkeypatch.setenv("CLSAS_CACHE", str(shared / "link" / "cache"))
+    assert cache.private_folder() == shared / "link" / "cache"
+    assert (own / "cache").is_dir()
+    os.chown(shared / "link", OTHER, OTHER, follow_symlinks=False)
+    refused(shared / "link", monkeypatch, f"{shared / 'link'} belongs to user {OTHER}")
+    (tmp_path / "outer").symlink_to(shared / "link")
+    refused(tmp_path / "outer", monkeypatch, f"{shared / 'link'} belongs to user {OTHER}")
+
+
+def test_a_symbolic_link_where_others_can_replace_it_is_refused(shared, tmp_path, monkeypatch):
+    (tmp_path / "own").mkdir(0o700)
+    (shared / "link").symlink_to(tmp_path / "own")
+    shared.chmod(0o777)
+    refused(shared / "link", monkeypatch, f"other users can write to {shared}")
+
+
+def test_a_loop_of_symbolic_links_ends(shared, monkeypatch):
+    (shared / "a").symlink_to(shared / "b")
+    (shared / "b").symlink_to(shared / "a")
+    monkeypatch.setenv("CLSAS_CACHE", str(shared / "a"))
+    with pytest.raises(OSError, match="a"):
+        cache.private_folder()
+
+
+@as_root
+def test_a_folder_made_by_another_user_meanwhile_is_refused(shared, monkeypatch):
+    """Between the check and the creation."""
+    make = Path.mkdir
+
+    def raced(path, *args, **options):
+        make(path, 0o777)
+        os.chown(path, OTHER, OTHER)
+        make(path, *args, **options)
+
+    monkeypatch.setenv("CLSAS_CACHE", str(shared / "cache"))
+    monkeypatch.setattr(Path, "mkdir", raced)
+    with pytest.raises(PermissionError, match=f"belongs to user {OTHER}"):
+        cache.private_folder("workers")
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="becomes another user")
+def test_another_users_private_cache_is_named(shared, monkeypatch):
+    """Where the next user got nothing but 'Permission denied'."""
+    (shared / "cache").mkdir(0o700)
+    os.setegid(OTHER)
+    os.seteuid(OTHER)
+    try:
+        refused(shared / "cache", monkeypatch, "you cannot read it")
+        refused(shared / "cache" / "deeper", monkeypatch, "cannot be searched")
+    finally:
+        os.seteuid(0)
+        os.setegid(0)
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="becomes another user")
+def test_a_cache_of_the_administrator_can_be_read(shared, monkeypatch):
+    (shared / "cache").mkdir(0o755)
+    monkeypatch.setenv("CLSAS_CACHE", str(shared / "cache"))
+    os.setegid(OTHER)
+    os.seteuid(OTHER)
+    try:
+        assert cache.trusted_cache() == shared / "cache"
+        with pytest.raises(PermissionError, match=r"you cannot write to it.*CLSAS_CACHE"):
+            cache.private_folder()
+    finally:
+        os.seteuid(0)
+        os.setegid(0)
+
+
+def test_a_file_in_its_place_is_named(folder):
+    folder.parent.mkdir()
+    folder.write_text("")
+    with pytest.raises(NotADirectoryError, match=str(folder)):
+        cache.private_folder()
