@@ -72,7 +72,7 @@ _LISTED = 3  # patches that are listed for each kind of defect
 )  # fmt: skip
 @click.option(
     "--verify", is_flag=True,
-    help="Only compare all patches of the store with their checksums; -o suffices without a scene.",
+    help="Only compare all of the store with its checksums; -o suffices without a scene.",
 )  # fmt: skip
 @options.picture("an overview in dB")
 @options.levels
@@ -102,8 +102,8 @@ def mosaic(
     """Form an image of any size patch by patch, into a Zarr store.
 
     Grid, method and beam are those of `clsas image`. After an interruption, by Ctrl-C or anything
-    else, the same command continues, and forms damaged patches again. With --verify it only lists
-    damaged patches; the exit code is 1 if there are any. Without --lines the scene is simulated
+    else, the same command continues, and mends what is damaged. With --verify it only lists
+    damage; the exit code is 1 if there is any. Without --lines the scene is simulated
     first.
 
     \b
@@ -258,22 +258,33 @@ def _store_to_verify(scene: Path | None, output: Path | None) -> Path:
 
 
 def _verify(path: Path, as_json: bool) -> None:
-    """Report which patches of a store are damaged; exit with 1 if any is."""
+    """Report which patches and arrays of a store are damaged; exit with 1 if any is."""
     store = clsas.Store.opened(path)
-    with progress_bar("verifying") as progress:
-        damage = store.damage(progress)
-    finished = sum(index not in damage for index in store.records())
+    arrays, has_digests = store.array_damage(), store.has_digests
+    # Without the metadata of pixels, patches cannot be read.
+    damage, finished = {}, None
+    if "pixels" not in arrays:
+        with progress_bar("verifying") as progress:
+            damage = store.damage(progress)
+        finished = sum(index not in damage for index in store.records())
     damaged = {f"{row},{column}": reason for (row, column), reason in damage.items()}
     summary = f"{len(damage)} damaged" if damage else "none damaged"
+    lines = [f"{path}: {finished} patches match their checksums, {summary}"]
+    if finished is None:
+        lines = [f"{path}: no patch can be compared with its checksum"]
+    lines += [f"  {name}: {reason}" for name, reason in arrays.items()]
+    lines += [f"  patch {index}: {reason}" for index, reason in damaged.items()]
+    if not has_digests:
+        lines.append(
+            "  The store has no digests of its metadata, since an earlier version of clsas wrote "
+            "it: changed\n  names and units of its arrays are not noticed. clsas mosaic with the "
+            "same inputs adds digests."
+        )
     report(
-        as_json,
-        "\n".join(
-            [f"{path}: {finished} patches match their checksums, {summary}"]
-            + [f"  patch {index}: {reason}" for index, reason in damaged.items()]
-        ),
-        file=path, finished=finished, damaged=damaged,
+        as_json, "\n".join(lines), file=path, finished=finished, damaged=damaged,
+        damaged_arrays=arrays, has_digests=has_digests,
     )  # fmt: skip
-    if damage:
+    if damage or arrays:
         click.get_current_context().exit(1)
 
 

@@ -15,6 +15,10 @@ REQUESTS = ("tolerance_db", "tolerance_wavelengths", "stages", "accuracy_db")
 """Requests for accuracy or a method, of which a mosaic takes at most one."""
 
 
+class OtherInputsError(ValueError):
+    """A store was made with other inputs than those given."""
+
+
 def inputs_of(
     survey: Survey, grid: Grid, request: dict[str, Any], beam: BeamWindow | None
 ) -> dict[str, Any]:
@@ -29,12 +33,17 @@ def inputs_of(
     return json.loads(json.dumps(inputs))
 
 
-def differences(stored: dict[str, Any], given: dict[str, Any]) -> list[str]:
-    """Return one message for every difference between stored and given inputs.
+def differences(
+    attributes: dict[str, Any], given: dict[str, Any], patch_shape: tuple[int, int]
+) -> list[str]:
+    """Return one message for every difference between the attributes of a store and given inputs.
 
     The survey may have grown: the given parts only have to begin with the stored ones.
     """
-    found = []
+    found, stored = [], attributes["inputs"]
+    if attributes["patch_shape"] != list(patch_shape):
+        mine, theirs = ("{} x {}".format(*s) for s in (attributes["patch_shape"], patch_shape))
+        found.append(f"patches of {mine} pixels there, of {theirs} given")
     if given["parts"][: len(stored["parts"])] != stored["parts"]:
         found.append("the range lines are others")
     for name, theirs in given.items():
