@@ -129,6 +129,7 @@ def mosaic(
         patch_shape_of(patches, grid)  # before anything is simulated
     recorded = lines_path or in_scene.get("lines")
     _check_paths(output, picture, recorded, follow)
+    clsas.Store.at(output).check()  # before anything is simulated
     lines_path = recorded or _simulated(described, scene, output, picture, quiet=as_json)
     start = time.perf_counter()
     with _cluster(workers, scheduler) as client:
@@ -353,8 +354,8 @@ def _cluster(workers: int | None, scheduler: str | None) -> Iterator[Any]:
 def _patch_progress(name: str, total: int, done: int) -> Iterator[Callable[[clsas.Patch], None]]:
     """Yield a function that prints a line for a patch and, on a terminal, moves a progress bar."""
     columns = (
-        TextColumn(name), BarColumn(), TextColumn("{task.completed}/{task.total}"),
-        TaskProgressColumn(), TimeRemainingColumn(),
+        TextColumn("{task.description}", markup=False), BarColumn(),
+        TextColumn("{task.completed}/{task.total}"), TaskProgressColumn(), TimeRemainingColumn(),
     )  # fmt: skip
     console = Console(stderr=True, soft_wrap=True, highlight=False)
     with Progress(

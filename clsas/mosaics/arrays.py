@@ -50,10 +50,8 @@ def create_store(
     Raises
     ------
     OSError
-        If the folder around it does not exist or cannot be written.
+        If the folder around it cannot be written.
     """
-    if not path.parent.is_dir():
-        raise FileNotFoundError(2, "there is no such folder", str(path.parent))
     plane = None
     if grid.points_m is None:
         plane = {name: getattr(grid, name).tolist() for name in VECTORS}

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from dataclasses import asdict
+from pathlib import Path
 from typing import Any
 
 from clsas.core.digests import grid_digest
 from clsas.core.grid import Grid
+from clsas.mosaics.documents import read_document
 from clsas.mosaics.survey import Survey
 from clsas.sonar.beam import BeamWindow
 
@@ -62,6 +65,18 @@ def differences(
         elif mine != theirs:
             found.append(f"{name} is {mine} there, {theirs} given")
     return found
+
+
+def stored_digest(path: Path) -> str:
+    """Return a digest of the inputs with which the store at a path was made.
+
+    Raises
+    ------
+    ValueError
+        If there is no mosaic, or its document is damaged.
+    """
+    text = json.dumps(read_document(path)["inputs"], sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
 def beam_json(beam: BeamWindow) -> str:

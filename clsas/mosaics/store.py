@@ -151,6 +151,23 @@ class Store:
         """
         return self._compared()[1]
 
+    def check(self) -> None:
+        """Raise an error unless a mosaic is there, or nothing yet and it can be created.
+
+        Raises
+        ------
+        ValueError
+            If the path holds something else, or a damaged mosaic.
+        OSError
+            If it cannot be written.
+        """
+        if self._is_there():
+            read_document(self.path)
+        elif not self.path.parent.is_dir():
+            raise FileNotFoundError(2, "there is no such folder", str(self.path.parent))
+        with tempfile.TemporaryFile(dir=self.path if self.path.is_dir() else self.path.parent):
+            pass  # raises where it cannot be written
+
     def begin(self, inputs: dict[str, Any], grid: Grid, patch_shape: tuple[int, int]) -> None:
         """Create the store, or check that it was made with the same inputs.
 
@@ -164,6 +181,7 @@ class Store:
             If the store cannot be written.
         """
         arrays = _arrays()
+        self.check()
         if not self._is_there():
             arrays.create_store(self.path, inputs, grid, patch_shape)
         stored = read_document(self.path)
@@ -174,8 +192,6 @@ class Store:
             raise OtherInputsError(
                 f"{self.path} was made with other inputs: {'; '.join(found)}; {ways}"
             )
-        with tempfile.TemporaryFile(dir=self.path):
-            pass  # raises where it cannot be written
         if mended := arrays.mend(self.path, grid):
             validate.warn(f"{self.path} was damaged and is mended: {describe_arrays(mended)}")
         self.grow(inputs)
