@@ -30,6 +30,7 @@ from clsas.core.threads import uninterrupted
 from clsas.exact.backprojection import ACCURACY_DB
 from clsas.files.scene_files import SceneFile, simulation_digest
 from clsas.files.scene_tables import PLAN_KEYS
+from clsas.mosaics.documents import check_place
 from clsas.mosaics.patches import patch_shape_of
 from clsas.mosaics.record import Record
 from clsas.opencl.device import open_device
@@ -129,7 +130,7 @@ def mosaic(
         patch_shape_of(patches, grid)  # before anything is simulated
     recorded = lines_path or in_scene.get("lines")
     _check_paths(output, picture, recorded, follow)
-    clsas.Store.at(output).check()  # before anything is simulated
+    check_place(output.resolve())  # before anything is simulated
     lines_path = recorded or _simulated(described, scene, output, picture, quiet=as_json)
     start = time.perf_counter()
     with _cluster(workers, scheduler) as client:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import os
+import tempfile
 import zlib
 from collections.abc import Mapping
 from pathlib import Path
@@ -54,6 +55,29 @@ def read_attributes(folder: Path) -> dict[str, Any]:
     if not (is_group and isinstance(attributes, dict)):
         raise DamageError("its record cannot be read")
     return attributes
+
+
+def is_there(path: Path) -> bool:
+    """Return whether there is anything at the path of a store."""
+    return path.exists() and not (path.is_dir() and not any(path.iterdir()))
+
+
+def check_place(path: Path) -> None:
+    """Raise an error unless a mosaic is at a path, or nothing yet and one can be created.
+
+    Raises
+    ------
+    ValueError
+        If the path holds something else, or a damaged mosaic.
+    OSError
+        If it cannot be written.
+    """
+    if is_there(path):
+        read_document(path)
+    elif not path.parent.is_dir():
+        raise FileNotFoundError(2, "there is no such folder", str(path.parent))
+    with tempfile.TemporaryFile(dir=path if path.is_dir() else path.parent):
+        pass  # raises where it cannot be written
 
 
 def check_own(store: Path, folder: Path) -> None:

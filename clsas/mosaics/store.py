@@ -11,7 +11,6 @@ import itertools
 import math
 import os
 import re
-import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
@@ -33,6 +32,8 @@ from clsas.mosaics.documents import (
     DIGESTS,
     DamageError,
     check_own,
+    check_place,
+    is_there,
     read_document,
     with_checksum,
     write_attributes,
@@ -96,7 +97,7 @@ class Store:
     @property
     def patch_shape(self) -> tuple[int, int] | None:
         """Pixels of a patch, or None if there is no mosaic yet."""
-        if not self._is_there():
+        if not is_there(self.path):
             return None
         rows, columns = read_document(self.path)["patch_shape"]
         return rows, columns
@@ -151,23 +152,6 @@ class Store:
         """
         return self._compared()[1]
 
-    def check(self) -> None:
-        """Raise an error unless a mosaic is there, or nothing yet and it can be created.
-
-        Raises
-        ------
-        ValueError
-            If the path holds something else, or a damaged mosaic.
-        OSError
-            If it cannot be written.
-        """
-        if self._is_there():
-            read_document(self.path)
-        elif not self.path.parent.is_dir():
-            raise FileNotFoundError(2, "there is no such folder", str(self.path.parent))
-        with tempfile.TemporaryFile(dir=self.path if self.path.is_dir() else self.path.parent):
-            pass  # raises where it cannot be written
-
     def begin(self, inputs: dict[str, Any], grid: Grid, patch_shape: tuple[int, int]) -> None:
         """Create the store, or check that it was made with the same inputs.
 
@@ -181,8 +165,8 @@ class Store:
             If the store cannot be written.
         """
         arrays = _arrays()
-        self.check()
-        if not self._is_there():
+        check_place(self.path)
+        if not is_there(self.path):
             arrays.create_store(self.path, inputs, grid, patch_shape)
         stored = read_document(self.path)
         if found := differences(stored, inputs, patch_shape):
@@ -411,10 +395,6 @@ class Store:
             _ = self.pixels[row, column]
         except ValueError as error:  # Zarr's message about a checksum
             raise DamageError("its pixels do not match their checksum") from error
-
-    def _is_there(self) -> bool:
-        """Return whether there is anything at the path."""
-        return self.path.exists() and not (self.path.is_dir() and not any(self.path.iterdir()))
 
 
 def _arrays() -> ModuleType:
