@@ -30,6 +30,7 @@ from clsas.core.threads import uninterrupted
 from clsas.exact.backprojection import ACCURACY_DB
 from clsas.files.scene_files import SceneFile, simulation_digest
 from clsas.files.scene_tables import PLAN_KEYS
+from clsas.mosaics.documents import check_place
 from clsas.mosaics.patches import patch_shape_of
 from clsas.mosaics.record import Record
 from clsas.opencl.device import open_device
@@ -72,7 +73,7 @@ _LISTED = 3  # patches that are listed for each kind of defect
 )  # fmt: skip
 @click.option(
     "--verify", is_flag=True,
-    help="Only compare all patches of the store with their checksums; -o suffices without a scene.",
+    help="Only compare all of the store with its checksums; -o suffices without a scene.",
 )  # fmt: skip
 @options.picture("an overview in dB")
 @options.levels
@@ -102,8 +103,8 @@ def mosaic(
     """Form an image of any size patch by patch, into a Zarr store.
 
     Grid, method and beam are those of `clsas image`. After an interruption, by Ctrl-C or anything
-    else, the same command continues, and forms damaged patches again. With --verify it only lists
-    damaged patches; the exit code is 1 if there are any. Without --lines the scene is simulated
+    else, the same command continues, and mends what is damaged. With --verify it only lists
+    damage; the exit code is 1 if there is any. Without --lines the scene is simulated
     first.
 
     \b
@@ -129,6 +130,7 @@ def mosaic(
         patch_shape_of(patches, grid)  # before anything is simulated
     recorded = lines_path or in_scene.get("lines")
     _check_paths(output, picture, recorded, follow)
+    check_place(output.resolve())  # before anything is simulated
     lines_path = recorded or _simulated(described, scene, output, picture, quiet=as_json)
     start = time.perf_counter()
     with _cluster(workers, scheduler) as client:
@@ -260,22 +262,33 @@ def _store_to_verify(scene: Path | None, output: Path | None) -> Path:
 
 
 def _verify(path: Path, as_json: bool) -> None:
-    """Report which patches of a store are damaged; exit with 1 if any is."""
+    """Report which patches and arrays of a store are damaged; exit with 1 if any is."""
     store = clsas.Store.opened(path)
-    with progress_bar("verifying") as progress:
-        damage = store.damage(progress)
-    finished = sum(index not in damage for index in store.records())
+    arrays, has_digests = store.array_damage(), store.has_digests
+    # Without the metadata of pixels, patches cannot be read.
+    damage, finished = {}, None
+    if "pixels" not in arrays:
+        with progress_bar("verifying") as progress:
+            damage = store.damage(progress)
+        finished = sum(index not in damage for index in store.records())
     damaged = {f"{row},{column}": reason for (row, column), reason in damage.items()}
     summary = f"{len(damage)} damaged" if damage else "none damaged"
+    lines = [f"{printable(path)}: {finished} patches match their checksums, {summary}"]
+    if finished is None:
+        lines = [f"{printable(path)}: no patch can be compared with its checksum"]
+    lines += [f"  {name}: {printable(reason)}" for name, reason in arrays.items()]
+    lines += [f"  patch {index}: {printable(reason)}" for index, reason in damaged.items()]
+    if not has_digests:
+        lines.append(
+            "  The store has no digests of its metadata, since an earlier version of clsas wrote "
+            "it: changed\n  names and units of its arrays are not noticed. clsas mosaic with the "
+            "same inputs adds digests."
+        )
     report(
-        as_json,
-        "\n".join(
-            [f"{printable(path)}: {finished} patches match their checksums, {summary}"]
-            + [f"  patch {index}: {printable(reason)}" for index, reason in damaged.items()]
-        ),
-        file=path, finished=finished, damaged=damaged,
+        as_json, "\n".join(lines), file=path, finished=finished, damaged=damaged,
+        damaged_arrays=arrays, has_digests=has_digests,
     )  # fmt: skip
-    if damage:
+    if damage or arrays:
         click.get_current_context().exit(1)
 
 
@@ -345,8 +358,7 @@ def _patch_progress(name: str, total: int, done: int) -> Iterator[Callable[[clsa
     """Yield a function that prints a line for a patch and, on a terminal, moves a progress bar."""
     columns = (
         TextColumn("{task.description}", markup=False), BarColumn(),
-        TextColumn("{task.completed}/{task.total}"),
-        TaskProgressColumn(), TimeRemainingColumn(),
+        TextColumn("{task.completed}/{task.total}"), TaskProgressColumn(), TimeRemainingColumn(),
     )  # fmt: skip
     console = Console(stderr=True, soft_wrap=True, highlight=False)
     with Progress(

@@ -7,7 +7,13 @@ import importlib.util
 PACKAGES = {
     "pocl": ("pyopencl[pocl]>=2024.1",),
     "plot": ("matplotlib>=3.8",),
-    "mosaic": ("zarr>=3.1.3", "distributed>=2024.1", "cryptography>=42.0", "xarray>=2024.1"),
+    "mosaic": (
+        "zarr>=3.1.3",
+        "numcodecs>=0.16.6,!=0.17.0",
+        "distributed>=2024.1",
+        "cryptography>=42.0",
+        "xarray>=2024.1",
+    ),
     "radar": ("sarkit>=1.8",),
 }
 """Requirements of every extra, as `pyproject.toml` has them."""

@@ -7,11 +7,15 @@ one more (`clsas.mosaics.record`).
 from __future__ import annotations
 
 import json
+import os
+import tempfile
 import zlib
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from clsas.core.atomic import make_folders, replacing
+from clsas.core.grid import Grid
 from clsas.core.reading import parse_json, read_bytes
 
 CHECKSUM = "crc32"
@@ -20,6 +24,12 @@ CHECKSUM = "crc32"
 
 FORMAT = "clsas mosaic"
 VERSION = 2  # version 1 had no checksums
+
+DIGESTS = "metadata"
+"""Attribute with a digest of every array's metadata. Early stores do not have it."""
+
+VECTORS = "origin_m", "row_step_m", "column_step_m"
+"""Vectors that make the plane of a grid."""
 
 
 class DamageError(ValueError):
@@ -37,12 +47,50 @@ def read_attributes(folder: Path) -> dict[str, Any]:
         If the document cannot be read.
     """
     try:
-        attributes = parse_json(read_bytes(folder / "zarr.json"))["attributes"]
+        document = parse_json(read_bytes(folder / "zarr.json"))
+        is_group = (document["zarr_format"], document["node_type"]) == (3, "group")
+        attributes = document["attributes"]
     except (ValueError, LookupError, TypeError) as error:
         raise DamageError("its record cannot be read") from error
-    if not isinstance(attributes, dict):
+    if not (is_group and isinstance(attributes, dict)):
         raise DamageError("its record cannot be read")
     return attributes
+
+
+def is_there(path: Path) -> bool:
+    """Return whether there is anything at the path of a store."""
+    return path.exists() and not (path.is_dir() and not any(path.iterdir()))
+
+
+def check_place(path: Path) -> None:
+    """Raise an error unless a mosaic is at a path, or nothing yet and one can be created.
+
+    Raises
+    ------
+    ValueError
+        If the path holds something else, or a damaged mosaic.
+    OSError
+        If it cannot be written.
+    """
+    if is_there(path):
+        read_document(path)
+    elif not path.parent.is_dir():
+        raise FileNotFoundError(2, "there is no such folder", str(path.parent))
+    with tempfile.TemporaryFile(dir=path if path.is_dir() else path.parent):
+        pass  # raises where it cannot be written
+
+
+def check_own(store: Path, folder: Path) -> None:
+    """Raise ValueError if a folder of a store, to be written, is elsewhere by a symbolic link.
+
+    A stranger's store could otherwise let a run write into any folder of its user.
+    """
+    own = Path(os.path.realpath(store)) / folder.relative_to(store)
+    if Path(os.path.realpath(folder)) != own:
+        raise ValueError(
+            f"{folder} must be a folder of its own to be written, and not lead elsewhere by a "
+            "symbolic link"
+        )
 
 
 def write_attributes(folder: Path, attributes: dict[str, Any]) -> None:
@@ -86,9 +134,41 @@ def read_document(path: Path) -> dict[str, Any]:
         )
     if not is_intact(attributes):
         raise ValueError(f"{path} is damaged: its attributes do not match their checksum")
-    shape, inputs = attributes.get("patch_shape"), attributes.get("inputs")
-    complete = isinstance(inputs, dict) and isinstance(inputs.get("parts"), list)
-    complete = complete and isinstance(shape, list) and [type(n) for n in shape] == [int, int]
-    if not complete:
+    if not _is_complete(attributes):
         raise ValueError(f"{path} is damaged: its attributes are not those of a mosaic")
     return attributes
+
+
+def plane_of(attributes: Mapping[str, Any]) -> Grid | None:
+    """Return the plane of a mosaic's grid, without heights, or None if it has arbitrary points."""
+    stored = attributes["grid"]
+    if stored is None:
+        return None
+    return Grid.oriented(**stored, shape=tuple(attributes["inputs"]["pixels"]))
+
+
+def _is_complete(attributes: dict[str, Any]) -> bool:
+    """Return whether attributes are those of a mosaic, and of the right types."""
+    inputs, grid = attributes.get("inputs"), attributes.get("grid", ())
+    if not (
+        isinstance(inputs, dict)
+        and isinstance(inputs.get("parts"), list)
+        and _is_shape(inputs.get("pixels"))
+        and _is_shape(attributes.get("patch_shape"))
+        and isinstance(attributes.get(DIGESTS, {}), dict)
+        and (grid is None or (isinstance(grid, dict) and grid.keys() == set(VECTORS)))
+    ):
+        return False
+    try:
+        plane_of(attributes)
+    except (TypeError, ValueError):
+        return False
+    return True
+
+
+def _is_shape(value: Any) -> bool:
+    return (
+        isinstance(value, list)
+        and len(value) == 2
+        and all(type(side) is int and side > 0 for side in value)
+    )

@@ -11,22 +11,39 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import zarr
-from numpy.typing import NDArray
 from zarr.abc.store import Store
-from zarr.codecs import Crc32cCodec
-from zarr.core.buffer import Buffer
+from zarr.core.buffer import Buffer, BufferPrototype, default_buffer_prototype
 from zarr.storage import LocalStore
 
-from clsas.core.atomic import creating, make_folders, replacing
-from clsas.core.grid import Grid
+from clsas.core.atomic import make_folders, replacing
 from clsas.core.reading import check_ordinary
-from clsas.mosaics.documents import FORMAT, VERSION, with_checksum, write_attributes
+from clsas.mosaics.documents import check_own
+from clsas.mosaics.metadata import Checked
 
 
 class DurableStore(LocalStore):
-    """Zarr store in a folder, written with `clsas.core.atomic`."""
+    """Zarr store in a folder, written with `clsas.core.atomic`.
+
+    Attributes
+    ----------
+    known : dict of str to bytes
+        Documents that Zarr is given as they are here, whatever the folder holds by now.
+    chunk_bytes : int or None
+        Size of every chunk's file; None while arrays are created.
+    """
+
+    def __init__(self, path: Path, *, read_only: bool = False) -> None:
+        super().__init__(path, read_only=read_only)
+        self.known: dict[str, bytes] = {}
+        self.chunk_bytes: int | None = None
+
+    @classmethod
+    def of_array(cls, path: Path, name: str, metadata: Checked, read_only: bool) -> DurableStore:
+        """Return the store of an array whose metadata have been checked."""
+        made = cls(path, read_only=read_only)
+        made.known = {f"{name}/zarr.json": metadata.text}
+        made.chunk_bytes = metadata.chunk_bytes
+        return made
 
     async def set(self, key: str, value: Buffer) -> None:
         """Write a chunk or document."""
@@ -36,94 +53,40 @@ class DurableStore(LocalStore):
         """Write a chunk or document. Some versions of Zarr call this method directly."""
         self._check_writable()
         path = Path(self.root) / key
+        check_own(Path(self.root), path.parent)
         make_folders(path.parent)
         with replacing(path) as temporary:
             temporary.write_bytes(value.as_buffer_like())
 
-    async def get(self, key: str, *options: Any, **named: Any) -> Buffer | None:
-        """Read a chunk or document; raise ValueError if it is a pipe or a device."""
-        self._check_ordinary(key)
-        return await super().get(key, *options, **named)
+    async def get(
+        self, key: str, prototype: BufferPrototype | None = None, *options: Any, **named: Any
+    ) -> Buffer | None:
+        """Read a chunk or document; raise ValueError if it is a pipe or a device, or too large."""
+        if key in self.known:
+            return _buffer(prototype, self.known[key])
+        self._check(key)
+        return await super().get(key, prototype, *options, **named)
 
-    def get_sync(self, key: str, *options: Any, **named: Any) -> Buffer | None:
+    def get_sync(
+        self, key: str, *options: Any, prototype: BufferPrototype | None = None, **named: Any
+    ) -> Buffer | None:
         """Read a chunk or document. Some versions of Zarr call this method directly."""
-        self._check_ordinary(key)
-        return super().get_sync(key, *options, **named)
+        if key in self.known:
+            return _buffer(prototype, self.known[key])
+        self._check(key)
+        return super().get_sync(key, *options, prototype=prototype, **named)
 
-    def _check_ordinary(self, key: str) -> None:
+    def _check(self, key: str) -> None:
+        path = Path(self.root) / key
         with suppress(OSError):  # no file: a chunk of zeros
-            check_ordinary(Path(self.root) / key)
+            check_ordinary(path)
+            size = path.stat().st_size
+            if self.chunk_bytes is not None and size != self.chunk_bytes:
+                raise ValueError(f"{path} must have {self.chunk_bytes} bytes, got {size}")
 
     # Zarr's base class implements this with `set`.
     set_if_not_exists = Store.set_if_not_exists
 
 
-def create_store(
-    path: Path, inputs: dict[str, Any], grid: Grid, patch_shape: tuple[int, int]
-) -> None:
-    """Create the store of a mosaic in one step, so that a killed process leaves no part of it.
-
-    Raises
-    ------
-    OSError
-        If the folder around it does not exist or cannot be written.
-    """
-    if not path.parent.is_dir():
-        raise FileNotFoundError(2, "there is no such folder", str(path.parent))
-    plane = None
-    if grid.points_m is None:
-        steps = ("origin_m", "row_step_m", "column_step_m")
-        plane = {name: getattr(grid, name).tolist() for name in steps}
-    attributes = {
-        "format": FORMAT,
-        "version": VERSION,
-        "patch_shape": list(patch_shape),
-        "grid": plane,
-        "inputs": inputs,
-    }
-    with creating(path) as temporary:
-        _create_arrays(temporary, grid, patch_shape)
-        write_attributes(temporary / "patches", {})
-        write_attributes(temporary, with_checksum(attributes))
-
-
-def _create_arrays(path: Path, grid: Grid, patch_shape: tuple[int, int]) -> None:
-    """Create the arrays of a mosaic: pixels, all zero, and coordinates."""
-    files = DurableStore(path)
-    # No compression, since noise does not compress; only a checksum behind every chunk.
-    checksum = Crc32cCodec()
-    names = ("y", "x") if grid.has_axes else ("row", "column")
-    zarr.create_array(
-        files,
-        name="pixels",
-        shape=grid.shape,
-        dtype=np.complex64,
-        chunks=patch_shape,
-        compressors=checksum,
-        fill_value=0,
-        dimension_names=names,
-    )
-    coordinates: dict[str, tuple[tuple[str, ...], NDArray[np.float64]]] = {}
-    if grid.has_axes:
-        coordinates |= {name: ((name,), axis) for name, axis in zip("xy", grid.axes_m, strict=True)}
-    if grid.height_m is not None:
-        coordinates["height"] = names, grid.height_m
-    for name, (dimensions, values) in coordinates.items():
-        zarr.create_array(
-            files,
-            name=name,
-            data=values,
-            compressors=checksum,
-            dimension_names=dimensions,
-            attributes={"units": "m"},
-        )
-
-
-def open_array(path: Path, name: str) -> zarr.Array:
-    """Open an array of a mosaic for reading."""
-    return zarr.open_array(DurableStore(path, read_only=True), path=name, mode="r")
-
-
-def write_pixels(path: Path, rows: slice, columns: slice, pixels: NDArray[np.complex64]) -> None:
-    """Write the pixels of whole patches. Zarr writes no chunk for pixels that are all zero."""
-    zarr.open_array(DurableStore(path), path="pixels", mode="r+")[rows, columns] = pixels
+def _buffer(prototype: BufferPrototype | None, content: bytes) -> Buffer:
+    return (prototype or default_buffer_prototype()).buffer.from_bytes(content)

@@ -2,17 +2,24 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from dataclasses import asdict
+from pathlib import Path
 from typing import Any
 
 from clsas.core.digests import grid_digest
 from clsas.core.grid import Grid
+from clsas.mosaics.documents import read_document
 from clsas.mosaics.survey import Survey
 from clsas.sonar.beam import BeamWindow
 
 REQUESTS = ("tolerance_db", "tolerance_wavelengths", "stages", "accuracy_db")
 """Requests for accuracy or a method, of which a mosaic takes at most one."""
+
+
+class OtherInputsError(ValueError):
+    """A store was made with other inputs than those given."""
 
 
 def inputs_of(
@@ -29,12 +36,17 @@ def inputs_of(
     return json.loads(json.dumps(inputs))
 
 
-def differences(stored: dict[str, Any], given: dict[str, Any]) -> list[str]:
-    """Return one message for every difference between stored and given inputs.
+def differences(
+    attributes: dict[str, Any], given: dict[str, Any], patch_shape: tuple[int, int]
+) -> list[str]:
+    """Return one message for every difference between the attributes of a store and given inputs.
 
     The survey may have grown: the given parts only have to begin with the stored ones.
     """
-    found = []
+    found, stored = [], attributes["inputs"]
+    if attributes["patch_shape"] != list(patch_shape):
+        mine, theirs = ("{} x {}".format(*s) for s in (attributes["patch_shape"], patch_shape))
+        found.append(f"patches of {mine} pixels there, of {theirs} given")
     if given["parts"][: len(stored["parts"])] != stored["parts"]:
         found.append("the range lines are others")
     for name, theirs in given.items():
@@ -53,6 +65,18 @@ def differences(stored: dict[str, Any], given: dict[str, Any]) -> list[str]:
         elif mine != theirs:
             found.append(f"{name} is {mine} there, {theirs} given")
     return found
+
+
+def stored_digest(path: Path) -> str:
+    """Return a digest of the inputs with which the store at a path was made.
+
+    Raises
+    ------
+    ValueError
+        If there is no mosaic, or its document is damaged.
+    """
+    text = json.dumps(read_document(path)["inputs"], sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
 def beam_json(beam: BeamWindow) -> str:

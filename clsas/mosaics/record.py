@@ -118,3 +118,8 @@ def describe_damage(found: dict[PatchIndex, str]) -> str:
     named = [f"patch {row},{column}: {reason}" for (row, column), reason in found.items()]
     more = f" and {len(named) - _LISTED} more" if len(named) > _LISTED else ""
     return "; ".join(named[:_LISTED]) + more
+
+
+def describe_arrays(found: dict[str, str]) -> str:
+    """Return the damaged arrays with their reasons."""
+    return "; ".join(f"{name}: {reason}" for name, reason in found.items())

@@ -11,11 +11,11 @@ import itertools
 import math
 import os
 import re
-import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -29,18 +29,24 @@ from clsas.core.grid import Grid
 from clsas.core.image import Image
 from clsas.core.reading import check_ordinary
 from clsas.mosaics.documents import (
+    DIGESTS,
     DamageError,
+    check_own,
+    check_place,
+    is_there,
     read_document,
     with_checksum,
     write_attributes,
 )
+from clsas.mosaics.metadata import CHECKSUM_BYTES, GROUP, has_height
 from clsas.mosaics.overview import reduced
-from clsas.mosaics.provenance import differences
-from clsas.mosaics.record import PatchIndex, Record, describe_damage
+from clsas.mosaics.provenance import OtherInputsError, differences
+from clsas.mosaics.record import PatchIndex, Record, describe_arrays, describe_damage
 
 if TYPE_CHECKING:
     import zarr
 
+_MENDED = "; clsas mosaic with the same inputs mends it"
 _OVERVIEW = 1024  # pixels along the longer side
 
 
@@ -68,7 +74,7 @@ class Store:
         ImportError
             If Zarr is not installed.
         """
-        _zarr()
+        _arrays()
         return cls(validate.path("store", path).resolve())
 
     @classmethod
@@ -91,7 +97,7 @@ class Store:
     @property
     def patch_shape(self) -> tuple[int, int] | None:
         """Pixels of a patch, or None if there is no mosaic yet."""
-        if not self._is_there():
+        if not is_there(self.path):
             return None
         rows, columns = read_document(self.path)["patch_shape"]
         return rows, columns
@@ -99,12 +105,18 @@ class Store:
     @cached_property
     def pixels(self) -> zarr.Array:
         """Pixels on disk, complex64 [rows, columns]. Zarr verifies their checksums."""
-        pixels, attributes = self._array("pixels"), read_document(self.path)
-        described = list(pixels.shape), list(pixels.chunks), pixels.dtype, pixels.fill_value
-        expected = attributes["inputs"].get("pixels"), attributes["patch_shape"], np.complex64, 0
-        if described != expected:
-            raise ValueError(f"{self.path} is damaged: its pixels are not those of its grid")
-        return pixels
+        try:
+            return _arrays().open_array(self.path, read_document(self.path), "pixels")
+        except DamageError as error:
+            raise ValueError(f"{self.path} is damaged: pixels: {error}{_MENDED}") from error
+
+    @property
+    def has_digests(self) -> bool:
+        """True if the store has digests of its arrays' metadata.
+
+        Stores of early versions do not, until a run continues them.
+        """
+        return DIGESTS in read_document(self.path)
 
     @property
     def grid(self) -> Grid:
@@ -113,48 +125,59 @@ class Store:
         Raises
         ------
         ValueError
-            If the mosaic has arbitrary points, which are not stored, or the grid is damaged.
+            If the mosaic has arbitrary points, which are not stored, or metadata, coordinates or
+            heights are damaged.
         """
-        attributes = read_document(self.path)
-        stored = attributes["grid"]
-        if stored is None:
+        grid, found = self._compared()
+        if grid is None:
             raise ValueError(f"{self.path} is a mosaic of points, whose grid it does not hold")
-        rows, columns = self.pixels.shape
-        grid = Grid.oriented(**stored, shape=(rows, columns))
-        if (self.path / "height").exists():
-            grid = grid.with_height(self._values("height"))
-        if grid_digest(grid) != attributes["inputs"].get("grid"):
+        if found:
+            raise ValueError(f"{self.path} is damaged: {describe_arrays(found)}{_MENDED}")
+        if grid_digest(grid) != read_document(self.path)["inputs"].get("grid"):
             raise ValueError(f"{self.path} is damaged: its grid is not the one that was written")
         return grid
+
+    def array_damage(self) -> dict[str, str]:
+        """Compare metadata, coordinates and heights with what was written.
+
+        Returns
+        -------
+        dict of str to str
+            Reasons by the name of the array, such as "its metadata do not match their digest".
+
+        Raises
+        ------
+        ValueError
+            If the store's own document is damaged.
+        """
+        return self._compared()[1]
 
     def begin(self, inputs: dict[str, Any], grid: Grid, patch_shape: tuple[int, int]) -> None:
         """Create the store, or check that it was made with the same inputs.
 
         Raises
         ------
+        OtherInputsError
+            If the path holds a mosaic with other inputs; the message names the differences.
         ValueError
-            If the path holds something else, or a mosaic with other inputs; the message names the
-            differences.
+            If the path holds something else.
         OSError
             If the store cannot be written.
         """
-        if not self._is_there():
-            from clsas.mosaics.durable import create_store
-
-            create_store(self.path, inputs, grid, patch_shape)
+        arrays = _arrays()
+        check_place(self.path)
+        if not is_there(self.path):
+            arrays.create_store(self.path, inputs, grid, patch_shape)
         stored = read_document(self.path)
-        found = differences(stored["inputs"], inputs)
-        if stored["patch_shape"] != list(patch_shape):
-            mine, theirs = ("{} x {}".format(*s) for s in (stored["patch_shape"], patch_shape))
-            found.insert(0, f"patches of {mine} pixels there, of {theirs} given")
-        if found:
+        if found := differences(stored, inputs, patch_shape):
             ways = "give it another path or the same inputs"
-            if not self.records():
+            if not any((self.path / GROUP).glob("*/zarr.json")):
                 ways += ", or delete it: no patch of it was finished"
-            raise ValueError(f"{self.path} was made with other inputs: {'; '.join(found)}; {ways}")
-        with tempfile.TemporaryFile(dir=self.path):
-            pass  # raises where it cannot be written
-        _ = self.pixels  # raises where they are damaged
+            raise OtherInputsError(
+                f"{self.path} was made with other inputs: {'; '.join(found)}; {ways}"
+            )
+        if mended := arrays.mend(self.path, grid):
+            validate.warn(f"{self.path} was damaged and is mended: {describe_arrays(mended)}")
         self.grow(inputs)
 
     def grow(self, inputs: dict[str, Any]) -> None:
@@ -223,14 +246,13 @@ class Store:
         OSError
             If the disk is full or the store is not writable.
         """
-        from clsas.mosaics.durable import write_pixels
-
         folder = self._folder((row, column))
+        check_own(self.path, folder)
         # Remove the old record before the pixels that it belongs to are replaced.
         if (folder / "zarr.json").exists():
             (folder / "zarr.json").unlink()
             sync_folder(folder)
-        write_pixels(self.path, rows, columns, pixels)
+        _arrays().write_pixels(self.path, read_document(self.path), rows, columns, pixels)
         write_attributes(folder, record.attributes(self._checksum((row, column))))
 
     def read(
@@ -245,22 +267,24 @@ class Store:
         OSError
             If a file cannot be read.
         """
-        indices = self._touched(rows, columns)
+        wanted = (
+            len(range(n)[part]) for n, part in zip(self.pixels.shape, (rows, columns), strict=True)
+        )
+        validate.memory("the mosaic", 8 * math.prod(wanted))
         try:
-            for index in indices:
+            _arrays().check_metadata(self.path, read_document(self.path))
+            for index in self._touched(rows, columns):
                 self._record(index)
             return np.asarray(self.pixels[rows, columns])
         except ValueError as error:
             found = {}
-            for index in indices:
+            for index in self._touched(rows, columns):
                 try:
                     self._verify(index)
                 except DamageError as damage:
                     found[index] = str(damage)
             reason = describe_damage(found) if found else str(error)
-            raise ValueError(
-                f"{self.path} is damaged: {reason}; clsas mosaic with the same inputs mends it"
-            ) from error
+            raise ValueError(f"{self.path} is damaged: {reason}{_MENDED}") from error
 
     def image(self, rows: slice = slice(None), columns: slice = slice(None)) -> Image:
         """Return pixels, by default all, as an image.
@@ -273,7 +297,6 @@ class Store:
             If a file cannot be read.
         """
         window = self.grid.window(rows, columns)
-        validate.memory("the mosaic", 8 * window.size)
         return Image(self.read(rows, columns), window)
 
     def overview(self, most: int = _OVERVIEW) -> Image:
@@ -288,27 +311,14 @@ class Store:
         rows, columns = self.pixels.chunks
         return reduced(self.grid, (rows, columns), self.read, most)
 
-    def _array(self, name: str) -> zarr.Array:
-        _zarr()
-        from clsas.mosaics.durable import open_array
-
-        try:
-            return open_array(self.path, name)
-        except (LookupError, OSError, ValueError, TypeError) as error:
-            raise ValueError(f"{self.path} is damaged: {name} cannot be read: {error}") from error
-
-    def _values(self, name: str) -> NDArray:
-        """Return a whole array."""
-        array = self._array(name)
-        try:
-            return np.asarray(array[:])
-        except ValueError as error:
-            raise ValueError(f"{self.path} is damaged: {name} cannot be read: {error}") from error
+    def _compared(self) -> tuple[Grid | None, dict[str, str]]:
+        attributes = read_document(self.path)
+        return _arrays().compared(self.path, attributes, has_height(self.path, attributes))
 
     def _indices(self) -> list[PatchIndex]:
         """Patches that have a folder for their record, in order."""
         shape = self._shape
-        folders = self.path / "patches"
+        folders = self.path / GROUP
         found = []
         for folder in folders.iterdir() if folders.is_dir() else ():
             if name := re.fullmatch(r"(\d+)\.(\d+)", folder.name):
@@ -324,7 +334,7 @@ class Store:
         rows, columns = (math.ceil(n / m) for n, m in zip(pixels.shape, pixels.chunks, strict=True))
         return rows, columns
 
-    def _touched(self, rows: slice, columns: slice) -> list[PatchIndex]:
+    def _touched(self, rows: slice, columns: slice) -> Iterator[PatchIndex]:
         """Patches to which some pixels belong."""
         touched: list[range] = []
         for part, count, side in zip(
@@ -332,14 +342,13 @@ class Store:
         ):
             pixels = range(count)[part]
             if not pixels:
-                return []
+                return
             ends = sorted((pixels[0], pixels[-1]))
             touched.append(range(ends[0] // side, ends[1] // side + 1))
-        rows_of, columns_of = touched
-        return list(itertools.product(rows_of, columns_of))
+        yield from itertools.product(*touched)
 
     def _folder(self, index: PatchIndex) -> Path:
-        return self.path / "patches" / "{}.{}".format(*index)
+        return self.path / GROUP / "{}.{}".format(*index)
 
     def _chunk(self, index: PatchIndex) -> Path:
         return self.path.joinpath("pixels", "c", *map(str, index))
@@ -350,7 +359,7 @@ class Store:
             check_ordinary(self._chunk(index))
             with self._chunk(index).open("rb") as file:
                 file.seek(8 * math.prod(self.pixels.chunks))
-                return file.read().hex()
+                return file.read(2 * CHECKSUM_BYTES).hex()  # a whole file has half as many
         except FileNotFoundError:
             return None  # Zarr writes no chunk of zeros
 
@@ -377,7 +386,7 @@ class Store:
 
     def _verify(self, index: PatchIndex) -> None:
         """Read a patch; raise DamageError if it is finished and differs from what was written."""
-        if self._record(index) is None:
+        if self._record(index) is None or not self._chunk(index).exists():
             return
         row, column = (
             slice(i * n, (i + 1) * n) for i, n in zip(index, self.pixels.chunks, strict=True)
@@ -387,14 +396,11 @@ class Store:
         except ValueError as error:  # Zarr's message about a checksum
             raise DamageError("its pixels do not match their checksum") from error
 
-    def _is_there(self) -> bool:
-        """Return whether there is anything at the path."""
-        return self.path.exists() and not (self.path.is_dir() and not any(self.path.iterdir()))
 
-
-def _zarr() -> Any:
+def _arrays() -> ModuleType:
+    """Return the module that needs Zarr."""
     try:
-        import zarr
-    except ImportError:
+        from clsas.mosaics import arrays
+    except ModuleNotFoundError:
         raise ImportError(f"stores of mosaics need Zarr: {install_command('mosaic')}") from None
-    return zarr
+    return arrays

@@ -246,6 +246,7 @@ class _Chain:
                 corrections=self.corrections,
                 device=self.device,
                 progress=progress,
+                former=self.records.get(name),
             )
             outcome, messages = _outcome(name, job)
             files = list(outcome.files)

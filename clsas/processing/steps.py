@@ -6,12 +6,13 @@ import csv
 import io
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from clsas.core.atomic import replacing
+from clsas.core.atomic import replacing, staging
 from clsas.core.digests import grid_digest
 from clsas.core.extras import install_command, is_installed
 from clsas.core.grid import Grid
@@ -25,6 +26,7 @@ from clsas.files.process_tables import CORRECTIONS
 from clsas.files.scene_files import SceneFile
 from clsas.files.scene_tables import EXACT_KEYS
 from clsas.mosaics.mosaic import mosaic
+from clsas.mosaics.provenance import OtherInputsError, stored_digest
 from clsas.navigation.autofocus import Autofocus, autofocus
 from clsas.navigation.known_points import calibrate_track
 from clsas.navigation.micronavigation import Micronavigation, micronavigate
@@ -32,6 +34,7 @@ from clsas.opencl.device import Device
 from clsas.planning.factorize import factorize
 from clsas.planning.planner import TOLERANCE_DB, plan
 from clsas.processing import numbers
+from clsas.processing.record import StepRecord
 from clsas.products import plot
 from clsas.products.inspection import inspect
 
@@ -57,6 +60,8 @@ class Job:
         Steps that corrected them.
     device : Device
     progress : Progress
+    former : StepRecord or None
+        Record of the step when it ran last.
     """
 
     scene: SceneFile
@@ -67,6 +72,7 @@ class Job:
     corrections: tuple[str, ...]
     device: Device
     progress: Progress
+    former: StepRecord | None
 
     def options(self, step: str) -> dict[str, Any]:
         """Return the scene's options of a step."""
@@ -191,18 +197,25 @@ def imaged(job: Job) -> Outcome:
 
 
 def joined(job: Job) -> Outcome:
-    """Form a mosaic in a Zarr store; patches that it has are not formed again."""
+    """Form a mosaic in a Zarr store. If its inputs are the same, patches are not formed again."""
     scene = job.scene
     (grid,) = scene.need("grid")
     request = request_of(scene)
     if set(request) & {"taps", "upsampling"}:
         raise ValueError("taps and upsampling have no effect in a mosaic")
     memory_mib = scene.mosaic.get("memory_mib")
-    formed = mosaic(
-        job.lines, grid, job.store, **request, beam=scene.image.get("beam"),
+    begin = partial(
+        mosaic, job.lines, grid, job.store, **request, beam=scene.image.get("beam"),
         patches=scene.mosaic.get("patches"), memory_bytes=memory_mib and memory_mib << 20,
         device=job.device,
     )  # fmt: skip
+    try:
+        formed = begin()
+    except OtherInputsError:
+        if not _is_own_store(job):
+            raise
+        _remove_store(job.store)
+        formed = begin()
     count, errors = formed.shape[0] * formed.shape[1], []
     done = len(formed.finished)
     for patch in formed:
@@ -210,7 +223,34 @@ def joined(job: Job) -> Outcome:
         errors.append(patch.record.predicted_error_db)
         if job.progress is not None:
             job.progress(done, count)
-    return Outcome({"store": str(job.store), "patches": list(formed.shape), "formed": len(errors)})
+    return Outcome(
+        {
+            "store": str(job.store),
+            "inputs": stored_digest(job.store.resolve()),
+            "patches": list(formed.shape),
+            "formed": len(errors),
+        }
+    )
+
+
+def _is_own_store(job: Job) -> bool:
+    """Return whether this step made the store, so that it may replace it.
+
+    A store in the folder of the processing is the step's once it is recorded. One elsewhere must
+    also be as the step left it.
+    """
+    if job.former is None or job.former.numbers.get("store") != str(job.store):
+        return False
+    if "store" not in job.scene.mosaic:
+        return True
+    return job.former.numbers.get("inputs") == stored_digest(job.store.resolve())
+
+
+def _remove_store(path: Path) -> None:
+    """Remove a store in one step, so that a killed process leaves no part of it at its path."""
+    real = path.resolve()
+    with staging(real.parent) as temporary:
+        real.rename(temporary / real.name)
 
 
 RUN: dict[str, Callable[[Job], Outcome]] = {

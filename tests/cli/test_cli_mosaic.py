@@ -1,19 +1,22 @@
 """The command `clsas mosaic`."""
 
+import io
 import json
 import os
 import re
 import runpy
 import shutil
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 from click.testing import CliRunner
 from interrupt import interrupted
+from rich.console import Console
 
 import clsas
-from clsas.cli import main
+from clsas.cli import main, mosaics
 from clsas.files.scene_files import read_scene
 
 ROOT = Path(__file__).parents[2]
@@ -289,3 +292,36 @@ def test_errors_of_scene_files(tmp_path, line, message):
     _, stderr = run("mosaic", tmp_path / "scene.toml", code=1)
     assert message in stderr
     assert [path.name for path in tmp_path.iterdir()] == ["scene.toml"]
+
+
+@pytest.mark.parametrize("what", ["folder", "file", "no folder", "read-only"])
+def test_a_store_that_cannot_be_is_refused_before_anything_is_simulated(tmp_path, what):
+    store = tmp_path / "other" / "a"
+    if what != "no folder":
+        store.parent.mkdir()
+    if what == "folder":
+        store.mkdir()
+        (store / "passwd").touch()
+    elif what == "file":
+        store.touch()
+    elif what == "read-only":
+        if os.geteuid() == 0:
+            pytest.skip("root writes everywhere")
+        store.parent.chmod(0o555)
+    (tmp_path / "scene.toml").write_text(SCENE + f"store = '{store}'\n")
+    before = sorted(tmp_path.rglob("*"))
+    result = CliRunner().invoke(main, ["mosaic", str(tmp_path / "scene.toml")])
+    assert result.exit_code == 1
+    assert re.match(r"Error: .*(is not a mosaic of clsas|no such folder|denied)", result.stderr)
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+@pytest.mark.parametrize("name", ["a{2}", "{", "a{task.fields[x]}", "[bold]a", "[/]"])
+def test_a_stores_name_is_shown_as_it_is(monkeypatch, name):
+    """On a terminal, beside the progress bar."""
+    text = io.StringIO()
+    terminal = partial(Console, file=text, force_terminal=True, width=120)
+    monkeypatch.setattr(mosaics, "Console", lambda **given: terminal(**given | {"stderr": False}))
+    with mosaics._patch_progress(name, 2, 1):
+        pass
+    assert f"{name} " in re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", text.getvalue())

@@ -329,6 +329,79 @@ def test_mosaic_continues(scene):
     assert clsas.Store.opened(found["mosaic"].numbers["store"]).image().shape == (121, 161)
 
 
+@pytest.fixture
+def joining(scene):
+    """A scene whose mosaic has been formed, from its recording as it came."""
+    pytest.importorskip("zarr")
+    choose(scene, "mosaic")
+    scene.write_text(scene.read_text() + "[mosaic]\npatches = [1, 2]\n")
+    clsas.process(scene)
+    return scene
+
+
+def change_recording(scene):
+    lines = clsas.load(scene.parent / "lines.h5")
+    (scene.parent / "lines.h5").unlink()  # a link to that of all tests
+    clsas.save(scene.parent / "lines.h5", replace(lines, samples=2 * lines.samples[::-1]))
+
+
+def test_a_mosaic_of_another_recording_is_formed_anew(joining):
+    """As every other step is run again."""
+    before = clsas.Store.opened(joining.with_suffix("") / "mosaic.zarr").read()
+    change_recording(joining)
+    found = clsas.process(joining)
+    assert found["mosaic"].numbers["formed"] == 2
+    after = clsas.Store.opened(found["mosaic"].numbers["store"]).read()
+    assert np.abs(after - before).max() > 0.1 * np.abs(before).max()
+    assert clsas.process(joining)["mosaic"].numbers["formed"] == 0
+    assert not list(joining.with_suffix("").glob(".clsas-*"))
+
+
+def test_a_mosaic_of_other_options_is_formed_anew(joining):
+    text = joining.read_text()
+    for changed in ("tolerance_db = -30", "tolerance_db = -40"):
+        joining.write_text(text.replace("tolerance_db = -40", changed))
+        assert clsas.process(joining)["mosaic"].numbers["formed"] == 2
+    joining.write_text(text.replace("[1, 2]", "[2, 2]"))
+    assert clsas.process(joining)["mosaic"].numbers["formed"] == 4
+
+
+def test_a_mosaic_that_the_step_did_not_make_is_not_replaced(joining, tmp_path):
+    """Neither one that was there before, nor one that came in its place."""
+    store = tmp_path / "elsewhere.zarr"
+    lines = clsas.load(joining.parent / "lines.h5")
+    other = replace(lines, samples=3 * lines.samples[::-1])
+    grid = clsas.Grid.plane((1, 5, 161), (13, 15, 121))
+    list(clsas.mosaic(other, grid, store, patches=(1, 1)))
+    joining.write_text(joining.read_text() + f"store = '{store}'\n")
+    for _ in range(2):
+        with pytest.raises(ValueError, match=r"\(\[mosaic\]\): .* made with other inputs"):
+            clsas.process(joining)
+        assert clsas.Store.opened(store).records()
+    store.rename(tmp_path / "kept.zarr")
+    clsas.process(joining)
+    change_recording(joining)
+    assert clsas.process(joining)["mosaic"].numbers["formed"] == 2  # made by the step
+    change_recording(joining)
+    store.rename(tmp_path / "made.zarr")
+    (tmp_path / "kept.zarr").rename(store)
+    with pytest.raises(ValueError, match="was made with other inputs"):
+        clsas.process(joining)
+    assert clsas.Store.opened(store).records()
+
+
+def test_a_refused_mosaic_leaves_the_old_one(joining):
+    """What is wrong with the request is found before anything is removed."""
+    before = clsas.Store.opened(joining.with_suffix("") / "mosaic.zarr").read()
+    change_recording(joining)
+    text = joining.read_text()
+    joining.write_text(text.replace("patches = [1, 2]", "patches = [500, 2]"))
+    with pytest.raises(ValueError, match="patches"):
+        clsas.process(joining)
+    after = clsas.Store.opened(joining.with_suffix("") / "mosaic.zarr").read()
+    np.testing.assert_array_equal(after, before)
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [

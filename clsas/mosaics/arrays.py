@@ -1,0 +1,250 @@
+"""Arrays of a store: created, opened after a check of their metadata, compared, and mended."""
+
+from __future__ import annotations
+
+import math
+import os
+import uuid
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import zarr
+from numpy.typing import NDArray
+from zarr.codecs import Crc32cCodec
+
+from clsas.core import validate
+from clsas.core.atomic import creating, make_folders, staging, sync_folder
+from clsas.core.digests import grid_digest
+from clsas.core.grid import Grid
+from clsas.mosaics.documents import (
+    DIGESTS,
+    FORMAT,
+    VECTORS,
+    VERSION,
+    DamageError,
+    check_own,
+    plane_of,
+    read_document,
+    with_checksum,
+    write_attributes,
+)
+from clsas.mosaics.durable import DurableStore
+from clsas.mosaics.metadata import (
+    GROUP,
+    Checked,
+    check_group,
+    checked,
+    forms,
+    has_height,
+)
+
+_COPIES = 3  # of values in memory: Zarr's, the grid's, and one for its digest
+
+
+def create_store(
+    path: Path, inputs: dict[str, Any], grid: Grid, patch_shape: tuple[int, int]
+) -> None:
+    """Create the store of a mosaic in one step, so that a killed process leaves no part of it.
+
+    Raises
+    ------
+    OSError
+        If the folder around it cannot be written.
+    """
+    plane = None
+    if grid.points_m is None:
+        plane = {name: getattr(grid, name).tolist() for name in VECTORS}
+    attributes = {
+        "format": FORMAT,
+        "version": VERSION,
+        "patch_shape": list(patch_shape),
+        "grid": plane,
+        "inputs": inputs,
+    }
+    with creating(path) as temporary:
+        _create_arrays(temporary, grid, patch_shape)
+        write_attributes(temporary / GROUP, {})
+        digests = _digests(temporary, attributes, grid.height_m is not None)
+        write_attributes(temporary, with_checksum(attributes | {DIGESTS: digests}))
+
+
+def open_array(path: Path, attributes: dict[str, Any], name: str) -> zarr.Array:
+    """Open an array of a store for reading.
+
+    Raises
+    ------
+    DamageError
+        If its metadata are not those of a mosaic, or not those that were written.
+    """
+    return _opened(path, attributes, name, read_only=True)
+
+
+def write_pixels(
+    path: Path,
+    attributes: dict[str, Any],
+    rows: slice,
+    columns: slice,
+    pixels: NDArray[np.complex64],
+) -> None:
+    """Write the pixels of whole patches. Zarr writes no chunk for pixels that are all zero."""
+    _opened(path, attributes, "pixels", read_only=False)[rows, columns] = pixels
+
+
+def check_metadata(path: Path, attributes: dict[str, Any]) -> None:
+    """Raise DamageError, which names the array, if the metadata of any array are damaged."""
+    for name in forms(attributes, has_height(path, attributes)):
+        try:
+            _checked(path, attributes, name)
+        except DamageError as error:
+            raise DamageError(f"{name}: {error}") from error
+
+
+def compared(
+    path: Path, attributes: dict[str, Any], with_height: bool
+) -> tuple[Grid | None, dict[str, str]]:
+    """Compare metadata, coordinates and heights of a store with what was written.
+
+    Returns
+    -------
+    grid : Grid or None
+        The store's grid, with its heights if they are intact; None if it has arbitrary points.
+    damage : dict of str to str
+        Reasons by the name of the array or group.
+    """
+    grid, found = plane_of(attributes), {}
+    axes_m = dict(zip("xy", grid.axes_m, strict=True)) if grid and grid.has_axes else {}
+    for name in forms(attributes, with_height):
+        try:
+            _checked(path, attributes, name)
+            if name in axes_m and not np.array_equal(_values(path, attributes, name), axes_m[name]):
+                raise DamageError("its values are not those of the grid")
+            if name == "height" and grid is not None:
+                grid = _raised(grid, _values(path, attributes, name), attributes)
+        except DamageError as error:
+            found[name] = str(error)
+    try:
+        check_group(path)
+    except DamageError as error:
+        found[GROUP] = str(error)
+    return grid, found
+
+
+def mend(path: Path, grid: Grid) -> dict[str, str]:
+    """Write damaged metadata, coordinates and heights anew; add digests where there are none.
+
+    Parameters
+    ----------
+    path : Path
+        The store.
+    grid : Grid
+        The grid that it was made with.
+
+    Returns
+    -------
+    dict of str to str
+        What was damaged, by name.
+    """
+    attributes = read_document(path)
+    with_height = grid.height_m is not None
+    _, found = compared(path, attributes, with_height)
+    if found:
+        rows, columns = attributes["patch_shape"]
+        with staging(path) as temporary:
+            new, old = temporary / "new", temporary / "old"
+            new.mkdir()
+            old.mkdir()
+            _create_arrays(new, grid, (rows, columns))
+            write_attributes(new / GROUP, {})
+            for name in found:
+                # Chunks of pixels and records of patches stay.
+                keeps = name in ("pixels", GROUP)
+                _exchange(path, f"{name}/zarr.json" if keeps else name, new, old)
+    if found or DIGESTS not in attributes:
+        digests = _digests(path, attributes, with_height)
+        write_attributes(path, with_checksum(attributes | {DIGESTS: digests}))
+    return found
+
+
+def _exchange(path: Path, name: str, new: Path, old: Path) -> None:
+    """Move a file or folder of a store into a folder `old`, and that of `new` to its place."""
+    target = path / name
+    check_own(path, target.parent)
+    make_folders(target.parent)
+    if os.path.lexists(target):
+        target.rename(old / uuid.uuid4().hex)
+    (new / name).rename(target)
+    sync_folder(target.parent)
+
+
+def _digests(path: Path, attributes: dict[str, Any], with_height: bool) -> dict[str, str]:
+    return {
+        name: checked(path, name, form, None).digest
+        for name, form in forms(attributes, with_height).items()
+    }
+
+
+def _checked(path: Path, attributes: dict[str, Any], name: str) -> Checked:
+    """Return the metadata of an array; raise DamageError if they are damaged."""
+    form = forms(attributes, name == "height")[name]
+    return checked(path, name, form, attributes.get(DIGESTS, {}).get(name))
+
+
+def _opened(path: Path, attributes: dict[str, Any], name: str, *, read_only: bool) -> zarr.Array:
+    metadata = _checked(path, attributes, name)
+    validate.memory(f"a chunk of {name} in {path}", 2 * metadata.chunk_bytes)
+    files = DurableStore.of_array(path, name, metadata, read_only=read_only)
+    return zarr.open_array(files, path=name, mode="r" if read_only else "r+", zarr_format=3)
+
+
+def _values(path: Path, attributes: dict[str, Any], name: str) -> NDArray[np.float64]:
+    """Return coordinates or heights; raise DamageError if they cannot be read."""
+    array = open_array(path, attributes, name)
+    validate.memory(f"{name} in {path}", _COPIES * 8 * math.prod(array.shape))
+    try:
+        return np.asarray(array[...])
+    except ValueError as error:  # Zarr's message about a checksum
+        raise DamageError("its values do not match their checksum") from error
+
+
+def _raised(plane: Grid, height_m: NDArray[np.float64], attributes: dict[str, Any]) -> Grid:
+    """Return a grid with heights; raise DamageError if they are not those that were written."""
+    try:
+        grid = plane.with_height(height_m)
+    except ValueError as error:
+        raise DamageError(f"its values are no heights: {error}") from error
+    if grid_digest(grid) != attributes["inputs"].get("grid"):
+        raise DamageError("its values are not those that were written")
+    return grid
+
+
+def _create_arrays(path: Path, grid: Grid, patch_shape: tuple[int, int]) -> None:
+    """Create the arrays of a mosaic: pixels, all zero, and coordinates."""
+    files = DurableStore(path)
+    # No compression, since noise does not compress; only a checksum behind every chunk.
+    checksum = Crc32cCodec()
+    names = ("y", "x") if grid.has_axes else ("row", "column")
+    zarr.create_array(
+        files,
+        name="pixels",
+        shape=grid.shape,
+        dtype=np.complex64,
+        chunks=patch_shape,
+        compressors=checksum,
+        fill_value=0,
+        dimension_names=names,
+    )
+    coordinates: dict[str, tuple[tuple[str, ...], NDArray[np.float64]]] = {}
+    if grid.has_axes:
+        coordinates |= {name: ((name,), axis) for name, axis in zip("xy", grid.axes_m, strict=True)}
+    if grid.height_m is not None:
+        coordinates["height"] = names, grid.height_m
+    for name, (dimensions, values) in coordinates.items():
+        zarr.create_array(
+            files,
+            name=name,
+            data=values,
+            compressors=checksum,
+            dimension_names=dimensions,
+            attributes={"units": "m"},
+        )

@@ -1,0 +1,205 @@
+"""Metadata of a store's arrays: what they may say, and digests of them.
+
+Zarr decodes an array as its metadata say, and some decoders run code that the array holds. Stores
+come from strangers too. So metadata are read and checked here, and Zarr is given only those that
+describe an array as clsas writes it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from clsas.core.reading import parse_json, read_bytes
+from clsas.mosaics.documents import DIGESTS, DamageError, plane_of, read_attributes
+
+GROUP = "patches"
+"""Group of the records, which has no attributes of its own."""
+
+_ITEM_BYTES = {"complex64": 8, "float64": 8}
+CHECKSUM_BYTES = 4
+"""Size of the checksum behind every chunk."""
+
+_CODECS = [("bytes", {"endian": "little"}), ("crc32c", {})]
+_KEYS = {
+    "zarr_format", "node_type", "data_type", "shape", "chunk_grid", "chunk_key_encoding",
+    "fill_value", "codecs", "attributes", "dimension_names", "storage_transformers",
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Form:
+    """What an array has to be.
+
+    Attributes
+    ----------
+    data_type : str
+        "complex64" or "float64".
+    shape : tuple of int
+    chunk_shape : tuple of int or None
+        None if Zarr has chosen it.
+    """
+
+    data_type: str
+    shape: tuple[int, ...]
+    chunk_shape: tuple[int, ...] | None = None
+
+
+@dataclass(frozen=True)
+class Checked:
+    """Metadata of an array that is as it has to be.
+
+    Attributes
+    ----------
+    text : bytes
+        What was read and checked.
+    chunk_bytes : int
+        Size of the file of every chunk.
+    digest : str
+        Digest of what the text says, whatever its layout.
+    """
+
+    text: bytes
+    chunk_bytes: int
+    digest: str
+
+
+def forms(attributes: Mapping[str, Any], has_height: bool) -> dict[str, Form]:
+    """Return what the arrays of a store have to be, by name."""
+    rows, columns = attributes["inputs"]["pixels"]
+    found = {"pixels": Form("complex64", (rows, columns), tuple(attributes["patch_shape"]))}
+    plane = plane_of(attributes)
+    if plane is not None and plane.has_axes:
+        found |= {"x": Form("float64", (columns,)), "y": Form("float64", (rows,))}
+    if has_height:
+        found["height"] = Form("float64", (rows, columns))
+    return found
+
+
+def has_height(path: Path, attributes: Mapping[str, Any]) -> bool:
+    """Return whether the grid of a store has heights."""
+    digests = attributes.get(DIGESTS)
+    return (path / "height").exists() if digests is None else "height" in digests
+
+
+def checked(path: Path, name: str, form: Form, digest: str | None) -> Checked:
+    """Read the metadata of an array of a store, and check them.
+
+    Parameters
+    ----------
+    path : Path
+        The store.
+    name : str
+        The array.
+    form : Form
+        What the array has to be.
+    digest : str or None
+        Expected digest, where there is one.
+
+    Raises
+    ------
+    DamageError
+        If the metadata differ from what was written.
+    """
+    try:
+        text = read_bytes(path / name / "zarr.json")
+        metadata = parse_json(text)
+    except FileNotFoundError as error:
+        raise DamageError("its metadata are gone") from error
+    except PermissionError:
+        raise
+    except (OSError, ValueError) as error:
+        raise DamageError(f"its metadata cannot be read: {error}") from error
+    wrong = _difference(metadata, form)
+    if wrong:
+        raise DamageError(f"its metadata are not those of a mosaic: {wrong}")
+    found = digest_of(metadata)
+    if digest is not None and found != digest:
+        raise DamageError("its metadata do not match their digest")
+    chunk = math.prod(metadata["chunk_grid"]["configuration"]["chunk_shape"])
+    return Checked(text, chunk * _ITEM_BYTES[form.data_type] + CHECKSUM_BYTES, found)
+
+
+def check_group(path: Path) -> None:
+    """Raise DamageError unless the group of the records is as it was written."""
+    try:
+        attributes = read_attributes(path / GROUP)
+    except PermissionError:
+        raise
+    except (OSError, DamageError) as error:
+        raise DamageError("its metadata cannot be read") from error
+    if attributes:
+        raise DamageError("it has attributes that were not written")
+
+
+def digest_of(metadata: Mapping[str, Any]) -> str:
+    """Return a digest of metadata."""
+    text = json.dumps(metadata, sort_keys=True, separators=(",", ":"))
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def _difference(metadata: Any, form: Form) -> str | None:
+    """Return what in an array's metadata is not as clsas writes it, or None."""
+    if not isinstance(metadata, dict):
+        return "they are no table"
+    if metadata.keys() - _KEYS:
+        return f"{sorted(metadata.keys() - _KEYS)[0]!r} is unknown"
+    chunks = _named(metadata.get("chunk_grid"))
+    encoding = _named(metadata.get("chunk_key_encoding"))
+    codecs = metadata.get("codecs")
+    codecs = [_named(codec) for codec in codecs] if isinstance(codecs, list) else None
+    zero = [0.0, 0.0] if form.data_type == "complex64" else 0.0
+    right = {
+        "zarr_format": metadata.get("zarr_format") == 3,
+        "node_type": metadata.get("node_type") == "array",
+        "data_type": metadata.get("data_type") == form.data_type,
+        "shape": _are_counts(metadata.get("shape")) and tuple(metadata["shape"]) == form.shape,
+        "chunk_grid": chunks is not None and chunks[0] == "regular" and _fits(chunks[1], form),
+        "chunk_key_encoding": encoding in (("default", {"separator": "/"}), ("default", {})),
+        "codecs": codecs == _CODECS,
+        "fill_value": metadata.get("fill_value") == zero,
+        "storage_transformers": metadata.get("storage_transformers", []) == [],
+        "attributes": isinstance(metadata.get("attributes", {}), dict),
+        "dimension_names": _are_names(metadata.get("dimension_names"), len(form.shape)),
+    }
+    return next((f"{name} is another" for name, is_right in right.items() if not is_right), None)
+
+
+def _named(part: Any) -> tuple[str, Any] | None:
+    """Return name and configuration of a part of metadata, or None if it has none."""
+    if isinstance(part, str):
+        return part, {}
+    if isinstance(part, dict) and part.keys() <= {"name", "configuration"} and "name" in part:
+        return part["name"], part.get("configuration", {})
+    return None
+
+
+def _fits(configuration: Any, form: Form) -> bool:
+    """Return whether chunks are those of a form."""
+    if not isinstance(configuration, dict) or configuration.keys() != {"chunk_shape"}:
+        return False
+    shape = configuration["chunk_shape"]
+    if not _are_counts(shape) or len(shape) != len(form.shape):
+        return False
+    if form.chunk_shape is not None:
+        return tuple(shape) == form.chunk_shape
+    return all(1 <= side <= most for side, most in zip(shape, form.shape, strict=True))
+
+
+def _are_counts(values: Any) -> bool:
+    return isinstance(values, list) and all(type(n) is int and n > 0 for n in values)
+
+
+def _are_names(values: Any, count: int) -> bool:
+    if values is None:
+        return True
+    return (
+        isinstance(values, list)
+        and len(values) == count
+        and all(isinstance(name, str) for name in values)
+    )

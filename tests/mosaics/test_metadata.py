@@ -1,0 +1,258 @@
+"""Metadata, coordinates and heights of stores: damage is found and mended."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from stores import GRID, LINES, WISH, change, change_metadata, files_of, written
+
+import clsas
+from clsas.cli import main
+
+ARRAYS = "pixels", "x", "y", "height"
+DOCUMENTS = [f"{name}/zarr.json" for name in (*ARRAYS, "patches")]
+VALUES = ["x/c/0", "y/c/0", "height/c/0/0"]
+
+
+@pytest.fixture(scope="module")
+def kept(tmp_path_factory):
+    """The files of a store."""
+    path = tmp_path_factory.mktemp("kept") / "a.zarr"
+    list(clsas.mosaic(LINES, GRID, path, **WISH))
+    return files_of(path)
+
+
+@pytest.fixture
+def path(kept, tmp_path):
+    """A store of its own for a test."""
+    return written(tmp_path / "a.zarr", kept)
+
+
+def verified(path, code):
+    result = CliRunner().invoke(main, ["mosaic", "--verify", "-o", str(path)])
+    assert result.exit_code == code, result.output
+    found = CliRunner().invoke(main, ["mosaic", "--verify", "--json", "-o", str(path)])
+    return result.stdout, json.loads(found.stdout)
+
+
+def check_mended(path, kept, name):
+    """A run warns, forms no patch again and leaves what was written first."""
+    with pytest.warns(clsas.ClsasWarning, match=rf"a\.zarr was damaged and is mended: {name}: its"):
+        mosaic = clsas.mosaic(LINES, GRID, path, **WISH)
+    assert len(mosaic.finished) == 6
+    assert list(mosaic) == []
+    assert files_of(path) == kept
+    assert verified(path, 0)[1]["damaged_arrays"] == {}
+
+
+def test_a_whole_store_has_no_damage(path):
+    assert clsas.Store.opened(path).array_damage() == {}
+    assert clsas.Store.opened(path).has_digests
+    said, found = verified(path, 0)
+    assert said == f"{path}: 6 patches match their checksums, none damaged\n"
+    assert (found["damaged_arrays"], found["has_digests"]) == ({}, True)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", DOCUMENTS)
+def test_any_bit_of_metadata_is_found_or_plays_no_part(path, kept, name):
+    chance = np.random.default_rng(3)
+    whole, found = kept[Path(name)], 0
+    for bit in chance.integers(0, 8 * len(whole), 60):
+        content = bytearray(whole)
+        content[bit // 8] ^= 1 << bit % 8
+        (path / name).write_bytes(content)
+        store = clsas.Store.opened(path)
+        if store.array_damage():
+            assert list(store.array_damage()) == [name.split("/")[0]]
+            found += 1
+        else:  # a blank
+            assert json.loads(content) == json.loads(whole)
+    assert found > 20
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", VALUES)
+def test_any_bit_of_coordinates_and_heights_is_found(path, kept, name):
+    chance = np.random.default_rng(4)
+    for bit in chance.integers(0, 8 * len(kept[Path(name)]), 12):
+        content = bytearray(kept[Path(name)])
+        content[bit // 8] ^= 1 << bit % 8
+        (path / name).write_bytes(content)
+        store = clsas.Store.opened(path)
+        assert list(store.array_damage()) == [name[: name.index("/")]]
+        for read in (store.image, store.overview, lambda store=store: store.grid):
+            with pytest.raises(ValueError, match=r"is damaged.*clsas mosaic .* mends it"):
+                read()
+    assert verified(path, 1)[1]["damaged_arrays"]
+
+
+def test_a_flipped_separator_is_found_and_mended(path, kept):
+    """Zarr then looks for pixels under other names, finds none, and takes them for zeros."""
+    document = path / "pixels" / "zarr.json"
+    text = document.read_text()
+    document.write_text(text.replace('"separator": "/"', '"separator": "."'))
+    assert document.read_text() != text
+    store = clsas.Store.opened(path)
+    for read in (store.image, store.read, store.overview, store.damage, store.records):
+        with pytest.raises(ValueError, match=r"pixels: its metadata .* chunk_key_encoding"):
+            read()
+    said, found = verified(path, 1)
+    assert "no patch can be compared with its checksum" in said
+    assert "  pixels: its metadata are not those of a mosaic" in said
+    assert found["finished"] is None
+    check_mended(path, kept, "pixels")
+
+
+def remove(path):
+    shutil.rmtree(path)
+
+
+def empty(path):
+    for chunk in path.glob("c/**/*"):
+        if chunk.is_file():
+            chunk.unlink()
+
+
+def replace(path):
+    """By what is no folder."""
+    shutil.rmtree(path)
+    path.write_text("")
+
+
+def zeros(path):
+    """With right checksums: of another store."""
+    other = np.zeros(GRID.shape if path.name == "height" else GRID.shape[path.name == "x"])
+    zarr = pytest.importorskip("zarr")
+    array = zarr.open_array(path, mode="r+")
+    array[...] = other + 1.0
+
+
+@pytest.mark.parametrize("name", ["x", "y", "height"])
+@pytest.mark.parametrize("damage", [remove, empty, replace, zeros])
+def test_coordinates_and_heights_are_mended(path, kept, name, damage):
+    damage(path / name)
+    assert list(clsas.Store.opened(path).array_damage()) == [name]
+    check_mended(path, kept, name)
+
+
+@pytest.mark.parametrize("name", DOCUMENTS)
+@pytest.mark.parametrize("content", [None, b"", b"{}", b"[1]", b"\xff", b"{" * 100_000])
+def test_metadata_are_mended(path, kept, name, content):
+    (path / name).unlink()
+    if content is not None:
+        (path / name).write_bytes(content)
+    check_mended(path, kept, name.split("/")[0])
+
+
+def test_metadata_that_were_changed_elsewhere_are_found(path, kept):
+    """Though an array may have such."""
+    change_metadata(path, "height", attributes={"units": "km"})
+    assert clsas.Store.opened(path).array_damage() == {
+        "height": "its metadata do not match their digest"
+    }
+    with pytest.raises(ValueError, match="height: its metadata do not match their digest"):
+        clsas.Store.opened(path).read()
+    check_mended(path, kept, "height")
+
+
+def test_a_killed_run_leaves_a_store_that_is_mended_by_the_next(path, kept, monkeypatch):
+    """Between taking what is damaged away and putting the new in its place."""
+    from clsas.mosaics import arrays
+
+    empty(path / "height")
+    exchange = arrays.os.path.lexists
+
+    def killed(target):
+        exchange(target)
+        Path(target).rename(path.parent / "gone")
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(arrays.os.path, "lexists", killed)
+        with pytest.raises(KeyboardInterrupt):
+            clsas.mosaic(LINES, GRID, path, **WISH)
+    assert not (path / "height").exists()
+    check_mended(path, kept, "height")
+
+
+class TestStoresWithoutDigests:
+    """As this version wrote them at first."""
+
+    @pytest.fixture
+    def path(self, path):
+        change(path, metadata=None)
+        return path
+
+    def test_it_is_read_and_verify_says_so(self, path):
+        store = clsas.Store.opened(path)
+        assert store.image().pixels.any()
+        np.testing.assert_array_equal(store.grid.height_m, GRID.height_m)
+        said, found = verified(path, 0)
+        assert "6 patches match their checksums, none damaged" in said
+        assert "no digests of its metadata, since an earlier version" in said
+        assert (found["has_digests"], found["damaged_arrays"]) == (False, {})
+
+    def test_it_gets_digests_when_it_is_continued(self, path, kept):
+        assert list(clsas.mosaic(LINES, GRID, path, **WISH)) == []
+        assert clsas.Store.opened(path).has_digests
+        assert files_of(path) == kept
+
+    @pytest.mark.parametrize("name", ["x", "y", "height"])
+    def test_values_are_compared_and_mended_all_the_same(self, path, kept, name):
+        zeros(path / name)
+        assert list(verified(path, 1)[1]["damaged_arrays"]) == [name]
+        check_mended(path, kept, name)
+
+    def test_heights_that_are_gone_are_missed(self, path, kept):
+        shutil.rmtree(path / "height")
+        with pytest.raises(ValueError, match="its grid is not the one that was written"):
+            clsas.Store.opened(path).image()
+        check_mended(path, kept, "height")
+
+
+class TestChunksOfNoPixels:
+    def test_in_metadata(self, path, kept):
+        grid = {"name": "regular", "configuration": {"chunk_shape": [0, 14]}}
+        change_metadata(path, "pixels", chunk_grid=grid)
+        with pytest.raises(ValueError, match=r"a\.zarr is damaged: pixels: .* chunk_grid"):
+            clsas.Store.opened(path).image()
+        assert verified(path, 1)[1]["damaged_arrays"].keys() == {"pixels"}
+        check_mended(path, kept, "pixels")
+
+    @pytest.mark.parametrize("name", ["x", "height"])
+    def test_in_coordinates(self, path, kept, name):
+        change(path, metadata=None)
+        shape = [0] if name == "x" else [30, 0]
+        grid = {"name": "regular", "configuration": {"chunk_shape": shape}}
+        change_metadata(path, name, chunk_grid=grid)
+        assert verified(path, 1)[1]["damaged_arrays"].keys() == {name}
+        check_mended(path, kept, name)
+
+    @pytest.mark.parametrize("shape", [[0, 14], [15, 0], [-1, 14], [15], [15.0, 14], "ab", None])
+    def test_in_the_document(self, path, shape):
+        change(path, patch_shape=shape)
+        for work in (clsas.Store.opened, lambda path: clsas.mosaic(LINES, GRID, path, **WISH)):
+            with pytest.raises(ValueError, match=r"a\.zarr is damaged: its attributes are not"):
+                work(path)
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {"grid": {"origin_m": [0, 0, 0]}},
+        {"grid": {"origin_m": 1, "row_step_m": [0, 1, 0], "column_step_m": [1, 0, 0]}},
+        {"grid": {"origin_m": [0, 0, "a"], "row_step_m": [0, 1, 0], "column_step_m": [1, 0, 0]}},
+        {"grid": []},
+        {"inputs": {"parts": []}},
+        {"inputs": {"parts": [], "pixels": [0, 5]}},
+        {"metadata": []},
+    ],
+)
+def test_a_document_of_wrong_types_is_damage(path, changed):
+    change(path, **changed)
+    with pytest.raises(ValueError, match=r"a\.zarr is damaged: its attributes are not those"):
+        clsas.Store.opened(path)

@@ -1,0 +1,209 @@
+"""Stores of strangers: nothing in them runs code, takes all memory or leads elsewhere."""
+
+import contextlib
+import json
+import pickle
+import shutil
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+from stores import GRID, LINES, WISH, change, change_metadata, files_of, written
+
+import clsas
+from clsas.core import validate
+
+numcodecs = pytest.importorskip("numcodecs")
+zarr = pytest.importorskip("zarr")
+
+
+@pytest.fixture(scope="module")
+def kept(tmp_path_factory):
+    """The files of a store."""
+    path = tmp_path_factory.mktemp("kept") / "a.zarr"
+    list(clsas.mosaic(LINES, GRID, path, **WISH))
+    return files_of(path)
+
+
+@pytest.fixture
+def path(kept, tmp_path):
+    """A store of its own for a test."""
+    return written(tmp_path / "a.zarr", kept)
+
+
+class Payload:
+    """Makes a file when it is unpickled."""
+
+    def __init__(self, path):
+        self.path = path
+
+    def __reduce__(self):
+        return Path.touch, (self.path,)
+
+
+def ways_to_read(path):
+    """All that reads a store."""
+    yield lambda: clsas.Store.opened(path).grid
+    yield lambda: clsas.Store.opened(path).image()
+    yield lambda: clsas.Store.opened(path).read()
+    yield lambda: clsas.Store.opened(path).overview()
+    yield lambda: clsas.Store.opened(path).pixels[:]
+    yield lambda: clsas.Store.opened(path).damage()
+    yield lambda: clsas.Store.opened(path).array_damage()
+    yield lambda: clsas.Store.opened(path).records()
+
+
+def read_all(path):
+    for read in ways_to_read(path):
+        try:
+            read()
+        except ValueError:
+            continue
+
+
+@pytest.mark.parametrize("has_digests", [True, False])
+@pytest.mark.parametrize("name", ["height", "pixels", "x"])
+def test_pickles_of_zarr_format_2_do_not_run(path, tmp_path, monkeypatch, name, has_digests):
+    """With a version of numcodecs that unpickles whatever it reads."""
+    monkeypatch.setattr(numcodecs.pickles, "ALLOW_UNSAFE_PICKLE_DECODE", True, raising=False)
+    mark = tmp_path / "ran"
+    shape = [40] if name == "x" else [30, 40]
+    metadata = {
+        "zarr_format": 2, "shape": shape, "chunks": shape, "dtype": "|O", "order": "C",
+        "filters": [{"id": "vlen-utf8"}, {"id": "pickle", "protocol": 5}], "compressor": None,
+        "fill_value": "",
+    }  # fmt: skip
+    if not has_digests:
+        change(path, metadata=None)
+    shutil.rmtree(path / name)
+    (path / name).mkdir()
+    (path / name / ".zarray").write_text(json.dumps(metadata))
+    (path / name / ".".join("0" for _ in shape)).write_bytes(pickle.dumps(Payload(mark)))
+    # What the store would do to a program that reads it as Zarr is told to by default:
+    with contextlib.suppress(Exception):
+        _ = zarr.open_array(path / name, mode="r")[...]
+    assert mark.exists()
+    mark.unlink()
+    read_all(path)
+    assert not mark.exists()
+    with warnings.catch_warnings(record=True) as found:
+        warnings.simplefilter("always")
+        list(clsas.mosaic(LINES, GRID, path, **WISH))
+    assert f"is mended: {name}: its metadata are gone" in str(found[0].message)
+    assert not mark.exists()
+
+
+@pytest.mark.parametrize("has_digests", [True, False])
+@pytest.mark.parametrize("name", ["height", "pixels"])
+@pytest.mark.parametrize(
+    "entries",
+    [
+        {"codecs": [{"name": "vlen-utf8"}]},
+        {"codecs": [{"name": "bytes", "configuration": {"endian": "little"}}]},
+        {"codecs": [{"name": "bytes", "configuration": {"endian": "big"}}, {"name": "crc32c"}]},
+        {
+            "codecs": [
+                {"name": "bytes", "configuration": {"endian": "little"}},
+                {"name": "crc32c"},
+                {"name": "numcodecs.zlib", "configuration": {"level": 1}},
+            ]
+        },
+        {"codecs": [{"name": "no_such_module.Codec"}]},
+        {"codecs": "bytes"},
+        {"data_type": "string"},
+        {"data_type": {"name": "structured", "configuration": {}}},
+        {"fill_value": 1.0},
+        {"storage_transformers": [{"name": "any"}]},
+        {"zarr_format": 2},
+        {"node_type": "group"},
+        {"chunk_key_encoding": {"name": "v2", "configuration": {"separator": "/"}}},
+        {"chunk_key_encoding": {"name": "../../elsewhere"}},
+        {"shape": [30, 41]},
+        {"shape": [True, 40]},
+        {"dimension_names": [1, 2]},
+        {"attributes": 5},
+        {"anything": {"must_understand": False}},
+    ],
+    ids=lambda entries: str(entries)[:40],
+)
+def test_zarr_is_not_asked_about_other_metadata(path, monkeypatch, name, entries, has_digests):
+    if not has_digests:
+        change(path, metadata=None)
+    change_metadata(path, name, **entries)
+    opened = []
+    open_array = zarr.open_array
+
+    def recorded(*given, **options):
+        opened.append(options["path"])
+        return open_array(*given, **options)
+
+    monkeypatch.setattr(zarr, "open_array", recorded)
+    found = clsas.Store.opened(path).array_damage()
+    assert list(found) == [name]
+    read_all(path)
+    assert name not in opened
+
+
+def test_zarr_is_given_what_was_checked(path, monkeypatch):
+    """Whatever the file says by then."""
+    from clsas.mosaics import metadata
+
+    read = metadata.read_bytes
+
+    def swapped(file):
+        text = read(file)
+        if file.parent.name == "pixels":
+            file.write_text("{}")
+        return text
+
+    store = clsas.Store.opened(path)
+    expected = store.read()
+    monkeypatch.setattr(metadata, "read_bytes", swapped)
+    with monkeypatch.context() as patch:
+        patch.setattr("clsas.mosaics.arrays.check_metadata", lambda *_: None)
+        np.testing.assert_array_equal(clsas.Store.opened(path).read(), expected)
+
+
+def test_a_store_that_claims_more_than_memory_is_refused(path, monkeypatch):
+    """A few bytes can claim 50 000 x 50 000 heights of zero."""
+    side = 50_000
+    document = json.loads((path / "zarr.json").read_text())["attributes"]
+    inputs = document["inputs"] | {"pixels": [side, side]}
+    change(path, inputs=inputs, patch_shape=[50, 50], metadata=None)
+    for name, axes in {"pixels": 2, "height": 2, "x": 1, "y": 1}.items():
+        grid = {"name": "regular", "configuration": {"chunk_shape": axes * [50]}}
+        change_metadata(path, name, shape=axes * [side], chunk_grid=grid)
+    shutil.rmtree(path / "height" / "c")
+    monkeypatch.setattr(validate, "_memory_bytes", lambda: 2**30)
+    store = clsas.Store.opened(path)
+    for read in (lambda: store.grid, store.image, store.read):
+        with pytest.raises(ValueError, match="must ask for at most 1 GiB, this machine's memory"):
+            read()
+
+
+def test_a_chunk_larger_than_it_can_be_is_not_read(path, monkeypatch):
+    """A sparse file takes no room on the disk."""
+    with (path / "pixels" / "c" / "0" / "0").open("r+b") as file:
+        file.truncate(1 << 40)
+    store = clsas.Store.opened(path)
+    assert list(store.damage()) == [(0, 0)]
+    with pytest.raises(ValueError, match="patch 0,0"):
+        store.read()
+
+
+@pytest.mark.parametrize("name", ["pixels/c/1", "pixels", "patches/1.2", "patches"])
+def test_a_run_writes_nowhere_else(path, tmp_path, name):
+    """Where a folder of the store leads elsewhere by a symbolic link."""
+    elsewhere = tmp_path / "elsewhere"
+    (path / name).rename(elsewhere)
+    for each in elsewhere.rglob("1.2/zarr.json" if name == "patches" else "zarr.json"):
+        if name.startswith("patches"):
+            each.unlink()  # to be formed again
+    if name.startswith("pixels"):
+        (path / "patches" / "1.2" / "zarr.json").unlink()
+    (path / name).symlink_to(elsewhere)
+    before = files_of(elsewhere)
+    with pytest.raises(ValueError, match="must be a folder of its own to be written"):
+        list(clsas.mosaic(LINES, GRID, path, **WISH))
+    assert files_of(elsewhere) == before

@@ -1,0 +1,43 @@
+"""A small store with heights, to be damaged."""
+
+import json
+
+import numpy as np
+from cases import along_x, lines_over
+
+import clsas
+from clsas.core.grid import Grid
+from clsas.mosaics.documents import with_checksum
+
+PLANE = Grid.plane((-4, 4, 40), (30, 40, 30))
+GRID = PLANE.with_height(np.linspace(0, 1, PLANE.size).reshape(PLANE.shape))
+LINES = lines_over(GRID, along_x(60, 0.1), carrier_hz=100e3, step_m=0.03)
+WISH = {"accuracy_db": -50, "beam": clsas.BeamWindow(8.0, "hann"), "patches": (2, 3)}
+
+
+def files_of(path):
+    """The files of a store, by path in it."""
+    return {each.relative_to(path): each.read_bytes() for each in path.rglob("*") if each.is_file()}
+
+
+def written(path, files):
+    """Write the files of a store."""
+    for name, content in files.items():
+        (path / name).parent.mkdir(parents=True, exist_ok=True)
+        (path / name).write_bytes(content)
+    return path
+
+
+def change(path, **attributes):
+    """Change attributes of a store's document, and its checksum with them; None removes one."""
+    document = json.loads((path / "zarr.json").read_text())
+    changed = {**document["attributes"], **attributes}
+    kept = {name: value for name, value in changed.items() if value is not None}
+    document["attributes"] = with_checksum(kept)
+    (path / "zarr.json").write_text(json.dumps(document))
+
+
+def change_metadata(path, name, **entries):
+    """Change entries of an array's metadata."""
+    document = json.loads((path / name / "zarr.json").read_text())
+    (path / name / "zarr.json").write_text(json.dumps({**document, **entries}))
