@@ -19,9 +19,15 @@
 /* Whether registers hold the sums of all virtual channels that are open at a time: a GPU's, and the 32 of AVX-512. */
 #define RUNNING_SUMS (WIDTH == 1 || AVX == 512)
 
-/* Lines of different channels lie apart, so a CPU prefetches those of a later channel. Simulators lack the builtin. */
-#if defined(__clang__) && WIDTH > 1 && !defined(NO_PREFETCH)
+/* Lines of different channels lie apart, so a CPU prefetches those of a later channel. OpenCL's prefetch() does nothing in
+ * PoCL, hence the compiler's builtin where PoCL compiles for a processor. A driver that translates to SPIR-V may end the
+ * process when it meets the builtin (Mesa 25.0), and defines no processor. */
+#if WIDTH > 1
+#if defined(__clang__) && (defined(__x86_64__) || defined(__aarch64__))
 #define PREFETCH(p) __builtin_prefetch((const void *)(size_t)(p))
+#else
+#define PREFETCH(p) prefetch((__global const float *)(p), 16)
+#endif
 #define CHANNELS_AHEAD 4
 #define CACHE_LINE (64 / (int)sizeof(sample_t)) /* samples */
 #endif

@@ -46,17 +46,15 @@ INLINE Vector to_centre(__global const float *geometry, int geometry_pitch, int 
                     (centre[2] - antenna.z) + (centre[5] - remainder.z)};
 }
 
-/* Fixed-point passes that find where a moving receiver is when the echo arrives. Each pass gains a factor of the
- * velocity over the sound speed: 0.003 for a sonar at 5 m/s; the host allows up to 0.05. */
-#define PASSES 4
-
 /* The vector from a moving receiver, at the time that the echo of a point arrives there, to that point: from the vectors
- * from the transmitter and from the receiver at the time of transmission. */
+ * from the transmitter and from the receiver at the time of transmission.
+ *
+ * When the sound reaches the point, the receiver is at -d from it. The way back, of length l, satisfies |d - l b| = l, or
+ * (1 - b.b) l^2 + 2 (d.b) l - d.d = 0. */
 INLINE Vector from_receiver_at_arrival(Vector transmitter, Vector receiver, Vector velocity)
 {
-    const vfloat out = magnitude(transmitter);
-    Vector arrival = receiver;
-    for (int pass = 0; pass < PASSES; pass++)
-        arrival = sum_of(receiver, -(out + magnitude(arrival)), velocity);
-    return arrival;
+    const Vector d = sum_of(receiver, -magnitude(transmitter), velocity);
+    const vfloat along = scalar_product(d, velocity), rest = 1.0f - scalar_product(velocity, velocity);
+    const vfloat back = (sqrt(along * along + rest * scalar_product(d, d)) - along) / rest;
+    return sum_of(d, -back, velocity);
 }

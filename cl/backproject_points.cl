@@ -75,10 +75,7 @@ INLINE vfloat path_change(const Antennas *antennas, Vector offset)
 {
     const vfloat out = distance_change(antennas->transmitter, offset);
 #if MOVING
-    vfloat path = out + distance_change(antennas->receiver, offset);
-    for (int pass = 0; pass < PASSES; pass++)
-        path = out + distance_change(antennas->receiver, sum_of(offset, -path, antennas->velocity));
-    return path;
+    return out + moving_distance_change(antennas->receiver, sum_of(offset, -out, antennas->velocity), antennas->velocity);
 #elif BISTATIC
     return out + distance_change(antennas->receiver, offset);
 #else

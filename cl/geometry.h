@@ -2,6 +2,8 @@
 
 #include "vectors.h"
 
+/* No loop changes a Vector from pass to pass: where the number of passes is constant, Mesa's rusticl (25.0, on llvmpipe)
+ * copies what an earlier pass has left, to an inline function's parameter too. */
 typedef struct {
     vfloat x, y, z;
 } Vector;
@@ -38,4 +40,16 @@ INLINE vfloat distance_change(Vector D, Vector d)
     const vfloat square = scalar_product(D, D);
     const vfloat change = d.x * (2.0f * D.x + d.x) + d.y * (2.0f * D.y + d.y) + d.z * (2.0f * D.z + d.z);
     return change / (sqrt(max(square + change, 0.0f)) + sqrt(square) + FLT_MIN);
+}
+
+/* The same to a receiver that moves on while the echo comes back: q for which q = |D + d - q b| - |D|, from
+ *
+ *     (1 - b.b) q^2 + 2 (|D| + (D + d).b) q - (2 D + d).d = 0. */
+INLINE vfloat moving_distance_change(Vector D, Vector d, Vector b)
+{
+    const vfloat square = scalar_product(D, D), length = sqrt(square);
+    const vfloat change = d.x * (2.0f * D.x + d.x) + d.y * (2.0f * D.y + d.y) + d.z * (2.0f * D.z + d.z);
+    const vfloat half_slope = length + scalar_product(D, b) + scalar_product(d, b);
+    const vfloat root = half_slope * half_slope + (1.0f - scalar_product(b, b)) * change;
+    return change / (half_slope + sqrt(max(root, 0.0f)) + FLT_MIN);
 }
