@@ -171,6 +171,8 @@ def band_window(
 
     count = 4097
     try:
+        if not isinstance(window, (str, tuple)):  # SciPy takes True for a number
+            window = validate.number("it", window)
         values = get_window(window, count, fftbins=False)
     except (ValueError, TypeError, IndexError) as error:
         raise ValueError(

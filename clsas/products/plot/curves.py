@@ -9,7 +9,7 @@ import numpy as np
 
 from clsas.core import validate
 from clsas.products.cuts import Cut
-from clsas.products.plot.canvas import axis_label, length_unit, new_figure
+from clsas.products.plot.canvas import axis_label, drawable, length_unit, new_figure
 from clsas.products.quality import PointResponse
 
 if TYPE_CHECKING:
@@ -84,6 +84,7 @@ def tradeoff(measured: Tradeoff, *, title: str = "") -> Figure:
     """
     if not hasattr(measured, "front"):
         raise TypeError(f"measured must be of type Tradeoff, got {validate.shown(measured)}")
+    title = drawable("title", title)
     figure = new_figure(7.0, 6.0)
     from matplotlib import ticker
 
