@@ -55,6 +55,10 @@ class Store:
 
     path: Path
 
+    def __post_init__(self) -> None:
+        """Check the path and convert it."""
+        object.__setattr__(self, "path", validate.path("path", self.path))
+
     def __repr__(self) -> str:
         """Return where the store is."""
         return reprs.summary(self, repr(str(self.path)))
@@ -69,7 +73,7 @@ class Store:
             If Zarr is not installed.
         """
         _zarr()
-        return cls(validate.path("store", path).resolve())
+        return cls(validate.path("path", path).resolve())
 
     @classmethod
     def opened(cls, path: str | os.PathLike) -> Store:
@@ -138,6 +142,10 @@ class Store:
         OSError
             If the store cannot be written.
         """
+        validate.instance("inputs", inputs, dict)
+        validate.instance("grid", grid, Grid)
+        for side in validate.entries("patch_shape", patch_shape, "(rows, columns)"):
+            validate.count("every side of patch_shape", side)
         if not self._is_there():
             from clsas.mosaics.durable import create_store
 
@@ -159,6 +167,7 @@ class Store:
 
     def grow(self, inputs: dict[str, Any]) -> None:
         """Store the inputs of a survey that has grown."""
+        validate.instance("inputs", inputs, dict)
         attributes = read_document(self.path)
         if attributes["inputs"] != inputs:
             write_attributes(self.path, with_checksum(attributes | {"inputs": inputs}))
@@ -197,6 +206,7 @@ class Store:
         OSError
             If a file cannot be read.
         """
+        validate.function("tell", tell)
         found, indices = {}, self._indices()
         for done, index in enumerate(indices, 1):
             try:
@@ -225,6 +235,18 @@ class Store:
         """
         from clsas.mosaics.durable import write_pixels
 
+        row, column = (
+            validate.count(name, index, least=0, most=most - 1)
+            for name, index, most in zip(("row", "column"), (row, column), self._shape, strict=True)
+        )
+        part = [
+            range(count)[validate.selection(name, given)]
+            for name, given, count in zip(
+                ("rows", "columns"), (rows, columns), self.pixels.shape, strict=True
+            )
+        ]
+        pixels = validate.array("pixels", pixels, np.complex64, tuple(map(len, part)))
+        validate.instance("record", record, Record)
         folder = self._folder((row, column))
         # Remove the old record before the pixels that it belongs to are replaced.
         if (folder / "zarr.json").exists():
@@ -245,6 +267,8 @@ class Store:
         OSError
             If a file cannot be read.
         """
+        validate.selection("rows", rows)
+        validate.selection("columns", columns)
         indices = self._touched(rows, columns)
         try:
             for index in indices:
