@@ -348,16 +348,20 @@ def _checked_request(
 ) -> dict[str, Any]:
     """Return the one of `REQUESTS` that is given, checked, or the default tolerance."""
     given = (tolerance_db, tolerance_wavelengths, stages, accuracy_db)
-    request = {
+    request: dict[str, Any] = {
         name: value for name, value in zip(REQUESTS, given, strict=True) if value is not None
     }
     if len(request) > 1:
         raise ValueError(f"at most one of {', '.join(REQUESTS)} must be given, got {request}")
     tolerance_in_db(tolerance_db, tolerance_wavelengths)
-    if stages is not None:
-        checked_pairs(stages)
     if accuracy_db is not None:
         validate.number("accuracy_db", accuracy_db, "dB", least=BEST_ACCURACY_DB, below=0.0)
+    # Plain numbers, which records hold as JSON.
+    for name, value in request.items():
+        if name == "stages":
+            request[name] = checked_pairs(value)
+        elif not isinstance(value, (int, float)):
+            request[name] = float(value)
     return request or {"tolerance_db": TOLERANCE_DB}
 
 

@@ -93,12 +93,12 @@ def from_full_matrix(
     lines = compress(
         Echoes(
             samples,
-            start_time_s=start_time_s,
-            sample_rate_hz=sample_rate_hz,
+            start_time_s=start_s,
+            sample_rate_hz=rate_hz,
             carrier_hz=carrier_hz,
             tx_m=elements_m[tx],
             rx_m=elements_m[rx],
-            sound_speed_m_s=sound_speed_m_s,
+            sound_speed_m_s=speed,
         ),
         window=window,
         oversampling=oversampling,

@@ -54,7 +54,7 @@ def mosaic(
     from clsas.mosaics.store import Store
 
     if not isinstance(store, Store):
-        store = Store.opened(store)
+        store = Store.opened(validate.path("store", store))
     validate.flag("borders", borders)
     most = validate.count("most", most)
     figure = image_db(store.overview(most), **options)

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import shutil
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import scipy.io
@@ -174,7 +177,8 @@ def imaging(folder: Path) -> dict[str, Call]:
             kinds=device,
             names=scene_names,
             skips={"repeats": LARGE},
-            accepts=dict.fromkeys(("stages", "beam", "progress"), optional),
+            accepts=dict.fromkeys(("stages", "beam", "progress"), optional)
+            | {"tolerances_db": EMPTY},
         ),
         "from_phase_history": Call(
             clsas.from_phase_history,
@@ -212,7 +216,6 @@ def imaging(folder: Path) -> dict[str, Call]:
             {
                 "source": few,
                 "grid": grid,
-                "store": None,
                 "tolerance_db": None,
                 "tolerance_wavelengths": None,
                 "stages": None,
@@ -225,11 +228,12 @@ def imaging(folder: Path) -> dict[str, Call]:
                 "follow_s": None,
             },
             kinds=device,
+            skips={"source": ("str",)},
             names=scene_names,
-            accepts=dict.fromkeys(("beam", "patches", "memory_bytes"), optional),
+            accepts=dict.fromkeys(("accuracy_db", "beam", "patches", "memory_bytes"), optional),
         ),
         "mosaic:tolerance": Call(
-            clsas.mosaic,
+            _anew(folder / "new.zarr"),
             {
                 "source": folder / "lines.h5",
                 "grid": grid,
@@ -251,6 +255,16 @@ def imaging(folder: Path) -> dict[str, Call]:
             accepts={"tell": optional},
         ),
     }
+
+
+def _anew(store: Path) -> Callable[..., clsas.Mosaic]:
+    """Return `clsas.mosaic`, which first removes the store that the last call left."""
+
+    def mosaic(**given: Any) -> clsas.Mosaic:
+        shutil.rmtree(store, ignore_errors=True)
+        return clsas.mosaic(**given)
+
+    return mosaic
 
 
 def navigation(folder: Path) -> dict[str, Call]:

@@ -15,6 +15,7 @@ from api_calls.scene import Call, axes, scene
 def pictures(folder: Path) -> dict[str, Call]:
     s = scene(folder)
     plot, image = clsas.plot, s.image
+    clsas.mosaic(s.lines, s.grid, folder / "picture.zarr", accuracy_db=-50.0).image()
     title = {"title": "A title"}
     text = {"title": "text"}
     optional = ("None",)
@@ -85,7 +86,7 @@ def pictures(folder: Path) -> dict[str, Call]:
         "plot.sharpness": Call(plot.sharpness, {"found": focused}),
         "plot.tradeoff": Call(plot.tradeoff, {"measured": measured(folder), **title}, kinds=text),
         "plot.mosaic": Call(
-            plot.mosaic, {"store": folder / "store.zarr", "most": 16, "borders": True}
+            plot.mosaic, {"store": folder / "picture.zarr", "most": 16, "borders": True}
         ),
         "plot.patch_borders": Call(
             plot.patch_borders, {"axes": axes(), "grid": s.grid, "patch_shape": (12, 10)}

@@ -376,7 +376,9 @@ def judge_error(
     text = str(error)
     allowed = (ValueError, TypeError, clsas.DeviceError)
     if paths and isinstance(error, OSError) and not isinstance(error, clsas.FileFormatError):
-        named = str(value.value)[:200] in f"{error.filename}{text}"
+        given = str(value.value)
+        named = given[:200] in f"{error.filename}{text}"  # or a folder of it that is missing
+        named |= bool(error.filename) and given.startswith(str(error.filename))
         return None if named or _names(text, names) else Failure("names no path", _said(error))
     if not isinstance(error, allowed) or isinstance(error, (np.linalg.LinAlgError, UnicodeError)):
         return Failure("wrong exception", _said(error))
