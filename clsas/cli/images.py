@@ -70,6 +70,7 @@ from clsas.signal.interpolation import MOST_UPSAMPLING, TAPS
 @options.levels
 @click.option("--profile", is_flag=True, help="Also report the time of every kernel.")
 @options.as_json
+@options.refusing_unreached
 def image(
     lines_file: Path,
     output: Path,
@@ -218,7 +219,8 @@ def _exactly(
     why, warned = "", False
     if chosen is not None and isinstance(chosen.image, ExactImage):
         request = {"accuracy_db": chosen.image.accuracy_db}
-        why = f"exact: nothing faster within {chosen.tolerance_db:.4g} dB; "
+        if chosen.tolerance_db is not None:
+            why = f"exact: nothing faster within {chosen.tolerance_db:.4g} dB; "
         warned = chosen.kept["warned"]
     preparation = prepare(lines, grid, device=device, beam=beam, **request)
     if chosen is None:  # otherwise the plan has warned

@@ -79,6 +79,7 @@ _LISTED = 3  # patches that are listed for each kind of defect
 @options.levels
 @click.option("--borders", is_flag=True, help="Draw the borders of the patches into the picture.")
 @options.as_json
+@options.refusing_unreached
 def mosaic(
     scene: Path | None,
     exact: bool,

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+import warnings
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -15,6 +17,7 @@ from clsas.files.hdf5 import SUFFIXES
 from clsas.planning.planner import BEST_TOLERANCE_DB, WORST_TOLERANCE_DB, wavelengths
 from clsas.products.plot.canvas import SUFFIXES as PICTURES
 from clsas.sonar.beam import SHAPES
+from clsas.sonar.coverage import UnreachedWarning
 
 
 def checked(check: Callable[[Any], object]) -> Callable:
@@ -45,6 +48,25 @@ def picture(what: str) -> Callable:
         "--picture", "--png", "picture", type=Output(*PICTURES),
         help=f"Also draw {what}, as PNG, PDF or SVG after the file's name.",
     )  # fmt: skip
+
+
+def refusing_unreached(command: Callable) -> Callable:
+    """Let a command refuse grids that no line reaches, unless --allow-unreached is given."""
+
+    @functools.wraps(command)
+    def run(*args: Any, allow_unreached: bool, **given: Any) -> Any:
+        with warnings.catch_warnings():
+            if not allow_unreached:
+                warnings.simplefilter("error", UnreachedWarning)
+            try:
+                return command(*args, **given)
+            except UnreachedWarning as error:
+                raise ValueError(f"{error}. --allow-unreached forms it all the same") from None
+
+    return click.option(
+        "--allow-unreached", is_flag=True,
+        help="Form the image even if no line reaches any pixel: it is then zero.",
+    )(run)  # fmt: skip
 
 
 def _together(*options: Callable) -> Callable:

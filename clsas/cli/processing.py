@@ -35,6 +35,7 @@ from clsas.processing.record import StepRecord
 )
 @options.device
 @options.as_json
+@options.refusing_unreached
 def process(
     scene: Path,
     lines_path: Path | None,

@@ -79,7 +79,7 @@ def tapered_ends(lines: RangeLines, length_m: float, name: str = "length_m") -> 
 
 def without_background(lines: RangeLines, statistic: str, receivers: int | None) -> RangeLines:
     """Subtract what all pings have in common; see `RangeLines.without_background`."""
-    validate.one_of("statistic", statistic, STATISTICS)
+    statistic = validate.one_of("statistic", statistic, STATISTICS)
     count = _receivers(lines) if receivers is None else validate.count("receivers", receivers)
     pings, rest = divmod(lines.channels, count)
     if rest or pings < 2:
@@ -107,8 +107,7 @@ def without_background(lines: RangeLines, statistic: str, receivers: int | None)
 
 def weighted(lines: RangeLines, weights: ArrayLike) -> RangeLines:
     """Multiply every channel by its weight; see `RangeLines.weighted`."""
-    dtype = np.complex64 if np.iscomplexobj(weights) else np.float32
-    factors: NDArray = validate.array("weights", weights, dtype, (lines.channels,))
+    factors = validate.real_or_complex("weights", weights, np.complex64, (lines.channels,))
     with np.errstate(over="ignore", invalid="ignore"):
         samples = lines.samples * factors[:, None]
     if not np.isfinite(samples).all():

@@ -41,15 +41,18 @@ def level_db(values: NDArray, reference: float | None = None) -> NDArray[np.floa
         If `reference` is not a positive number.
     """
     if reference is not None:
-        validate.positive("reference", reference)
+        reference = validate.positive("reference", reference)
     scale, amplitude = _scaled_amplitude(values)
     if not scale:
         return np.full(amplitude.shape, -np.inf, np.float32)
-    unit = float(amplitude.max()) if reference is None else reference / scale
+    if reference is None:
+        unit_db = 20 * math.log10(float(amplitude.max()))
+    else:  # a quotient of extremes is no float
+        unit_db = 20 * (math.log10(reference) - math.log10(scale))
     with np.errstate(divide="ignore"):
         level = np.log10(amplitude, out=amplitude)
     level *= np.float32(20)
-    level -= np.float32(20 * math.log10(unit))
+    level -= np.float32(unit_db)
     return level
 
 

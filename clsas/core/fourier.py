@@ -9,6 +9,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import erfc
 
+from clsas.core import validate
+
 _EDGE_SIGMAS = 5.3  # half the width of a smooth edge, standard deviations; 6e-8 (-145 dB) remain
 
 EDGE_PRODUCT = _EDGE_SIGMAS**2 / np.pi
@@ -62,6 +64,7 @@ def fourier_integral(
     edges = np.asarray(edges, dtype=np.float64)
     at = np.asarray(at, dtype=np.float64)
     fastest = rate + np.max(np.abs(at), initial=0.0)
+    validate.memory("frequency_hz", 400 * fastest * (edges[-1] - edges[0]))  # of 16 points a panel
     panels = np.ceil(fastest * np.diff(edges) / 2).astype(int) + 1
     ends = np.concatenate(
         [

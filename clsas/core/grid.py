@@ -87,12 +87,14 @@ class Grid:
             value = validate.array(name, getattr(self, name), np.float64, shape)
             object.__setattr__(self, name, value)
 
+        counts = validate.entries("shape", self.shape, "whole numbers of pixels per axis")
         try:
-            shape = tuple(validate.count("every entry of shape", n) for n in self.shape)
+            shape = tuple(validate.count("every entry of shape", n) for n in counts)
         except TypeError:
             raise TypeError(
                 f"shape must be whole numbers of pixels per axis, got {validate.shown(self.shape)}"
             ) from None
+        validate.memory("shape", 8 * max(shape, default=0))
         object.__setattr__(self, "shape", shape)
 
         plane = ("origin_m", "row_step_m", "column_step_m")
@@ -183,8 +185,9 @@ class Grid:
             If the points are not finite real numbers, there is none, or the last axis does not have
             length 3.
         """
-        shape = (*(None,) * max(np.ndim(points_m) - 1, 1), 3)
-        checked = validate.array("points_m", points_m, np.float64, shape)
+        given = validate.array("points_m", points_m, np.float64, None)
+        shape = (*(None,) * max(given.ndim - 1, 1), 3)
+        checked = validate.array("points_m", given, np.float64, shape)
         return cls(None, None, None, checked.shape[:-1], points_m=checked)
 
     def with_height(self, height_m: ArrayLike) -> Self:
@@ -197,6 +200,7 @@ class Grid:
         """
         if not self.is_planar:
             raise ValueError("height_m can be put only on a plane, and once")
+        height_m = validate.array("height_m", height_m, np.float64, self.shape)
         return type(self)(
             self.origin_m, self.row_step_m, self.column_step_m, self.shape, height_m=height_m
         )
@@ -299,7 +303,14 @@ class Grid:
         ----------
         rows, columns : slice
             Rows and columns to return (the first two axes of points).
+
+        Raises
+        ------
+        TypeError, ValueError
+            If `rows` or `columns` is not a slice of whole numbers.
         """
+        validate.selection("rows", rows)
+        validate.selection("columns", columns)
         if self.points_m is not None:
             return self.points_m[self._index(rows, columns)].copy()
         origin_m, row_step_m, column_step_m = self.vectors_m
@@ -311,7 +322,14 @@ class Grid:
         return positions
 
     def at(self, index: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the positions of pixels with row-major indices, float64 [..., 3], metres."""
+        """Return the positions of pixels with row-major indices, float64 [..., 3], metres.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If the indices are not whole numbers from 0 to below `size`.
+        """
+        index = validate.indices("index", index, self.size)
         if self.points_m is not None:
             return self.points_m.reshape(-1, 3)[index]
         origin_m, row_step_m, column_step_m = self.vectors_m
@@ -322,8 +340,17 @@ class Grid:
         return positions
 
     def spread(self, most: int) -> NDArray[np.float64]:
-        """Return sample points all over the grid, edges included, [n, 3]; up to `most` a side."""
-        indices = [np.unique(np.linspace(0, n - 1, most).round().astype(int)) for n in self.shape]
+        """Return sample points all over the grid, edges included, [n, 3]; up to `most` a side.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If `most` is not a whole number of at least 1.
+        """
+        most = validate.count("most", most)
+        indices = [
+            np.unique(np.linspace(0, n - 1, min(most, n)).round().astype(int)) for n in self.shape
+        ]
         return self.at(np.ravel_multi_index(np.ix_(*indices), self.shape).ravel())
 
     def window(self, rows: slice = _ALL, columns: slice = _ALL) -> Self:
@@ -336,12 +363,12 @@ class Grid:
         Raises
         ------
         TypeError
-            If `rows` or `columns` is not a slice.
+            If `rows` or `columns` is not a slice of whole numbers.
         ValueError
             If nothing is selected.
         """
-        validate.instance("rows", rows, slice)
-        validate.instance("columns", columns, slice)
+        validate.selection("rows", rows)
+        validate.selection("columns", columns)
         if self.points_m is not None:
             return self.points(self.points_m[self._index(rows, columns)])
         row, column = (range(n)[s] for n, s in zip(self.shape, (rows, columns), strict=True))
@@ -383,11 +410,13 @@ def _axis(name: str, axis: tuple[float, float, int]) -> tuple[float, float, int]
         if start != stop:
             raise ValueError(f"{name} must be one position for 1 pixel, got {start} m to {stop} m")
         return start, 0.0, count
-    if start == stop:
+    step = (stop - start) / (count - 1)
+    if step == 0 or not math.isfinite(step):  # also of a distance beyond float64
         raise ValueError(
-            f"{name} must end elsewhere than it starts, got {count} pixels at {start} m"
+            f"{name} must end elsewhere than it starts, got {count} pixels from {start} m to "
+            f"{stop} m"
         )
-    return start, (stop - start) / (count - 1), count
+    return start, step, count
 
 
 def _check_steps(

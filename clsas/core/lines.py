@@ -178,25 +178,38 @@ class RangeLines:
 
         Raises
         ------
-        IndexError
-            If an index is out of range.
         TypeError
             If `channels` is neither a slice nor whole numbers nor bools.
         ValueError
-            If nothing is selected.
+            If an index is out of range, a mask is not one bool per channel, or nothing is selected.
         """
-        index: slice | NDArray[np.int64]
-        if isinstance(channels, slice):
-            index = channels
-        else:
-            index = np.atleast_1d(channels)
-            if index.size == 0:
-                raise ValueError("channels must select at least one line, got none")
-            if index.dtype.kind not in "iub":
-                got = validate.shown(channels)
-                raise TypeError(f"channels must be a slice, whole numbers or bools, got {got}")
+        index = self._index(channels)
+        if len(range(self.channels)[index] if isinstance(index, slice) else index) == 0:
+            raise ValueError("channels must select at least one line, got none")
         of_channels = {name: values[index] for name, values in self.per_channel.items()}
         return replace(self, samples=self.samples[index], **of_channels)
+
+    def _index(self, channels: slice | ArrayLike) -> slice | NDArray[np.int64]:
+        """Return checked channels: a slice, or indices [n]."""
+        if isinstance(channels, slice):
+            return validate.selection("channels", channels)
+        try:
+            given = np.atleast_1d(channels)
+        except ValueError as error:
+            raise ValueError(f"channels must be a regular array: {error}") from None
+        if given.ndim != 1:
+            raise ValueError(f"channels must have one axis, got shape {given.shape}")
+        given = given if given.size else given.astype(int)
+        if given.dtype.kind not in "iub":
+            got = validate.shown(channels)
+            raise TypeError(f"channels must be a slice, whole numbers or bools, got {got}")
+        if given.dtype.kind != "b":
+            return validate.indices("channels", given, self.channels, least=-self.channels)
+        if len(given) != self.channels:
+            raise ValueError(
+                f"channels must be one bool for each of {self.channels} channels, got {len(given)}"
+            )
+        return np.flatnonzero(given)
 
     def high_passed(self, cutoff_hz: float) -> RangeLines:
         """Return the lines without frequencies below a cutoff.

@@ -142,7 +142,9 @@ def without_still_pings(lines: RangeLines, least_advance_m: float | None) -> Ran
     kept = found.advancing(least_advance_m)
     if kept.sum() < min(2, found.count):
         near = (
-            "are at one place" if least_advance_m is None else f"lie within {least_advance_m:g} m"
+            "are at one place"
+            if least_advance_m is None
+            else f"lie within least_advance_m = {least_advance_m:g} m"
         )
         raise ValueError(
             f"lines must be of a platform that moves: of {found.count} pings ({lines.channels} "

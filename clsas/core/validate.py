@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import math
+import operator
 import os
 import re
 import reprlib
@@ -33,6 +34,7 @@ _GROUP_LIMITS = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limi
 
 MOST_HZ, MOST_M_S = 1e15, 3e8
 """Largest frequency and speed of waves that recordings may have: those of light."""
+_MOST_COUNT = 2**63 - 1
 _MOST_CYCLES = 1e10  # of phase: float64 holds them to 1e-6 of a cycle
 
 _T = TypeVar("_T")
@@ -42,14 +44,14 @@ class ClsasWarning(UserWarning):
     """The result is valid but probably not the intended one."""
 
 
-def warn(message: str) -> None:
+def warn(message: str, category: type[ClsasWarning] = ClsasWarning) -> None:
     """Warn with a ClsasWarning that points at the first caller outside clsas."""
     level = 2
     frame = sys._getframe(1)
     while frame.f_back is not None and frame.f_globals["__name__"].split(".")[0] == "clsas":
         frame = frame.f_back
         level += 1
-    warnings.warn(message, ClsasWarning, stacklevel=level)
+    warnings.warn(message, category, stacklevel=level)
 
 
 def number(
@@ -109,23 +111,44 @@ def positive(name: str, value: float, unit: str = "") -> float:
 
 
 def count(name: str, value: int, *, least: int = 1, most: int | None = None) -> int:
-    """Return `value` as an int from `least` to `most`; raises TypeError or ValueError."""
-    if isinstance(value, bool) or not isinstance(value, (int, np.integer)):
-        raise TypeError(f"{name} must be a whole number, got {shown(value)}")
-    if value < least:
+    """Return `value` as an int from `least` to `most`; raises TypeError or ValueError.
+
+    Without `most` the largest is that of a 64-bit integer, which sizes of arrays cannot exceed.
+    """
+    try:
+        if isinstance(value, (bool, np.bool_)) or np.ma.is_masked(value):
+            raise TypeError
+        result = operator.index(value)  # of Python's and NumPy's integers, and 0-d arrays of them
+    except TypeError:
+        raise TypeError(f"{name} must be a whole number, got {shown(value)}") from None
+    if result < least:
         raise ValueError(f"{name} must be at least {least}, got {shown(value)}")
-    if most is not None and value > most:
+    most = _MOST_COUNT if most is None else most
+    if result > most:
         raise ValueError(f"{name} must be at most {most}, got {shown(value)}")
-    return int(value)
+    return result
 
 
-def one_of(name: str, value: _T, allowed: Sequence[_T]) -> _T:
-    """Return `value`; raises ValueError unless it is one of `allowed`."""
-    if value not in allowed:
-        raise ValueError(
-            f"{name} must be one of {', '.join(map(repr, allowed))}, got {shown(value)}"
-        )
-    return value
+def flag(name: str, value: object) -> bool:
+    """Return `value` as a bool; raises TypeError unless it is one of Python or NumPy."""
+    if not isinstance(value, (bool, np.bool_)):
+        raise TypeError(f"{name} must be of type bool, got {type(value).__name__}")
+    return bool(value)
+
+
+def one_of(name: str, value: object, allowed: Sequence[_T]) -> _T:
+    """Return the one of `allowed` that equals `value`; raises ValueError if there is none.
+
+    NumPy's scalars equal Python's; a float never equals a whole number, nor a bool.
+    """
+    if isinstance(value, (np.generic, np.ndarray)) and value.ndim == 0:
+        value = value.item()
+    for each in allowed:
+        alike = isinstance(value, type(each)) and isinstance(value, bool) is isinstance(each, bool)
+        if alike and value == each:
+            return each
+    names = ", ".join(map(repr, allowed))
+    raise ValueError(f"{name} must be one of {names}, got {shown(value)}")
 
 
 def named(name: str, values: object, allowed: Sequence[str]) -> tuple[str, ...]:
@@ -135,6 +158,15 @@ def named(name: str, values: object, allowed: Sequence[str]) -> tuple[str, ...]:
     if not isinstance(values, Sequence):
         raise TypeError(f"{name} must be one or several of {tuple(allowed)}, got {shown(values)}")
     return tuple(one_of(f"every entry of {name}", each, allowed) for each in values)
+
+
+def entries(name: str, value: object, meaning: str) -> list[Any]:
+    """Return the entries of a sequence or array; raises TypeError for others, also for text."""
+    several = isinstance(value, (Sequence, np.ndarray)) and not isinstance(value, (str, bytes))
+    if not several or (isinstance(value, np.ndarray) and value.ndim == 0):
+        raise TypeError(f"{name} must be {meaning}, got {shown(value)}")
+    assert isinstance(value, (Sequence, np.ndarray))
+    return list(value)
 
 
 def instance(name: str, value: object, *kinds: type) -> None:
@@ -150,7 +182,57 @@ def path(name: str, value: object) -> Path:
         raise TypeError(f"{name} must be a path, got {shown(value)}")
     if not os.fspath(value):
         raise ValueError(f"{name} must be a path, got an empty one")
+    if not isinstance(os.fspath(value), str) or "\0" in os.fspath(value):
+        raise ValueError(f"{name} must be a path of text without NUL, got {shown(value)}")
     return Path(os.fspath(value))
+
+
+def text(name: str, value: object) -> str:
+    """Return `value`; raises TypeError unless it is text, ValueError if no file can hold it."""
+    if not isinstance(value, str):
+        raise TypeError(f"{name} must be text, got {shown(value)}")
+    try:
+        value.encode()
+    except UnicodeEncodeError:
+        raise ValueError(f"{name} must be text of Unicode characters, got {value!a}") from None
+    return str(value)
+
+
+def selection(name: str, value: object) -> slice:
+    """Return `value`; raises TypeError or ValueError unless it is a slice of whole numbers."""
+    instance(name, value, slice)
+    assert isinstance(value, slice)
+    try:
+        value.indices(0)
+    except (TypeError, ValueError) as error:
+        kind = TypeError if isinstance(error, TypeError) else ValueError
+        raise kind(f"{name} must be a slice of whole numbers, got {shown(value)}") from None
+    return value
+
+
+def indices(name: str, value: ArrayLike, count: int, *, least: int = 0) -> NDArray[np.int64]:
+    """Return `value` as whole numbers of any shape, from `least` to below `count`.
+
+    Raises
+    ------
+    TypeError
+        If the values are not whole numbers.
+    ValueError
+        If a value is outside its limits or masked, or the array is not regular.
+    """
+    try:
+        given = np.asarray(value)
+    except ValueError as error:
+        raise ValueError(f"{name} must be a regular array: {error}") from None
+    if given.dtype.kind not in "iu":
+        raise TypeError(f"{name} must be whole numbers, got {shown(value)}")
+    if np.ma.is_masked(value):
+        raise ValueError(f"{name} must hold no masked value, got {shown(value)}")
+    if given.size and not (least <= given.min() and given.max() < count):
+        raise ValueError(
+            f"{name} must be from {least} to {count - 1}, got {given.min()} to {given.max()}"
+        )
+    return given.astype(np.int64, copy=False)
 
 
 def suffix(name: str, value: Path, *allowed: str) -> None:
@@ -162,10 +244,15 @@ def suffix(name: str, value: Path, *allowed: str) -> None:
         raise ValueError(f"{name} must end in {' or '.join(allowed)}, got {shown(str(value))}")
 
 
+def function(name: str, given: object) -> None:
+    """Raise TypeError unless `given` is callable or None."""
+    if not (given is None or callable(given)):
+        raise TypeError(f"{name} must be a function or None, got {shown(given)}")
+
+
 def progress(given: object) -> None:
     """Raise TypeError unless `given`, a progress argument, is callable or None."""
-    if not (given is None or callable(given)):
-        raise TypeError(f"progress must be a function or None, got {shown(given)}")
+    function("progress", given)
 
 
 def shown(value: object) -> str:
@@ -247,7 +334,8 @@ def phase(carrier_hz: float, sound_speed_m_s: float, farthest_m: float) -> None:
     if not cycles <= _MOST_CYCLES:  # nor NaN
         raise ValueError(
             f"carrier_hz = {carrier_hz:g} Hz makes {cycles:.3g} cycles over {farthest_m:g} m "
-            f"at {sound_speed_m_s:g} m/s; float64 holds the phase of {_MOST_CYCLES:g}"
+            f"at sound_speed_m_s = {sound_speed_m_s:g} m/s; float64 holds the phase of "
+            f"{_MOST_CYCLES:g}"
         )
 
 
@@ -255,7 +343,7 @@ def array(
     name: str,
     value: ArrayLike,
     dtype: DTypeLike,
-    shape: tuple[int | None, ...],
+    shape: tuple[int | None, ...] | None,
     *,
     broadcast: bool = False,
 ) -> NDArray:
@@ -270,8 +358,9 @@ def array(
         caller's own array is never modified.
     dtype : dtype
         Required type. Real arrays are refused for complex types, and the reverse.
-    shape : tuple of int or None
-        Required shape; None stands for any length of at least 1.
+    shape : tuple of int or None, or None
+        Required shape; None within it stands for any length of at least 1. None in its place allows
+        any shape, also an empty one.
     broadcast : bool
         True repeats a value of shape `shape[1:]` along the first axis.
 
@@ -292,6 +381,8 @@ def array(
         given = np.asarray(value)
     except ValueError as error:
         raise ValueError(f"{name} must be a regular array: {error}") from None
+    except TypeError as error:  # an object whose own conversion fails
+        raise TypeError(f"{name} must be an array of numbers: {error}") from None
     if given.dtype.kind not in ("c" if dtype.kind == "c" else "iuf"):
         wanted = "complex" if dtype.kind == "c" else "real"
         got = given.dtype if given.ndim else type(value).__name__
@@ -304,7 +395,9 @@ def array(
     if np.ma.is_masked(value):
         masked = np.ma.count_masked(value)
         raise ValueError(f"{name} must hold no masked value, got {masked} of {given.size}")
-    if broadcast and given.shape == shape[1:]:
+    if shape is None:
+        shape = given.shape
+    elif broadcast and given.shape == shape[1:]:
         given = np.broadcast_to(given, (shape[0] or 1, *given.shape))
     fits = given.ndim == len(shape) and all(
         have == want or (want is None and have > 0)
@@ -316,7 +409,7 @@ def array(
     if given.dtype.kind in "fc" and np.can_cast(dtype, given.dtype) and dtype != given.dtype:
         _check_narrowing(name, given, dtype)
     with np.errstate(over="ignore", under="ignore"):
-        result = np.ascontiguousarray(given, dtype=dtype)
+        result = np.asarray(given, dtype=dtype, order="C")  # keeps arrays of no axis
     with np.errstate(over="ignore", invalid="ignore"):
         finite = np.isfinite(np.add.reduce(result, axis=None))  # or the sum overflowed
     if not finite and not np.isfinite(result).all():
@@ -329,6 +422,25 @@ def array(
     result = result.view()
     result.flags.writeable = False
     return result
+
+
+def real_or_complex(
+    name: str,
+    value: ArrayLike,
+    dtype: DTypeLike = np.complex128,
+    shape: tuple[int | None, ...] | None = None,
+    *,
+    broadcast: bool = False,
+) -> NDArray:
+    """Return `value` as `array` does: of a complex type, or the real counterpart if it is real."""
+    try:
+        given = np.asarray(value).dtype
+    except (TypeError, ValueError):  # the check below refuses it
+        given = np.dtype(dtype)
+    if given.kind not in "iufc":
+        raise TypeError(f"{name} must be real or complex numbers, got {given}")
+    kind = np.dtype(dtype) if given.kind == "c" else np.zeros((), dtype).real.dtype
+    return array(name, value, kind, shape, broadcast=broadcast)
 
 
 def _check_narrowing(name: str, given: NDArray, dtype: np.dtype) -> None:

@@ -16,6 +16,7 @@ from clsas.opencl.device import Device, open_device
 from clsas.signal.ambiguity import BEST_DB, ambiguity
 from clsas.signal.spectrum import measure_spectrum
 from clsas.sonar.beam import BeamWindow
+from clsas.sonar.coverage import reaches
 from clsas.sonar.simplify import simplify
 
 BEST_ACCURACY_DB = BEST_DB
@@ -150,9 +151,11 @@ def prepare(
     device = open_device(device)
     spectrum = measure_spectrum(model.lines, model.grid)
     left_open = ambiguity(model.lines, model.grid, spectrum, model.beam, along)
+    is_reached = reaches(model.lines, model.grid, model.beam, along)
     decision = decide(
         model.lines,
-        model.grid,
+        # Nothing is formed: far away, all pixels would take long to lay out.
+        model.grid if is_reached else Grid.points(model.grid.spread(1)),
         device=device,
         accuracy_db=accuracy_db,
         spectrum=spectrum,
@@ -175,6 +178,7 @@ def prepare(
         given_grid=grid,
         left_out=model.left_out,
         left_out_error=model.error,
+        is_reached=is_reached,
     )
 
 

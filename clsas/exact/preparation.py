@@ -50,6 +50,8 @@ class Preparation:
         Effects that `lines` and `grid` leave out: see `clsas.sonar.simplify`.
     left_out_error : float
         Error power that this adds.
+    is_reached : bool
+        False if no line reaches any pixel: the image is zero, and `layout` that of a single pixel.
     """
 
     device: Device
@@ -67,6 +69,7 @@ class Preparation:
     given_grid: Grid | None = None
     left_out: tuple[str, ...] = ()
     left_out_error: float = 0.0
+    is_reached: bool = True
 
     @property
     def predicted_error_db(self) -> float:

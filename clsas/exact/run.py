@@ -33,7 +33,7 @@ from clsas.opencl.buffers import (
 )
 from clsas.opencl.kernels import Kernel
 from clsas.sonar.beam import INTERVALS, normalising
-from clsas.sonar.coverage import warn_unseen
+from clsas.sonar.coverage import warn_unreached
 from clsas.sonar.visibility import BeamTrack
 
 _SINE_ROUNDING = 1e-5  # more than the device's rounding error of a sine
@@ -61,7 +61,11 @@ def execute(
     """
     validate.progress(progress)
     p = preparation
-    layout, device = p.layout, p.device
+    layout, device, grid = p.layout, p.device, p.given_grid or p.grid
+    if not p.is_reached:
+        if not warned:
+            warn_unreached(p.lines, grid, p.beam, p.along)
+        return Image(np.zeros(grid.shape, np.complex64), grid)
     pixels = np.empty(layout.parts * layout.part_pixels, np.complex64)
     normalise = p.beam is not None and p.beam.normalise
     try:
@@ -80,9 +84,9 @@ def execute(
                 pixels[part] *= normalising(sums.real, p.lines.channels)
     finally:
         device.finish()  # an interrupted run leaves nothing in use
-    image = Image(layout.collect(pixels), p.given_grid or p.grid)
-    if not warned and not holds_any(image.pixels) and p.lines.samples.any():
-        warn_unseen(p.lines, layout.centres_m(slice(None)), p.beam, p.along)
+    image = Image(layout.collect(pixels), grid)
+    if not warned and not holds_any(image.pixels):
+        warn_unreached(p.lines, grid, p.beam, p.along)
     return image
 
 

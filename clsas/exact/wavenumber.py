@@ -17,7 +17,7 @@ from clsas.exact.checks import check_numbers
 from clsas.exact.migration import migrate
 from clsas.exact.straight_track import Aspects, Band, StraightTrack, aspects_of, band_of, straighten
 from clsas.sonar.beam import BeamWindow
-from clsas.sonar.coverage import warn_unseen
+from clsas.sonar.coverage import reaches, warn_unreached
 
 _STRAIGHT = 1e-3  # wavelengths: smaller errors cause no warning
 
@@ -99,7 +99,7 @@ def wavenumber(
     validate.instance("lines", lines, RangeLines)
     validate.instance("grid", grid, Grid)
     validate.instance("beam", beam, BeamWindow, type(None))
-    validate.instance("motion_compensation", motion_compensation, bool)
+    validate.flag("motion_compensation", motion_compensation)
     workers = validate.count("workers", (os.cpu_count() or 1) if workers is None else workers)
     if not grid.is_planar:
         kind = "heights" if grid.points_m is None else "points"
@@ -114,10 +114,9 @@ def wavenumber(
     if aspects is not None:
         first_m, last_m = track.reach_m(aspects.low, aspects.high)
         visible = (track.along_m >= first_m) & (track.along_m <= last_m)
-    if aspects is None or not visible.any():
+    if aspects is None or not visible.any() or not reaches(lines, grid, None, None):
         along = None if beam is None else beam.directions(lines)
-        some = (slice(None, None, max(count // 32, 1)) for count in grid.shape)
-        warn_unseen(lines, grid.positions_m(*some).reshape(-1, 3), beam, along)
+        warn_unreached(lines, grid, beam, along)
         return Image(np.zeros(grid.shape, np.complex64), grid)
     _warn_bent(lines, grid, track, aspects, band, motion_compensation)
     on_line = replace(track, along_m=track.along_m[visible], shift_m=track.shift_m[visible])

@@ -8,7 +8,7 @@ from dataclasses import replace
 from clsas.core.digests import grid_digest, lines_digest
 from clsas.core.grid import Grid
 from clsas.core.lines import RangeLines
-from clsas.factorized.plan import Plan
+from clsas.factorized.plan import COVERAGE, Plan
 from clsas.sonar.beam import BeamWindow
 from clsas.sonar.simplify import Model, leave_out
 
@@ -49,5 +49,5 @@ def without_left_out(plan: Plan, lines: RangeLines, grid: Grid) -> tuple[RangeLi
     geometry, simple_grid, simpler = plan.kept["model"]
     simple_lines = replace(geometry, samples=lines.samples)
     simpler.kept["lines"] = weakref.ref(simple_lines)  # the given lines' band is theirs
-    simpler.kept["warned"] = plan.kept.get("warned", False)
+    simpler.kept.update({name: plan.kept[name] for name in COVERAGE if name in plan.kept})
     return simple_lines, simple_grid, simpler

@@ -9,6 +9,7 @@ import weakref
 from dataclasses import replace
 from typing import Annotated, Any, Literal, TypeAlias
 
+import numpy as np
 from pydantic import Field, TypeAdapter, ValidationError
 from pydantic.dataclasses import dataclass
 
@@ -30,6 +31,8 @@ from clsas.factorized.fields import (
 )
 from clsas.sonar.simplify import EFFECTS
 
+COVERAGE = ("reached", "warned")
+"""Entries of `Plan.kept`: whether any line reaches the grid, and whether a warning said no."""
 VERSION = 4
 """Version of a plan's JSON. Version 1, of clsas before 0.1.0, had no number; version 2 had one mean
 track; version 3 did not tell the origin of costs."""
@@ -237,8 +240,9 @@ class Plan:
         TypeError, ValueError
             If there is no such field, or its value is not allowed.
         """
+        plain = {name: _without_numpy(value) for name, value in fields.items()}
         try:
-            return replace(self, image=replace(self.image, **fields))
+            return replace(self, image=replace(self.image, **plain))
         except ValidationError as error:
             raise ValueError(explained(error, fields)) from None
 
@@ -247,10 +251,16 @@ class Plan:
 
         For navigation, which forms many images of the same samples. The predictions hold as far as
         both tracks are equally smooth.
+
+        Raises
+        ------
+        TypeError
+            If `lines` is not a RangeLines.
         """
+        validate.instance("lines", lines, RangeLines)
         plan = replace(self, lines_digest=lines_digest(lines))
         plan.kept["lines"] = weakref.ref(lines)  # their band is that of the plan
-        plan.kept["warned"] = self.kept.get("warned", False)
+        plan.kept.update({name: self.kept[name] for name in COVERAGE if name in self.kept})
         return plan
 
     def to_json(self, *, filters: bool = True) -> str:
@@ -262,6 +272,7 @@ class Plan:
             False leaves out the hundreds of coefficients of the filters. The text is then short,
             for people and logs, but no plan that `from_json` reads.
         """
+        validate.flag("filters", filters)
         # Lists and numbers as JSON has them.
         values = {"version": VERSION} | json.loads(json.dumps(_stored().dump_python(self)))
         if filters:
@@ -295,7 +306,9 @@ class Plan:
             raise ValueError(f"text must be a plan as of Plan.to_json: {error}") from error
 
     def check(self, lines: RangeLines, grid: Grid) -> None:
-        """Raise ValueError unless this plan was made for these lines and this grid."""
+        """Raise TypeError or ValueError unless this plan was made for these lines and this grid."""
+        validate.instance("lines", lines, RangeLines)
+        validate.instance("grid", grid, Grid)
         for name, mine, theirs in (
             ("lines", self.lines_digest, lines_digest(lines)),
             ("grid", self.grid_digest, grid_digest(grid)),
@@ -310,6 +323,11 @@ class Plan:
             most = abs(lines.carrier_cycles_per_m) + 1 / lines.range_step_m
             given = self.factorization.highest_cycles_per_m
             validate.number("highest_cycles_per_m", given, "cycles/m", most=most)
+
+
+def _without_numpy(value: Any) -> Any:
+    """Return a value of NumPy as Python's, which fields of plans are."""
+    return value.tolist() if isinstance(value, (np.generic, np.ndarray)) else value
 
 
 def _check_version(values: dict[str, Any]) -> None:

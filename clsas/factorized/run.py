@@ -41,7 +41,7 @@ from clsas.opencl.buffers import (
 )
 from clsas.opencl.device import Device, aligned
 from clsas.opencl.upsampling import upsample
-from clsas.sonar.coverage import warn_unseen
+from clsas.sonar.coverage import reaches, warn_unreached
 
 _GROUP = 64  # work-items that share a subimage where each has one lane
 _AHEAD_S = 0.1  # of enqueued work: hides the preparation of roots; an interruption waits for it
@@ -73,6 +73,13 @@ def form(
             warned=warned,
         )
     largest = check_numbers(lines, chosen.beam)
+    along = None if chosen.beam is None else chosen.beam.directions(lines)
+    if "reached" not in chosen.kept:
+        chosen.kept["reached"] = reaches(lines, grid, chosen.beam, along)
+    if not chosen.kept["reached"]:
+        if not warned:
+            warn_unreached(lines, grid, chosen.beam, along)
+        return Image(np.zeros(grid.shape, np.complex64), grid)
     pixels, done = aligned(np.empty, grid.shape, np.complex64), 0
     try:
         run = _Run(lines, grid, chosen, device.for_stages(), pixels, largest)
@@ -83,10 +90,8 @@ def form(
     finally:
         device.finish()  # an interrupted run leaves nothing in use
     image = Image(pixels, grid)
-    if not warned and not holds_any(pixels) and lines.samples.any():
-        corners_m = run.division.centres_m(0, run.division.roots)
-        along = None if chosen.beam is None else chosen.beam.directions(lines)
-        warn_unseen(lines, corners_m, chosen.beam, along)
+    if not warned and not holds_any(pixels):
+        warn_unreached(lines, grid, chosen.beam, along)
     return image
 
 

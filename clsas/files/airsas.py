@@ -90,7 +90,11 @@ def read_airsas(
                 "is an HDF5 file, but no scene of AirSAS: it must hold /na and microphones as "
                 f"/ch1, /ch2, got {validate.shown(sorted(file))}"
             )
-    folder = path.absolute().parent.parent / SHARED if shared is None else Path(shared)
+    folder = (
+        path.absolute().parent.parent / SHARED
+        if shared is None
+        else validate.path("shared", shared)
+    )
     parameters = _Parameters.read(folder / ACQUISITION)
     sensors_m = _sensors_m(folder / SENSORS)
     with hdf5.opened(path) as file:
@@ -232,7 +236,8 @@ def _microphones(path: Path, there: list[int], channels: Sequence[int] | None) -
         raise FileFormatError(f"{path} must hold microphones of {SENSORS} as /ch1, /ch2, got none")
     if channels is None:
         return there
-    numbers = [validate.count("channels", number) for number in channels]
+    given = validate.entries("channels", channels, "whole numbers of microphones")
+    numbers = [validate.count("every entry of channels", number) for number in given]
     if not numbers or not set(numbers) <= set(there):
         raise ValueError(f"channels must be of {there}, got {validate.shown(channels)}")
     return numbers

@@ -25,7 +25,7 @@ from clsas.core.extras import install_command
 from clsas.core.lines import RangeLines
 from clsas.files.hdf5 import FileFormatError
 from clsas.files.positions import checked_positions
-from clsas.signal.compression import Window
+from clsas.signal.compression import Window, check_options
 from clsas.signal.phase_history import from_phase_history
 
 SPEED, ORIGIN = "clsas.sound_speed_m_s", "clsas.origin_m"
@@ -99,6 +99,9 @@ def read_cphd(
     """
     sarkit = sarkit_cphd()
     path = validate.path("path", path)
+    if channel is not None:
+        channel = validate.text("channel", channel)
+    check_options(window=window, oversampling=oversampling)
     with _defects(path):
         reading.check_ordinary(path)
     with path.open("rb") as file:

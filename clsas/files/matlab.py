@@ -11,7 +11,6 @@ import math
 import os
 import struct
 import zlib
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -57,7 +56,7 @@ def read_matlab(path: str | os.PathLike) -> dict[str, Any]:
     OSError
         If the file cannot be read.
     """
-    path = Path(path)
+    path = validate.path("path", path)
     try:
         reading.check_ordinary(path)
         validate.memory(str(path), path.stat().st_size)

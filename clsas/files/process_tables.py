@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -111,7 +111,7 @@ class ProcessTable(Table):
         return options
 
 
-def checked_steps(steps: Iterable[str] | None, options: dict[str, Any]) -> tuple[str, ...]:
+def checked_steps(steps: Sequence[str] | None, options: dict[str, Any]) -> tuple[str, ...]:
     """Return steps in their order; by default the usual ones, and those with options.
 
     Raises
@@ -122,7 +122,7 @@ def checked_steps(steps: Iterable[str] | None, options: dict[str, Any]) -> tuple
     if steps is None:
         chosen = {*_USUAL, *(name for name in CORRECTIONS if name in options)}
     else:
-        chosen = set(validate.named("steps", list(steps), STEPS))
+        chosen = set(validate.named("steps", steps, STEPS))
     if not chosen:
         raise ValueError(f"steps must name one or several of {STEPS}, got none")
     if "calibrate" in chosen and "calibrate" not in options:

@@ -176,8 +176,8 @@ class _Image(Table):
                 validate.number(
                     "accuracy_db", self.accuracy_db, "dB", least=BEST_ACCURACY_DB, below=0.0
                 )
-            if self.taps is not None and self.taps not in TAPS:
-                raise ValueError(f"taps must be one of {TAPS}, got {self.taps}")
+            if self.taps is not None:
+                validate.one_of("taps", self.taps, TAPS)
             if self.upsampling is not None:
                 validate.number("upsampling", self.upsampling, least=1.0, most=MOST_UPSAMPLING)
         if self.stages is not None:

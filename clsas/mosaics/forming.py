@@ -30,6 +30,7 @@ from clsas.opencl.device import Device
 from clsas.planning.factorize import factorize
 from clsas.planning.planner import plan, tolerance_in_db
 from clsas.sonar.beam import BeamWindow
+from clsas.sonar.coverage import reaches
 
 _WORTH_A_PLAN = 5e7  # pixels times channels; smaller patches are backprojected in less time
 _OPENING = threading.Lock()
@@ -166,6 +167,8 @@ def _image(
         beam = replace(job.beam, along=visibility.along[visible][~missing])
     if missing.any():
         lines = lines.select(~missing)
+    if not reaches(lines, grid, beam, None if beam is None else beam.along):
+        return Record(**known, seconds=time.perf_counter() - start), _empty(grid)
     _check_memory(job, lines, grid)
     image, how = _formed(job, lines, grid, beam, device)
     if beam is not None and beam.normalise:
@@ -190,7 +193,7 @@ def _formed(
         preparation.warn_of_ambiguity()
         error_db = max(accuracy_db, preparation.predicted_error_db)
         how = {"predicted_error_db": error_db, "memory_bytes": patch_bytes}
-        return execute(preparation), how
+        return execute(preparation, warned=True), how  # records say which patches are zero
     before = time.perf_counter()
     available = min(job.memory_bytes - patch_bytes, device.info.memory_bytes // 2)
     chosen = plan(lines, grid, **job.request, beam=beam, device=device, memory_bytes=available)
@@ -201,6 +204,7 @@ def _formed(
         "memory_bytes": patch_bytes + int(chosen.memory_bytes),
         "plan": json.loads(_without_directions(chosen).to_json()),
     }
+    chosen.kept["warned"] = True
     return factorize(lines, grid, chosen, device=device), how
 
 

@@ -35,6 +35,7 @@ from clsas.mosaics.visibility import SurveyVisibility
 from clsas.opencl.device import Device
 from clsas.planning.planner import TOLERANCE_DB, checked_pairs, tolerance_in_db
 from clsas.sonar.beam import BeamWindow
+from clsas.sonar.coverage import warn_unreached
 from clsas.sonar.directions import MOST_TRACK_PINGS
 
 if TYPE_CHECKING:
@@ -191,8 +192,7 @@ class Mosaic:
             If the image does not fit into this machine's memory, or a patch cannot be imaged; the
             message names the patch.
         """
-        if not (tell is None or callable(tell)):
-            raise TypeError(f"tell must be a function or None, got {tell!r}")
+        validate.function("tell", tell)
         validate.memory("the mosaic", 8 * self.grid.size)
         stored = [self._patch(index, record, None) for index, record in self.finished.items()]
         pixels: NDArray[np.complex64] | None = None
@@ -316,7 +316,9 @@ def mosaic(
         wait_for_first_file(growth)
     survey = open_survey(source if isinstance(source, RangeLines) else source.resolve())
     visibility = SurveyVisibility.of(survey, beam)
-    opened = None if store is None else Store.at(store)
+    if growth is None and not visibility.channels(grid).any():
+        warn_unreached(survey.geometry, grid, beam, visibility.along, survey.span_m)
+    opened = None if store is None else Store.at(validate.path("store", store))
     inputs = {} if opened is None else inputs_of(survey, grid, request, beam)
     if patch_shape is None:
         stored = None if opened is None else opened.patch_shape
@@ -346,16 +348,20 @@ def _checked_request(
 ) -> dict[str, Any]:
     """Return the one of `REQUESTS` that is given, checked, or the default tolerance."""
     given = (tolerance_db, tolerance_wavelengths, stages, accuracy_db)
-    request = {
+    request: dict[str, Any] = {
         name: value for name, value in zip(REQUESTS, given, strict=True) if value is not None
     }
     if len(request) > 1:
         raise ValueError(f"at most one of {', '.join(REQUESTS)} must be given, got {request}")
     tolerance_in_db(tolerance_db, tolerance_wavelengths)
-    if stages is not None:
-        checked_pairs(stages)
     if accuracy_db is not None:
         validate.number("accuracy_db", accuracy_db, "dB", least=BEST_ACCURACY_DB, below=0.0)
+    # Plain numbers, which records hold as JSON.
+    for name, value in request.items():
+        if name == "stages":
+            request[name] = checked_pairs(value)
+        elif not isinstance(value, (int, float)):
+            request[name] = float(value)
     return request or {"tolerance_db": TOLERANCE_DB}
 
 

@@ -109,7 +109,8 @@ def patch_shape_of(patches: tuple[int, int], grid: Grid) -> tuple[int, int]:
         If `patches` is not two whole numbers, or some patches would be empty.
     """
     try:
-        counts = tuple(validate.count("every entry of patches", n) for n in patches)
+        given = validate.entries("patches", patches, "(rows, columns) of patches")
+        counts = tuple(validate.count("every entry of patches", n) for n in given)
     except TypeError:
         raise TypeError(f"patches must be (rows, columns) of patches, got {patches!r}") from None
     if len(counts) != 2:

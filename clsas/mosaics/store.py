@@ -61,6 +61,10 @@ class Store:
 
     path: Path
 
+    def __post_init__(self) -> None:
+        """Check the path and convert it."""
+        object.__setattr__(self, "path", validate.path("path", self.path))
+
     def __repr__(self) -> str:
         """Return where the store is."""
         return reprs.summary(self, repr(str(self.path)))
@@ -75,7 +79,7 @@ class Store:
             If Zarr is not installed.
         """
         _arrays()
-        return cls(validate.path("store", path).resolve())
+        return cls(validate.path("path", path).resolve())
 
     @classmethod
     def opened(cls, path: str | os.PathLike) -> Store:
@@ -165,6 +169,10 @@ class Store:
             If the store cannot be written.
         """
         arrays = _arrays()
+        validate.instance("inputs", inputs, dict)
+        validate.instance("grid", grid, Grid)
+        for side in validate.entries("patch_shape", patch_shape, "(rows, columns)"):
+            validate.count("every side of patch_shape", side)
         check_place(self.path)
         if not is_there(self.path):
             arrays.create_store(self.path, inputs, grid, patch_shape)
@@ -182,6 +190,7 @@ class Store:
 
     def grow(self, inputs: dict[str, Any]) -> None:
         """Store the inputs of a survey that has grown."""
+        validate.instance("inputs", inputs, dict)
         attributes = read_document(self.path)
         if attributes["inputs"] != inputs:
             write_attributes(self.path, with_checksum(attributes | {"inputs": inputs}))
@@ -220,6 +229,7 @@ class Store:
         OSError
             If a file cannot be read.
         """
+        validate.function("tell", tell)
         found, indices = {}, self._indices()
         for done, index in enumerate(indices, 1):
             try:
@@ -246,6 +256,18 @@ class Store:
         OSError
             If the disk is full or the store is not writable.
         """
+        row, column = (
+            validate.count(name, index, least=0, most=most - 1)
+            for name, index, most in zip(("row", "column"), (row, column), self._shape, strict=True)
+        )
+        part = [
+            range(count)[validate.selection(name, given)]
+            for name, given, count in zip(
+                ("rows", "columns"), (rows, columns), self.pixels.shape, strict=True
+            )
+        ]
+        pixels = validate.array("pixels", pixels, np.complex64, tuple(map(len, part)))
+        validate.instance("record", record, Record)
         folder = self._folder((row, column))
         check_own(self.path, folder)
         # Remove the old record before the pixels that it belongs to are replaced.
@@ -267,6 +289,8 @@ class Store:
         OSError
             If a file cannot be read.
         """
+        validate.selection("rows", rows)
+        validate.selection("columns", columns)
         wanted = (
             len(range(n)[part]) for n, part in zip(self.pixels.shape, (rows, columns), strict=True)
         )

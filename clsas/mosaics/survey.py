@@ -70,6 +70,13 @@ class Survey:
         """Samples of every channel, [channels]."""
         return np.repeat(self.lengths, np.diff(self.begins))
 
+    @property
+    def span_m(self) -> tuple[float, float]:
+        """Nearest and farthest range of all channels, metres."""
+        first_m = self.geometry.first_range_m
+        last_m = first_m + (self.length - 1) * self.geometry.range_step_m
+        return float(first_m.min()), float(last_m.max())
+
     def digests(self, first: int = 0) -> list[str]:
         """Return a digest of geometry and samples of every part from number `first` on.
 

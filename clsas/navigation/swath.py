@@ -71,7 +71,7 @@ def checked_swath(
     element_length_m: float | tuple[float, float] | None,
 ) -> Swath:
     """Return the swath of checked arguments."""
-    validate.one_of("side", side, ("port", "starboard"))
+    side = validate.one_of("side", side, ("port", "starboard"))
     nearest, farthest = float(lines.first_range_m.max()), float(lines.last_range_m.min())
     if range_m is None:
         # Rays are read where every channel has samples, whatever it is displaced.
@@ -109,9 +109,8 @@ def checked_swath(
             )
     lengths = None
     if element_length_m is not None:
-        given = np.atleast_1d(validate.array(
-            "element_length_m", np.ravel(element_length_m), np.float64, (None,)))  # fmt: skip
-        if given.size > 2 or given.min() <= 0:
+        given = validate.array("element_length_m", element_length_m, np.float64, None).ravel()
+        if not 1 <= given.size <= 2 or given.min() <= 0:
             raise ValueError(
                 "element_length_m must be one or two lengths above 0 m, got "
                 f"{validate.shown(element_length_m)}"

@@ -19,7 +19,7 @@ import numpy as np
 import pyopencl as cl
 from numpy.typing import DTypeLike
 
-from clsas.core import reprs
+from clsas.core import reprs, validate
 from clsas.opencl.kernels import Kernel, kernel_parameters, kernel_source, whole_source
 from clsas.opencl.refusals import DeviceError, check_process, no_device, not_built
 
@@ -405,10 +405,12 @@ def choose(wish: str | int | None = None) -> tuple[DeviceInfo, str]:
     elif isinstance(wish, str):
         fitting = _named(wish.strip().lower(), devices)
     else:
-        raise TypeError(f"device must be a name, an index or None, got {wish!r}")
+        raise TypeError(f"device must be a name, an index or None, got {validate.shown(wish)}")
     if not fitting:
         have = "; ".join(f"{info.index}: {info.label}" for info in devices)
-        raise DeviceError(f"No device matches {wish!r}, asked for{source}. Available: {have}")
+        raise DeviceError(
+            f"No device matches {validate.shown(wish)}, asked for{source}. Available: {have}"
+        )
     return _first(fitting), f"asked for{source} as {wish!r}"
 
 

@@ -40,7 +40,7 @@ from clsas.planning.search import MOST_STAGES, Allowed
 from clsas.planning.visibility_model import VisibilityModel
 from clsas.signal import interpolation
 from clsas.sonar.beam import BeamWindow
-from clsas.sonar.coverage import warn_unreached
+from clsas.sonar.coverage import reaches, warn_unreached
 from clsas.sonar.simplify import Model, simplify
 
 BEST_TOLERANCE_DB = -75.0
@@ -152,6 +152,7 @@ def plan(
         raise ValueError("taps and depth go with a tolerance, not with stages")
     if costs is not None:
         validate.instance("costs", costs, Costs)
+    validate.flag("full_model", full_model)
     device = open_device(device)
     known = stored_costs.load(device) if costs is None else KnownCosts(costs, "given")
     if memory_bytes is not None:
@@ -168,12 +169,18 @@ def plan(
     exact = expect(model, ACCURACY_DB if rest_db is None else rest_db - MARGIN_DB, device)
     # Exact imaging divides itself to fit a device.
     exact_fits = memory_bytes is None or exact.memory_bytes <= memory_bytes
-    searched = stages is None and _worth_a_search(exact, known.costs, exact_fits, allowed)
+    is_reached = reaches(lines, grid, beam, model.channels_along)
+    searched = (
+        is_reached and stages is None and _worth_a_search(exact, known.costs, exact_fits, allowed)
+    )
     if searched and known.source == "default":
         known = scaling.scaled(device)
     room = device.info.memory_bytes // 2 if memory_bytes is None else memory_bytes
     conditions = Conditions(of_passed_db, exact, device.for_stages(), known.costs, room)
-    found = _chosen(model, stages, conditions, exact_fits, allowed)
+    if is_reached:
+        found = _chosen(model, stages, conditions, exact_fits, allowed)
+    else:  # an image of zeros needs no search, nor memory
+        found = exact_plan(model, conditions, "no line reaches the grid")
     errors = found.errors
     if not found.is_exact:
         errors = errors.times(1 / model.ambiguity.brightness)
@@ -196,8 +203,10 @@ def plan(
     if scene.left_out:
         found = with_left_out(found, scene, lines, grid, beam)
     found.kept["lines"] = weakref.ref(lines)
-    # The image need not warn again.
-    found.kept["warned"] = warn_unreached(lines, grid, beam, model.channels_along)
+    found.kept["reached"] = is_reached
+    found.kept["warned"] = not is_reached  # the image need not warn again
+    if not is_reached:
+        warn_unreached(lines, grid, beam, model.channels_along)
     return found
 
 
@@ -301,16 +310,18 @@ def _allowed(taps: tuple[int, int] | None, depth: int | None) -> Allowed | None:
         return None
     fields = {}
     if taps is not None:
-        if not isinstance(taps, (tuple, list)) or len(taps) != 2:
-            raise TypeError(
-                f"taps must be two, in range and along the aperture, got {validate.shown(taps)}"
-            )
-        for each in taps:
+        meaning = "two, in range and along the aperture"
+        given = validate.entries("taps", taps, meaning)
+        if len(given) != 2:
+            raise TypeError(f"taps must be {meaning}, got {validate.shown(taps)}")
+        align, aperture = (
             validate.one_of("taps", validate.count("every entry of taps", each), ALIGN_TAPS)
-        fields = {"align_taps": (taps[0],), "aperture_taps": (taps[1],)}
+            for each in given
+        )
+        fields = {"align_taps": (align,), "aperture_taps": (aperture,)}
     if depth is not None:
-        validate.one_of("depth", validate.count("depth", depth), range(1, MOST_STAGES + 1))
-        fields["stages"] = (depth,)
+        depths = range(1, MOST_STAGES + 1)
+        fields["stages"] = (validate.one_of("depth", validate.count("depth", depth), depths),)
     return Allowed(**fields)
 
 
@@ -373,13 +384,13 @@ def _tile(model: VisibilityModel, leaf: tuple[int, int], device: Device) -> tupl
 
 def checked_pairs(stages: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
     """Return (QR, QI) of every stage; raises TypeError or ValueError if one is wrong."""
-    try:
-        pairs = [(stage[0], stage[1]) for stage in stages if len(stage) == 2]
-        whole = len(pairs) == len(stages)
-    except TypeError:
-        whole = False
-    if not whole:
-        raise TypeError(f"stages must be a sequence of (QR, QI), got {validate.shown(stages)}")
+    meaning = "a sequence of (QR, QI)"
+    pairs = [
+        validate.entries("stages", stage, meaning)
+        for stage in validate.entries("stages", stages, meaning)
+    ]
+    if any(len(pair) != 2 for pair in pairs):
+        raise TypeError(f"stages must be {meaning}, got {validate.shown(stages)}")
     return [
         (validate.count("QR of stages", beams), validate.count("QI of stages", divisions))
         for beams, divisions in pairs

@@ -287,7 +287,7 @@ class _Chain:
 def _outcome(name: str, job: Job) -> tuple[Outcome, tuple[str, ...]]:
     """Return the outcome of a step, and clsas's warnings; its errors get the step's name."""
     with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
+        warnings.simplefilter("always", append=True)  # after filters of the caller's
         try:
             outcome = RUN[name](job)
         except (TypeError, ValueError) as error:

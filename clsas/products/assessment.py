@@ -34,6 +34,7 @@ from clsas.products.effects import (
     track_errors_m,
 )
 from clsas.signal.compression import Window
+from clsas.signal.compression import check_options as check_compression
 from clsas.signal.spectrum import band_wavelength_m, measure_spectrum
 from clsas.simulation.scenes import PointTargets
 from clsas.simulation.simulator import simulate_lines
@@ -163,6 +164,9 @@ def _checked_survey(
         validate.instance("beam", beam, BeamWindow)
     validate.instance("sonar", sonar, Sonar, type(None))
     validate.instance("track", track, Track, type(None))
+    validate.instance("pointing", pointing, Pointing, type(None))
+    validate.flag("element_pattern", element_pattern)
+    validate.flag("ends", ends)
     if sonar is not None and track is not None and sonar.receivers * track.pings != lines.channels:
         raise ValueError(
             f"sonar and track must have the channels of the lines, {lines.channels}, got "
@@ -226,11 +230,13 @@ def survey_lines(
         As `clsas.simulate_lines` does.
     """
     geometry = channels(sonar, track, motion_in_flight=motion_in_flight)
-    if phase_centres:
+    validate.instance("grid", grid, Grid)
+    check_compression(window=window, oversampling=oversampling)
+    if validate.flag("phase_centres", phase_centres):
         middle_m = (geometry.tx_m + geometry.rx_m) / 2
         geometry = geometry._replace(tx_m=middle_m, rx_m=middle_m)
     pulse = sonar.pulse
-    step_m = sonar.sound_speed_m_s / (2 * oversampling * pulse.bandwidth_hz)
+    step_m = sonar.sound_speed_m_s / (2 * float(oversampling) * pulse.bandwidth_hz)
     range_m = pairwise_range_m(grid.spread(_POINTS), *geometry, sonar.sound_speed_m_s)
     first_m = range_m.min(axis=0) - _ROOM * step_m
     length = int(np.ceil((range_m.max(axis=0) - first_m).max() / step_m)) + _ROOM

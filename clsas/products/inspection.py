@@ -11,7 +11,7 @@ from clsas.core import validate
 from clsas.core.grid import Grid
 from clsas.core.lines import RangeLines
 from clsas.core.pings import Transmissions
-from clsas.opencl.device import Device
+from clsas.opencl.device import Device, open_device
 from clsas.products.inspection_result import Inspection, PhaseSign
 from clsas.products.phase_sign import check_sign, phase_sign
 from clsas.products.range_checks import check_ranges
@@ -91,6 +91,8 @@ def inspect(
         validate.instance("beam", beam, BeamWindow)
     if element_length_m is not None:
         element_length_m = validate.positive("element_length_m", element_length_m, "m")
+    if device is not None:  # whether it is used or not; none is needed to look at the track
+        device = open_device(device)
     # Compression would spread clipped samples over a line: levels are those of what was recorded.
     recorded, is_echoes = lines.samples, isinstance(lines, Echoes)
     given = compress(lines) if isinstance(lines, Echoes) else lines

@@ -189,9 +189,9 @@ def _find_peak(
 
 def _on_axes(grid: Grid, axes: tuple[Axis, Axis], near: Sequence[float]) -> NDArray[np.float64]:
     """Return where a place, given by two numbers or as a position, is on the axes, metres."""
-    if np.shape(near) != (3,):
-        return validate.array("near", near, np.float64, (2,))
-    position_m = validate.array("near", near, np.float64, (3,))
+    position_m = validate.array("near", near, np.float64, None)
+    if position_m.shape != (3,):
+        return validate.array("near", position_m, np.float64, (2,))
     origin_m, row_step_m, column_step_m = grid.vectors_m
     steps_m = np.stack([column_step_m, row_step_m], axis=1)
     index = np.linalg.lstsq(steps_m, position_m - origin_m, rcond=None)[0]

@@ -23,7 +23,7 @@ from clsas.factorized.filters import ALIGN_TAPS, APERTURE_TAPS
 from clsas.factorized.plan import Plan
 from clsas.opencl.device import Device, open_device
 from clsas.planning.factorize import factorize
-from clsas.planning.planner import plan
+from clsas.planning.planner import BEST_TOLERANCE_DB, WORST_TOLERANCE_DB, checked_pairs, plan
 from clsas.products.cuts import Cut
 from clsas.products.quality import measure_point
 from clsas.products.shadows import DARKEST, dark_level_db
@@ -95,8 +95,11 @@ def tradeoff(
     DeviceError
         If there is no such device.
     """
-    _check(lines, grid, stages, beam, repeats, study)
+    repeats = _check(lines, grid, beam, repeats, study)
     validate.progress(progress)
+    if stages is not None:
+        given = validate.entries("stages", stages, "a sequence of plans' (QR, QI)")
+        stages = [checked_pairs(each) for each in given]
     tolerances = _checked_tolerances(tolerances_db)
     device = open_device(device)
     requests = _requests(
@@ -142,28 +145,26 @@ class _Candidate:
     form: Callable[[], Image]
 
 
-def _check(
-    lines: object, grid: object, stages: object, beam: object, repeats: int, study: object
-) -> None:
-    """Raise TypeError or ValueError for arguments of a wrong kind."""
+def _check(lines: object, grid: object, beam: object, repeats: int, study: object) -> int:
+    """Raise TypeError or ValueError for arguments of a wrong kind; return the repeats."""
     validate.instance("lines", lines, RangeLines)
     validate.instance("grid", grid, Grid)
-    validate.count("repeats", repeats)
-    validate.instance("study", study, bool)
+    validate.flag("study", study)
     if beam is not None:
         validate.instance("beam", beam, BeamWindow)
-    if not (stages is None or isinstance(stages, Sequence)):
-        raise TypeError(
-            f"stages must be a sequence of plans' (QR, QI), got {validate.shown(stages)}"
-        )
+    return validate.count("repeats", repeats)
 
 
 def _checked_tolerances(tolerances_db: Sequence[float]) -> list[float]:
     """Return the tolerances, of which there may be none."""
-    given = np.atleast_1d(tolerances_db)
-    if not given.size:
-        return []
-    return validate.array("tolerances_db", given, np.float64, (None,)).tolist()
+    given = validate.array("tolerances_db", tolerances_db, np.float64, None)
+    return [
+        validate.number(
+            "every entry of tolerances_db", each, "dB", least=BEST_TOLERANCE_DB,
+            most=WORST_TOLERANCE_DB,
+        )
+        for each in given.ravel()
+    ]  # fmt: skip
 
 
 def _requests(

@@ -171,6 +171,8 @@ def band_window(
 
     count = 4097
     try:
+        if not isinstance(window, (str, tuple)):  # SciPy takes True for a number
+            window = validate.number("it", window)
         values = get_window(window, count, fftbins=False)
     except (ValueError, TypeError, IndexError) as error:
         raise ValueError(
@@ -178,8 +180,10 @@ def band_window(
             f"got {validate.shown(window)} ({error})"
         ) from None
     values = validate.array("window", values, np.float64, (count,))
-    half = bandwidth_hz / 2
-    return CubicSpline(np.linspace(-half, half, count), values)
+    nodes = np.linspace(-bandwidth_hz / 2, bandwidth_hz / 2, count)
+    if not np.diff(nodes).min() > 0:
+        raise ValueError(f"bandwidth_hz must be wider for a window, got {bandwidth_hz:g} Hz")
+    return CubicSpline(nodes, values)
 
 
 def _band(echoes: Echoes, bandwidth_hz: float | None, replica: Replica | None) -> float:

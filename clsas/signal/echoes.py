@@ -81,8 +81,8 @@ class Echoes:
         def put(name: str, value: object) -> None:
             object.__setattr__(self, name, value)
 
-        dtype = np.complex64 if np.iscomplexobj(self.samples) else np.float32
-        put("samples", validate.array("samples", self.samples, dtype, (None, None)))
+        samples = validate.real_or_complex("samples", self.samples, np.complex64, (None, None))
+        put("samples", samples)
         put("sample_rate_hz", validate.positive("sample_rate_hz", self.sample_rate_hz, "Hz"))
         for name, value in checked_channels(self, "start_time_s").items():
             put(name, value)

@@ -66,7 +66,10 @@ def from_full_matrix(
         samples = samples.reshape(count * count, -1)
     else:
         samples = validate.array("samples", samples, np.float32, (None, None))
-        tx, rx = (_elements(each, len(samples), count) for each in pairs)
+        both = validate.entries("pairs", pairs, "transmitting and receiving elements")
+        if len(both) != 2:
+            raise ValueError(f"pairs must be two arrays of elements, got {len(both)}")
+        tx, rx = (_elements(each, len(samples), count) for each in both)
     rate_hz = validate.number(
         "sample_rate_hz", sample_rate_hz, "Hz", above=0.0, most=validate.MOST_HZ
     )
@@ -90,12 +93,12 @@ def from_full_matrix(
     lines = compress(
         Echoes(
             samples,
-            start_time_s=start_time_s,
-            sample_rate_hz=sample_rate_hz,
+            start_time_s=start_s,
+            sample_rate_hz=rate_hz,
             carrier_hz=carrier_hz,
             tx_m=elements_m[tx],
             rx_m=elements_m[rx],
-            sound_speed_m_s=sound_speed_m_s,
+            sound_speed_m_s=speed,
         ),
         window=window,
         oversampling=oversampling,
@@ -105,16 +108,9 @@ def from_full_matrix(
 
 
 def _elements(given: ArrayLike, length: int, count: int) -> np.ndarray:
-    numbers = np.asarray(given)
-    if numbers.dtype.kind not in "iu" or numbers.shape != (length,):
+    numbers = validate.indices("every entry of pairs", given, count)
+    if numbers.shape != (length,):
         raise ValueError(
-            f"pairs must be whole numbers, one per line ({length}), got {numbers.dtype} of shape "
-            f"{numbers.shape}"
-        )
-    numbers = numbers.astype(np.int64)
-    if numbers.min() < 0 or numbers.max() >= count:
-        raise ValueError(
-            f"pairs must name elements from 0 to {count - 1}, got {numbers.min()} to "
-            f"{numbers.max()}"
+            f"pairs must be whole numbers, one per line ({length}), got shape {numbers.shape}"
         )
     return numbers

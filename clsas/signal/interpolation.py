@@ -207,8 +207,8 @@ def choose(
         If `taps` is not one of 2, 4, 6, 8, `upsampling` is below 1, or `accuracy_db` cannot be
         reached with the fixed one.
     """
-    if taps is not None and not (isinstance(taps, (int, np.integer)) and taps in TAPS):
-        raise ValueError(f"taps must be one of {TAPS}, got {validate.shown(taps)}")
+    if taps is not None:
+        taps = validate.one_of("taps", taps, TAPS)
     if upsampling is not None:
         upsampling = validate.number("upsampling", upsampling, least=1.0, most=MOST_UPSAMPLING)
     if taps is not None and upsampling is not None:

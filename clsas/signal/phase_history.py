@@ -91,8 +91,10 @@ def from_phase_history(
     channels, count = samples.shape
     if count < 2:
         raise ValueError(f"samples must hold at least 2 frequencies, got {count}")
-    if sign not in (-1, 1):
-        raise ValueError(f"sign must be -1 or +1, got {validate.shown(sign)}")
+    try:
+        sign = validate.one_of("sign", sign, (-1, 1))
+    except ValueError:
+        raise ValueError(f"sign must be -1 or +1, got {validate.shown(sign)}") from None
     oversampling = validate.number("oversampling", oversampling, least=1.0)
     speed = validate.number(
         "sound_speed_m_s", sound_speed_m_s, "m/s", above=0.0, most=validate.MOST_M_S

@@ -41,7 +41,7 @@ class Replica:
 
     def __post_init__(self) -> None:
         """Check every field and convert it."""
-        if np.asarray(self.samples).dtype.kind in "iuf":
+        if not np.iscomplexobj(validate.real_or_complex("samples", self.samples)):
             raise TypeError(
                 "samples must be complex numbers, relative to the carrier, got real ones: form the "
                 "analytic signal (scipy.signal.hilbert) and multiply it by exp(-2j pi carrier t)"
@@ -72,10 +72,15 @@ class Replica:
         """Return P(f), the sum of p_n exp(-j 2 pi f t_n) over the sample rate, in seconds.
 
         Frequencies are relative to the carrier, within half the sample rate.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If the frequencies are not finite real numbers.
         """
         import finufft  # slow to import
 
-        frequency = np.asarray(frequency_hz, dtype=np.float64)
+        frequency = validate.array("frequency_hz", frequency_hz, np.float64, None)
         cycles = frequency.ravel() / self.sample_rate_hz
         # The transform counts from the middle of the samples.
         middle = len(self.samples) // 2

@@ -83,7 +83,9 @@ class HeightField:
         ray = np.rint(azimuth / ray_step - first_ray).astype(np.intp)
         angles = centre + ray_step * (first_ray + np.arange(ray.max() + 1))
         nearest = max(_distance(eye_m[0], self.x_m), _distance(eye_m[1], self.y_m), step)
-        before = np.floor((ground - nearest) / step).astype(np.intp) - 1
+        # Nothing beyond the lattice casts shadows.
+        last = np.ceil((np.hypot(*away.max(axis=1)) - nearest) / step) + 2
+        before = np.floor(np.minimum((ground - nearest) / step, last)).astype(np.intp) - 1
         ranges = nearest + step * np.arange(max(before.max(), 0) + 1)
 
         validate.memory("heights_m", 40 * len(angles) * len(ranges))

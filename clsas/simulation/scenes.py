@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -78,14 +78,11 @@ class PointTargets:
         positions = validate.array("positions_m", self.positions_m, np.float64, (None, 3))
         farthest_m = float(np.abs(positions).max())
         validate.number("the farthest of positions_m", farthest_m, "m", most=_FARTHEST_M)
-        given = np.asarray(self.amplitudes)
-        # Real amplitudes are complex ones without a phase. Other types are left to the check.
-        given = given.astype(np.complex128) if given.dtype.kind in "iuf" else given
-        amplitudes = validate.array(
-            "amplitudes", given, np.complex128, (len(positions),), broadcast=True
+        amplitudes = validate.real_or_complex(
+            "amplitudes", self.amplitudes, np.complex128, (len(positions),), broadcast=True
         )
         object.__setattr__(self, "positions_m", positions)
-        object.__setattr__(self, "amplitudes", amplitudes)
+        object.__setattr__(self, "amplitudes", amplitudes.astype(np.complex128, copy=False))
 
     def __repr__(self) -> str:
         """Return the number of points and where they lie."""
@@ -108,10 +105,12 @@ class PointTargets:
 
     def spheres(self, observer: Observer) -> tuple[NDArray, NDArray]:
         """Return the points as spheres, centres [points, 3] and radii [points] of zero."""
+        validate.instance("observer", observer, Observer)
         return self.positions_m, np.zeros(self.points)
 
     def visible(self, observer: Observer) -> tuple[NDArray, NDArray]:
         """Return all positions and amplitudes, those near the beam's axis first."""
+        validate.instance("observer", observer, Observer)
         if observer.gain is None:
             return self.positions_m, self.amplitudes
         offsets = self.positions_m - observer.position_m
@@ -201,18 +200,23 @@ class Seabed:
             raise ValueError(
                 f"heights_m must have at least 2 rows and 2 columns, got {heights.shape}"
             )
-        texture: Any = self.texture
-        if np.ndim(texture) == 0:
-            texture = np.full(heights.shape, validate.number("texture", texture, least=0.0))
+        texture = validate.array("texture", self.texture, np.float64, None)
+        texture = np.broadcast_to(texture, heights.shape) if texture.ndim == 0 else texture
         texture = validate.array("texture", texture, np.float64, heights.shape)
         if texture.min() < 0:
             raise ValueError(f"texture must be at least 0, got {texture.min():g}")
-        validate.positive("density_m2", self.density_m2, "per m2")
-        validate.count("seed", self.seed, least=0)
-        validate.number("floor_db", self.floor_db, "dB", least=-200.0, most=-10.0)
-        object.__setattr__(self, "heights_m", heights)
-        object.__setattr__(self, "texture", texture)
-        validate.memory("density_m2", 100 * self.density_m2 * self._surface.cell_areas_m2.sum())
+        fields = {
+            "heights_m": heights,
+            "texture": texture,
+            "density_m2": validate.positive("density_m2", self.density_m2, "per m2"),
+            "seed": validate.count("seed", self.seed, least=0),
+            "floor_db": validate.number("floor_db", self.floor_db, "dB", least=-200.0, most=-10.0),
+        }
+        for name, value in fields.items():
+            object.__setattr__(self, name, value)
+        with np.errstate(over="ignore", invalid="ignore"):
+            area_m2 = self._surface.cell_areas_m2.sum()
+        validate.memory("density_m2", 100 * self.density_m2 * area_m2)
 
     def __repr__(self) -> str:
         """Return extents, the lattice's step and the density of scatterers."""
@@ -242,7 +246,21 @@ class Seabed:
         return 10 ** (self.floor_db / 20) / 3
 
     def height_m(self, x_m: ArrayLike, y_m: ArrayLike) -> NDArray[np.float64]:
-        """Return the heights at positions on the patch, which broadcast; NaN beside the patch."""
+        """Return the heights at positions on the patch, which broadcast; NaN beside the patch.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If the positions are not finite real numbers, or do not broadcast.
+        """
+        x_m = validate.array("x_m", x_m, np.float64, None)
+        y_m = validate.array("y_m", y_m, np.float64, None)
+        try:
+            np.broadcast_shapes(x_m.shape, y_m.shape)
+        except ValueError:
+            raise ValueError(
+                f"x_m and y_m must broadcast, got shapes {x_m.shape} and {y_m.shape}"
+            ) from None
         return self._surface.height_m(x_m, y_m)
 
     def lit(self, points_m: ArrayLike, eye_m: ArrayLike) -> NDArray[np.bool_]:
@@ -266,6 +284,7 @@ class Seabed:
 
     def spheres(self, observer: Observer) -> tuple[NDArray, NDArray]:
         """Return spheres that hold all visible points, centres [spheres, 3] and radii [spheres]."""
+        validate.instance("observer", observer, Observer)
         kept = self._in_beam(observer)
         # A receive window is needed even if no echo arrives.
         kept = kept if len(kept) else np.arange(len(self._scatterers.radii_m))
@@ -276,6 +295,7 @@ class Seabed:
 
         They are sorted by tile, with the tiles nearest to the beam's axis first.
         """
+        validate.instance("observer", observer, Observer)
         scatterers = self._scatterers
         kept = self._in_beam(observer)
         first, counts = scatterers.first[kept], scatterers.first[kept + 1] - scatterers.first[kept]

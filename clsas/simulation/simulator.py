@@ -174,10 +174,10 @@ def check_options(
 ) -> None:
     """Raise TypeError or ValueError for options that `simulate` refuses for every survey."""
     validate.instance("pointing", pointing, Pointing, type(None))
-    validate.instance("spreading", spreading, bool)
-    validate.instance("motion_in_flight", motion_in_flight, bool)
-    validate.instance("element_pattern", element_pattern, bool)
-    validate.instance("phase_centres", phase_centres, bool)
+    validate.flag("spreading", spreading)
+    validate.flag("motion_in_flight", motion_in_flight)
+    validate.flag("element_pattern", element_pattern)
+    validate.flag("phase_centres", phase_centres)
     if range_m is not None:
         near, far = validate.array("range_m", range_m, np.float64, (2,))
         if not 0 <= near < far:

@@ -118,8 +118,9 @@ class BeamWindow:
         elif self.shape == "inverse":
             raise ValueError("element_length_m must be given for the shape 'inverse'")
         if self.along is not None:
-            shape = (3,) if np.ndim(self.along) == 1 else (None, 3)
-            along = validate.array("along", self.along, np.float64, shape)
+            along = validate.array("along", self.along, np.float64, None)
+            shape = (3,) if along.ndim == 1 else (None, 3)
+            along = validate.array("along", along, np.float64, shape)
             largest = np.abs(along).max(axis=-1, keepdims=True)
             if not largest.all():
                 raise ValueError("along must hold directions of some length, got zeros")
@@ -127,10 +128,7 @@ class BeamWindow:
             fields["along"] = along / np.linalg.norm(along, axis=-1, keepdims=True)
         if self.track_pings is not None:
             fields["track_pings"] = validate.count("track_pings", self.track_pings, least=5)
-        if not isinstance(self.normalise, (bool, np.bool_)):
-            raise TypeError(
-                f"normalise must be True or False, got {validate.shown(self.normalise)}"
-            )
+        fields["normalise"] = validate.flag("normalise", self.normalise)
         for name, value in fields.items():
             object.__setattr__(self, name, value)
 
@@ -164,6 +162,11 @@ class BeamWindow:
         length = validate.positive("length_m", length_m, "m")
         wavelength = validate.positive("wavelength_m", wavelength_m, "m")
         width = 2 * math.degrees(math.asin(min(_HALF_POWER * wavelength / length, 1.0)))
+        if width < _NARROWEST:
+            raise ValueError(
+                f"length_m must make a beam of at least {_NARROWEST:g} degrees, got {length:g} m, "
+                f"which makes {width:g} degrees at wavelength_m = {wavelength:g} m"
+            )
         return cls(width, shape, **({"element_length_m": length} | others))
 
     @property
@@ -202,6 +205,7 @@ class BeamWindow:
         `reach` is the largest change of the sine from the block's middle. The edges of "tukey"
         begin with a kink that no cubic follows; the other shapes are smooth between the limits.
         """
+        reach = validate.number("reach", reach, least=0.0)
         low, high = np.clip(self.limits, -1, 1)
         width = high - low
         if not self._has_taper:
@@ -216,6 +220,7 @@ class BeamWindow:
         0.6 (r/R)^2 (`reach` is r/R). That shifts the beam's edges. Where the weights begin with a
         step, the shift adds or drops channels.
         """
+        reach = validate.number("reach", reach, least=0.0)
         square = self._all(wavelength_m) ** 2
         jump = (square[0] + square[-1]) / 2 / square.mean()
         bend = reach**2 / self.edge
@@ -238,6 +243,8 @@ class BeamWindow:
         share : float
             Fraction of all channels that `sine` has.
         """
+        share = validate.positive("share", share)
+        sine = validate.array("sine", sine, np.float64, None)
         weights = self.weights(sine, wavelength_m)
         visible = weights[weights > 0]
         if not visible.size:
@@ -254,12 +261,20 @@ class BeamWindow:
 
     def _all(self, wavelength_m: float) -> NDArray[np.float64]:
         """Weights at 65 sines, evenly over the whole beam."""
+        wavelength_m = _positive_or_infinite(wavelength_m)
         low, high = np.clip(self.limits, -1, 1)
         return self._inside(np.linspace(float(low), float(high), 65), wavelength_m)
 
     def weights(self, q: ArrayLike, wavelength_m: float = math.inf) -> NDArray[np.float64]:
-        """Return the weights at sines `q` of the aspect angle; `wavelength_m` is for "inverse"."""
-        q = np.asarray(q, np.float64)
+        """Return the weights at sines `q` of the aspect angle; `wavelength_m` is for "inverse".
+
+        Raises
+        ------
+        TypeError, ValueError
+            If `q` does not hold finite real numbers, or the wavelength is not positive.
+        """
+        q = validate.array("q", q, np.float64, None)
+        wavelength_m = _positive_or_infinite(wavelength_m)
         low, high = self.limits
         inside = (q > low) & (q < high)
         weights = np.zeros(q.shape)
@@ -278,6 +293,7 @@ class BeamWindow:
         ValueError
             If "inverse" would have to amplify by more than 40 dB.
         """
+        wavelength_m = _positive_or_infinite(wavelength_m)
         low, high = np.clip(self.limits, -1, 1)
         nodes = np.array([0.0, 0.25, 0.75, 1.0])
         number = np.arange(INTERVALS)[:, None]
@@ -351,6 +367,13 @@ class BeamWindow:
         """Angles from the beam's axis at sines `q`, in radians and in widths of the beam."""
         angle = np.arcsin(np.clip(q, -1, 1)) - math.radians(self.squint_deg)
         return angle, angle / math.radians(self.width_deg)
+
+
+def _positive_or_infinite(wavelength_m: float) -> float:
+    """Return a checked wavelength, infinite for lines on their carrier."""
+    if isinstance(wavelength_m, float) and wavelength_m == math.inf:
+        return math.inf
+    return validate.positive("wavelength_m", wavelength_m, "m")
 
 
 def _taylor(u: NDArray[np.float64]) -> NDArray[np.float64]:

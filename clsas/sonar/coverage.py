@@ -20,22 +20,23 @@ _BLOCKS = 8  # along either side of the grid; smaller blocks would find smaller 
 _TAPS = 8  # an interpolated line extends this many samples beyond its ends
 _SPEED_RATIO = 0.05  # largest speed of a receiver over that of sound
 
+_Span = tuple[float, float]  # nearest and farthest range, metres
 
-def warn_unreached(
+
+class UnreachedWarning(validate.ClsasWarning):
+    """No line contributes to any pixel, so that the image is zero."""
+
+
+def reaches(
     lines: RangeLines, grid: Grid, beam: BeamWindow | None, along: NDArray[np.float64] | None
 ) -> bool:
-    """Warn if no pixel lies within the range of any line and the beam; return whether it warned.
+    """Return False only if certainly no pixel lies within the range of any line and the beam.
 
-    `along` holds the track's unit directions for a beam, [channels, 3]. Lines that are all zero
-    cause no warning.
+    `along` holds the track's unit directions for a beam, [channels, 3].
     """
     if _reached_at_points(lines, grid, beam, along):
-        return False
-    centres_m, half_m = _boxes(grid)
-    if _reached_in_boxes(lines, centres_m, half_m, beam, along) or not lines.samples.any():
-        return False
-    warn_unseen(lines, centres_m, beam, along)
-    return True
+        return True
+    return _reached_in_boxes(lines, *_boxes(grid), beam, along)
 
 
 def _reached_at_points(
@@ -43,14 +44,12 @@ def _reached_at_points(
 ) -> bool:
     """Quick test: return True if any sampled channel receives from any sampled pixel."""
     some = some_channels(lines.channels, _SAMPLED_CHANNELS)
-    part, points_m = lines.select(some), grid.spread(_SAMPLED_PIXELS)
-    range_m = pairwise_range_m(
-        points_m, part.tx_m, part.rx_m, part.rx_velocity_m_s, part.sound_speed_m_s
-    )
-    inside = (range_m >= part.first_range_m) & (range_m <= part.last_range_m)
+    points_m = grid.spread(_SAMPLED_PIXELS)
+    range_m = _ranges_m(lines, points_m, some)
+    inside = (range_m >= lines.first_range_m[some]) & (range_m <= lines.last_range_m[some])
     if beam is not None and along is not None:
         low, high = beam.limits
-        sine = sines(points_m, part.phase_centres_m, along[some]).T
+        sine = sines(points_m, lines.phase_centres_m[some], along[some]).T
         inside &= (sine > low) & (sine < high)
     return bool(inside.any())
 
@@ -106,39 +105,66 @@ def _cuts(count: int) -> NDArray[np.int64]:
     return np.unique(np.linspace(0, count, min(count, _BLOCKS) + 1).astype(np.int64))
 
 
-def warn_unseen(
+def warn_unreached(
     lines: RangeLines,
-    centres_m: NDArray[np.float64],
+    grid: Grid,
     beam: BeamWindow | None,
     along: NDArray[np.float64] | None,
+    lines_m: _Span | None = None,
 ) -> None:
-    """Warn that no line contributes to parts of a grid, whose centres are [parts, 3]."""
-    some = lines.select(slice(None, None, max(lines.channels // 64, 1)))
-    range_m = pairwise_range_m(
-        centres_m[:: max(len(centres_m) // 1024, 1)],
-        some.tx_m,
-        some.rx_m,
-        some.rx_velocity_m_s,
-        some.sound_speed_m_s,
+    """Warn that no line contributes to a grid: with the distances, and the likely cause.
+
+    Lines that are all zero cause no warning. For lines that are geometry alone, `lines_m` is their
+    nearest and farthest range.
+    """
+    if lines_m is None:
+        if not lines.samples.any():
+            return
+        lines_m = float(lines.first_range_m.min()), float(lines.last_range_m.max())
+    some = some_channels(lines.channels, _SAMPLED_CHANNELS)
+    points_m = grid.spread(_SAMPLED_PIXELS)
+    range_m = _ranges_m(lines, points_m, some)
+    where = (
+        f"the lines span {lines_m[0]:.6g} to {lines_m[1]:.6g} m, the grid lies at "
+        f"{range_m.min():.6g} to {range_m.max():.6g} m"
     )
-    spans = (
-        f"the lines span {lines.first_range_m.min():.6g} to {lines.last_range_m.max():.6g} m, the "
-        f"grid lies at {range_m.min():.6g} to {range_m.max():.6g} m"
-    )
-    if beam is None or along is None:
-        validate.warn(
-            f"no pixel of the grid lies within any line's range, so the image is zero: {spans}"
+    if beam is not None and along is not None:
+        sine = sines(points_m, lines.phase_centres_m[some], along[some])
+        low, high = np.degrees(np.arcsin(np.clip([sine.min(), sine.max()], -1, 1)))
+        first, last = np.degrees(beam.limits_rad)
+        where = (
+            f"the beam spans {first:.4g} to {last:.4g} degrees, the grid lies at {low:.4g} to "
+            f"{high:.4g} degrees; {where}"
         )
-        return
-    sine = sines(
-        centres_m[:: max(len(centres_m) // 1024, 1)],
-        some.phase_centres_m,
-        along[:: max(lines.channels // 64, 1)],
-    )
-    low, high = np.degrees(np.arcsin(np.clip([sine.min(), sine.max()], -1, 1)))
-    first, last = np.degrees(beam.limits_rad)
+    within = "any line's range" if beam is None else "the beam and the range of any line"
     validate.warn(
-        f"no pixel of the grid lies within the beam and the range of any line, so the image is "
-        f"zero: the beam spans {first:.4g} to {last:.4g} degrees, the grid lies at {low:.4g} to "
-        f"{high:.4g} degrees; {spans}"
+        f"no pixel of the grid lies within {within}, so the image is zero: {where}. "
+        f"{_likely_cause(lines, points_m, some, lines_m)}",
+        UnreachedWarning,
     )
+
+
+def _ranges_m(
+    lines: RangeLines, points_m: NDArray[np.float64], some: NDArray[np.int64]
+) -> NDArray[np.float64]:
+    """Ranges of points from some channels, [points, channels]."""
+    velocity = None if lines.rx_velocity_m_s is None else lines.rx_velocity_m_s[some]
+    antennas = lines.tx_m[some], lines.rx_m[some]
+    return pairwise_range_m(points_m, *antennas, velocity, lines.sound_speed_m_s)
+
+
+def _likely_cause(
+    lines: RangeLines, points_m: NDArray[np.float64], some: NDArray[np.int64], lines_m: _Span
+) -> str:
+    """Return what probably went wrong, by what the grid would look like in other units."""
+
+    def fits(factor: float) -> bool:
+        range_m = _ranges_m(lines, factor * points_m, some)
+        return bool(((range_m >= lines_m[0]) & (range_m <= lines_m[1])).any())
+
+    if fits(1.0):
+        return "Check the beam's width and squint, and the grid's place along the track"
+    for factor, unit in ((1e3, "km"), (1e-3, "mm")):
+        if fits(factor):
+            return f"In {unit} the grid would be reached: lengths must be given in m"
+    return "Check the grid, the positions of the antennas and first_range_m, all in m"

@@ -58,24 +58,27 @@ class Pulse:
 
     def __post_init__(self) -> None:  # noqa: D105
         carrier = validate.positive("carrier_hz", self.carrier_hz, "Hz")
-        validate.positive("duration_s", self.duration_s, "s")
-        validate.number("bandwidth_hz", self.bandwidth_hz, "Hz", above=0.0, most=2 * carrier)
-        validate.number("taper", self.taper, least=0.0, most=1.0)
+        duration = validate.positive("duration_s", self.duration_s, "s")
+        band = validate.number("bandwidth_hz", self.bandwidth_hz, "Hz", above=0.0, most=2 * carrier)
+        code: str | tuple[int, ...]
         if isinstance(self.code, str):
-            validate.one_of("code", self.code, ("up", "down"))
-            return
-        given = np.ravel(self.code).tolist()
-        if not given or any(chip not in (1, -1) for chip in given):
-            raise ValueError(
-                f"code must be 'up', 'down' or chips of +1 and -1, got {validate.shown(self.code)}"
-            )
-        chips = tuple(int(chip) for chip in given)
-        if not np.isclose(self.bandwidth_hz * self.duration_s, len(chips)):
-            raise ValueError(
-                f"bandwidth_hz of a phase code must be chips/duration = "
-                f"{len(chips) / self.duration_s:g} Hz, got {self.bandwidth_hz:g} Hz"
-            )
-        object.__setattr__(self, "code", chips)
+            code = validate.one_of("code", self.code, ("up", "down"))
+        else:
+            code = _chips("code", self.code)
+            if not np.isclose(band * duration, len(code)):
+                raise ValueError(
+                    f"bandwidth_hz of a phase code must be chips/duration = "
+                    f"{len(code) / duration:g} Hz, got {band:g} Hz"
+                )
+        fields = {
+            "carrier_hz": carrier,
+            "bandwidth_hz": band,
+            "duration_s": duration,
+            "code": code,
+            "taper": validate.number("taper", self.taper, least=0.0, most=1.0),
+        }
+        for name, value in fields.items():
+            object.__setattr__(self, name, value)
 
     @classmethod
     def phase_code(
@@ -88,11 +91,24 @@ class Pulse:
     ) -> Pulse:
         """Return a binary phase code whose chips divide the duration evenly."""
         duration = validate.positive("duration_s", duration_s, "s")
-        return cls(carrier_hz, len(chips) / duration, duration, tuple(chips), taper)
+        chips = _chips("chips", chips)
+        carrier = validate.positive("carrier_hz", carrier_hz, "Hz")
+        if len(chips) > 2 * carrier * duration:
+            raise ValueError(
+                f"duration_s must be at least chips / (2 carrier_hz) = "
+                f"{len(chips) / (2 * carrier):g} s, got {duration:g} s"
+            )
+        return cls(carrier, len(chips) / duration, duration, chips, taper)
 
     def envelope(self, time_s: ArrayLike) -> NDArray[np.complex128]:
-        """Return the complex envelope p(t); zero before t = 0 and after the duration."""
-        t = np.asarray(time_s, dtype=np.float64)
+        """Return the complex envelope p(t); zero before t = 0 and after the duration.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If the times are not finite real numbers.
+        """
+        t = validate.array("time_s", time_s, np.float64, None)
         duration = self.duration_s
         inside = (t >= 0) & (t <= duration)
         if isinstance(self.code, str):
@@ -112,7 +128,14 @@ class Pulse:
 
         Frequencies are relative to the carrier. The quadrature between the edges of chips and taper
         is accurate to 1e-12 of the largest value returned.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If the frequencies are not finite real numbers, or so high that the quadrature does not
+            fit into memory.
         """
+        frequency = validate.array("frequency_hz", frequency_hz, np.float64, None)
         chips = 1 if isinstance(self.code, str) else len(self.code)
         edge = self.taper * self.duration_s / 2
         edges = np.unique(
@@ -124,7 +147,7 @@ class Pulse:
             )
         )
         return fourier_integral(
-            self.envelope, edges, frequency_hz, sign=-1, rate=self.bandwidth_hz / 2
+            self.envelope, edges, frequency, sign=-1, rate=self.bandwidth_hz / 2
         )
 
 
@@ -274,6 +297,21 @@ class Sonar:
         pulse = Pulse(carrier_hz=100e3, bandwidth_hz=37.5e3, duration_s=5e-3)
         length = 1500.0 / 100e3
         return cls(pulse, line_array(96, length), tx_length_m=length, rx_length_m=length)
+
+
+def _chips(name: str, value: object) -> tuple[int, ...]:
+    """Return the chips of a phase code as ints; raises TypeError or ValueError."""
+    try:
+        given = np.asarray(value)
+    except (TypeError, ValueError):
+        given = np.zeros(0)
+    is_code = given.ndim == 1 and given.size > 0 and given.dtype.kind in "iuf"
+    if not is_code or not np.isin(given, (1, -1)).all():
+        raise ValueError(
+            f"{name} must be {'up, down or ' * (name == 'code')}chips of +1 and -1, "
+            f"got {validate.shown(value)}"
+        )
+    return tuple(given.astype(int).tolist())
 
 
 def line_array(receivers: int, spacing_m: float) -> NDArray[np.float64]:

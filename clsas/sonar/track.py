@@ -212,7 +212,7 @@ def channels(sonar: Sonar, track: Track, *, motion_in_flight: bool = False) -> C
     """
     validate.instance("sonar", sonar, Sonar)
     validate.instance("track", track, Track)
-    validate.instance("motion_in_flight", motion_in_flight, bool)
+    motion_in_flight = validate.flag("motion_in_flight", motion_in_flight)
     # Nine numbers per channel, and the ranges to some points that every caller computes.
     validate.memory("sonar and track", 300 * track.pings * sonar.receivers)
     turn = track.rotations.as_matrix()
@@ -249,7 +249,8 @@ class Pointing:
         """Check every field and convert it."""
         squint = validate.array("squint_rad", self.squint_rad, np.float64, (None,))
         object.__setattr__(self, "squint_rad", tuple(squint.tolist()))
-        validate.number("depression_rad", self.depression_rad, "rad")
+        depression = validate.number("depression_rad", self.depression_rad, "rad")
+        object.__setattr__(self, "depression_rad", depression)
         if self.spot_m is not None:
             spot = validate.array("spot_m", self.spot_m, np.float64, (3,))
             object.__setattr__(self, "spot_m", tuple(spot.tolist()))
@@ -262,17 +263,19 @@ class Pointing:
     @classmethod
     def squint(cls, angle_rad: float, *, depression_rad: float = 0.0) -> Pointing:
         """Point forward of broadside by an angle (aft if negative)."""
-        return cls((angle_rad,), depression_rad)
+        return cls((validate.number("angle_rad", angle_rad, "rad"),), depression_rad)
 
     @classmethod
     def scan(cls, angles_rad: ArrayLike, *, depression_rad: float = 0.0) -> Pointing:
         """Step through angles forward of broadside, one per ping, repeatedly."""
-        return cls(tuple(np.atleast_1d(angles_rad).tolist()), depression_rad)
+        angles = validate.array("angles_rad", angles_rad, np.float64, None)
+        return cls(tuple(np.atleast_1d(angles).tolist()), depression_rad)
 
     @classmethod
     def spot(cls, point_m: ArrayLike) -> Pointing:
         """Point at a fixed position in the world (spotlight)."""
-        return cls(spot_m=point_m)  # type: ignore[arg-type]
+        point = validate.array("point_m", point_m, np.float64, (3,))
+        return cls(spot_m=tuple(point.tolist()))
 
     def axes(self, track: Track) -> NDArray[np.float64]:
         """Return the elements' unit vectors in the world at every ping.

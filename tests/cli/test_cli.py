@@ -195,7 +195,7 @@ def test_a_plan_that_is_exact_is_as_accurate_as_asked_for(made, tmp_path):
 @pytest.mark.filterwarnings("ignore::clsas.ClsasWarning")
 @pytest.mark.parametrize("method", [(), ("--exact",)], ids=["planned", "exact"])
 def test_an_image_of_zeros_has_no_predicted_error(made, tmp_path, method):
-    nowhere = ["--x", "0:1:4", "--y", "900:901:4", "-o", tmp_path / "zero.h5"]
+    nowhere = ["--x", "0:1:4", "--y", "900:901:4", "-o", tmp_path / "zero.h5", "--allow-unreached"]
     command = ["image", made[0] / "lines.h5", *nowhere, *method]
     stdout, _ = run(*command)
     assert "all pixels are zero" in stdout
@@ -392,15 +392,26 @@ def test_a_broken_sampling_limit_is_a_warning(made, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_grid_that_no_line_reaches_is_a_warning(made, tmp_path):
-    grid = ("--x", "0:1:4", "--y", "500:501:4")
-    _, stderr = run("image", made[0] / "lines.h5", *grid, "-o", tmp_path / "image.h5")
-    assert stderr.startswith("Warning: ")
+@pytest.mark.parametrize("method", [(), ("--exact",), ("--stages", "2x2")])
+def test_a_grid_that_no_line_reaches_is_refused_unless_it_is_allowed(made, tmp_path, method):
+    grid, path = ("--x", "0:1:4", "--y", "20000:21000:4"), tmp_path / "image.h5"
+    command = ("image", made[0] / "lines.h5", *grid, *method, "-o", path)
+    _, stderr = run(*command, code=1)
+    assert stderr.startswith("Error: no pixel of the grid lies within any line's range")
+    assert "the grid lies at 20000 to 21000 m" in stderr
+    assert "In mm the grid would be reached" in stderr
+    assert stderr.endswith("--allow-unreached forms it all the same\n")
     assert stderr.count("\n") == 1
-    assert run("plan", made[0] / "lines.h5", *grid)[1] == stderr
-    exact = "image", made[0] / "lines.h5", *grid, "--exact", "-o", tmp_path / "exact.h5"
-    assert run(*exact)[1].count("so the image is zero") == 1
-    assert not clsas.load(tmp_path / "image.h5").pixels.any()
+    assert not path.exists()
+    _, stderr = run(*command, "--allow-unreached")
+    assert stderr.startswith("Warning: ")
+    assert stderr.count("so the image is zero") == 1
+    assert not clsas.load(path).pixels.any()
+
+
+def test_a_plan_for_a_grid_that_no_line_reaches_is_a_warning(made):
+    grid = ("--x", "0:1:4", "--y", "500:501:4")
+    assert "so the image is zero" in run("plan", made[0] / "lines.h5", *grid)[1]
 
 
 @pytest.mark.parametrize(
@@ -480,7 +491,7 @@ FIXED = ["--taps", "4", "--upsampling", "2"]
         (
             ["image", "lines.h5", "--x", "0:1:9", "--y", f"0:1:{10**30}", "-o", "new.h5"],
             1,
-            "y count must ask for at most ",
+            "y count must be at most ",
         ),
         (
             ["image", "lines.h5", *GRID, "-o", "new.h5", *FIXED, "--accuracy-db", "-60"],

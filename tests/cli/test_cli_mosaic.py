@@ -156,7 +156,7 @@ def test_a_folder_that_has_ended(made, tmp_path):
 def test_flags_are_told(made, tmp_path):
     stdout, _ = run(
         "mosaic", made[0] / "scene.toml", "--lines", lines_of(made),
-        "--x", "100:104:20", "--y", "56:61:100", "-o", tmp_path / "a.zarr",
+        "--x", "100:104:20", "--y", "56:61:100", "-o", tmp_path / "a.zarr", "--allow-unreached",
     )  # fmt: skip
     assert "  patch 0,0; 0,1; 1,0 and 1 more: empty: in no channel's beam and range" in stdout
 
@@ -169,10 +169,21 @@ def test_exact_patches(made, tmp_path):
     assert all(record.plan is None for record in records)
 
 
+def test_a_mosaic_that_no_line_reaches_is_refused(made, tmp_path):
+    store = tmp_path / "far.zarr"
+    axes = "--x", "0:4:20", "--y", "56000:61000:20"
+    stderr = run(
+        "mosaic", made[0] / "scene.toml", "--lines", lines_of(made), *axes, "-o", store, code=1
+    )[1]
+    assert "no pixel of the grid lies within" in stderr
+    assert "--allow-unreached" in stderr
+    assert not store.exists()
+
+
 def test_a_mosaic_of_zeros_has_no_predicted_error(made, tmp_path):
     command = [
         "mosaic", made[0] / "scene.toml", "--lines", lines_of(made), "--x", "100:104:20",
-        "--y", "56:61:20", "-o", tmp_path / "zero.zarr",
+        "--y", "56:61:20", "-o", tmp_path / "zero.zarr", "--allow-unreached",
     ]  # fmt: skip
     stdout, stderr = run(*command)
     assert "; all pixels are zero" in stdout

@@ -17,6 +17,8 @@ PLANE = clsas.Grid.plane(x=(1e6 - 0.5, 1e6 + 0.5, 401), y=(40, 42, 201))
 POINTS = clsas.Grid.points(np.arange(36000.0).reshape(20, 20, 30, 3))
 SAMPLES = np.ones((500, 200), np.complex64)
 LINES = clsas.RangeLines(SAMPLES, 39.0, 0.00375, TRACK.positions_m, TRACK.positions_m, 1e6, 1500.0)
+AT_M = TRACK.positions_m - [0, 2e6, 0]
+BESIDE = clsas.RangeLines(SAMPLES, 39.9, 0.00375, AT_M, AT_M, 1e6, 1500.0)  # PLANE
 
 
 def pixels(grid):
@@ -94,7 +96,7 @@ def pixels(grid):
         ),
         (clsas.Store(Path("/data/image.zarr")), "Store('/data/image.zarr')"),
         (
-            clsas.mosaic(LINES, PLANE, patches=(2, 4)),
+            clsas.mosaic(BESIDE, PLANE, patches=(2, 4)),
             "Mosaic(2 x 4 patches of 101 x 101 pixels, 0 of 8 finished, "
             "x 999999.5 to 1000000.5 m, y 40 to 42 m, z 0 m)",
         ),

@@ -245,3 +245,85 @@ def test_memory_heeds_the_limit_of_the_address_space():
 def test_memory_refuses_any_size(size):
     with pytest.raises(ValueError, match=r"x must ask for at most .* GiB"):
         validate.memory("x", size)
+
+
+# Values that equal Python's
+
+
+@pytest.mark.parametrize("value", [np.int8(4), np.uint64(4), np.array(4), 4])
+def test_whole_numbers_of_every_type_become_ints(value):
+    for found in (validate.count("n", value), validate.one_of("n", value, (2, 4))):
+        assert type(found) is int
+        assert found == 4
+
+
+@pytest.mark.parametrize("value", [True, np.True_, np.array(4.0), np.array([4]), 4.0, "4", None])
+def test_nothing_else_is_a_whole_number(value):
+    with pytest.raises(TypeError, match="n must be a whole number"):
+        validate.count("n", value)
+    with pytest.raises(ValueError, match="n must be one of 2, 4, got"):
+        validate.one_of("n", value, (2, 4))
+
+
+def test_flags_are_bools_of_python_or_numpy():
+    assert validate.flag("f", np.True_) is True
+    assert validate.flag("f", False) is False
+    for value in (1, None, "yes", np.zeros(0), np.zeros(1, bool)):
+        with pytest.raises(TypeError, match="f must be of type bool"):
+            validate.flag("f", value)
+
+
+@pytest.mark.parametrize(
+    ("value", "error"),
+    [(slice("a"), TypeError), (slice(0, 1, 0.5), TypeError), (slice(0, 1, 0), ValueError),
+     (5, TypeError), (None, TypeError)],
+)  # fmt: skip
+def test_selections_are_slices_of_whole_numbers(value, error):
+    with pytest.raises(error, match="rows must be"):
+        validate.selection("rows", value)
+    part = slice(np.int64(2), None, np.int64(-1))
+    assert validate.selection("rows", part) is part
+
+
+def test_indices_are_whole_numbers_within_limits():
+    found = validate.indices("index", np.array([[0, 4]], np.uint8), 5)
+    assert found.dtype == np.int64
+    assert found.tolist() == [[0, 4]]
+    for value, error in (
+        ([0.0], TypeError), ([True], TypeError), ("0", TypeError), ([[0, 1], [2]], ValueError),
+        ([5], ValueError), ([-1], ValueError), (np.ma.masked_equal([0, 1], 1), ValueError),
+    ):  # fmt: skip
+        with pytest.raises(error, match="index must"):
+            validate.indices("index", value, 5)
+
+
+def test_arrays_of_any_shape_may_be_empty_or_have_no_axis():
+    for value in (2.5, [], [[1.0, 2.0]]):
+        assert validate.array("x", value, np.float64, None).shape == np.shape(value)
+    with pytest.raises(ValueError, match="x must be finite"):
+        validate.array("x", np.nan, np.float64, None)
+
+
+def test_real_and_complex_arrays_keep_their_kind():
+    assert validate.real_or_complex("x", [1, 2], np.complex64).dtype == np.float32
+    assert validate.real_or_complex("x", [1j], np.complex64).dtype == np.complex64
+    with pytest.raises(TypeError, match="x must be real or complex numbers"):
+        validate.real_or_complex("x", ["a"])
+    with pytest.raises(ValueError, match="x must be a regular array"):
+        validate.real_or_complex("x", [[1.0], [1.0, 2.0]])
+
+
+def test_entries_are_of_sequences_and_arrays():
+    assert validate.entries("x", np.array([1, 2]), "two") == [1, 2]
+    for value in ("ab", b"ab", {1, 2}, {1: 2}, 5, np.array(5), np.ma.masked):
+        with pytest.raises(TypeError, match="x must be two, got"):
+            validate.entries("x", value, "two")
+
+
+def test_paths_and_texts_without_a_file_are_refused():
+    with pytest.raises(ValueError, match=r"path must be .* without NUL"):
+        validate.path("path", "a\0b")
+    with pytest.raises(TypeError, match="title must be text, got 5"):
+        validate.text("title", 5)
+    with pytest.raises(ValueError, match="title must be text of Unicode"):
+        validate.text("title", "\ud800")

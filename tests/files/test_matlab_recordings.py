@@ -136,7 +136,7 @@ def test_the_sound_speed_may_be_given_and_must_be_known(tmp_path):
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        ({"tx": np.zeros((1, 528), np.uint8)}, "pairs must name elements from 0 to 31, got -1"),
+        ({"tx": np.zeros((1, 528), np.uint8)}, "pairs must be from 0 to 31, got -1"),
         ({"tx": np.full((1, 528), 1.5)}, "tx and rx as whole numbers"),
         ({"rx": np.ones((1, 5), np.uint8)}, "time_data of shape"),
         ({"time": np.zeros((400, 1))}, "time in equal, ascending steps"),

@@ -6,13 +6,16 @@ from functools import cache
 import numpy as np
 import pytest
 from cases import APERTURE, CARRIER, beside, noise
-from contract import IMAGERS, Scene, scene
+from contract import IMAGERS, Scene, near, scene
 from factorizing import bistatic_array
 from variants import DEFAULT, OWN, variant
 
-from clsas import ClsasWarning, Grid, PointTargets, simulate_lines
+import clsas
+from clsas import BeamWindow, Grid, PointTargets, simulate_lines
 from clsas.core.image import Image
 from clsas.core.image_error import relative_error_db
+from clsas.opencl.device import Device
+from clsas.sonar.coverage import UnreachedWarning
 
 BY_NAME = {imager.name: imager for imager in IMAGERS}
 FAR_M = np.array([1e7, -1e7, 1e7])
@@ -292,8 +295,32 @@ def test_lines_of_zeros_give_zeros_without_a_warning(bound):
 
 
 @pytest.mark.parametrize("y", [5.0, 400.0, -4000.0])
-@pytest.mark.parametrize("bound", pairs(but=("mosaic",)))  # whose records say so
-def test_a_grid_that_no_line_reaches_warns_and_is_zero(bound, y):
+@every_imager
+def test_a_grid_that_no_line_reaches_warns_and_is_zero_without_a_kernel(bound, y, monkeypatch):
     given = dataclasses.replace(scene(bound[0].known), grid=Grid.plane((-1, 1, 9), (y, y + 1, 9)))
-    with pytest.warns(ClsasWarning, match="no pixel"):
+    monkeypatch.setattr(Device, "kernel", no_kernel)
+    with pytest.warns(UnreachedWarning, match="no pixel") as caught:
         assert not former(bound)(given).any()
+    assert len([each for each in caught if each.category is UnreachedWarning]) == 1
+
+
+def no_kernel(*_, **__):
+    raise AssertionError("a kernel was built")
+
+
+@pytest.mark.parametrize(
+    ("factor", "cause"), [(1e3, "In mm the grid"), (1e-3, "In km the grid"), (10, "Check the grid")]
+)
+def test_the_warning_names_the_likely_cause(factor, cause):
+    given = scene(near)
+    x, y = (axis * factor for axis in given.grid.axes_m)
+    grid = Grid.plane((x[0], x[-1], 9), (y[0], y[-1], 9))
+    with pytest.warns(UnreachedWarning, match=rf"grid lies at [\d.]+ to [\d.]+ m\. .*{cause}"):
+        clsas.backproject(given.lines, grid)
+
+
+def test_the_warning_names_the_beam_where_ranges_are_right():
+    given = scene(near)
+    beam = BeamWindow(5, squint_deg=60, along=[1, 0, 0])
+    with pytest.warns(UnreachedWarning, match=r"beam spans 57.5 to 62.5 degrees.*squint"):
+        assert not clsas.backproject(given.lines, given.grid, beam=beam).pixels.any()

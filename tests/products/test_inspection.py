@@ -673,3 +673,9 @@ def test_the_picture_has_units_and_marks(lines):
     assert {"taken standing still (79)", "dead (3)", "Gaps (1)", "Grid"} <= shown
     with pytest.raises(TypeError, match="found must be of type Inspection"):
         clsas.plot.inspection(lines)
+
+
+def test_a_device_that_does_not_exist_is_refused_though_none_is_needed(lines):
+    still = replace(lines, tx_m=lines.tx_m[0], rx_m=lines.rx_m[0])
+    with pytest.raises(clsas.DeviceError, match="no such"):
+        clsas.inspect(still, device="no such")

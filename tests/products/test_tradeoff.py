@@ -120,7 +120,7 @@ def test_default_stages_leave_a_line_and_a_pixel(lines):
         (TypeError, "lines must be of type RangeLines", {"lines": 3}),
         (TypeError, "grid must be of type Grid", {"grid": 3}),
         (ValueError, "repeats must be at least 1, got 0", {"repeats": 0}),
-        (ValueError, "tolerance_db must be", {"tolerances_db": (-50, -200)}),
+        (ValueError, "tolerances_db must be", {"tolerances_db": (-50, -200)}),
         (ValueError, "stages must leave a line and a pixel", {"stages": [[(300, 2)]]}),
         (TypeError, "stages must be a sequence", {"stages": [2]}),
         (TypeError, "stages must be a sequence", {"stages": 3}),

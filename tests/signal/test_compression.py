@@ -288,7 +288,7 @@ def test_real_echoes_need_their_band_inside_what_was_sampled():
         ({"samples": np.zeros(5)}, ValueError, r"samples must have shape \(any, any\)"),
         ({"samples": np.zeros((2, 0))}, ValueError, "samples must have shape .* no empty axis"),
         ({"samples": [[1, np.nan]] * 2}, ValueError, "samples must be finite, got 2 NaN"),
-        ({"samples": [["a"]]}, TypeError, "samples must be real numbers"),
+        ({"samples": [["a"]]}, TypeError, "samples must be real or complex numbers"),
         ({"start_time_s": [0, 1, 2]}, ValueError, r"start_time_s must have shape \(2\)"),
         ({"sample_rate_hz": 0}, ValueError, "sample_rate_hz must be finite and > 0 Hz, got 0"),
         ({"carrier_hz": -1}, ValueError, "carrier_hz must be finite and >= 0 Hz, got -1"),

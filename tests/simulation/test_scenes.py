@@ -204,7 +204,7 @@ GOOD = {"x_m": (0, 1), "y_m": (20, 21), "heights_m": np.zeros((3, 4))}
         ({"heights_m": np.zeros((1, 4))}, ValueError, "heights_m must have at least 2 rows"),
         ({"heights_m": np.full((3, 4), np.nan)}, ValueError, "heights_m must be finite"),
         ({"heights_m": "flat"}, TypeError, "heights_m must be real numbers"),
-        ({"texture": -1.0}, ValueError, "texture must be finite and >= 0, got -1"),
+        ({"texture": -1.0}, ValueError, "texture must be at least 0, got -1"),
         ({"texture": np.full((3, 4), -1)}, ValueError, "texture must be at least 0, got -1"),
         ({"texture": np.ones((4, 3))}, ValueError, r"texture must have shape \(3, 4\)"),
         ({"density_m2": 0}, ValueError, "density_m2 must be finite and > 0 per m2, got 0"),

@@ -394,7 +394,7 @@ def test_a_beam_that_points_elsewhere_warns_and_gives_zeros(platform, kind):
         ({"along": [[1, 0, 0], [0, 0, 0]]}, ValueError, "along must hold directions"),
         ({"along": (np.inf, 0, 0)}, ValueError, "along must be finite"),
         ({"along": "x"}, (TypeError, ValueError), "along must"),
-        ({"normalise": 1}, TypeError, "normalise must be True or False"),
+        ({"normalise": 1}, TypeError, "normalise must be of type bool"),
     ],
 )
 def test_bad_windows_are_refused(arguments, error, says):

@@ -169,3 +169,15 @@ def test_bad_line_array():
 def test_more_than_the_machine_holds_is_refused():
     with pytest.raises(ValueError, match=r"receivers must ask for at most .* GiB, .* got .* GiB"):
         line_array(10**13, 0.01)
+
+
+def test_a_pulse_keeps_plain_numbers():
+    given = {
+        "carrier_hz": np.array(1e5),
+        "bandwidth_hz": np.float16(2e4),
+        "duration_s": np.array(1),
+    }
+    pulse = Pulse(**given, code="up", taper=np.float32(0.5))
+    for name in ("carrier_hz", "bandwidth_hz", "duration_s", "taper"):
+        assert type(getattr(pulse, name)) is float
+    assert Pulse.phase_code(1e5, 1e-3, np.array([1, -1])).code == (1, -1)

@@ -197,7 +197,7 @@ def test_bad_straight_track(arguments, error, message):
 def test_bad_pointing():
     with pytest.raises(ValueError, match=r"squint_rad must have shape \(any\)"):
         Pointing.scan([])
-    with pytest.raises(ValueError, match=r"spot_m must have shape \(3\)"):
+    with pytest.raises(ValueError, match=r"point_m must have shape \(3\)"):
         Pointing.spot([1, 2])
     with pytest.raises(ValueError, match="depression_rad must be finite"):
         Pointing.broadside(depression_rad=np.nan)

@@ -130,6 +130,24 @@ def axis_label(name: str, unit: str, of: str = "") -> str:
     return " ".join(filter(None, (_NAMES.get(name, f"Distance {name}"), of, f"({unit})")))
 
 
+def drawable(name: str, value: object) -> str:
+    """Return a text that matplotlib can draw; raises TypeError or ValueError.
+
+    Between dollar signs matplotlib reads mathematics, and control characters have no glyph.
+    """
+    from matplotlib import cbook
+    from matplotlib.mathtext import MathTextParser
+
+    given = validate.text(name, value)
+    if cbook.is_math_text(given):
+        try:
+            MathTextParser("path").parse(given)
+        except ValueError as error:
+            reason = str(error).splitlines()[-1]
+            raise ValueError(f"{name} must be text or valid mathematics: {reason}") from None
+    return given
+
+
 def plain_ticks(axes: Axes) -> None:
     """Write coordinates in full, however far the origin is, and only as many as fit."""
     from clsas.products.plot.ticks import FittingLocator

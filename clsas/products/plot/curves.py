@@ -9,7 +9,7 @@ import numpy as np
 
 from clsas.core import validate
 from clsas.products.cuts import Cut
-from clsas.products.plot.canvas import axis_label, length_unit, new_figure
+from clsas.products.plot.canvas import axis_label, drawable, length_unit, new_figure
 from clsas.products.quality import PointResponse
 
 if TYPE_CHECKING:
@@ -43,8 +43,8 @@ def cuts(response: PointResponse, *, floor_db: float = -60.0, resolutions: float
         If an argument is of a wrong kind, `floor_db` not negative or `resolutions` not positive.
     """
     validate.instance("response", response, PointResponse)
-    validate.number("floor_db", floor_db, "dB", below=0.0)
-    validate.positive("resolutions", resolutions)
+    floor_db = validate.number("floor_db", floor_db, "dB", below=0.0)
+    resolutions = validate.positive("resolutions", resolutions)
     figure = new_figure(7.0, 7.0)
     axes_of_both = figure.subplots(2)
     for axes, cut in zip(axes_of_both, (response.azimuth, response.range), strict=True):
@@ -82,8 +82,10 @@ def tradeoff(measured: Tradeoff, *, title: str = "") -> Figure:
     TypeError
         If `measured` is of another type.
     """
-    if not hasattr(measured, "front"):
-        raise TypeError(f"measured must be of type Tradeoff, got {validate.shown(measured)}")
+    from clsas.products.tradeoff_result import Tradeoff
+
+    validate.instance("measured", measured, Tradeoff)
+    title = drawable("title", title)
     figure = new_figure(7.0, 6.0)
     from matplotlib import ticker
 

@@ -18,6 +18,7 @@ from clsas.core.image import Image
 from clsas.core.lines import RangeLines
 from clsas.products.plot.canvas import (
     axis_label,
+    drawable,
     figure_class,
     length_unit,
     new_figure,
@@ -54,22 +55,29 @@ class Scale:
     colour_map: str | Colormap = COLOUR_MAP
 
     def __post_init__(self) -> None:
-        """Check every field but the colours, which need matplotlib."""
+        """Check every field but the colours, which need matplotlib, and convert it."""
+
+        def put(name: str, value: object) -> None:
+            object.__setattr__(self, name, value)
+
         if self.reference is not None:
-            validate.positive("reference", self.reference)
+            put("reference", validate.positive("reference", self.reference))
         if self.percentiles is None:
             if self.dynamic_range_db is not None:
-                validate.positive("dynamic_range_db", self.dynamic_range_db, "dB")
+                range_db = validate.positive("dynamic_range_db", self.dynamic_range_db, "dB")
+                put("dynamic_range_db", range_db)
             return
         if self.dynamic_range_db is not None:
             raise ValueError("dynamic_range_db and percentiles exclude each other, got both")
-        try:
-            low, high = self.percentiles
-        except (TypeError, ValueError):
+        given = validate.entries("percentiles", self.percentiles, "(low, high)")
+        if len(given) != 2:
             got = validate.shown(self.percentiles)
-            raise TypeError(f"percentiles must be (low, high), got {got}") from None
-        validate.number("low of percentiles", low, least=0.0, below=100.0)
-        validate.number("high of percentiles", high, above=low, most=100.0)
+            raise TypeError(f"percentiles must be (low, high), got {got}")
+        low = validate.number("low of percentiles", given[0], least=0.0, below=100.0)
+        put(
+            "percentiles",
+            (low, validate.number("high of percentiles", given[1], above=low, most=100.0)),
+        )
 
     @property
     def label(self) -> str:
@@ -145,6 +153,8 @@ def image(
     if image.grid.points_m is not None:
         raise ValueError("image must be on a plane or height map to be drawn, got points")
     scale = Scale(dynamic_range_db, percentiles, reference, colour_map)
+    validate.flag("colour_bar", colour_bar)
+    title = drawable("title", title)
     figure_class()  # raises where matplotlib is missing
     if axes is None:
         from matplotlib import pyplot
@@ -195,7 +205,13 @@ def image_html(image: Image) -> str:
 
     The picture is a PNG within the HTML. Without matplotlib, and of arbitrary points, there is only
     the summary.
+
+    Raises
+    ------
+    TypeError
+        If `image` is not an Image.
     """
+    validate.instance("image", image, Image)
     text = f"<pre>{escape(repr(image))}</pre>"
     if image.grid.points_m is not None or not is_installed("matplotlib"):
         return text
@@ -233,6 +249,7 @@ def range_lines(
     """
     validate.instance("lines", lines, RangeLines)
     scale = Scale(dynamic_range_db, percentiles, None, colour_map)
+    title = drawable("title", title)
     amplitude, first_m, last_m = _aligned(lines)
     extent = (-0.5, lines.channels - 0.5, first_m, last_m)
     figure = new_figure(_WIDTH_IN, 6.0)

@@ -54,8 +54,9 @@ def mosaic(
     from clsas.mosaics.store import Store
 
     if not isinstance(store, Store):
-        store = Store.opened(store)
-    validate.instance("borders", borders, bool)
+        store = Store.opened(validate.path("store", store))
+    validate.flag("borders", borders)
+    most = validate.count("most", most)
     figure = image_db(store.overview(most), **options)
     if borders and store.patch_shape is not None:
         patch_borders(figure.axes[0], store.grid, store.patch_shape)
@@ -83,7 +84,10 @@ def patch_borders(axes: Axes, grid: Grid, patch_shape: tuple[int, int]) -> None:
     validate.instance("grid", grid, Grid)
     across, upward = grid.sides
     factor, _ = length_unit(max(float(np.abs(s.places_m).max()) for s in (across, upward)))
-    rows, columns = (validate.count("every side of patch_shape", side) for side in patch_shape)
+    sides = validate.entries("patch_shape", patch_shape, "(rows, columns)")
+    if len(sides) != 2:
+        raise ValueError(f"patch_shape must be (rows, columns), got {validate.shown(patch_shape)}")
+    rows, columns = (validate.count("every side of patch_shape", side) for side in sides)
     for side, every, draw in ((across, columns, axes.axvline), (upward, rows, axes.axhline)):
         for first in range(every, len(side.places_m), every):
             place = factor * (side.places_m[first] - side.step_m / 2)

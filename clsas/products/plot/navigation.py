@@ -142,7 +142,9 @@ def _edges_m(found: Micronavigation, range_m: tuple[float, float] | None) -> NDA
     """Return the ranges between windows, which are equally wide and fill `range_m`."""
     middles_m, windows = found.range_m, len(found.range_m)
     if range_m is not None:
-        near_m, far_m = map(float, range_m)
+        near_m, far_m = validate.array("range_m", range_m, np.float64, (2,))
+        if not near_m < far_m:
+            raise ValueError(f"range_m must be near < far in m, got ({near_m:g}, {far_m:g})")
     elif windows > 1:
         half_m = float(middles_m[1] - middles_m[0]) / 2
         near_m, far_m = middles_m[0] - half_m, middles_m[-1] + half_m

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from clsas.core import validate
 from clsas.core.grid import Grid
 from clsas.core.image import Image
-from clsas.products.plot.canvas import axis_label, figure_class, length_unit
+from clsas.products.plot.canvas import axis_label, drawable, figure_class, length_unit
 from clsas.products.plot.levels import Scale, add_colour_bar, draw_levels, edges
 
 if TYPE_CHECKING:
@@ -87,7 +87,8 @@ def volume(
         `at` lies outside it.
     """
     validate.instance("image", image, Image)
-    validate.one_of("kind", kind, KINDS)
+    kind = validate.one_of("kind", kind, KINDS)
+    title = drawable("title", title)
     scale = Scale(**options)
     if at is not None and kind != "slices":
         raise ValueError(f"at goes with kind 'slices', got kind {kind!r}")

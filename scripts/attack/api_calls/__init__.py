@@ -1,0 +1,1 @@
+"""Valid calls of the public API, hostile values for their arguments, and the judgement."""

@@ -1,0 +1,132 @@
+"""Valid calls of readers, writers, stores and results."""
+
+from __future__ import annotations
+
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+
+import clsas
+from api_calls.scene import Call, nothing, scene
+from clsas.mosaics.documents import read_document
+from clsas.planning.costs import Costs
+
+
+def files(folder: Path) -> dict[str, Call]:
+    s = scene(folder)
+    optional = ("None",)
+    common = {"window": "hann", "oversampling": 2.0}
+    store = clsas.mosaic(
+        s.lines.select(slice(0, 20)),
+        s.grid,
+        folder / "store.zarr",
+        accuracy_db=-50.0,
+        patches=(2, 1),
+    )
+    store.image()
+    opened = clsas.Store.opened(folder / "store.zarr")
+    document = read_document(opened.path)
+    inputs, patch_shape = document["inputs"], document["patch_shape"]
+    record = opened.records()[0, 0]
+    shape = opened.pixels.chunks
+    return {
+        "load": Call(clsas.load, {"path": folder / "lines.h5"}),
+        "save": Call(
+            clsas.save,
+            {"path": folder / "out.h5", "obj": s.lines},
+            accepts={"obj": ("a Grid", "an Image", "list of it")},
+        ),
+        "read_airsas": Call(
+            clsas.read_airsas,
+            {
+                "path": folder / "scenes" / "a.h5",
+                "channels": (1,),
+                "shared": folder / "characterization data",
+                **common,
+            },
+            accepts={"channels": optional, "shared": optional},
+        ),
+        "read_cphd": Call(
+            clsas.read_cphd, {"path": folder / "lines.cphd", "channel": None, **common}
+        ),
+        "write_cphd": Call(clsas.write_cphd, {"path": folder / "out.cphd", "lines": s.lines}),
+        "read_full_matrix": Call(
+            clsas.read_full_matrix,
+            {"path": folder / "capture.mat", "sound_speed_m_s": 6000.0, **common},
+            accepts={"sound_speed_m_s": optional},
+        ),
+        "read_phase_history": Call(
+            clsas.read_phase_history, {"path": folder / "pass.mat", **common}
+        ),
+        "process": Call(
+            clsas.process,
+            {
+                "scene": folder / "scene.toml",
+                "lines": folder / "lines.h5",
+                "output": folder / "out",
+                "steps": ("image",),
+                "device": 0,
+                "progress": nothing,
+            },
+            kinds={"device": "device"},
+            accepts=dict.fromkeys(("output", "steps", "progress"), optional)
+            | {"lines": ("None", "RangeLines")},
+        ),
+        "Store": Call(clsas.Store, {"path": folder / "store.zarr"}),
+        "Store.at": Call(
+            clsas.Store.at, {"path": folder / "store.zarr"}, names={"path": ("store",)}
+        ),
+        "Store.opened": Call(
+            clsas.Store.opened, {"path": folder / "store.zarr"}, names={"path": ("store",)}
+        ),
+        "Store.read": Call(opened.read, {"rows": slice(0, 4), "columns": slice(1, 5)}),
+        "Store.image": Call(opened.image, {"rows": slice(0, 4), "columns": slice(1, 5)}),
+        "Store.overview": Call(opened.overview, {"most": 8}),
+        "Store.records": Call(opened.records, {}),
+        "Store.damage": Call(opened.damage, {"tell": nothing}, accepts={"tell": optional}),
+        "Store.begin": Call(
+            opened.begin,
+            {"inputs": inputs, "grid": s.grid, "patch_shape": tuple(patch_shape)},
+            accepts={"inputs": ("dict",)},
+        ),
+        "Store.grow": Call(opened.grow, {"inputs": inputs}, accepts={"inputs": ("dict",)}),
+        "Store.write": Call(
+            opened.write,
+            {
+                "row": 0,
+                "column": 0,
+                "rows": slice(0, shape[0]),
+                "columns": slice(0, shape[1]),
+                "pixels": np.array(opened.read(slice(0, shape[0]))),
+                "record": record,
+            },
+        ),
+    }
+
+
+def results(folder: Path) -> dict[str, Call]:
+    s = scene(folder)
+    assessed = clsas.assess(s.lines, s.grid, costs=Costs(), ends=False)
+    traded = measured(folder)
+    found = clsas.calibrate_track(
+        s.lines, s.targets.positions_m, unknowns=("time_offset",), search_m=0.2
+    )
+    return {
+        "Assessment.describe": Call(assessed.describe, {}),
+        "Calibration.describe": Call(found.describe, {}),
+        "Inspection.describe": Call(clsas.inspect(s.lines, s.grid).describe, {}),
+        "Tradeoff.describe": Call(traded.describe, {}),
+        "Tradeoff.save_csv": Call(traded.save_csv, {"path": folder / "out.csv"}),
+        "Tradeoff.save_png": Call(
+            traded.save_png,
+            {"path": folder / "out.png", "title": "A title"},
+            kinds={"title": "text"},
+        ),
+    }
+
+
+@cache
+def measured(folder: Path) -> clsas.Tradeoff:
+    s = scene(folder)
+    return clsas.tradeoff(s.lines, s.grid, tolerances_db=(-30.0,), repeats=1)

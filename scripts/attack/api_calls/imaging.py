@@ -1,0 +1,337 @@
+"""Valid calls of imagers, plans, measures of images and navigation."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import scipy.io
+
+import clsas
+from api_calls.scene import EMPTY, LARGE, Call, fields, nothing, scene
+from clsas.planning.costs import Costs
+
+
+def imaging(folder: Path) -> dict[str, Call]:
+    s = scene(folder)
+    lines, grid, beam, plan = s.lines, s.grid, s.beam, s.plan
+    few = lines.select(slice(0, 20))
+    scene_names = {"lines": ("samples", "range_step_m", "carrier_hz"), "grid": ("height_m",)}
+    whole = {"lines": lines, "grid": grid}
+    optional = ("None",)
+    device = {"device": "device"}
+    history = scipy.io.loadmat(folder / "pass.mat", simplify_cells=True)["data"]
+    tx_m = np.stack([history[axis] for axis in "xyz"], axis=1)
+    capture = np.cos(np.arange(60)[:, None] / 2 + np.arange(3)).T
+    return {
+        "backproject": Call(
+            clsas.backproject,
+            whole
+            | {
+                "device": 0,
+                "accuracy_db": -50.0,
+                "taps": 4,
+                "upsampling": 2.0,
+                "beam": beam,
+                "accumulate": s.image,
+                "progress": nothing,
+            },
+            kinds=device,
+            names=scene_names,
+            accepts=dict.fromkeys(
+                ("taps", "upsampling", "beam", "accumulate", "progress"), optional
+            ),
+        ),
+        "factorize": Call(
+            clsas.factorize,
+            whole
+            | {
+                "plan_or_tolerance": plan,
+                "beam": None,
+                "device": 0,
+                "accumulate": s.image,
+                "progress": nothing,
+            },
+            kinds=device,
+            names=scene_names,
+            accepts=dict.fromkeys(("beam", "accumulate", "progress"), optional),
+        ),
+        "wavenumber": Call(
+            clsas.wavenumber,
+            whole | {"beam": beam, "motion_compensation": True, "workers": 1},
+            names=scene_names,
+            accepts=dict.fromkeys(("beam", "workers"), optional),
+        ),
+        "plan": Call(
+            clsas.plan,
+            whole
+            | {
+                "tolerance_db": None,
+                "tolerance_wavelengths": None,
+                "stages": [(2, 2)],
+                "beam": beam,
+                "device": 0,
+                "memory_bytes": 1 << 30,
+                "costs": Costs(),
+                "taps": None,
+                "depth": None,
+                "full_model": False,
+            },
+            kinds=device,
+            names=scene_names,
+            accepts=dict.fromkeys(("beam", "memory_bytes", "costs"), optional) | {"stages": EMPTY},
+        ),
+        "Plan": Call(
+            clsas.Plan,
+            fields(plan),
+            kinds=dict.fromkeys(("lines_digest", "grid_digest"), "text"),
+            accepts={"tolerance_db": ("None", "number"), "beam": optional},
+            skips={"left_out": ("list", "int array")},
+        ),
+        "plan:tolerance": Call(
+            clsas.plan,
+            whole
+            | {
+                "tolerance_db": -30.0,
+                "tolerance_wavelengths": None,
+                "stages": None,
+                "taps": (4, 4),
+                "depth": 1,
+                "costs": Costs(),
+            },
+            names=scene_names,
+            accepts={
+                "taps": optional,
+                "depth": optional,
+                "costs": optional,
+                "tolerance_wavelengths": ("number",),
+            },
+        ),
+        "plan:wavelengths": Call(
+            clsas.plan,
+            whole | {"tolerance_wavelengths": 0.01, "full_model": True, "costs": Costs()},
+            names=scene_names,
+            accepts={"costs": optional},
+        ),
+        "factorize:tolerance": Call(
+            clsas.factorize,
+            whole | {"plan_or_tolerance": -30.0, "beam": beam},
+            names=scene_names | {"plan_or_tolerance": ("tolerance_db",)},
+            accepts={"beam": optional},
+        ),
+        "Plan.changed": Call(plan.changed, {"half_precision": False}),
+        "Plan.check": Call(plan.check, whole),
+        "Plan.describe": Call(plan.describe, {}),
+        "Plan.from_json": Call(clsas.Plan.from_json, {"text": plan.to_json()}),
+        "Plan.moved": Call(plan.moved, {"lines": lines}),
+        "Plan.to_json": Call(plan.to_json, {"filters": True}),
+        "assess": Call(
+            clsas.assess,
+            whole
+            | {
+                "beam": beam,
+                "tolerance_db": -40.0,
+                "sonar": s.sonar,
+                "track": s.track,
+                "pointing": clsas.Pointing(),
+                "element_pattern": True,
+                "device": 0,
+                "costs": Costs(),
+                "repeats": 0,
+                "ends": False,
+            },
+            kinds=device,
+            names=scene_names,
+            skips={"repeats": LARGE},
+            accepts=dict.fromkeys(("beam", "sonar", "track", "pointing", "costs"), optional),
+        ),
+        "inspect": Call(
+            clsas.inspect,
+            whole | {"device": 0, "beam": beam, "element_length_m": 0.1},
+            kinds=device,
+            names=scene_names,
+            accepts=dict.fromkeys(("grid", "beam", "element_length_m"), optional),
+        ),
+        "list_devices": Call(clsas.list_devices, {}),
+        "measure_point": Call(
+            clsas.measure_point,
+            {"image": s.image, "near": (0.1, 15.0), "search_m": 0.2, "extent_m": 0.3},
+            accepts=dict.fromkeys(("search_m", "extent_m"), optional),
+            names={"image": ("near",)},
+        ),
+        "tradeoff": Call(
+            clsas.tradeoff,
+            whole
+            | {
+                "tolerances_db": (-30.0, -40.0),
+                "stages": [[(2, 2)]],
+                "beam": beam,
+                "device": 0,
+                "repeats": 1,
+                "study": False,
+                "progress": nothing,
+            },
+            kinds=device,
+            names=scene_names,
+            skips={"repeats": LARGE},
+            accepts=dict.fromkeys(("stages", "beam", "progress"), optional)
+            | {"tolerances_db": EMPTY},
+        ),
+        "from_phase_history": Call(
+            clsas.from_phase_history,
+            {
+                "samples": history["fp"].T,
+                "first_frequency_hz": np.full(8, 9e9),
+                "frequency_step_hz": np.full(8, 1e6),
+                "reference_range_m": history["r0"],
+                "tx_m": tx_m,
+                "rx_m": tx_m,
+                "sound_speed_m_s": 3e8,
+                "window": "hann",
+                "oversampling": 2.0,
+                "sign": -1,
+            },
+        ),
+        "from_full_matrix": Call(
+            clsas.from_full_matrix,
+            {
+                "samples": capture,
+                "elements_m": np.array([[0.0, 0.0, 0.0], [1e-3, 0.0, 0.0]]),
+                "sample_rate_hz": 25e6,
+                "carrier_hz": 5e6,
+                "sound_speed_m_s": 6000.0,
+                "start_time_s": 0.0,
+                "pairs": (np.array([0, 0, 1]), np.array([0, 1, 1])),
+                "bandwidth_hz": 4e6,
+                "window": "hann",
+                "oversampling": 2.0,
+            },
+            accepts={"bandwidth_hz": optional},
+        ),
+        "mosaic": Call(
+            lambda **given: clsas.mosaic(**given).image(),
+            {
+                "source": few,
+                "grid": grid,
+                "tolerance_db": None,
+                "tolerance_wavelengths": None,
+                "stages": None,
+                "accuracy_db": -50.0,
+                "beam": beam,
+                "patches": (2, 1),
+                "memory_bytes": 1 << 28,
+                "device": 0,
+                "client": None,
+                "follow_s": None,
+            },
+            kinds=device,
+            skips={"source": ("str",)},
+            names=scene_names,
+            accepts=dict.fromkeys(("accuracy_db", "beam", "patches", "memory_bytes"), optional),
+        ),
+        "mosaic:tolerance": Call(
+            _anew(folder / "new.zarr"),
+            {
+                "source": folder / "lines.h5",
+                "grid": grid,
+                "store": folder / "new.zarr",
+                "tolerance_db": -30.0,
+                "patches": (2, 2),
+            },
+            names=scene_names,
+            accepts={
+                "store": optional,
+                "patches": optional,
+                "tolerance_db": optional,
+                "source": ("RangeLines", "folder"),
+            },
+        ),
+        "Mosaic.image": Call(
+            clsas.mosaic(few, grid, accuracy_db=-50.0, patches=(2, 1)).image,
+            {"tell": nothing},
+            accepts={"tell": optional},
+        ),
+    }
+
+
+def _anew(store: Path) -> Callable[..., clsas.Mosaic]:
+    """Return `clsas.mosaic`, which first removes the store that the last call left."""
+
+    def mosaic(**given: Any) -> clsas.Mosaic:
+        shutil.rmtree(store, ignore_errors=True)
+        return clsas.mosaic(**given)
+
+    return mosaic
+
+
+def navigation(folder: Path) -> dict[str, Call]:
+    s = scene(folder)
+    optional = ("None",)
+    array = clsas.Sonar(
+        s.sonar.pulse, [[0.05 * n, 0.0, 0.0] for n in range(8)], tx_length_m=0.1, rx_length_m=0.1
+    )
+    track = clsas.Track.straight((-1.0, 0.0, 0.0), (1.0, 0.0, 0.0), 12, 0.1)
+    rng = np.random.default_rng(0)
+    at = np.stack([rng.uniform(-1.5, 1.5, 150), rng.uniform(14, 16, 150), np.zeros(150)], axis=1)
+    overlapping = clsas.compress(
+        clsas.simulate(array, track, clsas.PointTargets(at, np.exp(2j * np.pi * rng.random(150))))
+    )
+    return {
+        "micronavigate": Call(
+            clsas.micronavigate,
+            {
+                "lines": overlapping,
+                "range_m": (14.25, 15.75),
+                "window_m": 0.5,
+                "side": "port",
+                "seabed_z_m": 0.0,
+                "element_length_m": (0.1, 0.1),
+                "sway_sd_m": np.full(12, 0.1),
+                "yaw_sd_rad": np.full(12, 0.01),
+                "surge_sd_m": np.full(12, 0.1),
+                "correlation_pings": 5.0,
+                "unknowns": ("sway", "yaw", "surge"),
+                "most_step_m": 0.1,
+                "progress": nothing,
+            },
+            accepts=dict.fromkeys(
+                (
+                    "range_m",
+                    "window_m",
+                    "seabed_z_m",
+                    "element_length_m",
+                    "correlation_pings",
+                    "progress",
+                ),
+                optional,
+            ),
+        ),
+        "autofocus": Call(
+            clsas.autofocus,
+            {
+                "lines": s.lines,
+                "grid": s.grid,
+                "beam": s.beam,
+                "unknowns": ("sway",),
+                "device": 0,
+                "progress": nothing,
+            },
+            kinds={"device": "device"},
+            accepts=dict.fromkeys(("beam", "progress"), optional),
+        ),
+        "calibrate_track": Call(
+            clsas.calibrate_track,
+            {
+                "lines": s.lines,
+                "points_m": np.array(s.targets.positions_m),
+                "unknowns": ("time_offset",),
+                "search_m": 0.2,
+                "track": s.track,
+                "progress": nothing,
+            },
+            accepts=dict.fromkeys(("search_m", "track", "progress"), optional),
+        ),
+    }
