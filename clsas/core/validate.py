@@ -208,7 +208,7 @@ def escaped(text: str) -> str:
 class Budget:
     """Memory that one call may take: what is left to this process when the call begins.
 
-    Every allocation that stays until the call ends is subtracted, so that their sum is checked, and
+    Every allocation that stays is subtracted, so that their sum is checked, and
     each of them before it is made. Nothing is refused if the system does not report its memory.
     """
 
@@ -231,6 +231,10 @@ class Budget:
                 f"this machine's memory, got {asked}"
             )
         self._left_bytes -= size_bytes
+
+    def give_back(self, size_bytes: float) -> None:
+        """Add what was taken before and is released."""
+        self._left_bytes += size_bytes
 
 
 def memory(name: str, size_bytes: float) -> None:
