@@ -300,6 +300,9 @@ class Store:
     def _values(self, name: str) -> NDArray:
         """Return a whole array."""
         array = self._array(name)
+        chunk_bytes = math.prod(array.chunks) * array.dtype.itemsize
+        # As read, and as converted; and a chunk as stored, which may be larger than the array.
+        validate.memory(f"{name} in {self.path}", 2 * array.nbytes + 2 * chunk_bytes)
         try:
             return np.asarray(array[:])
         except ValueError as error:
