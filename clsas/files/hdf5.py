@@ -62,7 +62,8 @@ def save(path: str | os.PathLike, obj: Saved) -> None:
     TypeError
         If `obj` is of another type.
     ValueError
-        If the file's name has the suffix of another format, such as .tif.
+        If the file's name has the suffix of another format, such as .tif, or `path` is a device, a
+        pipe or a socket.
     OSError
         If the folder does not exist or the file cannot be written, as on a full disk.
 
