@@ -82,8 +82,8 @@ def load(path: str | os.PathLike) -> Saved:
 def save(path: str | os.PathLike, obj: Saved) -> None:
     """Write an object to an HDF5 file, or range lines to a CPHD file.
 
-    An existing file is replaced in one step and keeps its mode. A symbolic link stays: the file that
-    it leads to is replaced.
+    An existing file is replaced in one step and keeps its mode. A symbolic link stays: the file it
+    leads to is replaced.
 
     Parameters
     ----------
