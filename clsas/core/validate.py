@@ -37,6 +37,8 @@ MOST_HZ, MOST_M_S = 1e15, 3e8
 _MOST_COUNT = 2**63 - 1
 _MOST_CYCLES = 1e10  # of phase: float64 holds them to 1e-6 of a cycle
 
+_SMALL_BYTES = 1 << 20  # of an array; asking the system for its memory takes longer
+
 _T = TypeVar("_T")
 
 
@@ -290,38 +292,77 @@ def escaped(text: str) -> str:
     )
 
 
-def memory(name: str, size_bytes: float) -> None:
-    """Raise ValueError if the argument `name` requires more memory than this process may have.
+class Budget:
+    """Memory that one call may take: what is left to this process when the call begins.
 
-    That is the machine's memory, or the limit of the process's control group or address space.
-    Nothing is refused if the system does not report it.
+    Every allocation that stays is subtracted, so that their sum is checked, and
+    each of them before it is made. Nothing is refused if the system does not report its memory.
     """
-    available = _memory_bytes()
-    if not size_bytes <= available:  # nor NaN
-        try:
-            asked = f"{size_bytes / 2**30:.3g} GiB"
-        except OverflowError:  # a whole number beyond float64
-            asked = "more than 1e300 GiB"
-        raise ValueError(
-            f"{name} must ask for at most {available / 2**30:.3g} GiB, this machine's memory, "
-            f"got {asked}"
-        )
+
+    def __init__(self) -> None:
+        self._left_bytes = _memory_bytes()
+
+    def take(self, name: str, size_bytes: float, *, passing_bytes: float = 0) -> None:
+        """Subtract an allocation for `name`, or raise ValueError if it is larger than what is left.
+
+        `passing_bytes` are needed besides, but only for a time.
+        """
+        wanted = size_bytes + passing_bytes
+        if not wanted <= self._left_bytes:  # nor NaN
+            try:
+                asked = f"{wanted / 2**30:.3g} GiB"
+            except OverflowError:  # a whole number beyond float64
+                asked = "more than 1e300 GiB"
+            raise ValueError(
+                f"{name} must ask for at most {self._left_bytes / 2**30:.3g} GiB, what is left of "
+                f"this machine's memory, got {asked}"
+            )
+        self._left_bytes -= size_bytes
+
+    def give_back(self, size_bytes: float) -> None:
+        """Add what was taken before and is released."""
+        self._left_bytes += size_bytes
+
+
+def memory(name: str, size_bytes: float) -> None:
+    """Raise ValueError if the argument `name` requires more memory than this process has left.
+
+    See `Budget`, for calls that allocate more than once.
+    """
+    Budget().take(name, size_bytes)
 
 
 def _memory_bytes() -> float:
-    """Memory that this process may have, infinite if the system does not report it."""
+    """Memory that this process may still take, infinite if the system does not report it.
+
+    That is the machine's memory or the limit of the process's control group, less what the process
+    holds; or what its address space has left, if that is limited.
+    """
     limits = [math.inf]
     if "SC_PHYS_PAGES" in getattr(os, "sysconf_names", ()):
         limits.append(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
     for file in _GROUP_LIMITS:
         with contextlib.suppress(OSError, ValueError):  # no such group, or "max"
             limits.append(int(Path(file).read_text()))
+    held_bytes, addressed_bytes = _held_bytes()
+    left_bytes = min(limits) - held_bytes
     with contextlib.suppress(ImportError):  # of Unix
         import resource
 
         soft, _ = resource.getrlimit(resource.RLIMIT_AS)
-        limits.append(math.inf if soft == resource.RLIM_INFINITY else soft)
-    return min(limits)
+        if soft != resource.RLIM_INFINITY:
+            left_bytes = min(left_bytes, soft - addressed_bytes)
+    return max(left_bytes, 0.0)
+
+
+def _held_bytes() -> tuple[int, int]:
+    """Memory of this process's own, without files and libraries, and all of its address space."""
+    try:
+        addressed, resident, shared = map(int, Path("/proc/self/statm").read_text().split()[:3])
+    except (OSError, ValueError):  # not Linux
+        return 0, 0
+    page = os.sysconf("SC_PAGE_SIZE")
+    return (resident - shared) * page, addressed * page
 
 
 def phase(carrier_hz: float, sound_speed_m_s: float, farthest_m: float) -> None:
@@ -408,6 +449,9 @@ def array(
         raise ValueError(f"{name} must have shape ({wanted}) and no empty axis, got {given.shape}")
     if given.dtype.kind in "fc" and np.can_cast(dtype, given.dtype) and dtype != given.dtype:
         _check_narrowing(name, given, dtype)
+    copied = given.dtype != dtype or not given.flags.c_contiguous
+    if copied and given.size * dtype.itemsize > _SMALL_BYTES:
+        memory(name, given.size * dtype.itemsize)
     with np.errstate(over="ignore", under="ignore"):
         result = np.asarray(given, dtype=dtype, order="C")  # keeps arrays of no axis
     with np.errstate(over="ignore", invalid="ignore"):

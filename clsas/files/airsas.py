@@ -22,7 +22,7 @@ from clsas.core.lines import RangeLines
 from clsas.files import hdf5
 from clsas.files.hdf5 import FileFormatError
 from clsas.files.positions import checked_positions
-from clsas.signal.compression import Window, compress
+from clsas.signal.compression import Window, check_options, compress
 from clsas.signal.echoes import Echoes
 from clsas.sonar.system import Pulse
 
@@ -84,6 +84,7 @@ def read_airsas(
         If all pings have one position, or the track turns back, so that pings may be out of order.
     """
     path = validate.path("path", path)
+    check_options(window=window, oversampling=oversampling)
     with hdf5.opened(path) as file:
         if not is_airsas(file):
             raise FileFormatError(
@@ -101,26 +102,29 @@ def read_airsas(
         there = [n for n in range(1, len(sensors_m)) if f"ch{n}" in file]
     numbers = _microphones(path, there, channels)
     with hdf5.opened(path) as file:
-        rail_m = _dataset(file, "na", "position").ravel()
+        budget = validate.Budget()
+        rail_m = _numbers(_dataset(file, "na", "position"), budget).ravel()
         pings = len(rail_m)
-        samples = [_dataset(file, f"ch{number}", "ts") for number in numbers]
-        for number, each in zip(numbers, samples, strict=True):
-            if each.shape != (pings, samples[0].shape[-1]):
+        recorded = [_dataset(file, f"ch{number}", "ts") for number in numbers]
+        for each in recorded:
+            if each.shape != (pings, recorded[0].shape[-1]):
                 raise FileFormatError(
-                    f"must hold /ch{number}/ts of shape [pings, time], {pings} by "
-                    f"{samples[0].shape[-1]}, got {each.shape}"
+                    f"must hold {each.name} of shape [pings, time], {pings} by "
+                    f"{recorded[0].shape[-1]}, got {each.shape}"
                 )
-        speed_m_s = _speeds_m_s(_dataset(file, "na", "temperature"), pings)
+        speed_m_s = _speeds_m_s(_numbers(_dataset(file, "na", "temperature"), budget), pings)
+        pulse = parameters.pulse
+        samples_per_sample = oversampling * pulse.bandwidth_hz / parameters.sample_rate_hz
+        samples = _together(recorded, budget, lines_bytes=8 * samples_per_sample)
     position_m = np.zeros((pings, 1, 3))
     position_m[..., 0] = rail_m[:, None]
     tx_m, rx_m = (
         np.broadcast_to(position_m + sensors_m[rows], (pings, len(numbers), 3)).reshape(-1, 3)
         for rows in ([0], numbers)
     )
-    time_s = (np.arange(samples[0].shape[1]) - parameters.group_delay) / parameters.sample_rate_hz
-    pulse = parameters.pulse
+    time_s = (np.arange(samples.shape[-1]) - parameters.group_delay) / parameters.sample_rate_hz
     echoes = Echoes(
-        _conditioned(samples, time_s, pulse.duration_s),
+        _conditioned(samples, time_s, pulse.duration_s).reshape(-1, len(time_s)),
         start_time_s=time_s[0],
         sample_rate_hz=parameters.sample_rate_hz,
         carrier_hz=pulse.carrier_hz,
@@ -151,6 +155,7 @@ def at_one_speed(lines: RangeLines, speed_m_s: NDArray[np.float64]) -> RangeLine
     """
     import finufft  # slow to import
 
+    validate.memory("lines at one speed of sound", lines.samples.nbytes)
     speed = lines.sound_speed_m_s
     samples = np.array(lines.samples)
     padded = fft.next_fast_len(lines.length + lines.length // 4)
@@ -243,15 +248,50 @@ def _microphones(path: Path, there: list[int], channels: Sequence[int] | None) -
     return numbers
 
 
-def _dataset(file: h5py.File, group: str, name: str) -> NDArray:
+def _dataset(file: h5py.File, group: str, name: str) -> h5py.Dataset:
     item = hdf5.find_item(file, group)
     item = hdf5.find_item(item, name) if isinstance(item, h5py.Group) else None
     if not isinstance(item, h5py.Dataset) or item.dtype.kind not in "iuf" or not item.size:
         raise FileFormatError(f"must hold numbers as /{group}/{name}")
-    values = hdf5.read_values(item).astype(np.float32 if name == "ts" else np.float64)
+    return item
+
+
+def _numbers(dataset: h5py.Dataset, budget: validate.Budget) -> NDArray[np.float64]:
+    """Return the values of a dataset, which must be finite."""
+    with hdf5.too_large():
+        budget.take(f"reading {dataset.name}", 8 * dataset.size)
+    values = hdf5.read_values(dataset, budget).astype(np.float64)
     if not np.isfinite(values).all():
-        raise FileFormatError(f"must hold finite numbers as /{group}/{name}")
+        raise FileFormatError(f"must hold finite numbers as {dataset.name}")
     return values
+
+
+def _together(
+    recorded: list[h5py.Dataset], budget: validate.Budget, lines_bytes: float
+) -> NDArray[np.float32]:
+    """Return the samples of all microphones, [pings, microphones, time].
+
+    Before any are read, there must be memory for all of them, for reading the largest, and for the
+    lines that they become, `lines_bytes` per sample.
+    """
+    for each in recorded:
+        hdf5.check_whole(each)
+    names = recorded[0].name
+    if len(recorded) > 1:
+        names += f" to {recorded[-1].name}"
+    with hdf5.too_large():
+        budget.take(
+            f"reading {names}",
+            (4 + lines_bytes) * sum(each.size for each in recorded),
+            passing_bytes=max(each.nbytes + hdf5.unpacking_bytes(each) for each in recorded),
+        )
+    pings, length = recorded[0].shape
+    together = np.empty((pings, len(recorded), length), np.float32)
+    for number, each in enumerate(recorded):
+        together[:, number] = each[()]
+        if not np.isfinite(together[:, number]).all():
+            raise FileFormatError(f"must hold finite numbers as {each.name}")
+    return together
 
 
 def _speeds_m_s(temperature: NDArray, pings: int) -> NDArray[np.float64]:
@@ -271,15 +311,16 @@ def _speeds_m_s(temperature: NDArray, pings: int) -> NDArray[np.float64]:
     return speed
 
 
-def _conditioned(samples: list[NDArray], time_s: NDArray, duration_s: float) -> NDArray[np.float32]:
-    """Remove constant and transmission from samples, and join them as [channels, time].
+def _conditioned(
+    together: NDArray[np.float32], time_s: NDArray, duration_s: float
+) -> NDArray[np.float32]:
+    """Remove constant and transmission from samples [..., time], in place; return them.
 
     Until the pulse has been transmitted the microphones record it directly. They are silenced, and
     faded in over another pulse length.
     """
     ramp = np.clip(time_s / duration_s - 1, 0, 1)
     blanking = np.sin(np.pi / 2 * ramp).astype(np.float32) ** 2
-    together = np.stack(samples, axis=1)
     together -= together.mean(axis=-1, keepdims=True, dtype=np.float64).astype(np.float32)
     together *= blanking
-    return together.reshape(-1, together.shape[-1])
+    return together

@@ -82,7 +82,8 @@ def load(path: str | os.PathLike) -> Saved:
 def save(path: str | os.PathLike, obj: Saved) -> None:
     """Write an object to an HDF5 file, or range lines to a CPHD file.
 
-    An existing file is replaced in one step.
+    An existing file is replaced in one step and keeps its mode. A symbolic link stays: the file it
+    leads to is replaced.
 
     Parameters
     ----------
@@ -97,8 +98,8 @@ def save(path: str | os.PathLike, obj: Saved) -> None:
     TypeError
         If `obj` is of another type.
     ValueError
-        If the file's name has the suffix of another format, such as .tif, or CPHD cannot represent
-        the lines.
+        If the file's name has the suffix of another format, such as .tif, CPHD cannot represent the
+        lines, or `path` is a device, a pipe or a socket.
     ImportError
         If a CPHD file is wanted and sarkit is not installed (extra `radar`).
     OSError

@@ -62,7 +62,8 @@ def save(path: str | os.PathLike, obj: Saved) -> None:
     TypeError
         If `obj` is of another type.
     ValueError
-        If the file's name has the suffix of another format, such as .tif.
+        If the file's name has the suffix of another format, such as .tif, or `path` is a device, a
+        pipe or a socket.
     OSError
         If the folder does not exist or the file cannot be written, as on a full disk.
 
@@ -106,7 +107,7 @@ def load(path: str | os.PathLike) -> Saved:
         If the file does not exist (FileNotFoundError) or cannot be read.
     """
     with _opened(validate.path("path", path)) as file:
-        obj = _read(file)
+        obj = _read(file, validate.Budget())
         if not isinstance(obj, _SAVED):
             raise FileFormatError(f"holds only a {type(obj).__name__}")
         return obj
@@ -130,7 +131,7 @@ def read_geometry(path: str | os.PathLike) -> tuple[RangeLines, int]:
     with _opened(path) as file:
         dataset = _samples_of(file)
         nothing = np.zeros((dataset.shape[0], 1), np.complex64)
-        return _read(file, samples=nothing), dataset.shape[1]
+        return _read(file, validate.Budget(), samples=nothing), dataset.shape[1]
 
 
 def read_samples(path: str | os.PathLike, rows: slice, columns: slice) -> np.ndarray:
@@ -146,7 +147,7 @@ def read_samples(path: str | os.PathLike, rows: slice, columns: slice) -> np.nda
         counts = [
             len(range(n)[part]) for n, part in zip(samples.shape, (rows, columns), strict=True)
         ]
-        _check_memory(samples, samples.dtype.itemsize * math.prod(counts))
+        _take(validate.Budget(), samples, samples.dtype.itemsize * math.prod(counts))
         return samples[rows, columns]
 
 
@@ -213,7 +214,7 @@ def _samples_of(file: h5py.File) -> h5py.Dataset:
     return samples
 
 
-def _read(group: h5py.Group, **instead: Any) -> Any:
+def _read(group: h5py.Group, budget: validate.Budget, **instead: Any) -> Any:
     """Return the object in a group. Fields in `instead` are not read."""
     name = _attribute(group, "kind")
     if not isinstance(name, str) or name not in _KINDS:
@@ -231,7 +232,7 @@ def _read(group: h5py.Group, **instead: Any) -> Any:
             # A group may contain a link to itself.
             if is_group and _kind_of_field(field.type) != _attribute(item, "kind"):
                 raise FileFormatError(f"holds another object as {field.name} of the {name}")
-            values[field.name] = _read(item) if is_group else read_values(item)
+            values[field.name] = _read(item, budget) if is_group else read_values(item, budget)
         elif "None" in str(field.type):
             values[field.name] = None
         else:
@@ -266,8 +267,15 @@ def find_item(group: h5py.Group, name: str) -> h5py.Group | h5py.Dataset | None:
     return item
 
 
-def read_values(dataset: h5py.Dataset) -> np.ndarray:
+def read_values(dataset: h5py.Dataset, budget: validate.Budget) -> np.ndarray:
     """Return a whole dataset that fits into memory; one with missing parts is refused."""
+    check_whole(dataset)
+    _take(budget, dataset, dataset.nbytes)
+    return dataset[()]
+
+
+def check_whole(dataset: h5py.Dataset) -> None:
+    """Raise FileFormatError if parts of a dataset are missing."""
     # HDF5 returns zeros for chunks that were never written.
     if dataset.chunks is None:
         whole = dataset.id.get_storage_size() >= dataset.nbytes
@@ -276,16 +284,25 @@ def read_values(dataset: h5py.Dataset) -> np.ndarray:
         whole = dataset.id.get_num_chunks() == math.prod(counts)
     if not whole:
         raise FileFormatError(f"lacks a part of {dataset.name}, of shape {dataset.shape}")
-    _check_memory(dataset, dataset.nbytes)
-    return dataset[()]
 
 
-def _check_memory(dataset: h5py.Dataset, size_bytes: int) -> None:
+def unpacking_bytes(dataset: h5py.Dataset) -> int:
+    """Return the memory in work while a dataset is read: two buffers, each of a whole chunk."""
+    return 2 * math.prod(dataset.chunks or (0,)) * dataset.dtype.itemsize
+
+
+def _take(budget: validate.Budget, dataset: h5py.Dataset, size_bytes: int) -> None:
     """Raise FileFormatError unless `size_bytes` of a dataset can be read into memory."""
-    # HDF5 unpacks whole chunks, from one buffer into another.
-    chunk = math.prod(dataset.chunks or (0,)) * dataset.dtype.itemsize
+    name = f"reading {dataset.name}"
+    with too_large():
+        budget.take(name, size_bytes, passing_bytes=unpacking_bytes(dataset))
+
+
+@contextmanager
+def too_large() -> Iterator[None]:
+    """Raise what a budget refuses as a FileFormatError, which says that the file is too large."""
     try:
-        validate.memory(f"reading {dataset.name}", size_bytes + 2 * chunk)
+        yield
     except ValueError as error:
         raise FileFormatError(f"is too large: {error}") from None
 

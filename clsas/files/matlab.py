@@ -16,12 +16,13 @@ from typing import Any
 import numpy as np
 
 from clsas.core import reading, validate
-from clsas.files.hdf5 import FileFormatError
+from clsas.files.hdf5 import FileFormatError, too_large
 
 _HEADER = 128  # bytes: text, and at their end version and byte order
 _MATRIX, _COMPRESSED = 14, 15  # types of elements
 _STRUCTURE, _COMPLEX = 2, 0x800  # class and flag of a matrix
 _DEEPEST = 32  # structures within structures
+_PARTS, _PART_BYTES = 1000, 256  # elements that are checked at once; memory of one without numbers
 # Types of numbers as stored, and by the class of a matrix; a double may be stored as a byte.
 _STORED = {
     1: "i1",
@@ -59,14 +60,15 @@ def read_matlab(path: str | os.PathLike) -> dict[str, Any]:
     path = validate.path("path", path)
     try:
         reading.check_ordinary(path)
-        validate.memory(str(path), path.stat().st_size)
+        budget = validate.Budget()
+        budget.take(str(path), path.stat().st_size)
         content = path.read_bytes()
     except ValueError as error:
         raise FileFormatError(str(error)) from None
     if not is_matlab(content):
         raise FileFormatError(f"{path} is not a MATLAB file of version 5 to 7")
     try:
-        return _variables(content)
+        return _variables(content, budget)
     except FileFormatError as error:
         raise FileFormatError(f"{path} {error}") from None
     except MemoryError:
@@ -119,7 +121,7 @@ def numbers(
     return value.reshape(value.shape + (1,) * (ndim - value.ndim))
 
 
-def _variables(content: bytes) -> dict[str, Any]:
+def _variables(content: bytes, budget: validate.Budget) -> dict[str, Any]:
     order = "<" if content[126:128] == b"IM" else ">"
     found: dict[str, Any] = {}
     place = _HEADER
@@ -129,20 +131,30 @@ def _variables(content: bytes) -> dict[str, Any]:
         if len(body) < size:
             raise FileFormatError("is damaged: its last variable is cut off")
         place += 8 + size
-        if kind == _COMPRESSED:
-            kind, body = _unpacked(body, order)
-        if kind != _MATRIX:
-            raise FileFormatError(f"is damaged: it holds an element of type {kind}")
-        name, value = _matrix(body, order, 0)
+        name, value = _variable(kind, body, order, budget)
         found[name] = value
     return found
 
 
-def _unpacked(packed: memoryview, order: str) -> tuple[int, memoryview]:
+def _variable(kind: int, body: memoryview, order: str, budget: validate.Budget) -> tuple[str, Any]:
+    """Return name and value of a variable."""
+    unpacked_bytes = 0
+    if kind == _COMPRESSED:
+        kind, body = _unpacked(body, order, budget)
+        unpacked_bytes = len(body)
+    if kind != _MATRIX:
+        raise FileFormatError(f"is damaged: it holds an element of type {kind}")
+    found = _matrix(body, order, 0, budget)
+    budget.give_back(unpacked_bytes)
+    return found
+
+
+def _unpacked(packed: memoryview, order: str, budget: validate.Budget) -> tuple[int, memoryview]:
     """Unpack a variable, whose first 8 bytes tell its type and size, if that fits into memory."""
     unpacker = zlib.decompressobj()
     kind, size = struct.unpack(f"{order}II", unpacker.decompress(packed, 8))
-    _check_memory("unpacking it", 2 * size)
+    with too_large():
+        budget.take("unpacking it", size, passing_bytes=size)
     content = unpacker.decompress(unpacker.unconsumed_tail, size) if size else b""
     # The rest is the checksum.
     if unpacker.decompress(unpacker.unconsumed_tail, 1) or not unpacker.eof or len(content) < size:
@@ -150,14 +162,9 @@ def _unpacked(packed: memoryview, order: str) -> tuple[int, memoryview]:
     return kind, memoryview(content)
 
 
-def _check_memory(what: str, size_bytes: int) -> None:
-    try:
-        validate.memory(what, size_bytes)
-    except ValueError as error:
-        raise FileFormatError(f"is too large: {error}") from None
-
-
-def _elements(body: memoryview, order: str) -> list[tuple[int, memoryview]]:
+def _elements(
+    body: memoryview, order: str, budget: validate.Budget
+) -> list[tuple[int, memoryview]]:
     """Return type and content of the elements of a matrix."""
     found, place = [], 0
     while place + 8 <= len(body):
@@ -168,14 +175,17 @@ def _elements(body: memoryview, order: str) -> list[tuple[int, memoryview]]:
         if start + size > min(len(body), place):
             raise FileFormatError("is damaged: a variable holds less than it claims")
         found.append((kind, body[start : start + size]))
+        if not len(found) % _PARTS:
+            with too_large():
+                budget.take("reading fields", _PARTS * _PART_BYTES)
     return found
 
 
-def _matrix(body: memoryview, order: str, depth: int) -> tuple[str, Any]:
+def _matrix(body: memoryview, order: str, depth: int, budget: validate.Budget) -> tuple[str, Any]:
     """Return name and value of a matrix."""
     if depth > _DEEPEST:
         raise FileFormatError(f"must hold at most {_DEEPEST} structures within each other")
-    parts = _elements(body, order)
+    parts = _elements(body, order, budget)
     if not parts:
         return "", np.zeros(0)
     flags = struct.unpack_from(f"{order}I", parts[0][1])[0]
@@ -187,28 +197,38 @@ def _matrix(body: memoryview, order: str, depth: int) -> tuple[str, Any]:
     if len(shape) < 2 or min(shape) < 0:
         raise FileFormatError(f"is damaged: a variable has the shape {validate.shown(shape)}")
     if kind == _STRUCTURE:
-        return name, _structure(parts[3:], order, depth) if math.prod(shape) == 1 else None
-    value = _array(parts[3], shape, kind, order)
+        if math.prod(shape) != 1:
+            return name, None
+        return name, _structure(parts[3:], order, depth, budget)
+    value = _array(parts[3], shape, kind, order, budget)
     if flags & _COMPLEX:
-        imaginary = _array(parts[4], shape, kind, order)
-        _check_memory("reading complex numbers", 2 * value.nbytes)
+        imaginary = _array(parts[4], shape, kind, order, budget)
+        complex_bytes = math.prod(shape) * np.result_type(value, np.complex64).itemsize
+        with too_large():
+            budget.take("reading complex numbers", complex_bytes, passing_bytes=complex_bytes)
+        budget.give_back(2 * value.nbytes)
         value = value + np.result_type(value, np.complex64).type(1j) * imaginary
     return name, value.squeeze()
 
 
-def _array(part: tuple[int, memoryview], shape: list[int], kind: int, order: str) -> np.ndarray:
+def _array(
+    part: tuple[int, memoryview], shape: list[int], kind: int, order: str, budget: validate.Budget
+) -> np.ndarray:
     stored = np.dtype(order + _STORED[part[0]])
     count = math.prod(shape)
     if count * stored.itemsize != len(part[1]):
         raise FileFormatError(
             f"is damaged: {len(part[1])} bytes are not a variable of shape {validate.shown(shape)}"
         )
-    _check_memory("reading numbers", count * np.dtype(_CLASSES[kind]).itemsize)
+    with too_large():
+        budget.take("reading numbers", count * np.dtype(_CLASSES[kind]).itemsize)
     # MATLAB's arrays are stored by columns.
     return np.frombuffer(part[1], stored).astype(_CLASSES[kind]).reshape(shape, order="F")
 
 
-def _structure(parts: list[tuple[int, memoryview]], order: str, depth: int) -> dict[str, Any]:
+def _structure(
+    parts: list[tuple[int, memoryview]], order: str, depth: int, budget: validate.Budget
+) -> dict[str, Any]:
     length = struct.unpack_from(f"{order}i", parts[0][1])[0]
     names = bytes(parts[1][1])
     if length < 1 or len(names) // length != len(parts) - 2:
@@ -217,5 +237,5 @@ def _structure(parts: list[tuple[int, memoryview]], order: str, depth: int) -> d
         names[n : n + length].split(b"\0")[0].decode("latin-1")
         for n in range(0, len(names) // length * length, length)
     ]
-    values = [_matrix(part, order, depth + 1)[1] for _, part in parts[2:]]
+    values = [_matrix(part, order, depth + 1, budget)[1] for _, part in parts[2:]]
     return dict(zip(fields, values, strict=True))

@@ -282,6 +282,8 @@ def open_files(paths: tuple[Path, ...], before: Survey | None = None) -> Survey:
                 )
         for name in geometry.per_channel.keys() ^ found[0].per_channel.keys():
             raise ValueError(f"{path}: {name} must be in every file of the survey or in none")
+    entries = sum(each.size for part in found for each in part.per_channel.values())
+    validate.memory(f"the {begins[-1]} channels of source", 8 * (entries + 2 * begins[-1]))
     of_channels: dict[str, Any] = {
         name: np.concatenate([each.per_channel[name] for each in found])
         for name in found[0].per_channel

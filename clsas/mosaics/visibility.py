@@ -8,12 +8,16 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from clsas.core import validate
 from clsas.core.geometry import bistatic_range_m
 from clsas.core.grid import Grid
 from clsas.mosaics.survey import Survey
 from clsas.sonar.beam import BeamWindow
 from clsas.sonar.directions import MOST_TRACK_PINGS
 from clsas.sonar.visibility import BeamTrack, Boxes
+
+# Memory of a channel while its visibility is found, without and with a beam: measured, 1e6 pings.
+_CHANNEL_BYTES, _BEAM_CHANNEL_BYTES = 200, 400
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,7 +40,12 @@ class SurveyVisibility:
 
     @classmethod
     def of(cls, survey: Survey, beam: BeamWindow | None) -> SurveyVisibility:
-        """Return a survey with the directions that a beam takes from its track."""
+        """Return a survey with the directions that a beam takes from its track.
+
+        Raises ValueError if the channels of the survey do not fit into memory.
+        """
+        per_channel = _CHANNEL_BYTES if beam is None else _BEAM_CHANNEL_BYTES
+        validate.memory(f"the {survey.channels} channels of source", per_channel * survey.channels)
         geometry = survey.geometry
         along = None if beam is None else beam.directions(geometry)
         return cls(survey, beam, along, geometry.phase_centres_m)

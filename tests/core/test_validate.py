@@ -1,3 +1,4 @@
+import re
 import subprocess
 import sys
 from fractions import Fraction
@@ -235,10 +236,42 @@ def test_escaped_keeps_the_lines_of_a_table():
 def test_memory_heeds_the_limit_of_the_address_space():
     script = (
         "import resource; from clsas.core import validate; validate.memory('x', 3 << 30);"
-        "resource.setrlimit(resource.RLIMIT_AS, (2 << 30,) * 2); validate.memory('x', 3 << 30)"
+        "resource.setrlimit(resource.RLIMIT_AS, (2 << 30,) * 2); validate.memory('x', 1 << 30);"
+        "validate.memory('x', 2 << 30)"
     )
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
-    assert "ValueError: x must ask for at most 2 GiB" in done.stderr
+    assert re.search(
+        r"x must ask for at most 1\.\d+ GiB, what is left of .*, got 2 GiB", done.stderr
+    )
+
+
+def test_memory_counts_what_the_process_holds():
+    """Pages that were written; not those of libraries."""
+    before = validate._memory_bytes()
+    held = np.ones(100 << 20, np.uint8)
+    assert before - validate._memory_bytes() == pytest.approx(held.nbytes, rel=0.2)
+    del held
+    assert validate._memory_bytes() == pytest.approx(before, abs=20 << 20)
+
+
+def test_a_budget_adds_up(monkeypatch):
+    monkeypatch.setattr(validate, "_memory_bytes", lambda: 10 << 30)
+    budget = validate.Budget()
+    budget.take("a", 4 << 30, passing_bytes=6 << 30)
+    budget.take("b", 4 << 30)
+    with pytest.raises(ValueError, match=r"c must ask for at most 2 GiB, .* got 4 GiB"):
+        budget.take("c", 1 << 30, passing_bytes=3 << 30)
+    budget.take("d", 2 << 30)
+    validate.memory("of another call", 10 << 30)
+
+
+def test_array_checks_the_memory_of_its_copy_before_it_is_made(monkeypatch):
+    """Bytes to float64 take eight times as much; what needs no conversion takes nothing."""
+    given = np.zeros((1 << 20, 3), np.int8)
+    monkeypatch.setattr(validate, "_memory_bytes", lambda: 8 << 20)
+    with pytest.raises(ValueError, match=r"tx_m must ask for at most .* got 0\.0234 GiB"):
+        validate.array("tx_m", given, np.float64, (None, 3))
+    validate.array("tx_m", given, np.int8, (None, 3))
 
 
 @pytest.mark.parametrize("size", [1e30, float("inf"), 10**400])

@@ -1,11 +1,15 @@
 """AirSAS scenes: synthetic files of the public schema."""
 
+import shutil
+
 import h5py
 import numpy as np
 import pytest
 
 import clsas
+from clsas.core import validate
 from clsas.core.validate import ClsasWarning
+from clsas.files import airsas
 from clsas.files.airsas import read_airsas
 from clsas.files.hdf5 import FileFormatError
 
@@ -200,3 +204,30 @@ def test_tables_that_disagree_are_refused(still, tmp_path, file, old, new, said)
         (tmp_path / source.name).write_bytes(text.encode(errors="surrogateescape"))
     with pytest.raises(FileFormatError, match=rf"{file}.*{said}"):
         read_airsas(still, shared=tmp_path)
+
+
+def test_microphones_must_fit_into_memory_together_before_any_is_read(still, tmp_path, monkeypatch):
+    """A byte of a file takes 4 in memory, and 3.2 more as lines."""
+    shutil.copytree(still.parent.parent, tmp_path / "copy")
+    path = tmp_path / "copy" / "scenes" / still.name
+    with h5py.File(path, "r+") as file:
+        for name in ("ch1/ts", "ch2/ts"):
+            del file[name]
+            silent = np.zeros((len(RAIL_M), 5000), np.int8)
+            file.create_dataset(name, data=silent, compression="gzip")
+
+    def compressed(*_, **__):
+        raise ValueError("as far as this")  # compression has a budget of its own
+
+    monkeypatch.setattr(airsas, "compress", compressed)
+    monkeypatch.setattr(validate, "_memory_bytes", lambda: 16 << 20)
+    with pytest.raises(ValueError, match="as far as this"):
+        read_airsas(path)
+    monkeypatch.setattr(validate, "_memory_bytes", lambda: 13 << 20)
+    words = (
+        r"is too large: reading /ch1/ts to /ch2/ts must ask for at most 0\.0127 GiB, .* got 0\.01"
+    )
+    with pytest.raises(FileFormatError, match=words):
+        read_airsas(path)
+    with pytest.raises(ValueError, match="as far as this"):
+        read_airsas(path, channels=[2])

@@ -337,6 +337,18 @@ def test_what_does_not_fit_into_memory_is_refused_before_it_is_read(tmp_path, mo
         read_samples(path, slice(0, 4), slice(0, 1 << 20))
 
 
+def test_datasets_must_fit_into_memory_together(tmp_path, monkeypatch):
+    path = tmp_path / "file.h5"
+    channels = 1 << 18
+    at_m = np.zeros((channels, 3))
+    save(path, RangeLines(np.ones((channels, 1), np.complex64), 0.0, 0.1, at_m, at_m, 1e5, 1500.0))
+    monkeypatch.setattr(validate, "_memory_bytes", lambda: 15 << 20)
+    with pytest.raises(FileFormatError, match=r"reading /rx_m must ask for at most .* GiB, what"):
+        load(path)
+    monkeypatch.setattr(validate, "_memory_bytes", lambda: 18 << 20)
+    assert load(path).channels == channels
+
+
 @pytest.mark.parametrize("values", [np.array([b"x"] * 4), np.ones(4, "?")], ids=["text", "bool"])
 def test_other_than_numbers_are_refused(values, tmp_path):
     path = tmp_path / "file.h5"

@@ -255,6 +255,27 @@ def test_a_variable_that_unpacks_beyond_memory_is_refused_unread(tmp_path, monke
         clsas.load(path)
 
 
+def test_variables_must_fit_into_memory_together(tmp_path, monkeypatch):
+    """Every one of them does: 5 MB as stored and 8 times as much as the doubles that they are."""
+    one = packed(variable(6, (5000, 1000), struct.pack("<II", 1, 5_000_000) + bytes(5_000_000)))
+    path = file_of(tmp_path / "sum.mat", one + one + one)
+    assert path.stat().st_size < 20_000
+    monkeypatch.setattr(matlab.validate, "_memory_bytes", lambda: 80 << 20)
+    words = r"sum\.mat is too large: reading numbers must ask for at most .* got 0\.0373 GiB"
+    with pytest.raises(FileFormatError, match=words):
+        clsas.load(path)
+    with pytest.raises(FileFormatError, match="must hold one structure"):
+        clsas.load(file_of(tmp_path / "one.mat", one))
+
+
+def test_fields_without_numbers_take_memory_too(tmp_path, monkeypatch):
+    path = file_of(tmp_path / "many.mat", packed(variable(2, (1, 1), bytes(8 * 100_000))))
+    assert path.stat().st_size < 2000
+    monkeypatch.setattr(matlab.validate, "_memory_bytes", lambda: 16 << 20)
+    with pytest.raises(FileFormatError, match=r"many\.mat is too large: reading fields must ask"):
+        clsas.load(path)
+
+
 def test_nesting_without_end_is_refused(tmp_path):
     inner = variable(6, (0, 0), struct.pack("<II", 9, 0))
     names = struct.pack("<HHIII", 5, 4, 8, 1, 8) + b"deeper".ljust(8, b"\0")

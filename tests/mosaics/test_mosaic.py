@@ -20,6 +20,7 @@ import pytest
 from cases import along_x, lines_over
 
 import clsas
+from clsas.core import validate
 from clsas.core.grid import Grid
 from clsas.core.image_error import relative_error_db
 from clsas.core.validate import ClsasWarning
@@ -205,6 +206,22 @@ def test_an_image_larger_than_memory_is_refused():
     grid = Grid.plane((-4, 4, 10**7), (30, 40, 10**7))
     with pytest.raises(ValueError, match=r"the mosaic must ask for at most .* GiB"):
         clsas.mosaic(LINES, grid, beam=BEAM).image()
+
+
+def test_pings_that_do_not_fit_into_memory_are_refused(tmp_path, monkeypatch):
+    """Even if none of their samples are read."""
+    pings = 100_000
+    at_m = np.zeros((pings, 3))
+    at_m[:, 0] = np.linspace(-4, 4, pings)
+    lines = clsas.RangeLines(
+        np.ones((pings, 1), np.complex64), 30.0, 0.03, at_m, at_m, 100e3, 1500.0
+    )
+    clsas.save(tmp_path / "1.h5", lines)
+    clsas.save(tmp_path / "2.h5", lines)
+    for most_mib, source in ((30, lines), (12, tmp_path)):
+        monkeypatch.setattr(validate, "_memory_bytes", lambda most=most_mib << 20: most)
+        with pytest.raises(ValueError, match=r"the [12]00000 channels of source must ask for"):
+            clsas.mosaic(source, GRID, beam=clsas.BeamWindow(8.0), accuracy_db=-40)
 
 
 @pytest.mark.slow

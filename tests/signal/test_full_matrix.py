@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import clsas
+from clsas.core import validate
 
 RIGHT = {
     "samples": np.random.default_rng(0).standard_normal((2, 2, 64)),
@@ -49,3 +50,12 @@ def test_a_carrier_above_a_quarter_of_the_rate_needs_a_band():
 def test_wrong_arguments_are_named(wrong, said):
     with pytest.raises((TypeError, ValueError), match=said):
         clsas.from_full_matrix(**(RIGHT | wrong))
+
+
+def test_a_band_whose_filter_is_too_long_for_memory_is_refused(monkeypatch):
+    """A band of 10 Hz at 1 MHz: FFTs of 18 million points, which take a GiB."""
+    monkeypatch.setattr(validate, "_memory_bytes", lambda: 1 << 29)
+    with pytest.raises(
+        ValueError, match=r"bandwidth_hz must ask for at most 0\.5 GiB, .* got 1\.0"
+    ):
+        clsas.from_full_matrix(**(RIGHT | {"carrier_hz": 5.0, "sample_rate_hz": 1e6}))
