@@ -69,10 +69,11 @@ def run(
 ) -> tuple[Result, ...]:
     """Form images at the extremes, and measure their errors against the oracle.
 
-    The scenes cover 1 kHz to 10 GHz, one to 1000 channels, guard bands down to a tenth, and
-    coordinates up to 10 000 km. Every imager is tested: exact, factorized (in single and in half
-    precision), mosaic and wavenumber. On a CPU the kernels are built for every vector width that
-    the CPU supports. An image that cannot be formed has not passed; the others follow.
+    The scenes cover 1 kHz to 10 GHz, bands of 0.5 to 190 % of the carrier, one to 1000 channels,
+    guard bands down to a tenth, and coordinates up to 10 000 km. Every imager is tested: exact,
+    factorized (in single and in half precision), mosaic and wavenumber. On a CPU the kernels are
+    built for every vector width that the CPU supports. An image that cannot be formed has not
+    passed; the others follow.
 
     Parameters
     ----------
@@ -224,9 +225,12 @@ _SCENES: dict[str, Callable[[], Known]] = {
     "10 000 km from the origin": lambda: extremes.ultrasonic(96, origin_m=_FAR_M, **_SMALL),
     "1 kHz": lambda: extremes.at_1_khz(**_SMALL),
     "10 GHz": lambda: extremes.radar(**_SMALL),
+    "band of 0.5 %": lambda: extremes.narrow(**_SMALL),
+    "band of 190 %": lambda: extremes.widest(**_SMALL),
     "one channel": lambda: extremes.ultrasonic(1, **_SMALL),
     "1000 channels": lambda: extremes.ultrasonic(1000, targets=2, shape=(12, 12)),
     "closed track": lambda: extremes.closed(**_SMALL),
+    "rings, on carrier": lambda: extremes.rings(**_SMALL),
     "bistatic": lambda: extremes.array(moving=False, **_SMALL),
     "moving receivers": lambda: extremes.array(moving=True, **_SMALL),
     "Hann beam": lambda: extremes.ultrasonic(

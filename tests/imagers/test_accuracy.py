@@ -19,9 +19,12 @@ from clsas.trials.extremes import (
     at_1_khz,
     closed,
     line_in_the_spectrum,
+    narrow,
     radar,
+    rings,
     steps,
     ultrasonic,
+    widest,
 )
 
 SLOW = Costs(pixel_ns=1e6, point_ns=1e6)  # plans for small images divide them
@@ -73,6 +76,9 @@ CASES = {
     "closed": lambda: closed(),
     "bistatic": lambda: array(moving=False),
     "moving": lambda: array(moving=True),
+    "band of 0.5 %": lambda: narrow(),
+    "band of 190 %": lambda: widest(),
+    "rings, on carrier": lambda: rings(),
     "narrow band": lambda: ultrasonic(bandwidth_hz=2e4, pixel_m=(4e-3, 2e-2)),
     "relief": lambda: ultrasonic(relief_m=0.1, track=along_x(160, 8.25e-3) + [0, 0, 20]),
     "one target": lambda: ultrasonic(targets=1),
