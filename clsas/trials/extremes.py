@@ -77,8 +77,10 @@ def scene(
     speed_m_s: float = 1500.0,
     rx_m: NDArray[np.float64] | None = None,
     rx_velocity_m_s: ArrayLike | None = None,
+    gains: ArrayLike = 1.0,
     beam: BeamWindow | None = None,
     targets: int = 5,
+    within: tuple[float, float] = (0.1, 0.9),
     oversampling: float = 1.5,
     colour: Callable[[float, float], Sequence[Band]] | None = None,
     tilt_db: float = 0.0,
@@ -106,10 +108,14 @@ def scene(
         Pixels of the grid.
     rx_velocity_m_s : array_like, optional
         Velocity of the receivers during flight.
+    gains : array_like, broadcasts with [channels]
+        Amplitude of the echoes in every channel.
     beam : BeamWindow, optional
-        Shape "hann" or "rectangular", with `along` of one direction.
+        Shape "hann" or "rectangular", with `along`.
     targets : int
         Number of points.
+    within : (from, to)
+        Part of the columns in which points lie.
     oversampling : float
         Sample rate over bandwidth.
     colour : callable, optional
@@ -142,7 +148,8 @@ def scene(
     corner, pixels = _pixels(centre_m, pixel_m, height_m)
     extent_m = pixels[-1, -1, :2] - corner[:2]
     # No points near the border, so that the image holds their main lobes.
-    points = corner + rng.uniform(0.1, 0.9, (targets, 3)) * [*extent_m, 0]
+    low, high = np.array([within, (0.1, 0.9), (0.1, 0.9)]).T
+    points = corner + rng.uniform(low, high, (targets, 3)) * [*extent_m, 0]
     amplitude = rng.normal(size=(targets, 2)) @ [1, 1j]
 
     per_m = 2 / speed_m_s
@@ -161,7 +168,8 @@ def scene(
         first_m = first_m - rng.uniform(0, step_m, len(tx))
     else:
         first_m, length = _from_one_start(first_m, length, step_m)
-    echoes = [Echo(at_m, amplitude, bands)]
+    of_channels = np.broadcast_to(np.asarray(gains, np.float64), len(tx))
+    echoes = [Echo(at_m, of_channels[:, None] * amplitude, bands)]
     mixed = partial(
         oracle.samples, first_range_m=first_m, range_step_m=step_m, length=length,
         carrier_cycles_per_m=0.0 if on_carrier else centre,
@@ -264,6 +272,80 @@ def closed(**options: Any) -> Known:
     )  # fmt: skip
 
 
+def narrow(**options: Any) -> Known:
+    """1 MHz with a band of 0.5 %."""
+    return ultrasonic(96, bandwidth_hz=5e3, **options)
+
+
+def widest(**options: Any) -> Known:
+    """30 kHz with a band of 190 %, 12 m away."""
+    return scene(
+        along_x(160, 0.02), (0.2, 12, 0), carrier_hz=3e4, bandwidth_hz=5.7e4, pixel_m=(0.01, 0.01),
+        **options,
+    )  # fmt: skip
+
+
+def rings(**options: Any) -> Known:
+    """20 kHz in air, on its carrier, from five rings of 0.8 m around the grid."""
+    track = np.concatenate([circle(90, 0.83, 0.5 + 0.04 * number) for number in range(5)])
+    return scene(
+        track, (0, 0, 0), carrier_hz=2e4, bandwidth_hz=4e3, pixel_m=(5e-3, 5e-3), speed_m_s=349.0,
+        on_carrier=True, oversampling=12.0, targets=2, **options,
+    )  # fmt: skip
+
+
+def apart(**options: Any) -> Known:
+    """100 kHz, 2 kHz, 40 m away, with the receiver 10 m above the transmitter."""
+    tx = along_x(200, 0.08)
+    defaults: dict[str, Any] = {"bandwidth_hz": 2e3, "pixel_m": (0.2, 0.2)}
+    return scene(
+        tx, (0.3, 42.0, -15), carrier_hz=1e5, rx_m=tx + [0, 0, 10.0], **(defaults | options)
+    )
+
+
+def uneven(**options: Any) -> Known:
+    """100 kHz, 500 Hz, with receivers whose velocity differs by 5 m/s rms from ping to ping."""
+    tx = along_x(200, 0.08)
+    velocity = [2.0, 0, 0] + np.random.default_rng(5).normal(0, 3, (200, 3))
+    return scene(
+        tx, (0.3, 42.0, -15), carrier_hz=1e5, bandwidth_hz=500, pixel_m=(0.2, 0.2), rx_m=tx,
+        rx_velocity_m_s=velocity, **options,
+    )  # fmt: skip
+
+
+def headings(**options: Any) -> Known:
+    """30 kHz, three passes on other headings, of which a Hann beam sees parts."""
+    turn = np.radians(np.repeat([0, 60, 120], 104))
+    along = np.stack([np.cos(turn), np.sin(turn), 0 * turn], axis=1)
+    aside = np.stack([np.sin(turn), -np.cos(turn), 0 * turn], axis=1)
+    track = np.tile(along_x(104, 0.03)[:, 0], 3)[:, None] * along
+    track += np.repeat([0.26, 0.52, 0.78], 104)[:, None] * aside
+    return scene(
+        track, (3, 0, -2), carrier_hz=3e4, bandwidth_hz=9e3, pixel_m=(0.01, 0.01),
+        beam=BeamWindow(40, "hann", along=along), **options,
+    )  # fmt: skip
+
+
+def loud(**options: Any) -> Known:
+    """30 kHz, with a channel of 30 dB more two wavelengths off the track."""
+    track, gains = along_x(300, 0.035), np.ones(300)
+    track[130] += [0, 0.1, 0.07]
+    gains[130] = 10**1.5
+    return scene(
+        track, (0, 11.5, 0), carrier_hz=3e4, bandwidth_hz=9e3, pixel_m=(0.08, 0.08), gains=gains,
+        **options,
+    )  # fmt: skip
+
+
+def edge(**options: Any) -> Known:
+    """30 kHz, with points where the coverage of a Hann beam ends: there weights are small."""
+    return scene(
+        along_x(300, 0.02), (3, 9.5, 0), carrier_hz=3e4, bandwidth_hz=9e3, pixel_m=(0.04, 0.02),
+        shape=(32, 96), beam=BeamWindow(20, "hann", along=[1, 0, 0]), within=(0.88, 0.97),
+        **options,
+    )  # fmt: skip
+
+
 def steps(centre: float, width: float) -> list[Band]:
     """Return three bands at 0, -15 and -30 dB."""
     return [
@@ -331,7 +413,8 @@ def _weights(
     if beam.along is None:
         raise ValueError("beam must have the direction `along`")
     towards = pixels_m.reshape(1, -1, 3) - centres_m[:, None]
-    sine = towards @ beam.along / np.linalg.norm(towards, axis=-1)
+    along = np.broadcast_to(beam.along, centres_m.shape)
+    sine = np.einsum("cpi,ci->cp", towards, along) / np.linalg.norm(towards, axis=-1)
     u = (np.degrees(np.arcsin(sine)) - beam.squint_deg) / beam.width_deg
     weights = np.where(np.abs(u) < 0.5, np.cos(np.pi * u) ** 2 if beam.shape == "hann" else 1.0, 0)
     if beam.normalise:

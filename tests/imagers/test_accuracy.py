@@ -15,13 +15,21 @@ from clsas.sonar.beam import BeamWindow
 from clsas.trials import extremes
 from clsas.trials.extremes import (
     along_x,
+    apart,
     array,
     at_1_khz,
     closed,
+    edge,
+    headings,
     line_in_the_spectrum,
+    loud,
+    narrow,
     radar,
+    rings,
     steps,
     ultrasonic,
+    uneven,
+    widest,
 )
 
 SLOW = Costs(pixel_ns=1e6, point_ns=1e6)  # plans for small images divide them
@@ -73,6 +81,16 @@ CASES = {
     "closed": lambda: closed(),
     "bistatic": lambda: array(moving=False),
     "moving": lambda: array(moving=True),
+    "band of 0.5 %": lambda: narrow(),
+    "band of 190 %": lambda: widest(),
+    "rings, on carrier": lambda: rings(),
+    "2 % and 10 m apart": lambda: apart(),
+    "0.5 % and 10 m apart": lambda: apart(bandwidth_hz=500),
+    "0.5 % and uneven velocities": lambda: uneven(),
+    "headings under a Hann beam": lambda: headings(),
+    "headings under a Hann beam, more pixels": lambda: headings(shape=(64, 64)),
+    "a loud channel off the track": lambda: loud(),
+    "edge of a Hann beam": lambda: edge(),
     "narrow band": lambda: ultrasonic(bandwidth_hz=2e4, pixel_m=(4e-3, 2e-2)),
     "relief": lambda: ultrasonic(relief_m=0.1, track=along_x(160, 8.25e-3) + [0, 0, 20]),
     "one target": lambda: ultrasonic(targets=1),

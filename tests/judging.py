@@ -1,0 +1,129 @@
+"""Images of a scene of `families`, and whether they err by more than was asked and predicted."""
+
+from __future__ import annotations
+
+import dataclasses
+import warnings
+from dataclasses import dataclass
+
+import numpy as np
+from families import Scene
+
+from clsas.core.image import Image
+from clsas.core.image_error import relative_error_db
+from clsas.exact.backprojection import prepare
+from clsas.exact.run import execute
+from clsas.planning.costs import Costs
+from clsas.planning.factorize import factorize
+from clsas.planning.planner import plan
+
+REFERENCE_DB = -85.0  # of the exact image with which others are compared everywhere
+SLACK_DB = 1.0  # by which an error may exceed a prediction, where that is above what was asked
+_DEFAULT = Costs()
+SLOW = dataclasses.replace(
+    Costs(**{each.name: 1e3 * getattr(_DEFAULT, each.name) for each in dataclasses.fields(Costs)}),
+    pixel_ns=1e6,
+    point_ns=1e6,
+    group_ns=1e6,
+)
+"""Costs with which small images are factorized: exact ones are predicted to be slow."""
+
+
+@dataclass(frozen=True)
+class Formed:
+    """One image: what was asked, predicted and measured, dB, or the exception it raised."""
+
+    kind: str
+    asked_db: float
+    predicted_db: float = 0.0
+    measured_db: float = 0.0
+    warned: bool = False
+    failure: str = ""
+
+    @property
+    def excess_db(self) -> float:
+        """How far the error is above both what was asked and what was predicted."""
+        return self.measured_db - max(self.asked_db, self.predicted_db)
+
+    @property
+    def missed(self) -> bool:
+        """True if it errs by more than asked, and more than predicted; NaN is a miss."""
+        bound_db = max(self.asked_db, self.predicted_db + SLACK_DB)
+        return bool(self.failure) or not self.measured_db <= bound_db
+
+    def __str__(self) -> str:
+        if self.failure:
+            return f"{self.kind}: asked {self.asked_db:g}: {self.failure}"
+        return (
+            f"{self.kind}: asked {self.asked_db:g} predicted {self.predicted_db:.1f} "
+            f"measured {self.measured_db:.1f}{' (warned)' if self.warned else ''}"
+        )
+
+
+def images_of(
+    scene: Scene, accuracy_db: float, tolerances_db: list[float], device=None
+) -> list[Formed]:
+    """Form two exact images of a scene and one for every tolerance, unless its plan is exact."""
+    formed, reference = _exactly(scene, REFERENCE_DB, None, device)
+    found = [formed, _exactly(scene, accuracy_db, reference, device)[0]]
+    found += [_factorized(scene, each, reference, device) for each in tolerances_db]
+    return [each for each in found if each is not None]
+
+
+def _exactly(
+    scene: Scene, asked_db: float, reference: Image | None, device
+) -> tuple[Formed, Image | None]:
+    try:
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            prepared = prepare(
+                scene.lines, scene.grid, accuracy_db=asked_db, beam=scene.beam, device=device
+            )
+            image = execute(prepared)
+        measured_db = _measured_db(scene, image, reference, asked_db)
+        warned = _says_an_error(caught)
+        return Formed("exact", asked_db, prepared.predicted_error_db, measured_db, warned), image
+    except Exception as error:  # which is a miss
+        return Formed("exact", asked_db, failure=_described(error)), None
+
+
+def _factorized(scene: Scene, asked_db: float, reference: Image | None, device) -> Formed | None:
+    try:
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            chosen = plan(
+                scene.lines, scene.grid, tolerance_db=asked_db, beam=scene.beam, device=device,
+                costs=SLOW,
+            )  # fmt: skip
+            if chosen.is_exact:
+                return None
+            image = factorize(scene.lines, scene.grid, chosen, device=device)
+        measured_db = _measured_db(scene, image, reference, asked_db)
+        warned = _says_an_error(caught)
+        return Formed("factorized", asked_db, chosen.predicted_error_db, measured_db, warned)
+    except Exception as error:  # which is a miss
+        return Formed("factorized", asked_db, failure=_described(error))
+
+
+def _measured_db(scene: Scene, image: Image, reference: Image | None, asked_db: float) -> float:
+    """Return the error of an image.
+
+    The sums judge the reference, and the reference judges other images at all pixels: at few of
+    them one bright point may decide. The sums judge these too where the reference is no better.
+    """
+    if not np.isfinite(image.pixels).all():
+        return np.nan
+    if scene.is_dark:  # at all known pixels; elsewhere it may be anything
+        return asked_db
+    if reference is not None and scene.error_db(reference.pixels) < asked_db - 10:
+        return relative_error_db(image, reference)
+    return scene.error_db(image.pixels)
+
+
+def _says_an_error(caught: list[warnings.WarningMessage]) -> bool:
+    """Tell whether a warning says that an image may err by more than asked."""
+    return any("error" in str(each.message) for each in caught)
+
+
+def _described(error: Exception) -> str:
+    return f"{type(error).__name__}: {str(error)[:200]}"
