@@ -85,7 +85,8 @@ class Autofocus:
     sharpness : tuple of (step, float)
         Sharpness after each step that was tried.
     focused : bool
-        False where the scene has no responses to focus on. The lines are then as they were.
+        False where the scene has no responses to focus on, or the platform stood still. The lines
+        are then as they were.
     """
 
     lines: RangeLines
@@ -103,7 +104,7 @@ class Autofocus:
             self,
             f"correction {reprs.quantity(rms_m, 'm')} rms",
             f"sharpness {self.sharpness_before:.3g} to {self.sharpness_after:.3g}",
-            None if self.focused else "no responses to focus on",
+            None if self.focused else "not focused",
         )
 
 
@@ -149,9 +150,10 @@ def autofocus(
     Warns
     -----
     ClsasWarning
-        If the scene has no responses: the lines are then returned as they are. If pings repeat a
-        position: they are corrected as one. If the track turns back, so that pings may be out of
-        order.
+        If the scene has no responses, or pings receive the same echoes although the navigation
+        moves: the lines are then returned as they are. If the correction is one that a wrong sound
+        speed explains. If pings repeat a position: they are corrected as one. If the track turns
+        back, so that pings may be out of order.
     """
     validate.instance("lines", lines, RangeLines)
     validate.instance("grid", grid, Grid)

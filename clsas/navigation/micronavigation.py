@@ -60,7 +60,9 @@ class Micronavigation:
         Number of pairs of channels that share a phase centre.
     persistence : float
         Variance that errors of many steps add up to, over that of independent ones: echoes stay in
-        the beam for many pings. Standard deviations of positions and of the shape hold it.
+        the beam for many pings. It is measured between blocks of range, and is at least the number
+        of pings times the share of the variance that few echoes make. Standard deviations of
+        positions and of the shape contain it.
     """
 
     lines: RangeLines
@@ -87,9 +89,8 @@ class Micronavigation:
         An image is as sharp as this is small: a shift and a turn of the whole track move and turn
         the image. NaN if echoes of some pings were not coherent.
 
-        It does not hold errors that all windows of range share, such as a constant error of yaw,
-        which bends the whole track. Over 5000 points of speckle and 100 pings the error was 2.2,
-        2.0 and 0.7 times this, for three seeds: yaw erred by 10, 12 and 2 microradians per ping.
+        It does not hold errors that all ranges share. Over 5000 points of speckle, 30 to 60 pings
+        and a navigation that was right, errors were 0.4 to 2.6 times this.
         """
         deviations = self.sway_steps_sd_m, self.yaw_steps_sd_rad
         if not all(np.isfinite(each).all() for each in deviations):
@@ -168,13 +169,15 @@ def micronavigate(
     ------
     TypeError, ValueError
         If an argument is of the wrong kind or outside its limits; if there is one ping, positions
-        are missing, or pings repeat a position; if fewer than three phase centres overlap; or if
-        hardly any two pings are coherent.
+        are missing, or pings repeat a position; if fewer than three phase centres overlap; if
+        hardly any two pings are coherent; or if yaw is looked for in the echoes of a few
+        reflectors.
 
     Warns
     -----
     ClsasWarning
-        If some pairs of pings are not coherent: the navigation bridges them. If channels are dead:
+        If some pairs of pings are not coherent, or hold too few echoes to tell yaw: the navigation
+        bridges them. If channels are dead:
         they are left out. If what is found is far beyond the accuracy of the navigation. If the
         track turns back, so that pings may be out of order.
 
