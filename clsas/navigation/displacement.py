@@ -315,16 +315,21 @@ def displacement(found: Correlation, *, first: bool, yaw: bool) -> Displacement:
     # More windows do not make the model of the array more exact.
     level = design.mean(axis=1)
     covariance[:unknowns, :unknowns] += _EXACT_RAD**2 * np.linalg.inv(level.T @ level)
-    gain = np.einsum("kwb,w->kwb", design, 1 / variance) @ inverse[:, -1]
+    gain = np.einsum("ab,kwb,w->akw", inverse, design, 1 / variance)
+    lasting = float(np.average(of_few / variance, weights=1 / variance))
+    if found.aligned is not None:
+        # Few echoes may all come from the middle of the beam.
+        apart = np.einsum("akw,k->a", gain, found.aligned.uneven_rad)
+        covariance[:unknowns, :unknowns] += lasting * np.outer(apart, apart)
     return Displacement(
         sway_m + float(solution[0]),
         slope + float(solution[1]),
         covariance,
         coherence,
         misfit,
-        _scatter(found, lag, phase - residual, gain),
+        _scatter(found, lag, phase - residual, gain[-1]),
         float(found.echoes.sum()),
-        float(np.average(of_few / variance, weights=1 / variance)),
+        lasting,
     )
 
 
