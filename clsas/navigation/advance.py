@@ -26,7 +26,7 @@ def surge(
     Channels in one geometry share their speckle with the neighbours on either side, so that
     it hardly disturbs the comparison of both.
     """
-    windows, _, frame, aligned = correlator.windows(lines, array, pairs, directions)
+    windows, frame, aligned = correlator.windows(lines, array, pairs, directions)
     order = np.argsort(pairs.along_m)
     steps_m = np.diff(pairs.along_m[order])
     spacing_m = array.spacing_m

@@ -23,6 +23,7 @@ from clsas.navigation.echoes import (
     Window,
     block_products,
     independent_echoes,
+    phase_variance,
     strongest,
     without_highlights,
 )
@@ -162,7 +163,9 @@ class Correlator:
     ) -> Correlation:
         """Return the correlation of pairs at lags of up to `most_m`. See `windows`."""
         most = max(math.ceil(most_m / self.step_m), 1)
-        windows, echoes, frame, aligned = self.windows(lines, array, pairs, directions)
+        received, frame, aligned = self._received(lines, array, pairs, directions)
+        windows = _weighed(received, aligned)
+        echoes = self._echoes(received, windows)
         values, coherence = [], []
         for (one, other), n in zip(windows, self.samples, strict=True):
             length = scipy.fft.next_fast_len(int(n) + most)
@@ -190,13 +193,20 @@ class Correlator:
 
     def windows(
         self, lines: RangeLines, array: Array, pairs: Overlap, directions: float
-    ) -> tuple[list[Window], NDArray[np.float64], Frame, Alignment | None]:
-        """Return both channels of all pairs by window, their echoes, and how they were aligned.
+    ) -> tuple[list[Window], Frame, Alignment | None]:
+        """Return both channels of all pairs by window of range, and how they were aligned.
 
         `lines` has the samples that the correlator was made for, and the positions to test.
         `directions` is the half width of `alignment`. Where the beam is narrow, all echoes are
-        aligned as those from broadside.
+        aligned as those from broadside; else strong ones are weakened.
         """
+        received, frame, aligned = self._received(lines, array, pairs, directions)
+        return _weighed(received, aligned), frame, aligned
+
+    def _received(
+        self, lines: RangeLines, array: Array, pairs: Overlap, directions: float
+    ) -> tuple[list[Window], Frame, Alignment | None]:
+        """Return what `windows` does, with echoes as strong as they are."""
         swath, frame = self.swath, self._frame(lines, array, pairs)
         range_m = np.concatenate(
             [
@@ -209,19 +219,15 @@ class Correlator:
         )
         ends = np.cumsum(self.samples)[:-1]
         if swath.element_length_m is None:
-            windows = _split(first, second, ends)
-            return windows, self._echoes(windows, windows), frame, None
+            return _split(first, second, ends), frame, None
         aligned = alignment(lines, array, pairs, frame, swath, self._band(), directions)
         first, second = aligned.apply((first, second), range_m, self.cycles_per_m)
-        windows = _split(first, second, ends)
-        largest = strongest(windows)
-        weakened = [without_highlights(each, largest) for each in windows]
-        return weakened, self._echoes(windows, weakened), frame, aligned
+        return _split(first, second, ends), frame, aligned
 
-    def _echoes(self, windows: list[Window], weakened: list[Window]) -> NDArray[np.float64]:
+    def _echoes(self, received: list[Window], windows: list[Window]) -> NDArray[np.float64]:
         """Return the number of independent samples that hold echoes of their own, [windows]."""
-        largest = strongest(windows)
-        each = zip(windows, weakened, self.independent.tolist(), strict=True)
+        largest = strongest(received)
+        each = zip(received, windows, self.independent.tolist(), strict=True)
         return np.array([independent_echoes(*some, largest) for some in each])
 
     def _frame(self, lines: RangeLines, array: Array, pairs: Overlap) -> Frame:
@@ -374,24 +380,20 @@ def _unambiguous_slope(found: Correlation) -> float:
     return 0.5 / max(abs(found.cycles_per_m) * apart_m, 1e-9)
 
 
+def _weighed(received: list[Window], aligned: Alignment | None) -> list[Window]:
+    """Return windows with strong echoes weakened, where echoes of all directions count."""
+    if aligned is None:
+        return received
+    largest = strongest(received)
+    return [without_highlights(each, largest) for each in received]
+
+
 def _split(
     first: NDArray[np.complex128], second: NDArray[np.complex128], ends: NDArray[np.int64]
 ) -> list[Window]:
     """Return both channels by window."""
     parts = np.split(first, ends, axis=1), np.split(second, ends, axis=1)
     return list(zip(*parts, strict=True))
-
-
-def phase_variance(
-    coherence: NDArray[np.float64], independent: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Return the variance of a correlation's phase, rad^2.
-
-    (1 - g^2)/(2 L g^2) for a coherence g over L independent samples; `coherence` is a sample's,
-    which noise alone makes 1/sqrt(L).
-    """
-    square = np.clip((independent * coherence**2 - 1) / (independent - 1), 1e-6, 1 - 1e-9)
-    return (1 - square) / (2 * independent * square)
 
 
 def _peak_m(summed: NDArray[np.complex128], lags_m: NDArray[np.float64]) -> float:

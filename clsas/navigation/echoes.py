@@ -1,4 +1,4 @@
-"""How many echoes decide a displacement, and what those of single stretches of range say of it."""
+"""How many echoes decide a displacement, how they are weighed, and how certain their phases are."""
 
 from __future__ import annotations
 
@@ -75,3 +75,15 @@ def block_products(window: Window, lag: int, independent: float) -> NDArray[np.c
     product[:, first:stop] = one[:, first:stop] * other[:, first + lag : stop + lag].conj()
     starts = np.arange(blocks) * count // blocks
     return np.asarray(np.add.reduceat(product, starts, axis=1))
+
+
+def phase_variance(
+    coherence: NDArray[np.float64], independent: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return the variance of a correlation's phase, rad^2.
+
+    (1 - g^2)/(2 L g^2) for a coherence g over L independent samples; `coherence` is a sample's,
+    which noise alone makes 1/sqrt(L).
+    """
+    square = np.clip((independent * coherence**2 - 1) / (independent - 1), 1e-6, 1 - 1e-9)
+    return (1 - square) / (2 * independent * square)
