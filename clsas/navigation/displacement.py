@@ -349,7 +349,7 @@ def _of_few_echoes(found: Correlation) -> NDArray[np.float64]:
     if found.aligned is None:
         return np.zeros_like(found.echoes)
     square = found.aligned.coherence**2
-    fewer = 1 / np.minimum(found.echoes, found.independent) - 1 / found.independent
+    fewer = 1 / np.clip(found.echoes, 1.0, found.independent) - 1 / found.independent
     return np.asarray((1 - square) / (2 * square) * fewer)
 
 

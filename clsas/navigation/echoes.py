@@ -16,7 +16,8 @@ _HIGHLIGHT = 3.0  # times the median power, from which on echoes are weakened
 # below it, the usual echo is none: with 0, yaw over one point errs by 7 times as much.
 _SIDE_LOBES = 3e-3
 _SMOOTHED = 9  # samples over which power is a mean
-_MAIN_LOBE = 3.0  # independent samples, to the level of side lobes
+_EMPTY = 1e-3  # power over that of the strongest echo of a window, or a window's over all others
+_MAIN_LOBE = 8.0  # independent samples, down to the former
 _SPECKLE = 2.0  # mean square of speckle's power over the squared mean
 _BLOCK_CELLS = 8.0  # independent samples of a block: neighbours share few echoes
 
@@ -52,8 +53,10 @@ def independent_echoes(
     power, left = _power(window), _power(weakened)
     count = len(power)
     length = _SMOOTHED + _MAIN_LOBE * count / independent
+    if float(power.max()) <= _EMPTY * largest:
+        return 0.0  # side lobes of echoes in other windows
     smoothed = uniform_filter1d(power, _SMOOTHED, mode="nearest")
-    empty = float(np.mean(smoothed < _SIDE_LOBES * largest))
+    empty = float(np.mean(smoothed < _EMPTY * float(power.max())))
     reflectors = math.inf if not empty else -count / length * math.log(empty)
     even = _SPECKLE * float(np.sum(left)) ** 2 / max(count * float(np.sum(left**2)), 1e-300)
     return max(min(independent * min(even, 1.0), reflectors), 1.0)
