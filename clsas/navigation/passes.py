@@ -275,12 +275,14 @@ class _Passes:
 
     def _is_coherent(self, step: Displacement) -> bool:
         """Return whether any window is more coherent than noise, and echoes tell the unknowns."""
-        coherent = bool(np.any(step.coherence > self._least_coherence))
-        return coherent and not self._is_sparse(step)
+        return self._exceeds_noise(step) and not self._is_sparse(step)
 
     def _is_sparse(self, step: Displacement) -> bool:
         """Return whether yaw is looked for in too few echoes."""
-        return self.yaw and step.echoes < LEAST_ECHOES
+        return self.yaw and self._exceeds_noise(step) and step.echoes < LEAST_ECHOES
+
+    def _exceeds_noise(self, step: Displacement) -> bool:
+        return bool(np.any(step.coherence > self._least_coherence))
 
     @property
     def _least_coherence(self) -> NDArray[np.float64]:
