@@ -25,6 +25,7 @@ from clsas.core.lines import RangeLines
 from clsas.navigation.checks import check_navigation, mean_wavelength_m
 from clsas.navigation.drift import drift_m
 from clsas.navigation.gradient import disagreement_m, phase_gradient_m, sharpest_m
+from clsas.navigation.halts import halt
 from clsas.navigation.responses import (
     READ_DB,
     Contributions,
@@ -33,6 +34,7 @@ from clsas.navigation.responses import (
     contributions,
     received_share,
 )
+from clsas.navigation.speed_check import check_speed
 from clsas.opencl.device import Device, open_device
 from clsas.planning.factorize import factorize
 from clsas.planning.planner import plan
@@ -62,6 +64,7 @@ _GAIN = 1.02  # of sharpness, for which a step is repeated
 _LARGE_CHANGE = 1 / 8  # wavelengths rms, likewise: finer steps find what smaller ones leave
 # Wavelengths rms, for which an image is formed. Less changes the sharpness by 0.2 % at most.
 _LEAST_CHANGE = 1 / 400
+_NO_RESPONSES = "the scene has no bright responses to focus on"
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +85,8 @@ class Autofocus:
     sharpness : tuple of (step, float)
         Sharpness after each step that was tried.
     focused : bool
-        False where the scene has no responses to focus on. The lines are then as they were.
+        False where the scene has no responses to focus on, or the platform stood still. The lines
+        are then as they were.
     """
 
     lines: RangeLines
@@ -100,7 +104,7 @@ class Autofocus:
             self,
             f"correction {reprs.quantity(rms_m, 'm')} rms",
             f"sharpness {self.sharpness_before:.3g} to {self.sharpness_after:.3g}",
-            None if self.focused else "no responses to focus on",
+            None if self.focused else "not focused",
         )
 
 
@@ -146,9 +150,10 @@ def autofocus(
     Warns
     -----
     ClsasWarning
-        If the scene has no responses: the lines are then returned as they are. If pings repeat a
-        position: they are corrected as one. If the track turns back, so that pings may be out of
-        order.
+        If the scene has no responses, or pings receive the same echoes although the navigation
+        moves: the lines are then returned as they are. If the correction is one that a wrong sound
+        speed explains. If pings repeat a position: they are corrected as one. If the track turns
+        back, so that pings may be out of order.
     """
     validate.instance("lines", lines, RangeLines)
     validate.instance("grid", grid, Grid)
@@ -240,7 +245,15 @@ class _Focus:
         responses = len(self.points_m) if self.before else 0
         if responses < _LEAST_RESPONSES:
             return self._unfocused(
-                f"the grid shows {responses} responses, at least {_LEAST_RESPONSES} are needed"
+                f"{_NO_RESPONSES}: the grid shows {responses} responses, at least "
+                f"{_LEAST_RESPONSES} are needed"
+            )
+        stood = halt(self.passage, self.readout, self._responses)
+        if stood is not None:
+            return self._unfocused(
+                f"pings {stood[0]} to {stood[1]} receive the same echoes, although the navigation "
+                "moves: the platform stood still, or the scene is the same all along the track (a "
+                "wall, a pipe, a background of all pings)"
             )
         stages, dropped = list(self._stages()), ""
         for number, (name, find) in enumerate(stages, start=1):
@@ -252,16 +265,16 @@ class _Focus:
         apart = disagreement_m(self.passage, self._responses) / self.passage.wavelength_m
         if apart > MOST_DISAGREEMENT:
             return self._unfocused(
-                f"one half of the responses and the other want the pings moved by displacements "
-                f"that differ by {apart:.2g} wavelengths rms, at most {MOST_DISAGREEMENT:g}"
+                f"{_NO_RESPONSES}: one half of the responses and the other want the pings moved by "
+                f"displacements that differ by {apart:.2g} wavelengths rms, at most "
+                f"{MOST_DISAGREEMENT:g}"
             )
+        check_speed(self.passage, self._responses, self.moved_m)
         return self._outcome(focused=True)
 
     def _unfocused(self, why: str) -> Autofocus:
-        """Warn that the scene has no responses to focus on, and return the lines as they were."""
-        validate.warn(
-            f"the scene has no bright responses to focus on: {why}; the lines are left as they were"
-        )
+        """Warn that the track cannot be told, and why, and return the lines as they were."""
+        validate.warn(f"{why}; the lines are left as they were")
         self.moved_m = np.zeros_like(self.moved_m)
         self.deviation_m = np.full_like(self.deviation_m, np.inf)
         return self._outcome(focused=False)

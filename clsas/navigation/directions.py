@@ -85,6 +85,10 @@ class Alignment:
         Decrease in range per metre of sway, a mean over the directions that pass.
     echoes, noise : complex128 [pairs, pairs]
         Correlation that filtered channels have of an even seabed, and of white noise.
+    coherence : float
+        Of both pings over an even seabed: filters leave differences.
+    uneven_rad : float64 [pairs]
+        Phases of echoes from the middle of the beam alone, beside those of an even seabed.
     """
 
     range_m: NDArray[np.float64]
@@ -94,6 +98,8 @@ class Alignment:
     sensitivity: NDArray[np.float64]
     echoes: NDArray[np.complex128]
     noise: NDArray[np.complex128]
+    coherence: float
+    uneven_rad: NDArray[np.float64]
 
     def apply(
         self,
@@ -178,7 +184,9 @@ def alignment(
     near_m, far_m = swath.edges_m[[0, -1]]
     range_m = 1 / np.linspace(1 / near_m, 1 / far_m, beam.nodes(near_m, far_m))
     made = [beam.filters(each) for each in range_m]
-    first, second, sensitivity, echoes, noise = (np.stack(each) for each in zip(*made, strict=True))
+    first, second, sensitivity, echoes, noise, coherence, uneven_rad = (
+        np.stack(each) for each in zip(*made, strict=True)
+    )
     return Alignment(
         range_m,
         cycles_per_m,
@@ -187,6 +195,8 @@ def alignment(
         sensitivity,
         _normalised(echoes.mean(axis=0)),
         _normalised(noise.mean(axis=0)),
+        float(coherence.mean()),
+        uneven_rad.mean(axis=0),
     )
 
 
@@ -234,13 +244,14 @@ class _Beam:
         return min(2 + int(float(change.max()) / _TURN), _MOST_NODES)
 
     def filters(self, range_m: float) -> tuple[NDArray, ...]:
-        """Return filters of both pings, sensitivity, and covariances of echoes and of noise."""
+        """Return what an `Alignment` holds at a range, from filters to `uneven_rad`."""
         first_m, second_m, rays = self._late_m(range_m)
         count, bands = len(first_m), len(self.cycles_per_m)
         filters = np.zeros((2, bands, count, count), np.complex128)
-        expected = np.zeros(count, np.complex128)
+        expected, of_middle = (np.zeros(count, np.complex128) for _ in range(2))
         seen = np.zeros(len(self.sine))
         echoes, noise = (np.zeros((count, count), np.complex128) for _ in range(2))
+        energy = np.zeros((2, count))
         for band, cycles_per_m in enumerate(self.cycles_per_m):
             power = self._power(rays, cycles_per_m)
             passed = self._passed(cycles_per_m)
@@ -255,15 +266,20 @@ class _Beam:
                 matrix = np.linalg.solve(covariance.conj(), (target @ weighted).T).T
                 filters[ping, band] = matrix
                 arrived.append(matrix @ steering)
+                energy[ping] += np.abs(arrived[-1]) ** 2 @ power
                 echoes += (power * arrived[-1]) @ arrived[-1].conj().T
                 noise += matrix @ matrix.conj().T
-            expected += (power * arrived[1].conj() * arrived[0]).sum(axis=1)
+            products = power * arrived[1].conj() * arrived[0]
+            expected += products.sum(axis=1)
+            of_middle += products[:, self._periods(cycles_per_m) <= MIDDLE].sum(axis=1)
             seen += power * passed**2
         # Few channels leave a phase, which an even seabed's mean tells.
         filters[1] *= (expected / np.maximum(np.abs(expected), 1e-300))[:, None]
         port = self.swath.side * self.frame.outward
         sensitivity = np.full(count, float(np.average(rays @ port, weights=seen)))
-        return filters[0], filters[1], sensitivity, echoes, noise
+        square = np.mean(np.abs(expected) ** 2 / np.maximum(energy[0] * energy[1], 1e-300))
+        uneven_rad = np.angle(of_middle * expected.conj())
+        return filters[0], filters[1], sensitivity, echoes, noise, np.sqrt(square), uneven_rad
 
     def _late_m(self, range_m: float) -> tuple[NDArray, NDArray, NDArray]:
         """Return ranges of directions beyond those of channels' own rays, and the directions.
@@ -284,10 +300,13 @@ class _Beam:
 
     def _passed(self, cycles_per_m: float) -> NDArray[np.float64]:
         """Return the amplitude with which directions pass."""
+        return 1 / (1 + np.exp((self._periods(cycles_per_m) - self.half_width) / _EDGE))
+
+    def _periods(self, cycles_per_m: float) -> NDArray[np.float64]:
+        """Return directions in periods of those that the array cannot tell apart."""
         steps_m = np.diff(np.sort(self.pairs.along_m))
         spacing_m = float(np.median(steps_m)) if len(steps_m) else 0.0
-        periods = np.abs(self.sine) * abs(cycles_per_m) * spacing_m
-        return 1 / (1 + np.exp((periods - self.half_width) / _EDGE))
+        return np.abs(self.sine) * abs(cycles_per_m) * spacing_m
 
     def _power(self, rays: NDArray[np.float64], cycles_per_m: float) -> NDArray[np.float64]:
         """Return the power that an even seabed returns from directions."""

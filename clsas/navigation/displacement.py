@@ -15,11 +15,18 @@ from functools import cached_property
 import numpy as np
 import scipy.fft
 from numpy.typing import NDArray
-from scipy.ndimage import uniform_filter1d
 
 from clsas.core.conditioning import are_dead
 from clsas.core.lines import RangeLines
 from clsas.navigation.directions import Alignment, Frame, alignment, ranges_m
+from clsas.navigation.echoes import (
+    Window,
+    block_products,
+    independent_echoes,
+    phase_variance,
+    strongest,
+    without_highlights,
+)
 from clsas.navigation.overlap import Array, Overlap
 from clsas.navigation.swath import Swath
 from clsas.signal.readout import Readout
@@ -29,8 +36,6 @@ _CANCELLED = 1e-6  # length of the sum of two unit vectors, up to which they are
 _SLOPES = np.linspace(-0.2, 0.2, 81)  # yaw between pings that is tried first, rad
 _FINE = 16  # points per sample at which the envelope's peak is looked for
 _FREQUENCIES = 9  # of either half of the band, which stand for equal shares of the power
-_HIGHLIGHT = 3.0  # times the median power, from which on echoes are weakened
-_SMOOTHED = 9  # samples over which that power is a mean
 # Standard deviation of yaw over that of independent pairs, by `scripts/bench navigation`: 1 covers
 # 0.89 to 0.94 of errors by 95 % intervals.
 _SHARED = 1.1
@@ -38,9 +43,6 @@ _SHARED = 1.1
 # deviation fell short of the sway of coarse arrays over even speckle without noise.
 _EXACT_RAD = 2e-3
 _SPECKLE_LAGS = 64  # samples over which speckle may be correlated in range
-
-Window = tuple[NDArray[np.complex128], NDArray[np.complex128]]
-"""Samples of both channels of all pairs in a window of range, [pairs, n] each."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,6 +64,10 @@ class Correlation:
         See `Overlap`.
     independent : float64 [windows]
         Number of independent samples of speckle in a window.
+    echoes : float64 [windows]
+        Number of these that hold echoes of their own.
+    windows : list of Window
+        What was correlated.
     aligned : Alignment or None
         Filters that channels went through; None as they were received.
     """
@@ -73,6 +79,8 @@ class Correlation:
     sensitivity: NDArray[np.float64]
     along_m: NDArray[np.float64]
     independent: NDArray[np.float64]
+    echoes: NDArray[np.float64]
+    windows: list[Window]
     aligned: Alignment | None = None
 
 
@@ -90,8 +98,13 @@ class Displacement:
         Mean over the pairs.
     misfit : float
         Mean square of the residual phases over what their coherence explains; 1 is expected.
-    scatter : float64 [windows]
-        What every window by itself says beyond this: of yaw, or of sway where there is no yaw.
+    scatter : float64 [blocks]
+        What the echoes of every block of range say beyond this: of yaw, or of sway where there is
+        no yaw. Blocks are parts of the windows.
+    echoes : float
+        Number of independent samples that hold echoes.
+    lasting : float
+        Share of the variance that fewer echoes than those of speckle make: they last.
     """
 
     sway_m: float
@@ -100,6 +113,8 @@ class Displacement:
     coherence: NDArray[np.float64]
     misfit: float
     scatter: NDArray[np.float64]
+    echoes: float
+    lasting: float
 
 
 class Correlator:
@@ -148,7 +163,9 @@ class Correlator:
     ) -> Correlation:
         """Return the correlation of pairs at lags of up to `most_m`. See `windows`."""
         most = max(math.ceil(most_m / self.step_m), 1)
-        windows, frame, aligned = self.windows(lines, array, pairs, directions)
+        received, frame, aligned = self._received(lines, array, pairs, directions)
+        windows = _weighed(received, aligned)
+        echoes = self._echoes(received, windows)
         values, coherence = [], []
         for (one, other), n in zip(windows, self.samples, strict=True):
             length = scipy.fft.next_fast_len(int(n) + most)
@@ -169,6 +186,8 @@ class Correlator:
             self._sensitivity(frame, aligned),
             pairs.along_m,
             self.independent,
+            echoes,
+            windows,
             aligned,
         )
 
@@ -179,8 +198,15 @@ class Correlator:
 
         `lines` has the samples that the correlator was made for, and the positions to test.
         `directions` is the half width of `alignment`. Where the beam is narrow, all echoes are
-        aligned as those from broadside.
+        aligned as those from broadside; else strong ones are weakened.
         """
+        received, frame, aligned = self._received(lines, array, pairs, directions)
+        return _weighed(received, aligned), frame, aligned
+
+    def _received(
+        self, lines: RangeLines, array: Array, pairs: Overlap, directions: float
+    ) -> tuple[list[Window], Frame, Alignment | None]:
+        """Return what `windows` does, with echoes as strong as they are."""
         swath, frame = self.swath, self._frame(lines, array, pairs)
         range_m = np.concatenate(
             [
@@ -196,8 +222,13 @@ class Correlator:
             return _split(first, second, ends), frame, None
         aligned = alignment(lines, array, pairs, frame, swath, self._band(), directions)
         first, second = aligned.apply((first, second), range_m, self.cycles_per_m)
-        windows = [_without_highlights(*each) for each in _split(first, second, ends)]
-        return windows, frame, aligned
+        return _split(first, second, ends), frame, aligned
+
+    def _echoes(self, received: list[Window], windows: list[Window]) -> NDArray[np.float64]:
+        """Return the number of independent samples that hold echoes of their own, [windows]."""
+        largest = strongest(received)
+        each = zip(received, windows, self.independent.tolist(), strict=True)
+        return np.array([independent_echoes(*some, largest) for some in each])
 
     def _frame(self, lines: RangeLines, array: Array, pairs: Overlap) -> Frame:
         centre_m = (lines.phase_centres_m[pairs.first] + lines.phase_centres_m[pairs.second]) / 2
@@ -268,7 +299,8 @@ def displacement(found: Correlation, *, first: bool, yaw: bool) -> Displacement:
     mean = np.angle(np.sum(found.values[:, :, lag] * np.exp(-1j * model)))
     phase = np.angle(np.exp(1j * (phase - mean))) + mean
     coherence = np.sqrt(np.mean(found.coherence[:, :, lag] ** 2, axis=0))
-    variance = phase_variance(coherence, found.independent)
+    of_few = _of_few_echoes(found)
+    variance = phase_variance(coherence, found.independent) + of_few
     design = np.stack([-turns, -steer] if yaw else [-turns], axis=-1)
     normal = np.einsum("w,kwa,kwb->ab", 1 / variance, design, design)
     inverse = np.linalg.inv(normal)
@@ -289,18 +321,53 @@ def displacement(found: Correlation, *, first: bool, yaw: bool) -> Displacement:
     # More windows do not make the model of the array more exact.
     level = design.mean(axis=1)
     covariance[:unknowns, :unknowns] += _EXACT_RAD**2 * np.linalg.inv(level.T @ level)
-    alone = np.linalg.solve(
-        np.einsum("kwa,kwb->wab", design, design),
-        np.einsum("kwa,kw->wa", design, residual)[..., None],
-    )
+    gain = np.einsum("ab,kwb,w->akw", inverse, design, 1 / variance)
+    lasting = float(np.average(of_few / variance, weights=1 / variance))
+    if found.aligned is not None:
+        # Few echoes may all come from the middle of the beam.
+        apart = np.einsum("akw,k->a", gain, found.aligned.uneven_rad)
+        covariance[:unknowns, :unknowns] += lasting * np.outer(apart, apart)
     return Displacement(
         sway_m + float(solution[0]),
         slope + float(solution[1]),
         covariance,
         coherence,
         misfit,
-        alone[:, -1, 0],
+        _scatter(found, lag, phase - residual, gain[-1]),
+        float(found.echoes.sum()),
+        lasting,
     )
+
+
+def _of_few_echoes(found: Correlation) -> NDArray[np.float64]:
+    """Return the variance of phases because echoes are fewer than those of speckle, [windows].
+
+    Every direction keeps a phase of its own. Those of speckle make pings less coherent, and average
+    out as noise does. Few echoes come from few directions: they stay coherent, and what is expected
+    of an even seabed is wrong for them.
+    """
+    if found.aligned is None:
+        return np.zeros_like(found.echoes)
+    square = found.aligned.coherence**2
+    fewer = 1 / np.clip(found.echoes, 1.0, found.independent) - 1 / found.independent
+    return np.asarray((1 - square) / (2 * square) * fewer)
+
+
+def _scatter(
+    found: Correlation, lag: int, fitted: NDArray[np.float64], gain: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return what blocks of range add to a displacement, [blocks]; their sum is about 0.
+
+    `fitted` and `gain` are the phases of the fit, and the displacement per phase, [pairs, windows].
+    """
+    shift = round(float(found.lags_m[lag] / (found.lags_m[1] - found.lags_m[0])))
+    added = []
+    for number, (window, count) in enumerate(zip(found.windows, found.independent, strict=True)):
+        products = block_products(window, shift, float(count))
+        turned = (products * np.exp(-1j * fitted[:, number, None])).imag
+        total = np.maximum(np.abs(found.values[:, number, lag]), 1e-300)
+        added.append((gain[:, number] / total) @ turned)
+    return np.concatenate(added)
 
 
 def _unambiguous_slope(found: Correlation) -> float:
@@ -313,40 +380,20 @@ def _unambiguous_slope(found: Correlation) -> float:
     return 0.5 / max(abs(found.cycles_per_m) * apart_m, 1e-9)
 
 
+def _weighed(received: list[Window], aligned: Alignment | None) -> list[Window]:
+    """Return windows with strong echoes weakened, where echoes of all directions count."""
+    if aligned is None:
+        return received
+    largest = strongest(received)
+    return [without_highlights(each, largest) for each in received]
+
+
 def _split(
     first: NDArray[np.complex128], second: NDArray[np.complex128], ends: NDArray[np.int64]
 ) -> list[Window]:
     """Return both channels by window."""
     parts = np.split(first, ends, axis=1), np.split(second, ends, axis=1)
     return list(zip(*parts, strict=True))
-
-
-def _without_highlights(
-    one: NDArray[np.complex128], other: NDArray[np.complex128]
-) -> tuple[NDArray[np.complex128], NDArray[np.complex128]]:
-    """Return samples of both channels of all pairs, with strong echoes weakened.
-
-    The stronger an echo, the less is left of it: it then weighs less than what is usual. A strong
-    echo comes from one direction only. It would decide the mean phase, which is expected of echoes
-    from all over the beam.
-    """
-    power = np.mean(np.abs(one) ** 2 + np.abs(other) ** 2, axis=0)
-    power = uniform_filter1d(power, _SMOOTHED, mode="nearest")
-    usual = _HIGHLIGHT * float(np.median(power))
-    amplitude = np.minimum(1.0, usual / np.maximum(power, 1e-300))
-    return amplitude * one, amplitude * other
-
-
-def phase_variance(
-    coherence: NDArray[np.float64], independent: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Return the variance of a correlation's phase, rad^2.
-
-    (1 - g^2)/(2 L g^2) for a coherence g over L independent samples; `coherence` is a sample's,
-    which noise alone makes 1/sqrt(L).
-    """
-    square = np.clip((independent * coherence**2 - 1) / (independent - 1), 1e-6, 1 - 1e-9)
-    return (1 - square) / (2 * independent * square)
 
 
 def _peak_m(summed: NDArray[np.complex128], lags_m: NDArray[np.float64]) -> float:

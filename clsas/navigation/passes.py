@@ -19,6 +19,9 @@ from clsas.navigation.smoother import Step, integrated
 LEAST_PAIRS = 3
 """Fewest pairs of channels that tell yaw from sway."""
 
+LEAST_ECHOES = 8.0
+"""Fewest independent samples with echoes that tell yaw: fewer come from too few directions."""
+
 _LEAST_COHERENCE = 3.0  # of a window, times that of noise alone, 1/sqrt(independent samples)
 _PASSES = 6  # at most, and again after a surge
 _SETTLED = 0.1  # changes of the last pass, over their standard deviations
@@ -45,12 +48,15 @@ class Displacements:
         See `Step.over`.
     coherence : float64 [pings - 1, windows]
     misfit : float64 [pings - 1]
-    scatter : float64 [pings - 1, windows]
+    scatter : float64 [pings - 1, blocks]
+    echoes, lasting : float64 [pings - 1]
         See `Displacement`.
     pairs : int64 [pings - 1]
         Pairs of channels that share a phase centre.
     coherent : bool [pings - 1]
-        False where no window is more coherent than noise would be.
+        False where no window is more coherent than noise would be, or where echoes are sparse.
+    sparse : bool [pings - 1]
+        True where the echoes are too few to tell yaw.
     least_coherence : float64 [windows]
         What noise would not reach.
     """
@@ -63,8 +69,11 @@ class Displacements:
     coherence: NDArray[np.float64]
     misfit: NDArray[np.float64]
     scatter: NDArray[np.float64]
+    echoes: NDArray[np.float64]
+    lasting: NDArray[np.float64]
     pairs: NDArray[np.int64]
     coherent: NDArray[np.bool_]
+    sparse: NDArray[np.bool_]
     least_coherence: NDArray[np.float64]
 
 
@@ -221,8 +230,11 @@ class _Passes:
             coherence=np.stack([step.coherence for step in self.steps]),
             misfit=np.array([step.misfit for step in self.steps]),
             scatter=np.stack([step.scatter for step in self.steps]),
+            echoes=np.array([step.echoes for step in self.steps]),
+            lasting=np.array([step.lasting for step in self.steps]),
             pairs=np.array([each.pairs for each in self.overlaps]),
             coherent=self.coherent,
+            sparse=np.array([self._is_sparse(step) for step in self.steps]),
             least_coherence=self._least_coherence,
         )
 
@@ -271,7 +283,14 @@ class _Passes:
         return levers_m
 
     def _is_coherent(self, step: Displacement) -> bool:
-        """Return whether any window is more coherent than noise would be."""
+        """Return whether any window is more coherent than noise, and echoes tell the unknowns."""
+        return self._exceeds_noise(step) and not self._is_sparse(step)
+
+    def _is_sparse(self, step: Displacement) -> bool:
+        """Return whether yaw is looked for in too few echoes."""
+        return self.yaw and self._exceeds_noise(step) and step.echoes < LEAST_ECHOES
+
+    def _exceeds_noise(self, step: Displacement) -> bool:
         return bool(np.any(step.coherence > self._least_coherence))
 
     @property

@@ -23,8 +23,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-_LAGS = 10  # pings over which errors may persist
-_PINGS_PER_LAG = 4
+_ERRORS_PER_LAG = 60  # of pings and blocks: tell the variance of independent errors to 15 %
 _DRAWS = 400  # of errors: the deviation is certain to 4 %
 
 
@@ -183,14 +182,14 @@ def persistence(scatter: NDArray[np.float64]) -> float:
     """Return the variance of a sum of errors over that of independent ones, at least 1.
 
     Echoes stay in the beam for many pings, and so do the errors that they make. They differ between
-    windows of range: `scatter`, [pings - 1, windows], is how far every window is off the joint
+    blocks of range: `scatter`, [pings - 1, blocks], is how far every block is off the joint
     displacement. Its covariance from ping to ping tells, weighted by a triangle (Newey and West
-    1987). One window or few pings do not tell: 1.
+    1987), over as many pings as all blocks together tell. One block or few pings do not tell: 1.
     """
-    count, windows = scatter.shape
-    lags = min(_LAGS, count // _PINGS_PER_LAG)
+    count, blocks = scatter.shape
+    lags = min(count - 1, int(count * blocks / _ERRORS_PER_LAG))
     square = float(np.sum(scatter**2))
-    if windows < 2 or lags < 1 or square <= 0:
+    if blocks < 2 or lags < 1 or square <= 0:
         return 1.0
     shared = [float(np.sum(scatter[each:] * scatter[:-each])) for each in range(1, lags + 1)]
     weights = 1 - np.arange(1, lags + 1) / (lags + 1)

@@ -1,0 +1,118 @@
+"""Micronavigation over few reflectors, and how certain it is of a navigation that is right."""
+
+import numpy as np
+import pytest
+
+import clsas
+from clsas.navigation.echoes import block_products, independent_echoes
+from clsas.navigation.micronavigation import micronavigate
+from clsas.trials.navigating import (
+    WAVELENGTH_M,
+    detrended,
+    overlapping_array,
+    said_to_be_on,
+    seabed,
+    with_noise,
+)
+
+NEAR_M, FAR_M = 12.0, 16.0
+
+
+def right(scene_of, pings):
+    """Lines of a straight track, as their navigation says."""
+    sonar, advance_m = overlapping_array(56, 24)
+    track = clsas.Track.straight((0, 0, 0), (advance_m, 0, 0), pings, 1.0)
+    echoes = clsas.simulate(sonar, track, scene_of(track), range_m=(NEAR_M - 0.5, FAR_M + 0.5))
+    return said_to_be_on(clsas.compress(echoes), sonar, track)
+
+
+def reflectors(count, seed):
+    """Points in front of the middle of a track."""
+    random = np.random.default_rng(seed)
+
+    def scene(track):
+        x = track.positions_m[:, 0]
+        along_m = x.mean() + np.ptp(x) / 2 * random.uniform(-1, 1, count)
+        across_m = np.linspace(NEAR_M + 0.5, FAR_M - 0.5, count + 2)[1:-1]
+        at = np.stack([along_m, random.permutation(across_m), np.zeros(count)], axis=1)
+        return clsas.PointTargets(at, np.exp(2j * np.pi * random.random(count)))
+
+    return scene
+
+
+def navigate(lines, **options):
+    return micronavigate(lines, range_m=(NEAR_M, FAR_M), **options)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("count", "noise"), [(1, False), (1, True), (3, False)])
+def test_few_reflectors_do_not_tell_a_yaw(count, noise):
+    """Their directions look like one."""
+    lines = right(reflectors(count, 3), 8)
+    if noise:
+        lines = with_noise(lines, 0.95, np.random.default_rng(count))
+    with pytest.raises(ValueError, match=r"those of about .* reflectors, at least 8"):
+        navigate(lines)
+    with pytest.raises(ValueError, match=r"reflectors, at least 8|must be coherent"):
+        navigate(lines, element_length_m=WAVELENGTH_M)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("count", [1, 3])
+def test_few_reflectors_tell_a_sway(count):
+    found = navigate(right(reflectors(count, 4), 8), unknowns=("sway",))
+    assert np.abs(found.sway_steps_m).max() <= 1e-6 + 3 * found.sway_steps_sd_m.max()
+    assert np.std(detrended(found.sway_m)) <= 3 * found.shape_sd_m.max()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("count", [12, 30])
+def test_deviations_over_some_reflectors_are_true(count):
+    """All lie near broadside, and an even seabed is expected."""
+    found = navigate(right(reflectors(count, 5), 12), element_length_m=WAVELENGTH_M)
+    wrong_rad = np.sqrt(np.mean(found.yaw_steps_rad**2))
+    assert wrong_rad <= 2 * np.sqrt(np.mean(found.yaw_steps_sd_rad**2))
+
+
+@pytest.mark.slow
+def test_one_window_tells_how_errors_persist():
+    """Of a navigation that is right. One window is the default for a short swath."""
+    wrong_m, told_m = [], []
+    for seed in (20, 26):
+        lines = right(lambda track, seed=seed: seabed(track, NEAR_M, FAR_M, 5000, seed=seed), 40)
+        found = navigate(lines, element_length_m=WAVELENGTH_M)
+        assert found.coherence.shape[1] == 1
+        assert found.persistence > 1
+        wrong_m.append(np.std(detrended(found.lines.ping_centres_m[:, 1])))
+        told_m.append(np.sqrt(np.mean(found.shape_sd_m**2)))
+    assert np.sqrt(np.mean(np.square(wrong_m))) <= 1.4 * np.sqrt(np.mean(np.square(told_m)))
+
+
+def window(samples):
+    values = np.broadcast_to(samples, (4, len(samples))).astype(np.complex128)
+    return values, values
+
+
+def test_echoes_are_counted():
+    """Points with slopes count one by one, speckle by its independent samples."""
+    random = np.random.default_rng(0)
+    white = random.standard_normal((2, 4, 400, 2)) @ [1, 1j]
+    speckle = white[0], white[1]
+    assert independent_echoes(speckle, speckle, 400.0, 4.0) == pytest.approx(400, rel=0.05)
+    for count in (1, 4):
+        samples = np.full(400, 1e-3)
+        samples[np.arange(count) * 97 + 20] = 1.0
+        points = window(samples)
+        assert independent_echoes(points, points, 400.0, 1.0) == pytest.approx(count, rel=0.5)
+
+
+@pytest.mark.parametrize("lag", [0, 3, -2])
+def test_blocks_add_up_to_the_correlation(lag):
+    random = np.random.default_rng(1)
+    one, other = random.standard_normal((2, 3, 100, 2)) @ [1, 1j]
+    expected = sum(
+        one[:, n] * other[:, n + lag].conj() for n in range(max(0, -lag), min(100, 100 - lag))
+    )
+    found = block_products((one, other), lag, 50.0)
+    assert found.shape == (3, 6)
+    np.testing.assert_allclose(found.sum(axis=1), expected, rtol=1e-12)
