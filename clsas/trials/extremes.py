@@ -294,6 +294,58 @@ def rings(**options: Any) -> Known:
     )  # fmt: skip
 
 
+def apart(**options: Any) -> Known:
+    """100 kHz, 2 kHz, 40 m away, with the receiver 10 m above the transmitter."""
+    tx = along_x(200, 0.08)
+    defaults: dict[str, Any] = {"bandwidth_hz": 2e3, "pixel_m": (0.2, 0.2)}
+    return scene(
+        tx, (0.3, 42.0, -15), carrier_hz=1e5, rx_m=tx + [0, 0, 10.0], **(defaults | options)
+    )
+
+
+def uneven(**options: Any) -> Known:
+    """100 kHz, 500 Hz, with receivers whose velocity differs by 5 m/s rms from ping to ping."""
+    tx = along_x(200, 0.08)
+    velocity = [2.0, 0, 0] + np.random.default_rng(5).normal(0, 3, (200, 3))
+    return scene(
+        tx, (0.3, 42.0, -15), carrier_hz=1e5, bandwidth_hz=500, pixel_m=(0.2, 0.2), rx_m=tx,
+        rx_velocity_m_s=velocity, **options,
+    )  # fmt: skip
+
+
+def headings(**options: Any) -> Known:
+    """30 kHz, three passes on other headings, of which a Hann beam sees parts."""
+    turn = np.radians(np.repeat([0, 60, 120], 104))
+    along = np.stack([np.cos(turn), np.sin(turn), 0 * turn], axis=1)
+    aside = np.stack([np.sin(turn), -np.cos(turn), 0 * turn], axis=1)
+    track = np.tile(along_x(104, 0.03)[:, 0], 3)[:, None] * along
+    track += np.repeat([0.26, 0.52, 0.78], 104)[:, None] * aside
+    return scene(
+        track, (3, 0, -2), carrier_hz=3e4, bandwidth_hz=9e3, pixel_m=(0.01, 0.01),
+        beam=BeamWindow(40, "hann", along=along), **options,
+    )  # fmt: skip
+
+
+def loud(**options: Any) -> Known:
+    """30 kHz, with a channel of 30 dB more two wavelengths off the track."""
+    track, gains = along_x(300, 0.035), np.ones(300)
+    track[130] += [0, 0.1, 0.07]
+    gains[130] = 10**1.5
+    return scene(
+        track, (0, 11.5, 0), carrier_hz=3e4, bandwidth_hz=9e3, pixel_m=(0.08, 0.08), gains=gains,
+        **options,
+    )  # fmt: skip
+
+
+def edge(**options: Any) -> Known:
+    """30 kHz, with points where the coverage of a Hann beam ends: there weights are small."""
+    return scene(
+        along_x(300, 0.02), (3, 9.5, 0), carrier_hz=3e4, bandwidth_hz=9e3, pixel_m=(0.04, 0.02),
+        shape=(32, 96), beam=BeamWindow(20, "hann", along=[1, 0, 0]), within=(0.88, 0.97),
+        **options,
+    )  # fmt: skip
+
+
 def steps(centre: float, width: float) -> list[Band]:
     """Return three bands at 0, -15 and -30 dB."""
     return [

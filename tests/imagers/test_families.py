@@ -1,12 +1,38 @@
 """Random scenes of every family, held to float64 sums that share nothing with the imagers."""
 
 import pytest
-from families import draw
+from families import FAMILIES, draw
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 from judging import images_of
 
-HOLDING = ("plain", "bands", "reliefs and points")
+MISSED = (
+    ("dense, narrow, apart", 2131, -40),
+    ("apart, narrow", 5025, -20),
+    ("apart, narrow", 5061, -15),
+    ("moving", 5008, -20),
+    ("moving", 5026, -40),
+    ("headings with beam", 103, -15),
+    ("gains", 2065, -50),
+    ("gains, dense", 2084, -60),
+    ("dense", 5082, -50),
+    ("rings", 492835, -20),
+    ("reliefs and points with beam", 5020, -50),
+    ("anything", 2159, -20),
+)
+"""Families, seeds and tolerances of images that once erred by more than was predicted."""
+
+
+def missed(family, seed, accuracy_db, tolerances_db):
+    """Images that err by more than was asked and predicted, in words."""
+    images = images_of(draw(family, seed), accuracy_db, tolerances_db)
+    return [str(each) for each in images if each.missed and not each.warned]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("family", "seed", "tolerance_db"), MISSED)
+def test_scenes_that_once_missed(family, seed, tolerance_db):
+    assert missed(family, seed, -50, [tolerance_db]) == []
 
 
 @pytest.mark.slow
@@ -17,7 +43,6 @@ HOLDING = ("plain", "bands", "reliefs and points")
     suppress_health_check=[HealthCheck.too_slow],
 )
 @given(seed=st.integers(0, 2**32 - 1))
-@pytest.mark.parametrize("family", HOLDING)
+@pytest.mark.parametrize("family", FAMILIES)
 def test_no_image_errs_by_more_than_was_asked_and_predicted(family, seed):
-    images = images_of(draw(family, seed), accuracy_db=-55, tolerances_db=[-20, -45])
-    assert [str(each) for each in images if each.missed and not each.warned] == []
+    assert missed(family, seed, -55, [-20, -45]) == []
