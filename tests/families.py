@@ -25,7 +25,7 @@ from clsas.sonar.beam import BeamWindow
 from clsas.trials import oracle
 
 SAMPLED = 70  # random pixels at which the ideal image is known, besides those around the points
-AROUND = 6  # pixels around every point
+AROUND = 6  # pixels around every point, besides the one where it is
 
 
 @dataclass(frozen=True, eq=False)
@@ -328,8 +328,10 @@ def _echoes(
     points_m = pixels_m[chosen] + 0.3 * wave_m * rng.normal(size=(count, 3))
     amplitude = rng.normal(size=(count, 2)) @ [1, 1j]
     tilt_db = float(rng.choice([0, 0, 10]))
-    near = np.clip(chosen[:, None] + rng.integers(-3, 4, (count, AROUND)), 0, len(pixels_m) - 1)
-    return Points.of(channels, sampling, points_m, amplitude, tilt_db, span_m), near.ravel()
+    # Coarse pixels beside a point hold side lobes only: the brightest must be among the known.
+    around = chosen[:, None] + rng.integers(-3, 4, (count, AROUND))
+    near = np.append(chosen, np.clip(around, 0, len(pixels_m) - 1))
+    return Points.of(channels, sampling, points_m, amplitude, tilt_db, span_m), near
 
 
 def _wanted(

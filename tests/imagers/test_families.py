@@ -16,6 +16,7 @@ MISSED = (
     ("gains", 2065, -50),
     ("gains, dense", 2084, -60),
     ("dense", 5082, -50),
+    ("rings", 492835, -20),
     ("reliefs and points with beam", 5020, -50),
     ("anything", 2159, -20),
 )

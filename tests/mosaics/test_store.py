@@ -12,7 +12,6 @@ from click.testing import CliRunner
 
 import clsas
 from clsas.cli import main
-from clsas.core import validate
 from clsas.core.grid import Grid
 from clsas.mosaics.documents import is_intact, read_attributes
 from clsas.mosaics.store import Store
@@ -146,17 +145,6 @@ def test_a_damaged_height_map_is_found(tmp_path):
         ValueError, match=r"a\.zarr is damaged: height: its values do not match their checksum"
     ):
         _ = store.grid
-
-
-def test_heights_that_do_not_fit_into_memory_are_refused_unread(tmp_path, monkeypatch):
-    grid = GRID.with_height(np.zeros(GRID.shape))
-    list(clsas.mosaic(LINES, grid, tmp_path / "a.zarr", **WISH))
-    described = tmp_path / "a.zarr" / "height" / "zarr.json"
-    claim = json.loads(described.read_text()) | {"shape": [1000, 1000]}
-    described.write_text(json.dumps(claim))  # what is missing in it is zero
-    monkeypatch.setattr(validate, "_memory_bytes", lambda: 8 << 20)
-    with pytest.raises(ValueError, match=r"height in .*a\.zarr must ask for at most 0\.00781 GiB"):
-        _ = Store.opened(tmp_path / "a.zarr").grid
 
 
 def test_a_store_without_checksums_is_refused_by_its_version(path):

@@ -682,7 +682,7 @@ def test_line_arguments_of_another_type(arguments):
         ({"positions_m": [[1, 2, np.inf]]}, ValueError, "positions_m must be finite, got 1"),
         ({"amplitudes": [1, 2]}, ValueError, r"amplitudes must have shape \(1\).* got \(2,\)"),
         ({"amplitudes": np.nan}, ValueError, "amplitudes must be finite"),
-        ({"amplitudes": "loud"}, TypeError, "amplitudes must be complex"),
+        ({"amplitudes": "loud"}, TypeError, "amplitudes must be real or complex"),
     ],
 )
 def test_bad_points(arguments, error, message):
