@@ -93,10 +93,12 @@ def run(name, command, device, report):
 
 
 def commit():
-    """Return the commit of this checkout, or that it is none."""
-    done = subprocess.run(
-        ["git", "-C", ROOT, "rev-parse", "--short", "HEAD"], text=True, capture_output=True
-    )
+    """Return the commit of this checkout, or that there is none or no git to ask."""
+    command = ["git", "-C", ROOT, "rev-parse", "--short", "HEAD"]
+    try:
+        done = subprocess.run(command, text=True, capture_output=True)
+    except FileNotFoundError:
+        return "unknown (git is not installed)"
     return done.stdout.strip() or "unknown (no git checkout)"
 
 

@@ -12,10 +12,10 @@ from clsas.opencl.device import open_device
 ROOT = Path(__file__).parents[1]
 
 
-def run(*arguments):
+def run(*arguments, **variables):
     return subprocess.run(
         [sys.executable, ROOT / "scripts" / "gpu_report.py", *arguments],
-        text=True, capture_output=True, env=os.environ | {"PYTHONPATH": str(ROOT)},
+        text=True, capture_output=True, env=os.environ | {"PYTHONPATH": str(ROOT)} | variables,
     )  # fmt: skip
 
 
@@ -31,6 +31,13 @@ def test_a_report_holds_what_a_part_printed(tmp_path, selection):
     assert "`python -m clsas devices`: ended with 0 after" in text
     assert info.label in text.split("## Devices")[1]
     assert text.endswith("All parts ended well.\n")
+
+
+def test_a_report_needs_no_git(tmp_path):
+    report = tmp_path / "report.md"
+    done = run("--device", "0", "--only", "Devices", "--out", report, PATH=str(tmp_path))
+    assert done.returncode == 0, done.stderr
+    assert "commit unknown (git is not installed)" in report.read_text()
 
 
 def test_a_device_that_is_missing_is_named_and_nothing_is_written(tmp_path):
