@@ -64,7 +64,7 @@ def rows(
             sides,
             f"{predicted_s:.3f}",
             f"{median_s:.3f} ({min(measured_s):.3f} to {max(measured_s):.3f})",
-            f"{predicted_s / median_s:.2f}",
+            f"{predicted_s / median_s:.3g}",
         ]
 
 

@@ -171,11 +171,14 @@ def test_costs_that_cannot_be_stored_serve_this_process(cache, measured, monkeyp
 
 
 def test_a_device_is_measured(platform):
-    """Whatever the machine does meanwhile: factors are within the reach of known devices."""
+    """Whatever the machine does meanwhile: factors are within the reach of known devices.
+
+    A CPU's driver that passes for a GPU takes 500 times as long as the GPU of the defaults.
+    """
     with platform.profile() as times:
         found = scaling.measure(platform)
     assert not times  # of the measurement's own kernels
-    assert all(1e-3 < factor < 1e3 for factor in vars(found).values())
+    assert all(1e-3 < factor < 1e5 for factor in vars(found).values())
 
 
 def test_images_whose_times_do_not_repeat_are_timed_for_longer(platform, monkeypatch):

@@ -39,7 +39,8 @@ def test_every_request_has_a_row(small):
 def test_the_title_tells_device_and_costs():
     device = open_device()
     day = costs.load(device).measured[:10]
-    words = rf"{device.info.driver}, \d+ compute units: costs that `clsas calibrate` .* on {day}"
+    driver = re.escape(device.info.driver)
+    words = rf"{driver}, \d+ compute units: costs that `clsas calibrate` .* on {day}"
     assert re.search(words, predictions.title(device))
 
 
