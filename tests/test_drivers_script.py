@@ -39,6 +39,7 @@ def test_where_there_is_no_chroot_to_be_had_it_says_why(checkout):
     ("arguments", "message"),
     [
         (["--fast"], "unknown option --fast"),
+        (["--turns", "0", "bench"], "--turns is a number from 1 on"),
         (["speed"], "unknown part speed"),
         (["--driver", "cuda"], "--driver is one of: pypi pocl rusticl rusticl-gpu"),
     ],
