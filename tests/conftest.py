@@ -1,5 +1,6 @@
 """The devices that tests run on, and what they allocate there."""
 
+import hypothesis
 import pytest
 from variants import DEFAULT, EVERY_VARIANT, OTHERS, OWN, is_repeated, variant
 
@@ -7,6 +8,10 @@ from clsas.opencl.device import Device, list_devices
 from clsas.planning import costs
 
 _ALL = OWN | OTHERS
+
+# No test fails because a machine is slow.
+hypothesis.settings.register_profile("clsas", deadline=None)
+hypothesis.settings.load_profile("clsas")
 
 
 @pytest.fixture(autouse=True, scope="session")
