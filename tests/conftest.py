@@ -5,6 +5,7 @@ import signal
 import sys
 import warnings
 
+import hypothesis
 import numpy as np
 import pytest
 from variants import DEFAULT, EVERY_VARIANT, OTHERS, OWN, is_repeated, variant
@@ -15,6 +16,10 @@ from clsas.planning import costs
 os.environ["MPLBACKEND"] = "agg"  # before Matplotlib is imported: figures open no windows
 _ALL = OWN | OTHERS
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGPIPE)
+
+# No test fails because a machine is slow.
+hypothesis.settings.register_profile("clsas", deadline=None)
+hypothesis.settings.load_profile("clsas")
 
 
 @pytest.fixture(autouse=True, scope="session")

@@ -39,6 +39,7 @@ def test_where_there_is_no_chroot_to_be_had_it_says_why(checkout):
     ("arguments", "message"),
     [
         (["--fast"], "unknown option --fast"),
+        (["--turns", "0", "bench"], "--turns is a number from 1 on"),
         (["speed"], "unknown part speed"),
         (["--driver", "cuda"], "--driver is one of: pypi pocl rusticl rusticl-gpu"),
     ],
@@ -54,6 +55,21 @@ def test_what_was_made_is_removed(checkout):
     done = run(checkout, "--remove")
     assert done.returncode == 0, done.stderr
     assert [path.name for path in checkout.iterdir()] == ["scripts"]
+
+
+def test_nothing_is_removed_through_a_mount(checkout):
+    kept, mounted = checkout / "kept", checkout / ".drivers" / "trixie" / "dev"
+    kept.mkdir()
+    (kept / "file").touch()
+    mounted.mkdir(parents=True)
+    namespace = ["unshare", "--mount", "--propagation", "private", "bash", "-c"]
+    if subprocess.run([*namespace, f"mount --bind '{kept}' '{mounted}'"]).returncode:
+        pytest.skip("mounts are not allowed here")
+    command = f"mount --bind '{kept}' '{mounted}' && bash '{checkout}/scripts/drivers' --remove"
+    done = subprocess.run([*namespace, command], text=True, capture_output=True)
+    assert done.returncode == 1
+    assert "nothing was deleted" in done.stderr
+    assert (kept / "file").exists()
 
 
 def test_the_table_shows_what_every_driver_did(tmp_path):

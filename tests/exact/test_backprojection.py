@@ -155,7 +155,7 @@ def test_any_shape_of_grid(device, shape, kind):
 
 
 @pytest.mark.slow
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(st.data())
 def test_any_geometry(data):
     """Antennas, motion and planes of any direction at 1 MHz, imaged on the default device."""

@@ -185,7 +185,7 @@ def test_ranges_grow_as_those_of_places_do_once_stretched(speed):
         assert np.abs(grown - of_place - stretch).max() < most
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(st.integers(0, 2**32 - 1))
 def test_no_phase_turns_faster_than_its_bound(seed):
     """The phase of any pixel against its subimage's centre, along any track."""

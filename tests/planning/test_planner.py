@@ -132,7 +132,7 @@ def test_relief_takes_virtual_channels_and_samples():
     wish = {"tolerance_db": -40, "costs": EXACT_IS_SLOW, "depth": 2, "full_model": True}
     plans = [
         plan(lines, grid.with_height(height_m), **wish)
-        for height_m in (0 * row, tilt, tilt + 0.5 * waves, tilt + 3 * waves)
+        for height_m in (0 * row, tilt, tilt + waves, tilt + 3 * waves)
     ]
     flat, tilted, low, high = (p.predicted_seconds for p in plans)
     assert tilted == pytest.approx(flat, rel=0.1)  # a slope is a plane

@@ -111,7 +111,7 @@ positions = st.lists(st.floats(-100, 100), min_size=3, max_size=3).map(np.array)
 speeds = st.lists(st.floats(-30, 30), min_size=3, max_size=3).map(np.array)
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 @given(point=positions, tx=positions, rx=positions, velocity=speeds)
 def test_motion_in_flight_meets_the_moving_receiver(point, tx, rx, velocity):
     c = 1500.0
