@@ -132,8 +132,8 @@ def _over_places(model: VisibilityModel, stages: Stages, part: Callable[[float],
 _Place = tuple[Literal["track", "along", "across"], float]
 """A curve: the track, or a line along or across a sheet at some coordinate."""
 _TRACK: _Place = ("track", 0.0)
-_LINES_ALONG: tuple[_Place, ...] = (("along", 0.25),)
-_LINES_ACROSS: tuple[_Place, ...] = (("across", 0.2), ("across", 0.7))
+_LINES_ALONG: tuple[_Place, ...] = (("along", 0.5),)
+_LINES_ACROSS: tuple[_Place, ...] = (("across", 0.2), ("across", 0.5))
 _DIMENSIONS = (_LINES_ALONG, _LINES_ACROSS)
 
 
