@@ -51,14 +51,22 @@ def replacing(path: str | os.PathLike) -> Iterator[Path]:
         before = path.stat()
     with _temporary(path, _make_file) as (temporary, descriptor):
         if before is not None:
-            # Before there is anything to read in it.
-            with suppress(PermissionError):
-                os.fchown(descriptor, before.st_uid, before.st_gid)
-            os.fchmod(descriptor, stat.S_IMODE(before.st_mode))
+            # Before there is anything to read in it; whoever writes it must be able to open it.
+            _own_as(descriptor, before)
+            os.fchmod(descriptor, stat.S_IMODE(before.st_mode) | stat.S_IWUSR)
         yield temporary
+        if before is not None:
+            os.fchmod(descriptor, stat.S_IMODE(before.st_mode))
         os.fsync(descriptor)
         os.replace(temporary, path)
         sync_folder(path.parent)
+
+
+def _own_as(descriptor: int, before: os.stat_result) -> None:
+    """Give a file the owner and the group of another one, or either, where that is permitted."""
+    for owner, group in ((before.st_uid, -1), (-1, before.st_gid)):
+        with suppress(PermissionError):
+            os.fchown(descriptor, owner, group)
 
 
 @contextmanager

@@ -7,6 +7,7 @@ to the cache folder therefore acts as its user, so it is used only if nobody els
 from __future__ import annotations
 
 import errno
+import grp
 import os
 import pwd
 import stat
@@ -132,11 +133,20 @@ def _exposure(folder: Path, link: Path | None = None) -> str | None:
         if each == link:
             continue
         is_closed = is_closed or not found.st_mode & (stat.S_IXGRP | stat.S_IXOTH)
-        is_open = found.st_mode & (stat.S_IWGRP | stat.S_IWOTH) and not is_closed
+        open_to = stat.S_IWOTH if _is_private(found.st_gid) else stat.S_IWGRP | stat.S_IWOTH
+        is_open = found.st_mode & open_to and not is_closed
         lets_only_add = found.st_mode & stat.S_ISVTX and (link is not None or each != folder)
         if is_open and not lets_only_add:
             return f"other users can write to {each}"
     return None
+
+
+def _is_private(group: int) -> bool:
+    """Return whether a group has no member but this user, as many systems give each user one."""
+    with suppress(KeyError):
+        found, user = grp.getgrgid(group), pwd.getpwuid(os.geteuid())
+        return group == user.pw_gid and found.gr_name == user.pw_name and not found.gr_mem
+    return False
 
 
 def _user(number: int) -> str:

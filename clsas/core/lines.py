@@ -368,6 +368,15 @@ def wavelength_m(lines: RangeLines) -> float:
     return lines.sound_speed_m_s / lines.carrier_hz if lines.carrier_hz else math.inf
 
 
+def steepest(lines: RangeLines) -> float:
+    """Return an upper bound of how fast ranges change per metre that a point moves.
+
+    With unit vectors u from both antennas, the gradient of range is (u_tx + u_rx) / 2 over
+    1 + u_rx . velocity / c.
+    """
+    return 1 / (1 - min(fastest(lines), 0.999))
+
+
 def fastest(lines: RangeLines) -> float:
     """Return the speed of the fastest receiver relative to the sound speed."""
     if lines.rx_velocity_m_s is None:

@@ -21,7 +21,7 @@ from numpy.typing import DTypeLike
 
 from clsas.core import reprs, validate
 from clsas.opencl.kernels import Kernel, kernel_parameters, kernel_source, whole_source
-from clsas.opencl.refusals import DeviceError, check_process, no_device, not_built
+from clsas.opencl.refusals import DeviceError, check_process, no_device, no_match, not_built
 
 ENVIRONMENT_VARIABLE = "CLSAS_DEVICE"
 KINDS = ("gpu", "cpu", "accelerator")
@@ -408,9 +408,7 @@ def choose(wish: str | int | None = None) -> tuple[DeviceInfo, str]:
         raise TypeError(f"device must be a name, an index or None, got {validate.shown(wish)}")
     if not fitting:
         have = "; ".join(f"{info.index}: {info.label}" for info in devices)
-        raise DeviceError(
-            f"No device matches {validate.shown(wish)}, asked for{source}. Available: {have}"
-        )
+        raise no_match(f"{validate.shown(wish)}, asked for{source}. Available: {have}", devices)
     return _first(fitting), f"asked for{source} as {wish!r}"
 
 

@@ -5,12 +5,17 @@ from __future__ import annotations
 import functools
 import os
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 from textwrap import indent
+from typing import TYPE_CHECKING
 
 import pyopencl as cl
 
 from clsas.core.extras import install_command
+
+if TYPE_CHECKING:
+    from clsas.opencl.device import DeviceInfo
 
 _HOW_TO_GET_A_DEVICE = """\
 No OpenCL device was found. Any one of these gives one:
@@ -19,7 +24,7 @@ No OpenCL device was found. Any one of these gives one:
     PyOpenCL's wheel looks there and in {folder}
     (copy or write an .icd file there when the driver lives in your Python environment:
     it is one line, the path of the driver's shared library).
-The environment variable OCL_ICD_VENDORS, where it is set, replaces these places."""
+  The environment variable OCL_ICD_VENDORS, where it is set, replaces these places."""
 
 
 POCL = "Portable Computing Language"
@@ -37,6 +42,16 @@ def no_device() -> DeviceError:
         return DeviceError(f"No OpenCL device was found: {why}")
     folder = Path(cl.__file__).parent / ".libs"
     return DeviceError(_HOW_TO_GET_A_DEVICE.format(folder=folder, command=install_command("pocl")))
+
+
+def no_match(what: str, devices: Sequence[DeviceInfo]) -> DeviceError:
+    """Return the error that says why none of some devices is what was asked for.
+
+    PoCL has no device where it cannot write its cache.
+    """
+    of_pocl = any(info.platform == POCL for info in devices)
+    why = "" if of_pocl or all(each.name != POCL for each in _platforms()) else _cache_problem()
+    return DeviceError(f"No device matches {what}{why and f'. {why}'}")
 
 
 def not_built(what: str, platform: str, error: cl.Error) -> DeviceError:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsas.core.geometry import pairwise_range_m
-from clsas.core.lines import SAMPLED_CHANNELS, fastest, some_channels
+from clsas.core.lines import SAMPLED_CHANNELS, some_channels, steepest
 from clsas.factorized import aperture
 from clsas.factorized.tracks import MeanTrack
 from clsas.planning.caching import cached, shared
@@ -158,8 +158,8 @@ def _some_of(
 def range_window_m(model: VisibilityModel, root: Side) -> tuple[float, float]:
     """Return the least and the largest range of any part of roots, from lines' first samples.
 
-    Ranges to a pixel and to the middle of the grid differ by their distance at most; receivers
-    that move change that by their speed over the sound's.
+    Ranges to a pixel and to the middle of the grid differ by their distance at most, or by a little
+    more for receivers that move: see `clsas.core.lines.steepest`.
     """
     plane, lines = model.surface.plane, model.lines
     whole = -(-plane.shape[0] // root[0]) * root[0], -(-plane.shape[1] // root[1]) * root[1]
@@ -168,7 +168,7 @@ def range_window_m(model: VisibilityModel, root: Side) -> tuple[float, float]:
     relief_m = 0.0 if model.surface.is_plane else 2 * float(np.abs(model.surface.off_m).max())
     extents = model.surface.extents(whole, relief_m)
     radius_m = float(np.linalg.norm(np.abs(extents[:, None] * model.surface.steps_m).sum(axis=0)))
-    radius_m *= (1 + 2 * fastest(lines)) / 2
+    radius_m *= steepest(lines) / 2
     range_m = model.from_cache(
         ("ranges", whole),
         lambda: (

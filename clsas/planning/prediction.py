@@ -26,6 +26,7 @@ from clsas.factorized.factorization import ExactImage, Factorization
 from clsas.factorized.filters import LONGEST_UPSAMPLING_SHARE, UPSAMPLING_SHARE
 from clsas.factorized.interpolated import InterpolatedAperture
 from clsas.factorized.plan import Plan, Prediction, Stage
+from clsas.factorized.surface import LEAST_SIDE
 from clsas.factorized.thesis import NearestBeams
 from clsas.opencl import phases
 from clsas.opencl.buffers import padded_length
@@ -214,13 +215,16 @@ def margin_db(model: VisibilityModel) -> float:
 @cached
 def _resolution_cells(model: VisibilityModel) -> float:
     """Return the number of resolution cells of an image, roughly; at least 1."""
-    height, width = model.surface.plane.shape
-    side, phases = (height, width), AperturePhases(replace(model, root=None))
+    # Of a root around the whole image, less what overhangs it.
+    shape, least = np.array(model.surface.plane.shape), np.array(LEAST_SIDE)
+    doublings = np.ceil(np.log2(np.maximum(shape / least, 1))).astype(int)
+    rows, columns = (least * 2**doublings).tolist()
+    side, phases = (rows, columns), AperturePhases(replace(model, root=None))
     visible = model.visible(model.small)
     cells = phases.rows(side, 1, 1.0) * (1 + phases.subimage_phase_cycles(side, visible))
     extent_m = 2 * float(half_range_extents_m(model, [side])[0])
     in_range = extent_m / model.lines.range_step_m / model.spectrum.oversampling
-    return max(cells * (1 + in_range), 1.0)
+    return max(cells * (1 + in_range) * float(shape.prod()) / (rows * columns), 1.0)
 
 
 def band_of(model: VisibilityModel, outside: float) -> tuple[float, float]:

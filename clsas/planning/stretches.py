@@ -8,7 +8,7 @@ each line. That shifts the band of the line, so later range filters must pass a 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from clsas.factorized.aperture import drift, stretches
 from clsas.factorized.filters import Gain
 from clsas.planning.channels import SampledChannels, sampled_channels
+from clsas.planning.subimages import SMALL
 from clsas.planning.visibility_model import VisibilityModel
 from clsas.signal.interpolation import Interpolator
 from clsas.signal.spectrum import Spectrum, cycles_per_m_at, shares_of_bins
@@ -49,14 +50,15 @@ def stretch_of(model: VisibilityModel) -> Stretch:
 
 
 def _stretch_of(model: VisibilityModel) -> Stretch:
-    channels: SampledChannels = sampled_channels(model, model.small)
-    if not channels.points.size:
+    channels: SampledChannels = sampled_channels(replace(model, root=None), SMALL)
+    power = float(channels.weight.sum())
+    if not power:  # no channel's beam touches the grid, or those are silent
         return Stretch()
     centres_m = model.points_m[channels.points]
     virtual_m = channels.virtual_m(centres_m)
     along = drift(model.lines)
     found = stretches(*channels.antennas, along, model.surface.plane, centres_m, virtual_m)
-    share = channels.weight / max(channels.weight.sum(), 1e-300)
+    share = channels.weight / power
     mean = float(np.clip(np.sum(share * found), *_BOUNDS))
     cycles = cycles_per_m_at(model.lines, model.spectrum.centre) * model.lines.range_step_m
     shift = np.clip((found - mean) * cycles, -_MOST_CYCLES, _MOST_CYCLES)

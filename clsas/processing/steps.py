@@ -239,10 +239,14 @@ def _is_own_store(job: Job) -> bool:
     A store in the folder of the processing is the step's once it is recorded. One elsewhere must
     also be as the step left it.
     """
-    if job.former is None or job.former.numbers.get("store") != str(job.store):
+    if job.former is None or "store" not in job.former.numbers:
         return False
+    recorded = str(job.former.numbers["store"])
     if "store" not in job.scene.mosaic:
-        return True
+        # The folder may have moved, or be named from another working directory.
+        return Path(recorded).name == job.store.name
+    if recorded != str(job.store):
+        return False
     return job.former.numbers.get("inputs") == stored_digest(job.store.resolve())
 
 

@@ -1,4 +1,4 @@
-"""How bright an image is beside the power that its beam passes.
+"""Ratio of the power of an image to the power that its beam passes.
 
 Where the beam hardly covers the parts of a scene that its lines hold the echoes of, most of what it
 passes cancels in the image. Errors of interpolation do not cancel. They are therefore larger
@@ -20,6 +20,7 @@ from clsas.sonar.visibility import sines
 _GROUP = 32  # channels summed coherently; with half as many dark images look 2 to 3 dB brighter
 _GROUPS = 8  # spread evenly along the lines
 _POINTS = (16, 64)  # along either side of the grid: at first, and where that finds little power
+_DARKEST = 1e-8  # far below what any image resolves
 _DARK = 0.5  # power ratio above which images are not dark; sampling alone moves it by 1 dB
 _COVERED = 0.25  # of the best point's power: a beam that covers all points so well leaves none dark
 _COVERAGE_CHANNELS = 256  # sampled for that
@@ -48,7 +49,9 @@ def brightness(
     groups, over that of all z_i is the brightness. It takes the groups as incoherent, as they are
     for echoes of a seabed; coherent ones make images brighter still.
     """
-    if beam is None or along is None or beam.normalise or lines.channels < 2 * _GROUP:
+    if beam is None or along is None or beam.normalise:
+        return 1.0
+    if lines.channels < 2 * _GROUP or lines.length < 2:
         return 1.0
     some = some_channels(lines.channels, _COVERAGE_CHANNELS)
     covered = _weights(lines, some, grid.spread(_POINTS[0]), beam, along) ** 2
@@ -63,7 +66,7 @@ def brightness(
         found = _of_groups(lines, channels, points_m, spectrum, beam, along)
         if found > _DARK:
             return 1.0
-    return found
+    return max(found, _DARKEST)
 
 
 def _of_groups(

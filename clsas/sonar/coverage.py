@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from clsas.core import validate
 from clsas.core.geometry import pairwise_range_m
 from clsas.core.grid import Grid
-from clsas.core.lines import RangeLines, some_channels
+from clsas.core.lines import RangeLines, some_channels, steepest
 from clsas.sonar.beam import BeamWindow
 from clsas.sonar.visibility import BeamTrack, Boxes, sines
 
@@ -18,7 +18,6 @@ _SAMPLED_CHANNELS = 64  # a quick test that finds nearly every grid covered
 _SAMPLED_PIXELS = 16  # along either side of the grid, in the quick test
 _BLOCKS = 8  # along either side of the grid; smaller blocks would find smaller gaps
 _TAPS = 8  # an interpolated line extends this many samples beyond its ends
-_SPEED_RATIO = 0.05  # largest speed of a receiver over that of sound
 
 _Span = tuple[float, float]  # nearest and farthest range, metres
 
@@ -73,7 +72,7 @@ def _reached_in_boxes(
         range_m = pairwise_range_m(
             centre_m[None], lines.tx_m, lines.rx_m, lines.rx_velocity_m_s, lines.sound_speed_m_s
         )[0]
-        radius_m = np.linalg.norm(sides_m) * (1 + 2 * _SPEED_RATIO) + beyond_m
+        radius_m = np.linalg.norm(sides_m) * steepest(lines) + beyond_m
         reached = range_m + radius_m >= lines.first_range_m
         reached &= range_m - radius_m <= lines.last_range_m
         if track is not None and reached.any():

@@ -13,6 +13,12 @@ OTHER = 54321  # another user
 as_root = pytest.mark.skipif(os.geteuid() != 0, reason="only root can give folders to others")
 
 
+@pytest.fixture(autouse=True)
+def shared_group(monkeypatch):
+    """The group of files has other members."""
+    monkeypatch.setattr(cache, "_is_private", lambda group: False)
+
+
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
     """The cache folder, which does not exist yet."""
@@ -185,3 +191,14 @@ def test_a_file_in_its_place_is_named(folder):
     folder.write_text("")
     with pytest.raises(NotADirectoryError, match=str(folder)):
         cache.private_folder()
+
+
+def test_a_group_of_this_user_alone_is_nobody_else(shared, monkeypatch):
+    """Many systems give each user such a group, and make folders with mode 0775."""
+    (shared / "cache").mkdir()
+    (shared / "cache").chmod(0o775)
+    monkeypatch.setenv("CLSAS_CACHE", str(shared / "cache"))
+    with pytest.raises(PermissionError):
+        cache.trusted_cache()
+    monkeypatch.setattr(cache, "_is_private", lambda group: True)
+    assert cache.trusted_cache() == shared / "cache"

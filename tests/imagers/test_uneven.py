@@ -128,3 +128,12 @@ def test_a_dark_image_beyond_single_precision_warns():
     lines, grid = bright_where_coverage_ends(4.8)
     with pytest.warns(ClsasWarning, match=r"1\d dB darker than what the beam passes.*-7\d dB"):
         backproject(lines, grid, accuracy_db=-85, beam=BEAM)
+
+
+def test_lines_of_one_sample_under_a_beam():
+    track = along_x(200, 0.02)
+    lines = RangeLines(np.ones((200, 1), complex), 10.0, 0.06, track, track, 30e3, 1500.0)
+    grid = Grid.plane((0, 60, 31), (9.9, 10.1, 31))
+    with pytest.warns(ClsasWarning, match="lines do not fade"):
+        image = backproject(lines, grid, beam=BEAM)
+    assert np.isfinite(image.pixels).all()

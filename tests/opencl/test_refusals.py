@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from clsas.core.validate import printable
 from clsas.opencl import refusals
 from clsas.opencl.device import DeviceError, list_devices, open_device
 
@@ -137,3 +138,8 @@ def test_a_command_without_a_cache_names_it(no_folder):
     for folder in (str(no_folder), "/dev/null"):
         said = in_a_process(BUILD, POCL_CACHE_DIR=folder, PYOPENCL_NO_CACHE="1")
         assert f"PoCL cannot write its cache folder {folder!r}" in said
+
+
+def test_the_command_line_prints_the_advice_line_by_line():
+    """Lines that are not indented would be escaped, as those of strangers are."""
+    assert "\\n" not in printable(str(refusals.no_device()))

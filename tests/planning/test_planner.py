@@ -538,3 +538,11 @@ clsas.plan(lines, grid, tolerance_db=-40, beam=clsas.BeamWindow(20.0), costs=cos
 sys.exit("scipy.signal" in sys.modules)
 """
     assert not subprocess.run([sys.executable, "-c", code], check=False).returncode
+
+
+def test_scattered_points_and_reliefs_of_any_size_are_planned():
+    """Neither fills whole subimages."""
+    lines, grid = over(around(0, 40, shape=(51, 37)))
+    positions_m = grid.positions_m().reshape(-1, 3)
+    for other in (Grid.points(positions_m[::17]), grid.with_height(np.zeros(grid.shape))):
+        assert plan(lines, other, tolerance_db=-40, costs=EXACT_IS_SLOW).predicted_error_db <= -40

@@ -1,5 +1,7 @@
 """Stretch of lines against closed forms, and the bands that range filters must pass for it."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 from cases import along_x
@@ -9,6 +11,7 @@ from clsas.planning.stretches import aligned_spectrum, stretch_of, uncompensated
 from clsas.planning.visibility_model import VisibilityModel
 from clsas.signal import interpolation
 from clsas.signal.spectrum import shares_of_bins
+from clsas.sonar.beam import BeamWindow
 
 TRACK = along_x(200, 0.02)
 GRID = around(0, 40, shape=(32, 32))
@@ -79,3 +82,14 @@ def test_a_gain_for_another_band_errs():
     gain = lambda frequency: 1 / align.response(frequency / 1.25) ** 3  # noqa: E731
     assert uncompensated(still, align, align, 2, 1.25, gain) == 0
     assert uncompensated(moving, align, align, 2, 1.25, gain) > 1e-5
+
+
+def test_silent_channels_have_none():
+    """Those that the beam sees received nothing; others did."""
+    lines, grid = over(around(0, 40, shape=(32, 32)), along_x(400, 0.2))
+    samples = lines.samples.copy()
+    samples[100:300] = 0
+    silent = dataclasses.replace(lines, samples=samples, rx_m=lines.rx_m + [0, 0, 20])
+    model = VisibilityModel.of(silent, grid, BeamWindow(20, "hann"))
+    assert stretch_of(model).shares is None
+    assert np.isfinite(aligned_spectrum(model).power).all()

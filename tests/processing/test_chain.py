@@ -366,6 +366,14 @@ def test_a_mosaic_of_other_options_is_formed_anew(joining):
     assert clsas.process(joining)["mosaic"].numbers["formed"] == 4
 
 
+def test_a_mosaic_is_the_steps_own_from_any_working_directory(joining, monkeypatch):
+    """Its path was recorded from another one."""
+    text = joining.read_text()
+    monkeypatch.chdir(joining.parent)
+    joining.write_text(text.replace("tolerance_db = -40", "tolerance_db = -30"))
+    assert clsas.process(joining.name)["mosaic"].numbers["formed"] == 2
+
+
 def test_a_mosaic_that_the_step_did_not_make_is_not_replaced(joining, tmp_path):
     """Neither one that was there before, nor one that came in its place."""
     store = tmp_path / "elsewhere.zarr"

@@ -6,13 +6,16 @@ import pytest
 from cases import along_x, lines_over
 from factorizing import EXACT_IS_SLOW, around
 
+from clsas.core.geometry import pairwise_range_m
 from clsas.core.grid import Grid
+from clsas.core.lines import RangeLines
 from clsas.core.validate import ClsasWarning
 from clsas.exact.backprojection import backproject
 from clsas.planning.costs import Costs
 from clsas.planning.factorize import factorize
 from clsas.planning.planner import plan
 from clsas.sonar.beam import BeamWindow
+from clsas.sonar.coverage import reaches
 
 NEAR = around(0, 40)
 LINES = lines_over(NEAR, along_x(200, 0.02), None, carrier_hz=120e3, step_m=0.02)
@@ -76,3 +79,14 @@ def test_nothing_is_said_of_lines_of_zeros():
         LINES.tx_m, LINES.rx_m, LINES.carrier_hz, LINES.sound_speed_m_s,
     )  # fmt: skip
     assert heard(lambda: plan(silent, FAR, tolerance_db=-40, costs=Costs())) == []
+
+
+@pytest.mark.parametrize("speed", [15.0, 450.0, 1350.0])
+def test_lines_of_fast_receivers_reach_the_pixels_in_their_range(speed):
+    """Seen from behind, ranges change faster than distances."""
+    grid = Grid.plane((-80, 0, 81), (0, 20, 21))
+    tx, velocity = np.zeros((1, 3)), np.array([[speed, 0, 0]])
+    points_m = grid.positions_m().reshape(-1, 3)[1::7]
+    for range_m in pairwise_range_m(points_m, tx, tx, velocity, 1500.0)[:, 0]:
+        line = RangeLines(np.ones((1, 4), complex), range_m, 1e-3, tx, tx, 1e4, 1500.0, velocity)
+        assert reaches(line, grid, None, None)
