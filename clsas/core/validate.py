@@ -200,7 +200,16 @@ def text(name: str, value: object) -> str:
     return str(value)
 
 
-def selection(name: str, value: object) -> slice:
+def sides(name: str, value: object) -> tuple[int, int]:
+    """Return the rows and columns of a block of pixels, from 1."""
+    given = entries(name, value, "(rows, columns)")
+    if len(given) != 2:
+        raise ValueError(f"{name} must be (rows, columns), got {shown(value)}")
+    rows, columns = (count(f"every side of {name}", side) for side in given)
+    return rows, columns
+
+
+def selection(name: str, value: object, *, ascending: bool = False) -> slice:
     """Return `value`; raises TypeError or ValueError unless it is a slice of whole numbers."""
     instance(name, value, slice)
     assert isinstance(value, slice)
@@ -209,6 +218,8 @@ def selection(name: str, value: object) -> slice:
     except (TypeError, ValueError) as error:
         kind = TypeError if isinstance(error, TypeError) else ValueError
         raise kind(f"{name} must be a slice of whole numbers, got {shown(value)}") from None
+    if ascending and value.step is not None and value.step < 1:
+        raise ValueError(f"{name} must be a slice with a step from 1, got {shown(value)}")
     return value
 
 

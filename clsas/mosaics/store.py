@@ -171,8 +171,9 @@ class Store:
         arrays = _arrays()
         validate.instance("inputs", inputs, dict)
         validate.instance("grid", grid, Grid)
-        for side in validate.entries("patch_shape", patch_shape, "(rows, columns)"):
-            validate.count("every side of patch_shape", side)
+        if "parts" not in inputs:
+            raise ValueError(f"inputs must have 'parts', got {validate.shown(sorted(inputs))}")
+        patch_shape = validate.sides("patch_shape", patch_shape)
         check_place(self.path)
         if not is_there(self.path):
             arrays.create_store(self.path, inputs, grid, patch_shape)
@@ -289,8 +290,8 @@ class Store:
         OSError
             If a file cannot be read.
         """
-        validate.selection("rows", rows)
-        validate.selection("columns", columns)
+        validate.selection("rows", rows, ascending=True)
+        validate.selection("columns", columns, ascending=True)
         wanted = (
             len(range(n)[part]) for n, part in zip(self.pixels.shape, (rows, columns), strict=True)
         )

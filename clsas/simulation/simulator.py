@@ -322,7 +322,11 @@ def simulate_lines(
 
 def _channels(tx_m: ArrayLike, rx_m: ArrayLike, rx_velocity_m_s: ArrayLike | None) -> Channels:
     """Check positions and return those of every channel; a single position is repeated."""
-    given = (tx_m, rx_m) if rx_velocity_m_s is None else (tx_m, rx_m, rx_velocity_m_s)
+    parts = (tx_m, rx_m) if rx_velocity_m_s is None else (tx_m, rx_m, rx_velocity_m_s)
+    given = [
+        validate.array(name, part, np.float64, None)
+        for name, part in zip(Channels._fields, parts, strict=False)
+    ]
     count = max(len(np.atleast_2d(part)) for part in given)
     tx, rx, *velocity = (
         validate.array(name, part, np.float64, (count, 3), broadcast=True)
@@ -338,7 +342,7 @@ def _add_noise(samples: NDArray[np.complex64], snr_db: float, seed: int) -> None
         raise ValueError(f"snr_db needs an echo to refer to: {NO_ECHO}")
     # Standard deviation of the real and of the imaginary part.
     deviation = np.float32(peak * 10 ** (-snr_db / 20) / np.sqrt(2))
-    random = np.random.default_rng(seed)
+    random = np.random.default_rng(int(seed))
     for line in samples:
         parts = random.standard_normal((len(line), 2), dtype=np.float32)
         line += deviation * parts.view(np.complex64)[:, 0]

@@ -220,7 +220,7 @@ class BeamWindow:
         0.6 (r/R)^2 (`reach` is r/R). That shifts the beam's edges. Where the weights begin with a
         step, the shift adds or drops channels.
         """
-        reach = validate.number("reach", reach, least=0.0)
+        reach = validate.number("reach", reach, least=0.0, most=1e6)
         square = self._all(wavelength_m) ** 2
         jump = (square[0] + square[-1]) / 2 / square.mean()
         bend = reach**2 / self.edge

@@ -18,6 +18,7 @@ SUFFIXES = (".png", ".pdf", ".svg")
 """Suffixes of pictures."""
 
 _NAMES = {"x": "Along-track", "y": "Across-track", "z": "Height"}
+_LEAST_DPI, _MOST_DPI = 10.0, 10_000.0  # letters of less have no pixels
 _PNG_DPI, _VECTOR_DPI = 150.0, 300.0  # for screens, and for images on a printed page
 _SETTINGS: Any = {
     "pdf.fonttype": 42,  # TrueType: publishers refuse matplotlib's default, Type 3
@@ -43,8 +44,8 @@ def save(figure: Figure, path: str | os.PathLike, *, dpi: float | None = None) -
     ImportError
         If matplotlib is not installed.
     TypeError, ValueError
-        If `figure` is not a Figure, `path` ends in another suffix, or `dpi` is not a positive
-        number.
+        If `figure` is not a Figure, `path` ends in another suffix, or `dpi` is not a number
+        from 10 to 10 000.
     OSError
         If the folder does not exist or the file cannot be written.
     """
@@ -54,7 +55,7 @@ def save(figure: Figure, path: str | os.PathLike, *, dpi: float | None = None) -
     kind = path.suffix.lower().removeprefix(".") or "png"
     if dpi is None:
         dpi = _PNG_DPI if kind == "png" else _VECTOR_DPI
-    validate.positive("dpi", dpi, "pixels per inch")
+    dpi = validate.number("dpi", dpi, "pixels per inch", least=_LEAST_DPI, most=_MOST_DPI)
     import matplotlib as mpl
 
     options: Any = {"metadata": _DATES[kind]} if kind in _DATES else {}
@@ -63,7 +64,7 @@ def save(figure: Figure, path: str | os.PathLike, *, dpi: float | None = None) -
         figure.savefig(temporary, format=kind, dpi=dpi, bbox_inches="tight", **options)
 
 
-def save_png(figure: Figure, path: str | os.PathLike, *, dpi: float = _PNG_DPI) -> None:
+def save_png(figure: Figure, path: str | os.PathLike, *, dpi: float | None = None) -> None:
     """Write a figure as PNG; `save` also writes PDF and SVG.
 
     Raises
@@ -71,7 +72,7 @@ def save_png(figure: Figure, path: str | os.PathLike, *, dpi: float = _PNG_DPI) 
     ImportError, TypeError, OSError
         As `save` does.
     ValueError
-        If `path` ends in another suffix than .png, or `dpi` is not a positive number.
+        If `path` ends in another suffix than .png, or `dpi` is not a number from 10 to 10 000.
     """
     validate.instance("figure", figure, figure_class())
     validate.suffix("path", validate.path("path", path), ".png")

@@ -81,13 +81,13 @@ def patch_borders(axes: Axes, grid: Grid, patch_shape: tuple[int, int]) -> None:
         If `grid` is not a plane or height map, or a side of `patch_shape` is not a whole number
         from 1.
     """
+    from matplotlib.axes import Axes
+
+    validate.instance("axes", axes, Axes)
     validate.instance("grid", grid, Grid)
     across, upward = grid.sides
     factor, _ = length_unit(max(float(np.abs(s.places_m).max()) for s in (across, upward)))
-    sides = validate.entries("patch_shape", patch_shape, "(rows, columns)")
-    if len(sides) != 2:
-        raise ValueError(f"patch_shape must be (rows, columns), got {validate.shown(patch_shape)}")
-    rows, columns = (validate.count("every side of patch_shape", side) for side in sides)
+    rows, columns = validate.sides("patch_shape", patch_shape)
     for side, every, draw in ((across, columns, axes.axvline), (upward, rows, axes.axhline)):
         for first in range(every, len(side.places_m), every):
             place = factor * (side.places_m[first] - side.step_m / 2)
