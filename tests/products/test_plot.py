@@ -231,7 +231,9 @@ def test_only_figures_are_saved(tmp_path):
         plot.save_png(plot.image_db(IMAGE), tmp_path / "a.pdf")
     with pytest.raises(ValueError, match=r"path must end in .png or .pdf or .svg, got '.*a.jpg'"):
         plot.save(plot.image_db(IMAGE), tmp_path / "a.jpg")
-    with pytest.raises(ValueError, match="dpi must be finite and >= 10 and <= 10000 pixels per inch"):
+    with pytest.raises(
+        ValueError, match="dpi must be finite and >= 10 and <= 10000 pixels per inch"
+    ):
         plot.save(plot.image_db(IMAGE), tmp_path / "a.pdf", dpi=0)
     with pytest.raises(TypeError, match="figure must be of type Figure, got int"):
         plot.save_png(5, tmp_path / "a.png")
