@@ -58,7 +58,7 @@ def test_wrong_values_are_refused_by_name_and_equal_ones_accepted(group):
         [sys.executable, *map(str, command)], capture_output=True, text=True, check=False
     )
     assert run.returncode == 0, run.stdout + run.stderr
-    assert int(run.stdout.split(" calls")[0]) > 50
+    assert int(run.stdout.split(" calls")[0]) >= 40
 
 
 def test_the_judgement_finds_what_is_wrong(judge):
