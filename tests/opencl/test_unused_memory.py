@@ -16,7 +16,7 @@ SCENES = {
     "plane": lambda: extremes.ultrasonic(70, shape=(37, 29)),
     "relief": lambda: extremes.ultrasonic(70, shape=(37, 29), relief_m=0.05),
     "beam": lambda: extremes.ultrasonic(track=along_x(90, 0.1), beam=BEAM, shape=(21, 19)),
-    "moving": lambda: extremes.array(moving=True, shape=(21, 19)),
+    "moving": lambda: extremes.array(moving=True, shape=(53, 47)),
 }
 REQUESTS = (("exact", -80.0), ("exact", -40.0), ("factorized", -55.0), ("half precision", -30.0))
 
