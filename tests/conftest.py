@@ -15,9 +15,6 @@ from clsas.planning import costs
 
 os.environ["MPLBACKEND"] = "agg"  # before Matplotlib is imported: figures open no windows
 _ALL = OWN | OTHERS
-# Set by pytest, and by Dask while it starts a worker again.
-_NOT_OF_TESTS = {"PYTEST_CURRENT_TEST", "PYTHONHASHSEED", "OMP_NUM_THREADS"}
-_NOT_OF_TESTS |= {"MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MALLOC_TRIM_THRESHOLD_"}
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGPIPE)
 
 # No test fails because a machine is slow.
@@ -63,7 +60,7 @@ def _shared_state():
     umask = os.umask(0o077)
     os.umask(umask)
     found = {
-        "environment": {k: v for k, v in os.environ.items() if k not in _NOT_OF_TESTS},
+        "environment": {k: v for k, v in os.environ.items() if k != "PYTEST_CURRENT_TEST"},
         "working directory": os.getcwd(),
         "mask of modes": umask,
         "folders of modules": list(sys.path),

@@ -11,7 +11,7 @@ pytest.importorskip("zarr")
 pytest.importorskip("sarkit", reason="sarkit (extra radar) is not installed")
 
 ATTACK = Path(__file__).parents[1] / "scripts" / "attack"
-EVERY = {"data": 4, "sonars": 6, "imaging": 40, "files": 40}
+EVERY = {"data": 4, "sonars": 6, "imaging": 40, "files": 30}
 """Groups that take little time, and of how many values one is tried."""
 
 
@@ -58,7 +58,7 @@ def test_wrong_values_are_refused_by_name_and_equal_ones_accepted(group):
         [sys.executable, *map(str, command)], capture_output=True, text=True, check=False
     )
     assert run.returncode == 0, run.stdout + run.stderr
-    assert int(run.stdout.split(" calls")[0]) >= 40
+    assert int(run.stdout.split(" calls")[0]) > 50
 
 
 def test_the_judgement_finds_what_is_wrong(judge):

@@ -133,8 +133,8 @@ def _exposure(folder: Path, link: Path | None = None) -> str | None:
         if each == link:
             continue
         is_closed = is_closed or not found.st_mode & (stat.S_IXGRP | stat.S_IXOTH)
-        open_to = stat.S_IWOTH if _is_private(found.st_gid) else stat.S_IWGRP | stat.S_IWOTH
-        is_open = found.st_mode & open_to and not is_closed
+        to_group = found.st_mode & stat.S_IWGRP and not _is_private(found.st_gid)
+        is_open = (to_group or found.st_mode & stat.S_IWOTH) and not is_closed
         lets_only_add = found.st_mode & stat.S_ISVTX and (link is not None or each != folder)
         if is_open and not lets_only_add:
             return f"other users can write to {each}"
@@ -145,7 +145,10 @@ def _is_private(group: int) -> bool:
     """Return whether a group has no member but this user, as many systems give each user one."""
     with suppress(KeyError):
         found, user = grp.getgrgid(group), pwd.getpwuid(os.geteuid())
-        return group == user.pw_gid and found.gr_name == user.pw_name and not found.gr_mem
+        # A group's list leaves out those of whom it is the first group.
+        members = {each.pw_uid for each in pwd.getpwall() if each.pw_gid == group}
+        is_own = group == user.pw_gid and found.gr_name == user.pw_name and not found.gr_mem
+        return is_own and members == {user.pw_uid}
     return False
 
 

@@ -368,6 +368,18 @@ def wavelength_m(lines: RangeLines) -> float:
     return lines.sound_speed_m_s / lines.carrier_hz if lines.carrier_hz else math.inf
 
 
+def antennas_of(
+    lines: RangeLines, channels: NDArray[np.int64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64] | None, float]:
+    """Return positions of transmitters and receivers, velocities of receivers, and sound speed.
+
+    They are those of some channels, as functions of ranges in `clsas.core.geometry` take them.
+    """
+    velocity = lines.rx_velocity_m_s
+    moving = None if velocity is None else velocity[channels]
+    return lines.tx_m[channels], lines.rx_m[channels], moving, lines.sound_speed_m_s
+
+
 def steepest(lines: RangeLines) -> float:
     """Return an upper bound of how fast ranges change per metre that a point moves.
 

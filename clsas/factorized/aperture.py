@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import product
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -136,7 +137,9 @@ def own_drift(lines: RangeLines) -> NDArray[np.float64] | None:
 
 @dataclass(frozen=True, eq=False)
 class SampledLines:
-    """Positions and tangents of samples of some lines, [n, 3] each."""
+    """Positions and tangents of samples of some lines of a sheet, [n, 3] each."""
+
+    is_dense: ClassVar[bool] = True
 
     sampled_m: tuple[NDArray[np.float64], NDArray[np.float64]]
 
@@ -173,7 +176,8 @@ def cycles_per_extent(
     nearest_m : float
         Lower bound assumed for distances from the track.
     limits : (low, high), optional
-        Sines of the aspect angle at which the beam begins and ends; rates beyond are 0.
+        Sines of the aspect angle at which the beam begins and ends; rates beyond are 0. Dense
+        apertures ignore them: all their virtual channels are formed and used, wherever beams point.
     along : float64 [samples, 3]
         With limits, the track's unit direction at `track.samples`.
     every : int
@@ -185,6 +189,7 @@ def cycles_per_extent(
         Cycles per unit of the aperture coordinate, per row, per column and per metre of relief, at
         `track.samples`.
     """
+    limits = None if track.is_dense else limits
     position, tangent = (each[::every] for each in track.sampled_m)
     steps = surface.steps_m
     sides_m = extents[:, None] * steps

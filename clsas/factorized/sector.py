@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
 from clsas.core.geometry import pairwise_range_m
-from clsas.core.lines import RangeLines, some_channels
+from clsas.core.lines import RangeLines, antennas_of, some_channels
 from clsas.factorized import tree, visibility
 from clsas.factorized.aperture import cycles_per_extent, drift, own_drift, stretches
 from clsas.factorized.beam_directions import BeamDirections, beam_rate
@@ -294,9 +294,8 @@ class Geometry:
         self, roots: NDArray[np.int64], root_m: NDArray[np.float64]
     ) -> NDArray[np.float64]:
         """Return the largest phase rates of subimages in some roots: see `cycles_per_extent`."""
-        # On dense apertures virtual channels that no beam points at are formed, and used, too.
-        limits = None if self.track.is_dense else self.factorization.limits
-        return cycles_per_extent(self.track, *self._boxes(roots, root_m), limits, self.along)
+        boxes = self._boxes(roots, root_m)
+        return cycles_per_extent(self.track, *boxes, self.factorization.limits, self.along)
 
     def sheet_rates(self, roots: NDArray[np.int64], root_m: NDArray[np.float64]) -> SheetRates:
         """Return the largest phase rates of subimages in some roots, along and across a sheet."""
@@ -368,10 +367,7 @@ class Geometry:
 
     def _antennas(self, sector: Sector) -> tuple:
         """Return antennas, velocities and sound speed of a sector's channels."""
-        lines, channels = self.lines, self.channels[sector.channels]
-        velocity = lines.rx_velocity_m_s
-        moving = velocity if velocity is None else velocity[channels]
-        return lines.tx_m[channels], lines.rx_m[channels], moving, lines.sound_speed_m_s
+        return antennas_of(self.lines, self.channels[sector.channels])
 
     def _ramp(self, sector: Sector) -> NDArray[np.float64]:
         """Return cycles per sample by which channels' phases grow faster than the mean of all."""

@@ -103,6 +103,15 @@ class VirtualChannels:
             return np.ones((*self.base.shape, 1))
         return self.aperture.weights(self.between)
 
+    @property
+    def contributed(self) -> NDArray[np.int64]:
+        """Virtual channels to which channels contribute, counted on from root to root.
+
+        int64 [roots, channels, taps]; `weights` has their weights.
+        """
+        first = self.coordinate.shape[1] * np.arange(len(self.base))
+        return (first[:, None] + self.base)[..., None] + np.arange(self.taps)
+
     def ordered(self, values: NDArray) -> NDArray:
         """Return values of every channel, [roots, channels], in the order of `base`."""
         return values if self.order is None else np.take_along_axis(values, self.order, axis=1)

@@ -104,8 +104,12 @@ def write_attributes(folder: Path, attributes: dict[str, Any]) -> None:
 def with_checksum(attributes: dict[str, Any]) -> dict[str, Any]:
     """Return attributes with a checksum added."""
     others = {name: value for name, value in attributes.items() if name != CHECKSUM}
-    text = json.dumps(others, sort_keys=True, separators=(",", ":"))
-    return others | {CHECKSUM: f"{zlib.crc32(text.encode()):08x}"}
+    return others | {CHECKSUM: f"{zlib.crc32(canonical(others)):08x}"}
+
+
+def canonical(values: Mapping[str, Any]) -> bytes:
+    """Return values as JSON that is the same whatever their order, for checksums and digests."""
+    return json.dumps(values, sort_keys=True, separators=(",", ":")).encode()
 
 
 def is_intact(attributes: dict[str, Any]) -> bool:

@@ -8,7 +8,6 @@ describe an array as clsas writes it.
 from __future__ import annotations
 
 import hashlib
-import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -16,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from clsas.core.reading import parse_json, read_bytes
-from clsas.mosaics.documents import DIGESTS, DamageError, plane_of, read_attributes
+from clsas.mosaics.documents import DIGESTS, DamageError, canonical, plane_of, read_attributes
 
 GROUP = "patches"
 """Group of the records, which has no attributes of its own."""
@@ -139,8 +138,7 @@ def check_group(path: Path) -> None:
 
 def digest_of(metadata: Mapping[str, Any]) -> str:
     """Return a digest of metadata."""
-    text = json.dumps(metadata, sort_keys=True, separators=(",", ":"))
-    return hashlib.sha256(text.encode()).hexdigest()[:16]
+    return hashlib.sha256(canonical(metadata)).hexdigest()[:16]
 
 
 def _difference(metadata: Any, form: Form) -> str | None:

@@ -8,7 +8,7 @@ from clsas.core import validate
 from clsas.core.lines import RangeLines
 from clsas.core.pings import Transmissions
 from clsas.signal.readout import Readout
-from clsas.signal.spectrum import LEAST_CYCLES, band_wavelength_m, cycles_per_m_at
+from clsas.signal.spectrum import band_wavelength_m, is_about_zero
 
 _REMEDY = "lines.without_still_pings() drops them"
 
@@ -22,7 +22,7 @@ def mean_wavelength_m(readout: Readout) -> float:
         If the lines tell no wavelength.
     """
     lines, centre = readout.lines, readout.spectrum.centre
-    if not abs(cycles_per_m_at(lines, centre)) * lines.range_step_m > LEAST_CYCLES:
+    if is_about_zero(lines, centre):
         raise ValueError(
             "carrier_hz must be that of the lines, or their samples must hold the carrier still; "
             f"got {lines.carrier_hz:g} Hz, and samples about 0 Hz"

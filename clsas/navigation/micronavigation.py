@@ -176,8 +176,7 @@ def micronavigate(
     Warns
     -----
     ClsasWarning
-        If some pairs of pings are not coherent, or hold too few echoes to tell yaw: the navigation
-        bridges them. If channels are dead:
+        If some pairs of pings are not coherent: the navigation bridges them. If channels are dead:
         they are left out. If what is found is far beyond the accuracy of the navigation. If the
         track turns back, so that pings may be out of order.
 
@@ -294,11 +293,11 @@ def _contradiction(found: Displacements) -> float:
 
 
 def _check_coherence(found: Displacements) -> None:
-    """Refuse lines if hardly any pair of pings is coherent; warn of pairs that are not."""
+    """Refuse lines if hardly any pair of pings tells much; warn of pairs that are not coherent."""
     count, without = len(found.coherent), int((~found.coherent).sum())
     few = int(found.sparse.sum())
-    if count - without < max(1, _LEAST_SHARE * count):
-        if few > without / 2:
+    if count - without - few < max(1, _LEAST_SHARE * count):
+        if few > without:
             raise ValueError(
                 f"lines must hold echoes from all over a seabed; {few} of {count} pairs of pings "
                 f"have those of about {np.median(found.echoes):.1f} reflectors, at least "
@@ -312,8 +311,7 @@ def _check_coherence(found: Displacements) -> None:
             f"noise. Check range_m, and the navigation's advance from ping to ping"
         )
     if without:
-        why = f"are not coherent, or hold too few echoes ({few})" if few else "are not coherent"
         validate.warn(
-            f"{without} of {count} pairs of pings {why} (the first after "
+            f"{without} of {count} pairs of pings are not coherent (the first after "
             f"ping {int(np.argmin(found.coherent))}): the navigation's accuracy bridges them"
         )

@@ -54,9 +54,9 @@ class Displacements:
     pairs : int64 [pings - 1]
         Pairs of channels that share a phase centre.
     coherent : bool [pings - 1]
-        False where no window is more coherent than noise would be, or where echoes are sparse.
+        False where no window is more coherent than noise would be.
     sparse : bool [pings - 1]
-        True where the echoes are too few to tell yaw.
+        True where echoes are coherent, but hardly tell yaw: there are too few.
     least_coherence : float64 [windows]
         What noise would not reach.
     """
@@ -283,15 +283,12 @@ class _Passes:
         return levers_m
 
     def _is_coherent(self, step: Displacement) -> bool:
-        """Return whether any window is more coherent than noise, and echoes tell the unknowns."""
-        return self._exceeds_noise(step) and not self._is_sparse(step)
+        """Return whether any window is more coherent than noise would be."""
+        return bool(np.any(step.coherence > self._least_coherence))
 
     def _is_sparse(self, step: Displacement) -> bool:
         """Return whether yaw is looked for in too few echoes."""
-        return self.yaw and self._exceeds_noise(step) and step.echoes < LEAST_ECHOES
-
-    def _exceeds_noise(self, step: Displacement) -> bool:
-        return bool(np.any(step.coherence > self._least_coherence))
+        return self.yaw and self._is_coherent(step) and step.echoes < LEAST_ECHOES
 
     @property
     def _least_coherence(self) -> NDArray[np.float64]:

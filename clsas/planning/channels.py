@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsas.core.geometry import pairwise_range_m
-from clsas.core.lines import SAMPLED_CHANNELS, some_channels, steepest
+from clsas.core.lines import SAMPLED_CHANNELS, antennas_of, some_channels, steepest
 from clsas.factorized import aperture
 from clsas.factorized.tracks import MeanTrack
 from clsas.planning.caching import cached, shared
@@ -109,10 +109,7 @@ class SampledChannels:
     @property
     def antennas(self) -> tuple[Any, Any, Any, float]:
         """Positions of transmitters and receivers, velocities of receivers, and sound speed."""
-        lines = self.model.lines
-        velocity = lines.rx_velocity_m_s
-        moving = velocity if velocity is None else velocity[self.index]
-        return lines.tx_m[self.index], lines.rx_m[self.index], moving, lines.sound_speed_m_s
+        return antennas_of(self.model.lines, self.index)
 
     def virtual_m(self, centres_m: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return where the channels appear on the track, from some points: [points, n, 3]."""

@@ -106,7 +106,7 @@ def _along(
         extents,
         model.highest_cycles_per_m,
         model.nearest_m,
-        None if model.track.is_dense else model.limits,
+        model.limits,
         model.along,
         every,
     )

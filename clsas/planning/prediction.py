@@ -52,7 +52,7 @@ OUTSIDE = 0.1
 _ROUNDING_SHARE = 0.1  # of an image's error power, for half precision; half or twice: the same
 _MOST_CHUNKS = 16  # in a sum rounded to half precision; more lose what is added
 _FEW_CHANNELS = 7.0, 30.0  # per pixel, that double the scatter of errors; the latter with steps
-_FEW_CELLS = 10.0  # of an image, that double the scatter of errors; half or twice: 0.5 dB at 60
+_FEW_CELLS = 10.0  # of an image, that double the scatter; arbitrary, and of no effect above 1000
 _ROOM = 1.06  # of buffers, over the predicted virtual channels; twice the spare room: 2 % slower
 
 
@@ -208,18 +208,23 @@ def margin_db(model: VisibilityModel) -> float:
     power = model.channel_power
     channels = power.sum() ** 2 / (power @ power) * model.visible_share(model.small)
     few = _FEW_CHANNELS[model.beam is not None and model.beam.jumps]
-    factor = (1 + few / max(channels, 1.0)) * (1 + _FEW_CELLS / _resolution_cells(model))
+    factor = (1 + few / max(channels, 1.0)) * (
+        1 + _FEW_CELLS / _resolution_cells(replace(model, root=None))
+    )
     return MARGIN_DB + in_db(model.spectrum.scatter * factor)
 
 
 @cached
 def _resolution_cells(model: VisibilityModel) -> float:
-    """Return the number of resolution cells of an image, roughly; at least 1."""
+    """Return the number of resolution cells of an image, roughly; at least 1.
+
+    `model` is that without roots.
+    """
     # Of a root around the whole image, less what overhangs it.
     shape, least = np.array(model.surface.plane.shape), np.array(LEAST_SIDE)
     doublings = np.ceil(np.log2(np.maximum(shape / least, 1))).astype(int)
     rows, columns = (least * 2**doublings).tolist()
-    side, phases = (rows, columns), AperturePhases(replace(model, root=None))
+    side, phases = (rows, columns), AperturePhases(model)
     visible = model.visible(model.small)
     cells = phases.rows(side, 1, 1.0) * (1 + phases.subimage_phase_cycles(side, visible))
     extent_m = 2 * float(half_range_extents_m(model, [side])[0])

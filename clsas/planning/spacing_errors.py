@@ -222,8 +222,7 @@ def _interpolated(
     nodes = _virtual_channels(line, samples.points, stages[-1], extents, at.coordinate)
     of_nodes = _steering(model, line, samples.pixels, weighted, nodes.coordinate)
     # One sparse matrix interpolates at all aperture coordinates of all subimages.
-    index = nodes.base[..., None] + np.arange(nodes.taps)
-    index += nodes.coordinate.shape[1] * np.arange(len(index))[:, None, None]
+    index = nodes.contributed
     weights = nodes.weights.astype(np.float32).ravel()
     rows = np.arange(0, weights.size + 1, nodes.taps)
     of_nodes = of_nodes.reshape(-1, of_nodes.shape[-1])
@@ -283,10 +282,8 @@ def _with_ends(model: VisibilityModel, line: _Line, samples: _Samples, before: S
     for stage in before:
         extents = model.extents(stage.side)
         nodes = _virtual_channels(line, samples.points, stage, tuple(extents), at.coordinate)
-        index = nodes.base[..., None] + np.arange(nodes.taps)
-        index += nodes.coordinate.shape[1] * np.arange(len(index))[:, None, None]
         share = at.share[..., None] * nodes.weights**2
-        held = np.bincount(index.ravel(), share.ravel(), nodes.coordinate.size)
+        held = np.bincount(nodes.contributed.ravel(), share.ravel(), nodes.coordinate.size)
         held = held.reshape(nodes.coordinate.shape) * line.past_ends(nodes.coordinate)
         some = held.any(axis=0)
         coordinate = np.concatenate([of_channels, nodes.coordinate[:, some]], axis=1)

@@ -21,7 +21,7 @@ from clsas.planning.visibility_model import VisibilityModel
 from clsas.signal.interpolation import Interpolator
 from clsas.signal.spectrum import Spectrum, cycles_per_m_at, shares_of_bins
 
-_LEAST_BINS = 1 / 32  # of the lines' spectrum: smaller shifts widen no band; twice: the same
+_LEAST_BINS = 1 / 32  # of the lines' spectrum; arbitrary: so small a shift widens no band
 _MOST_CYCLES = 8.0  # per sample, far beyond what any filter passes
 _BOUNDS = -0.5, 1.0  # of the mean stretch
 
@@ -100,11 +100,10 @@ def uncompensated(
     shares, spectrum = stretch_of(model).shares, model.spectrum
     if shares is None:
         return 0.0
-    before = np.concatenate([-spectrum.frequency[::-1], spectrum.frequency])
-    most = len(shares) // 2
-    step = spectrum.bin_width
-    wide = np.concatenate([before[0] - step * np.arange(most, 0, -1), before])
-    wide = np.concatenate([wide, before[-1] + step * np.arange(1, most + 1)])
+    before, wide = (
+        np.concatenate([-each.frequency[::-1], each.frequency])
+        for each in (spectrum, aligned_spectrum(model))
+    )
     after = align.response(wide / ratio) ** (stages - 1) * final.response(wide / ratio)
     shifted = np.lib.stride_tricks.sliding_window_view(after, len(shares))
     of_all = (gain(np.abs(before)) * align.response(before / ratio))[:, None] * shifted

@@ -19,10 +19,9 @@ MEASURED_CHANNELS = 256
 0.05 dB; with half as many, filters depend a little on the order of channels."""
 FEW_CHANNELS = 32
 """Channels sampled for a quick estimate of the power outside a band."""
-LEAST_CYCLES = 0.02
-"""Cycles per sample at the middle of a band, up to which lines tell nothing of their carrier."""
 NEEDED_OVERSAMPLING = 1.05
 """Sample rate over occupied bandwidth above which a guard band separates the band's edges."""
+_LEAST_CYCLES = 0.02  # per sample, at the middle of a band that shows the carrier
 _FREQUENCIES = 128  # bins; with half as many measured errors move by 0.2 dB, with twice by 0.1 dB
 _FLOOR_WIDTH = 1 / 64  # cycles per sample; the quietest part of this width is taken as noise
 _FLOOR_MARGIN = 2.0  # scatter of the mean of a few periodograms
@@ -354,8 +353,8 @@ def _largest_part(samples: NDArray[np.complex64]) -> np.float32:
 def band_wavelength_m(lines: RangeLines, centre: float) -> float:
     """Return the wavelength in the middle of the band that lines occupy, metres.
 
-    Lengths are compared with it, whether the carrier was mixed out or not. Lines about 0 Hz tell
-    nothing of their carrier: the wavelength is then that of the highest frequency sampled.
+    Lengths are compared with it, whether the carrier was mixed out or not. Lines about 0 Hz do not
+    show their carrier: the wavelength is then that of the highest frequency sampled.
 
     Parameters
     ----------
@@ -363,10 +362,14 @@ def band_wavelength_m(lines: RangeLines, centre: float) -> float:
     centre : float
         Middle of the band, cycles per sample: `Spectrum.centre`, or that of a plan's lines.
     """
-    cycles_per_m = abs(cycles_per_m_at(lines, centre))
-    if cycles_per_m * lines.range_step_m <= LEAST_CYCLES:
-        cycles_per_m = 0.5 / lines.range_step_m
-    return 2 / cycles_per_m
+    if is_about_zero(lines, centre):
+        return 4 * lines.range_step_m
+    return 2 / abs(cycles_per_m_at(lines, centre))
+
+
+def is_about_zero(lines: RangeLines, centre: float) -> bool:
+    """Return whether a band is so near to 0 Hz that it does not show the carrier of its lines."""
+    return abs(cycles_per_m_at(lines, centre)) * lines.range_step_m <= _LEAST_CYCLES
 
 
 @overload

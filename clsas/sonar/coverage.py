@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from clsas.core import validate
 from clsas.core.geometry import pairwise_range_m
 from clsas.core.grid import Grid
-from clsas.core.lines import RangeLines, some_channels, steepest
+from clsas.core.lines import RangeLines, antennas_of, some_channels, steepest
 from clsas.sonar.beam import BeamWindow
 from clsas.sonar.visibility import BeamTrack, Boxes, sines
 
@@ -147,9 +147,7 @@ def _ranges_m(
     lines: RangeLines, points_m: NDArray[np.float64], some: NDArray[np.int64]
 ) -> NDArray[np.float64]:
     """Ranges of points from some channels, [points, channels]."""
-    velocity = None if lines.rx_velocity_m_s is None else lines.rx_velocity_m_s[some]
-    antennas = lines.tx_m[some], lines.rx_m[some]
-    return pairwise_range_m(points_m, *antennas, velocity, lines.sound_speed_m_s)
+    return pairwise_range_m(points_m, *antennas_of(lines, some))
 
 
 def _likely_cause(

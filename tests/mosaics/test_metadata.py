@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from stores import GRID, LINES, WISH, change, change_metadata, files_of, written
+from stores import GRID, LINES, WISH, change, change_metadata, files_of
 
 import clsas
 from clsas.cli import main
@@ -15,20 +15,6 @@ from clsas.cli import main
 ARRAYS = "pixels", "x", "y", "height"
 DOCUMENTS = [f"{name}/zarr.json" for name in (*ARRAYS, "patches")]
 VALUES = ["x/c/0", "y/c/0", "height/c/0/0"]
-
-
-@pytest.fixture(scope="module")
-def kept(tmp_path_factory):
-    """The files of a store."""
-    path = tmp_path_factory.mktemp("kept") / "a.zarr"
-    list(clsas.mosaic(LINES, GRID, path, **WISH))
-    return files_of(path)
-
-
-@pytest.fixture
-def path(kept, tmp_path):
-    """A store of its own for a test."""
-    return written(tmp_path / "a.zarr", kept)
 
 
 def verified(path, code):

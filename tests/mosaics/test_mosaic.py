@@ -13,6 +13,7 @@ import threading
 import time
 from concurrent.futures import wait
 from types import MappingProxyType, SimpleNamespace
+from unittest import mock
 
 import h5py
 import numpy as np
@@ -587,6 +588,7 @@ class TestDistributed:
         for _ in clsas.mosaic(file, GRID, tmp_path / "local.zarr", **REQUEST):
             pass
         with (
+            mock.patch.dict(os.environ),  # Dask changes it while it starts a worker again
             distributed.LocalCluster(
                 n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None
             ) as cluster,

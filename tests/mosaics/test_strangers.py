@@ -9,27 +9,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from stores import GRID, LINES, WISH, change, change_metadata, files_of, written
+from stores import GRID, LINES, WISH, change, change_metadata, files_of
 
 import clsas
 from clsas.core import validate
 
 numcodecs = pytest.importorskip("numcodecs")
 zarr = pytest.importorskip("zarr")
-
-
-@pytest.fixture(scope="module")
-def kept(tmp_path_factory):
-    """The files of a store."""
-    path = tmp_path_factory.mktemp("kept") / "a.zarr"
-    list(clsas.mosaic(LINES, GRID, path, **WISH))
-    return files_of(path)
-
-
-@pytest.fixture
-def path(kept, tmp_path):
-    """A store of its own for a test."""
-    return written(tmp_path / "a.zarr", kept)
 
 
 class Payload:
