@@ -12,8 +12,8 @@ from numpy.typing import ArrayLike, NDArray
 from clsas.core import conditioning, pings, reprs, validate
 
 _PER_CHANNEL = ("first_range_m", "tx_m", "rx_m", "rx_velocity_m_s")
-_GOLDEN = (np.sqrt(5) - 1) / 2
-
+GOLDEN = (np.sqrt(5) - 1) / 2
+"""Its multiples fill the interval from 0 to 1 evenly, modulo 1, but never at regular steps."""
 SAMPLED_CHANNELS = 128
 """Channels that stand for all in estimates of geometry and coverage. Half or twice as many change
 predicted errors by less than 0.2 dB (`scripts/bench sensitivity`)."""
@@ -357,7 +357,7 @@ def some_channels(count: int, most: int = SAMPLED_CHANNELS) -> NDArray[np.int64]
     if count <= most:
         return np.arange(count)
     number = np.arange(most)
-    return ((number + number * _GOLDEN % 1) * count / most).astype(np.int64)
+    return ((number + number * GOLDEN % 1) * count / most).astype(np.int64)
 
 
 def wavelength_m(lines: RangeLines) -> float:

@@ -14,7 +14,7 @@ from clsas.exact.preparation import Preparation
 from clsas.exact.run import execute
 from clsas.opencl.device import Device, open_device
 from clsas.signal.ambiguity import BEST_DB, ambiguity
-from clsas.signal.spectrum import measure_spectrum
+from clsas.signal.spectrum import line_energy, measure_spectrum
 from clsas.sonar.beam import BeamWindow
 from clsas.sonar.coverage import reaches
 from clsas.sonar.simplify import simplify
@@ -149,8 +149,9 @@ def prepare(
     model = simplify(lines, grid, beam, None if fixed or full_model else accuracy_db)
     along = None if model.beam is None else model.beam.directions(model.lines)
     device = open_device(device)
-    spectrum = measure_spectrum(model.lines, model.grid)
-    left_open = ambiguity(model.lines, model.grid, spectrum, model.beam, along)
+    energy = line_energy(model.lines.samples)
+    spectrum = measure_spectrum(model.lines, model.grid, energy)
+    left_open = ambiguity(model.lines, model.grid, spectrum, energy, model.beam, along)
     is_reached = reaches(model.lines, model.grid, model.beam, along)
     decision = decide(
         model.lines,

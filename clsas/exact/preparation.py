@@ -75,7 +75,7 @@ class Preparation:
     def predicted_error_db(self) -> float:
         """Relative rms error, dB, of interpolation, ambiguous lines and effects left out."""
         of_passed = power(self.interpolator.error_db)
-        error = of_passed / self.ambiguity.brightness + self.ambiguity.error_power
+        error = of_passed / self.ambiguity.least_brightness + self.ambiguity.error_power
         return in_db(error + self.left_out_error)
 
     def warn_of_ambiguity(self) -> None:

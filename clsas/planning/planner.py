@@ -183,7 +183,7 @@ def plan(
         found = exact_plan(model, conditions, "no line reaches the grid")
     errors = found.errors
     if not found.is_exact:
-        errors = errors.times(1 / model.ambiguity.brightness)
+        errors = errors.times(1 / model.ambiguity.least_brightness)
     errors = replace(
         errors,
         line_ends=model.ambiguity.ends,

@@ -26,18 +26,16 @@ from clsas.factorized.factorization import ExactImage, Factorization
 from clsas.factorized.filters import LONGEST_UPSAMPLING_SHARE, UPSAMPLING_SHARE
 from clsas.factorized.interpolated import InterpolatedAperture
 from clsas.factorized.plan import Plan, Prediction, Stage
-from clsas.factorized.surface import LEAST_SIDE
 from clsas.factorized.thesis import NearestBeams
 from clsas.opencl import phases
 from clsas.opencl.buffers import padded_length
 from clsas.opencl.device import Device
 from clsas.planning.aperture_phases import AperturePhases
-from clsas.planning.caching import cached
 from clsas.planning.channels import peak_density, range_window_m, references
 from clsas.planning.costs import Costs
 from clsas.planning.exact_image import Exact
 from clsas.planning.memory import BufferSizes, batches_within
-from clsas.planning.range_extents import half_line_lengths, half_range_extents_m
+from clsas.planning.range_extents import half_line_lengths
 from clsas.planning.stretches import stretch_of, uncompensated
 from clsas.planning.visibility_model import VisibilityModel
 from clsas.signal import interpolation
@@ -52,7 +50,6 @@ OUTSIDE = 0.1
 _ROUNDING_SHARE = 0.1  # of an image's error power, for half precision; half or twice: the same
 _MOST_CHUNKS = 16  # in a sum rounded to half precision; more lose what is added
 _FEW_CHANNELS = 7.0, 30.0  # per pixel, that double the scatter of errors; the latter with steps
-_FEW_CELLS = 10.0  # of an image, that double the scatter; arbitrary, and of no effect above 1000
 _ROOM = 1.06  # of buffers, over the predicted virtual channels; twice the spare room: 2 % slower
 
 
@@ -203,33 +200,12 @@ def margin_db(model: VisibilityModel) -> float:
 
     Errors scatter more if few channels see a pixel, or a few hold most of the power: they depend on
     the positions of these between virtual channels, and relative to a step of the beam. They also
-    scatter more if the lines' power lies at few frequencies, or the image has few resolution cells.
+    scatter more if the lines' power lies at few frequencies.
     """
     power = model.channel_power
     channels = power.sum() ** 2 / (power @ power) * model.visible_share(model.small)
     few = _FEW_CHANNELS[model.beam is not None and model.beam.jumps]
-    factor = (1 + few / max(channels, 1.0)) * (
-        1 + _FEW_CELLS / _resolution_cells(replace(model, root=None))
-    )
-    return MARGIN_DB + in_db(model.spectrum.scatter * factor)
-
-
-@cached
-def _resolution_cells(model: VisibilityModel) -> float:
-    """Return the number of resolution cells of an image, roughly; at least 1.
-
-    `model` is that without roots.
-    """
-    # Of a root around the whole image, less what overhangs it.
-    shape, least = np.array(model.surface.plane.shape), np.array(LEAST_SIDE)
-    doublings = np.ceil(np.log2(np.maximum(shape / least, 1))).astype(int)
-    rows, columns = (least * 2**doublings).tolist()
-    side, phases = (rows, columns), AperturePhases(model)
-    visible = model.visible(model.small)
-    cells = phases.rows(side, 1, 1.0) * (1 + phases.subimage_phase_cycles(side, visible))
-    extent_m = 2 * float(half_range_extents_m(model, [side])[0])
-    in_range = extent_m / model.lines.range_step_m / model.spectrum.oversampling
-    return max(cells * (1 + in_range) * float(shape.prod()) / (rows * columns), 1.0)
+    return MARGIN_DB + in_db(model.spectrum.scatter * (1 + few / max(channels, 1.0)))
 
 
 def band_of(model: VisibilityModel, outside: float) -> tuple[float, float]:

@@ -166,8 +166,9 @@ class VisibilityModel:
     @property
     def ambiguity(self) -> Ambiguity:
         """Errors that the lines themselves leave open."""
-        given = self.lines, self.grid, self.spectrum, self.beam, self.channels_along
-        found: Ambiguity = self.from_cache(_AMBIGUITY, lambda: ambiguity(*given))
+        given = self.lines, self.grid, self.spectrum, self.channel_power
+        beam = self.beam, self.channels_along
+        found: Ambiguity = self.from_cache(_AMBIGUITY, lambda: ambiguity(*given, *beam))
         return found
 
     @property

@@ -18,6 +18,7 @@ from clsas.core.geometry import pairwise_range_m
 from clsas.core.grid import Grid
 from clsas.core.lines import RangeLines, some_channels
 from clsas.signal.brightness import brightness
+from clsas.signal.scatter import scatter
 from clsas.signal.spectrum import NEEDED_OVERSAMPLING, Spectrum
 from clsas.sonar.beam import BeamWindow
 from clsas.sonar.visibility import sines
@@ -52,12 +53,21 @@ class Ambiguity:
         Sample rate over the width of the occupied band.
     brightness : float
         Power of the image over that of what its beam passes: see `clsas.signal.brightness`.
+    scatter : float
+        Factor of relative error power, by chance, in images of few resolution cells: see
+        `clsas.signal.scatter`.
     """
 
     ends: float = 0.0
     aliasing: float = 0.0
     oversampling: float = np.inf
     brightness: float = 1.0
+    scatter: float = 1.0
+
+    @property
+    def least_brightness(self) -> float:
+        """Power of the image over that of what its beam passes, if chance makes it dark."""
+        return self.brightness / self.scatter
 
     @property
     def error_power(self) -> float:
@@ -69,7 +79,7 @@ class Ambiguity:
 
         It is never below `BEST_DB`, for which `warn` warns.
         """
-        return max(requested_db + in_db(self.brightness), min(requested_db, BEST_DB))
+        return max(requested_db + in_db(self.least_brightness), min(requested_db, BEST_DB))
 
     def rest_db(self, requested_db: float, other_error: float = 0.0) -> float:
         """Error left for all other causes, dB, so that the whole image keeps `requested_db`.
@@ -119,18 +129,21 @@ def ambiguity(
     lines: RangeLines,
     grid: Grid,
     spectrum: Spectrum,
+    energy: NDArray[np.float64],
     beam: BeamWindow | None = None,
     along: NDArray[np.float64] | None = None,
 ) -> Ambiguity:
     """Unavoidable error power of an image on a grid.
 
-    `along` holds the track's unit directions for a beam, [channels, 3].
+    `energy` holds that of every line, in any unit, [channels]; `along` the track's unit directions
+    for a beam, [channels, 3].
     """
     return Ambiguity(
         ends_error(lines, grid, spectrum, beam, along),
         spectrum.aliasing,
         spectrum.oversampling,
         brightness(lines, grid, spectrum, beam, along),
+        scatter(lines, grid, spectrum, energy, beam, along),
     )
 
 

@@ -1,7 +1,7 @@
 """Random scenes of every family, held to float64 sums that share nothing with the imagers."""
 
 import pytest
-from families import draw
+from families import FAMILIES, draw
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 from judging import images_of
@@ -14,13 +14,14 @@ MISSED = (
     ("moving", 5026, -40),
     ("headings with beam", 103, -15),
     ("gains", 2065, -50),
+    ("gains, dense", 2084, -60),
     ("dense", 5082, -50),
     ("rings", 492835, -20),
+    ("rings", 123, -50),
+    ("reliefs and points with beam", 5020, -50),
+    ("anything", 2159, -20),
 )
 """Families, seeds and tolerances of images that once erred by more than was predicted."""
-
-
-HELD = ("plain", "bands", "reliefs and points")
 
 
 def missed(family, seed, accuracy_db, tolerances_db):
@@ -44,6 +45,6 @@ def test_scenes_that_once_missed(family, seed, tolerance_db):
     suppress_health_check=[HealthCheck.too_slow],
 )
 @given(seed=st.integers(0, 2**32 - 1))
-@pytest.mark.parametrize("family", HELD)
+@pytest.mark.parametrize("family", FAMILIES)
 def test_no_image_errs_by_more_than_was_asked_and_predicted(family, seed):
     assert missed(family, seed, -55, [-20, -45]) == []
