@@ -556,3 +556,18 @@ def test_command(scene):
     assert results["repeated"] == []
     assert list(results["steps"]) == list(STEPS_HERE)
     assert CliRunner().invoke(main, ["process", str(scene), "--step", "x"]).exit_code == 2
+
+
+def test_the_command_refuses_a_grid_that_no_line_reaches(plain):
+    plain.write_text(
+        plain.read_text().replace(
+            "start_m = 13.0, stop_m = 15.0", "start_m = 13000.0, stop_m = 15000.0"
+        )
+    )
+    refused = CliRunner().invoke(main, ["process", str(plain)])
+    assert refused.exit_code == 1
+    assert "no pixel of the grid lies within any line's range" in refused.output
+    assert not plain.with_suffix("").exists()
+    allowed = CliRunner().invoke(main, ["process", str(plain), "--allow-unreached"])
+    assert allowed.exit_code == 0, allowed.output
+    assert not clsas.load(plain.with_suffix("") / "image.h5").pixels.any()
