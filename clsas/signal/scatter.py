@@ -18,6 +18,7 @@ from clsas.sonar.beam import BeamWindow
 from clsas.sonar.visibility import sines
 
 _POINTS = 256  # sampled all over the grid: an image of more cells scatters by less than `_SPARE_DB`
+_CHANNELS = 512  # sampled as often as they have power; a beam passes some of them
 _TERMS = 256  # of the sums that pixels are; twice as many change nothing
 _DEVIATIONS = 2.58  # of a normal distribution: 99.5 % of its values are smaller
 _SPARE_DB = 1.0  # by which errors of most images fall short of their predictions
@@ -66,29 +67,35 @@ def independent_pixels(
     -----
     A pixel is a sum of many terms, each of a channel and a frequency. N is the inverse of the mean
     squared correlation of two pixels, over all pairs. Terms are sampled as often as they have
-    power. That there are only some adds to correlations as if phases were random, which is taken
-    out; N is at most a third too large for that, up to 60.
+    power. As there are only some, they are correlated by 1/`_TERMS` even if phases are random: that
+    is taken out, and makes N a third too large at most, up to 60.
     """
     if not energy.any():
         return float(_POINTS)
     points_m = grid.spread(max(round(_POINTS ** (1 / len(grid.shape))), 1))
-    number = np.arange(_TERMS)
-    held = np.cumsum(energy / energy.max())
-    some = np.searchsorted(held, (number + 0.5) / _TERMS * held[-1])
-    away = 2 * (number * GOLDEN % 1) - 1
+    some = _quantiles(energy / energy.max(), _CHANNELS)
+    weights = np.ones((len(points_m), len(some)))
+    if beam is not None and along is not None:
+        sine = sines(points_m, lines.phase_centres_m[some], along[some]).T
+        weights = beam.weights(sine, wavelength_m(lines))
+    seen = np.mean(weights**2, axis=0)
+    if not seen.any():
+        return float(_POINTS)
+    chosen = _quantiles(seen, _TERMS)
+    away = 2 * (np.arange(_TERMS) * GOLDEN % 1) - 1
     share = np.cumsum(spectrum.share)
     frequency = np.copysign(np.interp(np.abs(away), share / share[-1], spectrum.frequency), away)
     cycles_per_m = cycles_per_m_at(lines, spectrum.centre + frequency)
-    turns = cycles_per_m * pairwise_range_m(points_m, *antennas_of(lines, some))
+    turns = cycles_per_m * pairwise_range_m(points_m, *antennas_of(lines, some[chosen]))
     terms = np.exp(2j * np.pi * (turns - np.rint(turns)))
-    if beam is not None and along is not None:
-        sine = sines(points_m, lines.phase_centres_m[some], along[some]).T
-        terms *= beam.weights(sine, wavelength_m(lines))
-    power_of_terms = np.sum(np.abs(terms) ** 2, axis=0)
-    total = float(power_of_terms.sum())
-    if not total:
-        return float(_POINTS)
-    terms = (terms / np.sqrt(total)).astype(np.complex64)
+    terms *= weights[:, chosen] / np.sqrt(len(points_m) * _TERMS * seen[chosen])
+    terms = terms.astype(np.complex64)
     alike = float(np.sum(np.abs(terms @ terms.conj().T) ** 2))
-    by_few = float(np.sum((power_of_terms / total) ** 2))
+    by_few = 1 / _TERMS
     return 1 / float(np.clip((alike - by_few) / (1 - by_few), 1 / _POINTS, 1.0))
+
+
+def _quantiles(weight: NDArray[np.float64], count: int) -> NDArray[np.int64]:
+    """Return `count` numbers, each as often as it has weight, in ascending order."""
+    held = np.cumsum(weight)
+    return np.searchsorted(held, (np.arange(count) + 0.5) / count * held[-1])

@@ -73,7 +73,7 @@ def test_a_loud_channel_leaves_only_its_own_cells_in_range():
     assert found < 0.3 * even
 
 
-@pytest.mark.parametrize("width_deg", [1.5, 4.0, 60.0])
+@pytest.mark.parametrize("width_deg", [0.4, 1.5, 4.0, 60.0])
 def test_beams_change_which_pixels_are_independent(width_deg):
     lines, image, beam = straight(60, 4.0), grid(1.0, 0.4), BeamWindow(width_deg, "hann")
     along = np.tile([1.0, 0.0, 0.0], (60, 1))
