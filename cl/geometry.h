@@ -2,11 +2,15 @@
 
 #include "vectors.h"
 
-/* No loop changes a Vector from pass to pass: where the number of passes is constant, Mesa's rusticl (25.0, on llvmpipe)
- * copies what an earlier pass has left, to an inline function's parameter too. */
+/* No loop changes a Vector from pass to pass, and that of one lane is no struct: where the number of passes is constant,
+ * Mesa's rusticl (25.0, on llvmpipe) gives inline functions the struct that an earlier pass has left. */
+#if WIDTH == 1
+typedef float3 Vector;
+#else
 typedef struct {
     vfloat x, y, z;
 } Vector;
+#endif
 
 INLINE vfloat scalar_product(Vector a, Vector b)
 {
