@@ -11,6 +11,7 @@ from __future__ import annotations
 import logging
 import os
 import signal
+import sys
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from multiprocessing import resource_tracker
@@ -19,6 +20,7 @@ from typing import Any
 
 from dask import config
 from distributed import Client, Nanny, Scheduler, Security, SpecCluster, Worker
+from distributed.comm.core import CommClosedError
 from distributed.system import MEMORY_LIMIT
 
 from clsas.core.cache import private_folder
@@ -92,7 +94,7 @@ def _cluster(workers: int, folder: Path) -> SpecCluster:
             security=security,
             silence_logs=logging.CRITICAL,
         )
-    except RuntimeError as error:
+    except (RuntimeError, CommClosedError) as error:
         raise ChildProcessError(
             f"a worker process ended while it started: {_cause(error)}"
         ) from error
@@ -119,15 +121,17 @@ def _environment_of_workers() -> Iterator[None]:
 
     `python -c`, as which workers start, looks there first, and others may be able to write to it.
     Afterwards this process has the variables that it had before. Dask sets its workers' variables
-    here, too, such as OMP_NUM_THREADS = 1.
+    here, too, such as OMP_NUM_THREADS = 1, and adds the folder of a scheduler to where modules are
+    looked for.
     """
     of_dask = config.get("distributed.nanny.pre-spawn-environ")
     names = (_SAFE_PATH, "PYTHONHASHSEED", "__DASK_PARENT_PID", *of_dask)
-    before = {name: os.environ.get(name) for name in names}
+    before, folders = {name: os.environ.get(name) for name in names}, list(sys.path)
     os.environ[_SAFE_PATH] = "1"
     try:
         yield
     finally:
+        sys.path[:] = folders
         for name, value in before.items():
             if value is None:
                 os.environ.pop(name, None)
@@ -147,10 +151,13 @@ def _certificate() -> Security:
 
 def _cause(error: BaseException) -> str:
     """Return the first cause of an exception, on one line."""
+    killed = "it was killed or exited by itself (out of memory?)"
+    if isinstance(error, CommClosedError):  # the end of the process was noticed by others first
+        return killed
     while error.__cause__ is not None:
         error = error.__cause__
     text = " ".join(str(error).split())
     # This is all that Dask reports about a process that was killed.
     if text == "Nanny failed to start worker process":
-        return "it was killed or exited by itself (out of memory?)"
+        return killed
     return f"{type(error).__name__}: {text}"

@@ -48,11 +48,18 @@ def read_all(path):
             continue
 
 
+@pytest.fixture
+def trusting(monkeypatch):
+    """Let Zarr and numcodecs unpickle whatever they read, as their older versions do."""
+    monkeypatch.setattr(numcodecs.pickles, "ALLOW_UNSAFE_PICKLE_DECODE", True, raising=False)
+    with zarr.config.set({"array.allow_unsafe_pickle_decode": True}):
+        yield
+
+
 @pytest.mark.parametrize("has_digests", [True, False])
 @pytest.mark.parametrize("name", ["height", "pixels", "x"])
-def test_pickles_of_zarr_format_2_do_not_run(path, tmp_path, monkeypatch, name, has_digests):
-    """With a version of numcodecs that unpickles whatever it reads."""
-    monkeypatch.setattr(numcodecs.pickles, "ALLOW_UNSAFE_PICKLE_DECODE", True, raising=False)
+@pytest.mark.usefixtures("trusting")
+def test_pickles_of_zarr_format_2_do_not_run(path, tmp_path, name, has_digests):
     mark = tmp_path / "ran"
     shape = [40] if name == "x" else [30, 40]
     metadata = {
