@@ -138,7 +138,7 @@ def read_document(path: Path) -> dict[str, Any]:
         )
     if not is_intact(attributes):
         raise ValueError(f"{path} is damaged: its attributes do not match their checksum")
-    if not _is_complete(attributes):
+    if not is_complete(attributes):
         raise ValueError(f"{path} is damaged: its attributes are not those of a mosaic")
     return attributes
 
@@ -151,7 +151,7 @@ def plane_of(attributes: Mapping[str, Any]) -> Grid | None:
     return Grid.oriented(**stored, shape=tuple(attributes["inputs"]["pixels"]))
 
 
-def _is_complete(attributes: dict[str, Any]) -> bool:
+def is_complete(attributes: dict[str, Any]) -> bool:
     """Return whether attributes are those of a mosaic, and of the right types."""
     inputs, grid = attributes.get("inputs"), attributes.get("grid", ())
     if not (

@@ -33,6 +33,7 @@ from clsas.mosaics.documents import (
     DamageError,
     check_own,
     check_place,
+    is_complete,
     is_there,
     read_document,
     with_checksum,
@@ -190,11 +191,21 @@ class Store:
         self.grow(inputs)
 
     def grow(self, inputs: dict[str, Any]) -> None:
-        """Store the inputs of a survey that has grown."""
+        """Store the inputs of a survey that has grown.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If `inputs` are not a dict, or not those of a mosaic.
+        """
         validate.instance("inputs", inputs, dict)
         attributes = read_document(self.path)
         if attributes["inputs"] != inputs:
-            write_attributes(self.path, with_checksum(attributes | {"inputs": inputs}))
+            changed = attributes | {"inputs": inputs}
+            if not is_complete(changed):
+                given = validate.shown(sorted(inputs))
+                raise ValueError(f"inputs must have the parts and pixels of a mosaic, got {given}")
+            write_attributes(self.path, with_checksum(changed))
 
     def records(self) -> dict[PatchIndex, Record]:
         """Return the records of all finished patches, by row and column.
@@ -262,7 +273,7 @@ class Store:
             for name, index, most in zip(("row", "column"), (row, column), self._shape, strict=True)
         )
         part = [
-            range(count)[validate.selection(name, given)]
+            range(count)[validate.selection(name, given, ascending=True)]
             for name, given, count in zip(
                 ("rows", "columns"), (rows, columns), self.pixels.shape, strict=True
             )

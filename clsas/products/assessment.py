@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 import warnings
 from dataclasses import dataclass, replace
@@ -239,7 +240,9 @@ def survey_lines(
     step_m = sonar.sound_speed_m_s / (2 * float(oversampling) * pulse.bandwidth_hz)
     range_m = pairwise_range_m(grid.spread(_POINTS), *geometry, sonar.sound_speed_m_s)
     first_m = range_m.min(axis=0) - _ROOM * step_m
-    length = int(np.ceil((range_m.max(axis=0) - first_m).max() / step_m)) + _ROOM
+    extent = float((range_m.max(axis=0) - first_m).max() / step_m)
+    validate.memory("oversampling", 8 * len(first_m) * extent)
+    length = math.ceil(extent) + _ROOM
     middle = np.ravel_multi_index([n // 2 for n in grid.shape], grid.shape)
     return simulate_lines(
         geometry.tx_m,

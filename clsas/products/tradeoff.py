@@ -68,8 +68,8 @@ def tradeoff(
     tolerances_db : sequence of float
         Tolerances as for `clsas.plan`.
     stages : sequence of sequences of (QR, QI), optional
-        Stages of the thesis's method, as for `clsas.plan`. By default those of `STAGES` that the
-        lines and the grid allow.
+        Stages of the thesis's method, as for `clsas.plan`; an empty sequence for none. By default
+        those of `STAGES` that the lines and the grid allow.
     beam : BeamWindow, optional
         Weights of the channels, also for the exact image.
     device : Device, str or int, optional

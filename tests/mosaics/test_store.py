@@ -200,6 +200,22 @@ def test_a_patch_that_is_written_anew_has_no_record_meanwhile(path, monkeypatch)
     assert not store.damage()
 
 
+def test_a_refused_write_leaves_the_patch(path, kept):
+    store = Store.opened(path)
+    rows, columns = (slice(0, n) for n in store.pixels.chunks)
+    pixels, record = store.read(rows, columns), store.records()[0, 0]
+    with pytest.raises(ValueError, match="columns must be a slice with a step from 1"):
+        store.write(0, 0, rows, slice(None, None, -1), pixels, record)
+    test_all_is_well_of_a_whole_store(path, kept)
+
+
+def test_a_store_does_not_grow_into_what_is_no_mosaic(path, kept):
+    store = Store.opened(path)
+    with pytest.raises(ValueError, match="inputs must have the parts and pixels of a mosaic"):
+        store.grow({"a": 1})
+    test_all_is_well_of_a_whole_store(path, kept)
+
+
 @pytest.mark.parametrize("folder", ["pixels/c/1", "patches/1.2", "."])
 def test_leftovers_of_killed_runs_are_removed(path, folder):
     (path / RECORD).unlink()

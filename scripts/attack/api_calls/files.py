@@ -73,9 +73,13 @@ def files(folder: Path) -> dict[str, Call]:
             accepts=dict.fromkeys(("output", "steps", "progress"), optional)
             | {"lines": ("None", "RangeLines")},
         ),
-        "Store": Call(clsas.Store, {"path": folder / "store.zarr"}),
+        # Neither looks whether anything is there.
+        "Store": Call(clsas.Store, {"path": folder / "store.zarr"}, accepts={"path": ("long",)}),
         "Store.at": Call(
-            clsas.Store.at, {"path": folder / "store.zarr"}, names={"path": ("store",)}
+            clsas.Store.at,
+            {"path": folder / "store.zarr"},
+            names={"path": ("store",)},
+            accepts={"path": ("long",)},
         ),
         "Store.opened": Call(
             clsas.Store.opened, {"path": folder / "store.zarr"}, names={"path": ("store",)}
@@ -91,7 +95,7 @@ def files(folder: Path) -> dict[str, Call]:
             {"inputs": inputs, "grid": s.grid, "patch_shape": tuple(patch_shape)},
             accepts={"inputs": ("dict",)},
         ),
-        "Store.grow": Call(opened.grow, {"inputs": inputs}, accepts={"inputs": ("dict",)}),
+        "Store.grow": Call(opened.grow, {"inputs": inputs}),
         "Store.write": Call(
             opened.write,
             {

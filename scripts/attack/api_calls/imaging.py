@@ -177,8 +177,8 @@ def imaging(folder: Path) -> dict[str, Call]:
             kinds=device,
             names=scene_names,
             skips={"repeats": LARGE},
-            accepts=dict.fromkeys(("stages", "beam", "progress"), optional)
-            | {"tolerances_db": EMPTY},
+            accepts=dict.fromkeys(("beam", "progress"), optional)
+            | {"tolerances_db": EMPTY, "stages": (*optional, *EMPTY)},
         ),
         "from_phase_history": Call(
             clsas.from_phase_history,
@@ -194,6 +194,7 @@ def imaging(folder: Path) -> dict[str, Call]:
                 "oversampling": 2.0,
                 "sign": -1,
             },
+            accepts={"samples": ("an Image",)},
         ),
         "from_full_matrix": Call(
             clsas.from_full_matrix,
