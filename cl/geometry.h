@@ -2,8 +2,9 @@
 
 #include "vectors.h"
 
-/* No loop changes a Vector from pass to pass, and that of one lane is no struct: where the number of passes is constant,
- * Mesa's rusticl (25.0, on llvmpipe) gives inline functions the struct that an earlier pass has left. */
+/* In loops of a constant number of passes, Mesa's rusticl (25.0, on llvmpipe) hands inline functions the value that a struct
+ * had in an earlier pass. So no loop changes a Vector from pass to pass, and that of one lane, where the compiler unrolls
+ * more, is no struct. */
 #if WIDTH == 1
 typedef float3 Vector;
 #else

@@ -13,7 +13,8 @@ from clsas.core import conditioning, pings, reprs, validate
 
 _PER_CHANNEL = ("first_range_m", "tx_m", "rx_m", "rx_velocity_m_s")
 GOLDEN = (np.sqrt(5) - 1) / 2
-"""Its multiples fill the interval from 0 to 1 evenly, modulo 1, but never at regular steps."""
+"""Modulo 1, its multiples fill the interval from 0 to 1 evenly, but never at regular steps."""
+
 SAMPLED_CHANNELS = 128
 """Channels that stand for all in estimates of geometry and coverage. Half or twice as many change
 predicted errors by less than 0.2 dB (`scripts/bench sensitivity`)."""

@@ -35,6 +35,7 @@ _GROUP_LIMITS = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limi
 MOST_HZ, MOST_M_S = 1e15, 3e8
 """Largest frequency and speed of waves that recordings may have: those of light."""
 _MOST_COUNT = 2**63 - 1
+_MOST_OVERSAMPLING = 1e4  # far beyond what any interpolation gains from
 _MOST_CYCLES = 1e10  # of phase: float64 holds them to 1e-6 of a cycle
 
 _SMALL_BYTES = 1 << 20  # of an array; asking the system for its memory takes longer
@@ -207,6 +208,11 @@ def sides(name: str, value: object) -> tuple[int, int]:
         raise ValueError(f"{name} must be (rows, columns), got {shown(value)}")
     rows, columns = (count(f"every side of {name}", side) for side in given)
     return rows, columns
+
+
+def oversampling(value: float) -> float:
+    """Return samples over those of the band alone; raises TypeError or ValueError as `number`."""
+    return number("oversampling", value, least=1.0, most=_MOST_OVERSAMPLING)
 
 
 def selection(name: str, value: object, *, ascending: bool = False) -> slice:

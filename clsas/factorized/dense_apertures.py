@@ -41,10 +41,10 @@ _ALONG_CLOSE = 1e-4  # rms of directions: less than any beam resolves
 _OPEN = np.pi / 6  # of a ring's gap: then its ends are apart
 _OVERLAP = 0.08  # of a closed ring's ends
 _FLAT = 1e-6  # of the length: extents that are none
-# All channels but a few, on either side, must take up this share of a sheet's width. Otherwise a
-# single channel off a ring makes the width, and neighbours are far apart across the sheet. Regular
-# apertures take up 0.4 to 1.
-_SPREAD, _FEW = 0.2, 0.1
+# Without the outermost tenth on either side, channels must still spread over this share of the
+# width of a sheet. Otherwise a single channel off a ring makes the width, and neighbours are far
+# apart across the sheet. Regular apertures spread over 0.4 to 1.
+_SPREAD, _OUTERMOST = 0.2, 0.1
 _SCREENED = 512  # channels that tell whether one curve may serve
 _FAR_OFF = 2.0  # wavelengths rms, per axis: channels so far from a curve need several
 _CHANNELS_PER_TERM = 4
@@ -150,8 +150,8 @@ def sheet(lines: RangeLines, wavelength_m: float) -> MeanTrack | None:
     ranked: list[tuple[float, int, _Surface]] = []
     for surface in _surfaces(some_m):
         coordinates = surface.coordinates(some_m)
-        few, most = np.quantile(coordinates[1], [_FEW, 1 - _FEW])
-        if most - few < _SPREAD:
+        low, high = np.quantile(coordinates[1], [_OUTERMOST, 1 - _OUTERMOST])
+        if high - low < _SPREAD:
             continue
         _, rms_m = _fitted(coordinates, some_m, surface.closed, *_TRIED)
         ranked.append((rms_m, len(ranked), surface))

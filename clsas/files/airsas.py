@@ -279,14 +279,12 @@ def _together(
     names = recorded[0].name
     if len(recorded) > 1:
         names += f" to {recorded[-1].name}"
-    size = sum(each.size for each in recorded)
     with hdf5.too_large():
         budget.take(
             f"reading {names}",
-            4 * size,
+            (4 + lines_bytes) * sum(each.size for each in recorded),
             passing_bytes=max(each.nbytes + hdf5.unpacking_bytes(each) for each in recorded),
         )
-    budget.take("oversampling", lines_bytes * size)
     pings, length = recorded[0].shape
     together = np.empty((pings, len(recorded), length), np.float32)
     for number, each in enumerate(recorded):

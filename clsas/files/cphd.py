@@ -325,7 +325,7 @@ def _lines_of_fx(
     scale = collection.frequency_scale
     sampled_hz = signal.shape[1] * vectors["SCSS"]
     occupied = float(np.max((vectors["FX2"] - vectors["FX1"]) / sampled_hz))
-    oversampling = validate.number("oversampling", oversampling, least=1.0)
+    oversampling = validate.oversampling(oversampling)
     return from_phase_history(
         signal,
         first_frequency_hz=scale * vectors["SC0"].astype(np.float64),

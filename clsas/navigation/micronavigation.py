@@ -176,7 +176,8 @@ def micronavigate(
     Warns
     -----
     ClsasWarning
-        If some pairs of pings are not coherent: the navigation bridges them. If channels are dead:
+        If some pairs of pings are not coherent: the navigation bridges them. If some hold so few
+        echoes that their yaw may err by more than its deviation. If channels are dead:
         they are left out. If what is found is far beyond the accuracy of the navigation. If the
         track turns back, so that pings may be out of order.
 
@@ -293,7 +294,7 @@ def _contradiction(found: Displacements) -> float:
 
 
 def _check_coherence(found: Displacements) -> None:
-    """Refuse lines if hardly any pair of pings tells much; warn of pairs that are not coherent."""
+    """Refuse lines if hardly any pair of pings is usable; warn of those that are not."""
     count, without = len(found.coherent), int((~found.coherent).sum())
     few = int(found.sparse.sum())
     if count - without - few < max(1, _LEAST_SHARE * count):
@@ -306,12 +307,19 @@ def _check_coherence(found: Displacements) -> None:
             )
         raise ValueError(
             f"lines must be coherent from ping to ping; {without} of {count} pairs "
-            f"of pings are not: their coherence is at most {found.coherence.max():.2f} in any "
-            f"window, and {found.least_coherence.min():.2f} at least is needed to tell echoes from "
-            f"noise. Check range_m, and the navigation's advance from ping to ping"
+            f"of pings are not: their coherence is at most "
+            f"{found.coherence[~found.coherent].max():.2f} in any window, and "
+            f"{found.least_coherence.min():.2f} at least is needed to tell echoes from noise. "
+            f"Check range_m, and the navigation's advance from ping to ping"
         )
     if without:
         validate.warn(
             f"{without} of {count} pairs of pings are not coherent (the first after "
             f"ping {int(np.argmin(found.coherent))}): the navigation's accuracy bridges them"
+        )
+    if few:
+        validate.warn(
+            f"{few} of {count} pairs of pings hold the echoes of fewer than {LEAST_ECHOES:g} "
+            f"reflectors (the first after ping {int(np.argmax(found.sparse))}), which may all lie "
+            f"in one direction: yaw may err by several of its standard deviations there"
         )

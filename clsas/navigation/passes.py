@@ -56,7 +56,7 @@ class Displacements:
     coherent : bool [pings - 1]
         False where no window is more coherent than noise would be.
     sparse : bool [pings - 1]
-        True where echoes are coherent, but hardly tell yaw: there are too few.
+        True where echoes are coherent, but too few to tell yaw well.
     least_coherence : float64 [windows]
         What noise would not reach.
     """

@@ -54,8 +54,8 @@ class Ambiguity:
     brightness : float
         Power of the image over that of what its beam passes: see `clsas.signal.brightness`.
     scatter : float
-        Factor of relative error power, by chance, in images of few resolution cells: see
-        `clsas.signal.scatter`.
+        Factor by which chance may raise the relative error power of images of few resolution
+        cells: see `clsas.signal.scatter`.
     """
 
     ends: float = 0.0
@@ -66,7 +66,7 @@ class Ambiguity:
 
     @property
     def least_brightness(self) -> float:
-        """Power of the image over that of what its beam passes, if chance makes it dark."""
+        """Power of the image over that of what its beam passes, as dark as chance may make it."""
         return self.brightness / self.scatter
 
     @property
@@ -100,13 +100,19 @@ class Ambiguity:
             found_db = in_db(allowed + error_power)
             return f"the error may be {found_db:.0f} dB in place of {name} {requested_db:.3g} dB"
 
-        if requested_db + in_db(self.brightness) < BEST_DB - _CLOSE_DB:
-            dark_db = -in_db(self.brightness)
+        if requested_db + in_db(self.least_brightness) < BEST_DB - _CLOSE_DB:
+            dark_db, scatter_db = -in_db(self.brightness), in_db(self.scatter)
+            may_be = (
+                f"the error may be {BEST_DB + dark_db + scatter_db:.0f} dB in place of {name} "
+                f"{requested_db:.3g} dB"
+            )
             validate.warn(
                 f"the image is {dark_db:.0f} dB darker than what the beam passes, since most "
-                "echoes come from where the beam hardly covers the grid: the error may be "
-                f"{BEST_DB + dark_db:.0f} dB in place of {name} {requested_db:.3g} dB; use a wider "
+                f"echoes come from where the beam hardly covers the grid: {may_be}; use a wider "
                 "beam, or a grid that it covers"
+                if dark_db > scatter_db
+                else "the grid holds so few resolution cells that the power of the image may by "
+                f"chance be {scatter_db:.0f} dB less than expected: {may_be}; image more pixels"
             )
         if self.ends > _MOST * allowed:
             validate.warn(

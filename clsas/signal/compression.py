@@ -51,7 +51,7 @@ def compress(
         Window over the band: "none", or a window of `scipy.signal.get_window`, such as "hamming",
         "taylor" or ("kaiser", 6.0).
     oversampling : float
-        Sample rate of the lines over the bandwidth, at least 1. A ratio of whole numbers
+        Sample rate of the lines over the bandwidth, 1 to 10 000. A ratio of whole numbers
         approximates it to 1e-6; `range_step_m` of the result is exact.
     bandwidth_hz : float, optional
         Width of the band that is kept, centred on the carrier; by default the pulse's. Required
@@ -150,7 +150,7 @@ def compress(
 def check_options(*, window: Window = "none", oversampling: float = 2.0) -> None:
     """Raise TypeError or ValueError for options that `compress` refuses for all echoes."""
     band_window(window, 1.0)
-    validate.number("oversampling", oversampling, least=1.0)
+    validate.oversampling(oversampling)
 
 
 def band_window(

@@ -54,7 +54,7 @@ def from_phase_history(
     window : str, float or tuple
         Window over the frequencies: "none", or a window of `scipy.signal.get_window`.
     oversampling : float
-        Samples per line over samples per frequency response, at least 1; zeros pad the spectrum.
+        Samples per line over samples per frequency response, 1 to 10 000; zeros pad the spectrum.
     sign : {-1, +1}
         Sign of the phase with growing range in `samples`.
 
@@ -95,7 +95,7 @@ def from_phase_history(
         sign = validate.one_of("sign", sign, (-1, 1))
     except ValueError:
         raise ValueError(f"sign must be -1 or +1, got {validate.shown(sign)}") from None
-    oversampling = validate.number("oversampling", oversampling, least=1.0)
+    oversampling = validate.oversampling(oversampling)
     speed = validate.number(
         "sound_speed_m_s", sound_speed_m_s, "m/s", above=0.0, most=validate.MOST_M_S
     )

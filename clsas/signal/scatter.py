@@ -7,21 +7,23 @@ together, and errors far more: their ratio is that of two means over few indepen
 from __future__ import annotations
 
 import numpy as np
+import scipy.special
 from numpy.typing import NDArray
 
 from clsas.core.decibels import power
 from clsas.core.geometry import pairwise_range_m
 from clsas.core.grid import Grid
 from clsas.core.lines import GOLDEN, RangeLines, antennas_of, wavelength_m
-from clsas.signal.spectrum import Spectrum, cycles_per_m_at
+from clsas.signal.spectrum import Spectrum, cycles_per_m_at, representative_channels
 from clsas.sonar.beam import BeamWindow
 from clsas.sonar.visibility import sines
 
-_POINTS = 256  # sampled all over the grid: an image of more cells scatters by less than `_SPARE_DB`
-_CHANNELS = 512  # sampled as often as they have power; a beam passes some of them
+_PIXELS = 256  # sampled; images of more independent ones scatter by less than `_SPARE_DB`
+_CHANNELS = 256  # sampled, besides the loudest: a beam passes some of them
 _TERMS = 256  # of the sums that pixels are; twice as many change nothing
-_DEVIATIONS = 2.58  # of a normal distribution: 99.5 % of its values are smaller
+_KEPT = 0.995  # share of the images that keep their accuracy
 _SPARE_DB = 1.0  # by which errors of most images fall short of their predictions
+_LEAST_WEIGHT = 1e-3  # mean weight of channels, up to which normalising beams raise pixels
 
 
 def scatter(
@@ -32,7 +34,7 @@ def scatter(
     beam: BeamWindow | None,
     along: NDArray[np.float64] | None,
 ) -> float:
-    """Return a factor of relative error power that 99.5 % of images do not exceed.
+    """Return a factor of relative error power that 99.5 % of images of noise do not exceed.
 
     Parameters
     ----------
@@ -45,12 +47,11 @@ def scatter(
 
     Notes
     -----
-    The logarithm of the ratio of two mean powers over N independent complex Gaussian values has
-    about the variance 2/N.
+    The ratio of two mean powers over N independent complex Gaussian values has the F distribution
+    of 2 N and 2 N degrees of freedom.
     """
-    count = independent_pixels(lines, grid, spectrum, energy, beam, along)
-    factor = np.exp(_DEVIATIONS * np.sqrt(2 / count))
-    return max(float(factor) / power(_SPARE_DB), 1.0)
+    degrees = 2 * independent_pixels(lines, grid, spectrum, energy, beam, along)
+    return max(float(scipy.special.fdtri(degrees, degrees, _KEPT)) / power(_SPARE_DB), 1.0)
 
 
 def independent_pixels(
@@ -61,41 +62,51 @@ def independent_pixels(
     beam: BeamWindow | None,
     along: NDArray[np.float64] | None,
 ) -> float:
-    """Return how many pixels of an image of noise are independent, from 1 to `_POINTS`.
+    """Return how many pixels of an image of noise are independent, from 1 to 256.
 
     Notes
     -----
     A pixel is a sum of many terms, each of a channel and a frequency. N is the inverse of the mean
     squared correlation of two pixels, over all pairs. Terms are sampled as often as they have
-    power. As there are only some, they are correlated by 1/`_TERMS` even if phases are random: that
-    is taken out, and makes N a third too large at most, up to 60.
+    power. Even random phases would correlate sums of so few terms by 1/`_TERMS`. This is
+    subtracted, which overestimates N by up to a third for N up to 60.
     """
-    if not energy.any():
-        return float(_POINTS)
-    points_m = grid.spread(max(round(_POINTS ** (1 / len(grid.shape))), 1))
-    some = _quantiles(energy / energy.max(), _CHANNELS)
+    is_whole = grid.size <= _PIXELS
+    number = np.arange(_PIXELS)
+    points_m = grid.at(
+        np.arange(grid.size) if is_whole else (number * GOLDEN % 1 * grid.size).astype(np.int64)
+    )
+    some, factor = representative_channels(lines, _CHANNELS, energy)
     weights = np.ones((len(points_m), len(some)))
     if beam is not None and along is not None:
         sine = sines(points_m, lines.phase_centres_m[some], along[some]).T
         weights = beam.weights(sine, wavelength_m(lines))
+        if beam.normalise:
+            weights /= np.maximum(weights.mean(axis=1, keepdims=True), _LEAST_WEIGHT)
     seen = np.mean(weights**2, axis=0)
-    if not seen.any():
-        return float(_POINTS)
-    chosen = _quantiles(seen, _TERMS)
-    away = 2 * (np.arange(_TERMS) * GOLDEN % 1) - 1
+    held = np.cumsum(seen * factor.astype(np.float64) ** 2 * (energy[some] / (energy.max() or 1.0)))
+    if not held[-1]:
+        return float(_PIXELS)
+    term = np.arange(_TERMS)
+    chosen = np.searchsorted(held, (term + 0.5) / _TERMS * held[-1])
+    away = 2 * (term * GOLDEN % 1) - 1
     share = np.cumsum(spectrum.share)
     frequency = np.copysign(np.interp(np.abs(away), share / share[-1], spectrum.frequency), away)
-    cycles_per_m = cycles_per_m_at(lines, spectrum.centre + frequency)
-    turns = cycles_per_m * pairwise_range_m(points_m, *antennas_of(lines, some[chosen]))
-    terms = np.exp(2j * np.pi * (turns - np.rint(turns)))
-    terms *= weights[:, chosen] / np.sqrt(len(points_m) * _TERMS * seen[chosen])
-    terms = terms.astype(np.complex64)
-    alike = float(np.sum(np.abs(terms @ terms.conj().T) ** 2))
+    channels = some[chosen]
+    range_m = pairwise_range_m(points_m, *antennas_of(lines, channels))
+    turns = range_m * cycles_per_m_at(lines, spectrum.centre + frequency)
+    terms = np.exp(2j * np.pi * (turns - np.rint(turns))).astype(np.complex64)
+    sample = (range_m - lines.first_range_m[channels]) / lines.range_step_m
+    is_reached = (sample > -1) & (sample < lines.length)
+    terms *= is_reached * weights[:, chosen] / np.sqrt(_TERMS * seen[chosen])
+    alike = np.abs(terms @ terms.conj().T) ** 2
+    own = np.abs(terms).astype(np.float64) ** 2
+    both = np.multiply.outer(own.sum(axis=1), own.sum(axis=1))
+    if not is_whole:  # a pixel is not sampled twice
+        np.fill_diagonal(alike, 0.0)
+        np.fill_diagonal(both, 0.0)
+    if not both.any():
+        return float(_PIXELS)
     by_few = 1 / _TERMS
-    return 1 / float(np.clip((alike - by_few) / (1 - by_few), 1 / _POINTS, 1.0))
-
-
-def _quantiles(weight: NDArray[np.float64], count: int) -> NDArray[np.int64]:
-    """Return `count` numbers, each as often as it has weight, in ascending order."""
-    held = np.cumsum(weight)
-    return np.searchsorted(held, (np.arange(count) + 0.5) / count * held[-1])
+    mean = float(alike.sum(dtype=np.float64) / both.sum())
+    return 1 / float(np.clip((mean - by_few) / (1 - by_few), 1 / _PIXELS, 1.0))

@@ -229,23 +229,32 @@ def _distance(frequency: NDArray[np.float64], centre: float) -> NDArray[np.float
     return np.abs((frequency - centre + 0.5) % 1.0 - 0.5)
 
 
-def _sampled_lines(
-    lines: RangeLines, most_channels: int, energy: NDArray[np.float64] | None = None
-) -> tuple[NDArray[np.complex64], NDArray[np.float32]]:
-    """Lines of channels spread evenly and of the loudest, and a factor for each.
+def representative_channels(
+    lines: RangeLines, most: int, energy: NDArray[np.float64] | None = None
+) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+    """Return up to `most` channels spread evenly and the loudest, and a factor for each.
 
-    With these factors the sampled channels have the power of all channels.
+    With these factors the channels have the power of all. `energy` is the `line_energy` of the
+    lines, if it is known.
     """
-    some = some_channels(lines.channels, most_channels)
+    some = some_channels(lines.channels, most)
     if len(some) == lines.channels:
-        return lines.samples, np.ones(lines.channels, np.float32)
+        return some, np.ones(lines.channels, np.float32)
     energy = line_energy(lines.samples) if energy is None else energy
     loudest = np.argpartition(energy, -_LOUDEST)[-_LOUDEST:]
     even = np.setdiff1d(some, loudest)
     rest, held = energy.sum() - energy[loudest].sum(), energy[even].sum()
     weight = np.sqrt(max(rest, 0.0) / held) if held > 0 else 0.0
     factor = np.append(np.full(len(even), weight), np.ones(len(loudest))).astype(np.float32)
-    return lines.samples[np.append(even, loudest)], factor
+    return np.append(even, loudest), factor
+
+
+def _sampled_lines(
+    lines: RangeLines, most_channels: int, energy: NDArray[np.float64] | None = None
+) -> tuple[NDArray[np.complex64], NDArray[np.float32]]:
+    """Return the lines of representative channels, and a factor for each."""
+    index, factor = representative_channels(lines, most_channels, energy)
+    return lines.samples if len(index) == lines.channels else lines.samples[index], factor
 
 
 def line_energy(samples: NDArray[np.complex64]) -> NDArray[np.float64]:

@@ -387,7 +387,10 @@ def test_a_track_file_that_is_no_text(tmp_path):
         ("[simulate]\nrange_m = [5, 1]", "[simulate] range_m must be 0 <= near < far in m, got"),
         ("[compress]\nwindow = 'foo'", "[compress] window must be 'none' or a window of scipy"),
         ("[compress]\nwindow = []", "[compress] window must be 'none' or a window of scipy"),
-        ("[compress]\noversampling = 0", "[compress] oversampling must be finite and >= 1, got 0"),
+        (
+            "[compress]\noversampling = 0",
+            "[compress] oversampling must be finite and >= 1 and <= 10000, got 0",
+        ),
         ("[image]\ntaps = 3", "[image] taps must be one of 2, 4, 6, 8, got 3"),
         ("[image]\naccuracy_db = 5", "[image] accuracy_db must be finite and < 0 and >= -85 dB"),
         ("[image]\nupsampling = nan", "[image] upsampling must be finite and >= 1 and <= 64"),

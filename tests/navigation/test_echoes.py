@@ -1,5 +1,7 @@
 """Micronavigation over few reflectors, and how certain it is of a navigation that is right."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -116,3 +118,19 @@ def test_blocks_add_up_to_the_correlation(lag):
     found = block_products((one, other), lag, 50.0)
     assert found.shape == (3, 6)
     np.testing.assert_allclose(found.sum(axis=1), expected, rtol=1e-12)
+
+
+@pytest.mark.slow
+def test_a_few_pairs_of_few_echoes_are_used_and_counted():
+    """The first pings see speckle, and the last ones hardly anything but one bright corner."""
+    lines = right(lambda track: seabed(track, NEAR_M, FAR_M, 5000, seed=3), 16)
+    bright = right(reflectors(1, 3), 16)
+    samples = lines.samples.copy()
+    last = slice(lines.ping_starts[12], None)
+    samples[last] = 1e-3 * samples[last] + bright.samples[last, : lines.length]
+    mixed = dataclasses.replace(lines, samples=samples)
+    with pytest.warns(
+        clsas.ClsasWarning, match=r"[34] of 15 pairs of pings hold the echoes of few"
+    ):
+        found = navigate(mixed)
+    assert np.isfinite(found.shape_sd_m).all()

@@ -1,5 +1,7 @@
 """How many pixels of an image of noise are independent, and how its power scatters."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -12,6 +14,7 @@ from clsas.sonar.visibility import sines
 
 STEP_M, WAVELENGTH_M, SPEED_M_S = 0.1, 0.15, 1500.0
 CARRIER_HZ = SPEED_M_S / WAVELENGTH_M
+FIRST_M, LENGTH = 20.0, 200
 BAND = 0.6  # cycles per sample
 
 
@@ -23,8 +26,8 @@ def flat():
 
 
 def lines_at(position_m):
-    samples = np.ones((len(position_m), 4), np.complex64)
-    return RangeLines(samples, 0.0, STEP_M, position_m, position_m, CARRIER_HZ, SPEED_M_S)
+    samples = np.ones((len(position_m), LENGTH), np.complex64)
+    return RangeLines(samples, FIRST_M, STEP_M, position_m, position_m, CARRIER_HZ, SPEED_M_S)
 
 
 def straight(channels, length_m):
@@ -82,6 +85,54 @@ def test_beams_change_which_pixels_are_independent(width_deg):
     weights = beam.weights(sine, WAVELENGTH_M)
     measured = relative_variance(lines, image, weights, np.random.default_rng(5))
     assert found == pytest.approx(1 / measured, rel=0.35)
+
+
+def test_beams_that_normalise_change_which_pixels_count():
+    lines, image = straight(60, 4.0), grid(6.0, 0.4)
+    beam = BeamWindow(6.0, "hann", normalise=True)
+    along = np.tile([1.0, 0.0, 0.0], (60, 1))
+    found = independent_pixels(lines, image, flat(), np.ones(60), beam, along)
+    weights = beam.weights(sines(image.spread(40), lines.phase_centres_m, along).T, WAVELENGTH_M)
+    weights /= np.maximum(weights.mean(axis=1, keepdims=True), 1e-3)
+    measured = relative_variance(lines, image, weights, np.random.default_rng(7))
+    assert found == pytest.approx(1 / measured, rel=0.35)
+
+
+def test_pixels_that_no_line_reaches_do_not_count():
+    image = grid(0.5, 8.0)
+    whole, short = straight(60, 4.0), straight(60, 4.0)
+    short = dataclasses.replace(short, samples=short.samples[:, :82])  # the near quarter
+    near = Grid.plane((-0.25, 0.25, 48), (26.0, 28.2, 48))
+    even = np.ones(60)
+    found = independent_pixels(short, image, flat(), even, None, None)
+    alone = independent_pixels(whole, near, flat(), even, None, None)
+    assert found == pytest.approx(alone, rel=0.35)
+
+
+@pytest.mark.parametrize("loud", [1.0, 1e3, 1e8])
+def test_a_loud_channel_that_the_beam_does_not_pass_does_not_count(loud):
+    lines, image = straight(600, 30.0), grid(0.3, 0.1, count=8)
+    along = np.tile([1.0, 0.0, 0.0], (600, 1))
+    energy = np.ones(600)
+    energy[0] = loud
+    found = independent_pixels(lines, image, flat(), energy, BeamWindow(10.0, "hann"), along)
+    even = independent_pixels(lines, image, flat(), np.ones(600), BeamWindow(10.0, "hann"), along)
+    assert found == pytest.approx(even, rel=0.2)
+
+
+def test_the_shape_of_a_grid_plays_no_part():
+    lines = straight(60, 4.0)
+    random = np.random.default_rng(11)
+    points_m = random.uniform([-1, 29.8, 0], [1, 30.2, 0], (2000, 3))
+    found = [
+        independent_pixels(
+            lines, Grid.points(points_m.reshape(*shape, 3)), flat(), np.ones(60), None, None
+        )
+        for shape in [(2000,), (2000, 1), (20, 10, 10), (1, 1, 1, 2000)]
+    ]
+    assert found == pytest.approx([found[0]] * 4, rel=0.01)
+    row = Grid.plane((-40.0, 40.0, 4096), (30.0, 30.0, 1))
+    assert scatter(lines, row, flat(), np.ones(60), None, None) < 1.2
 
 
 def test_one_pixel_scatters_most_and_large_images_do_not():
