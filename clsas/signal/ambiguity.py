@@ -77,7 +77,8 @@ class Ambiguity:
     def of_passed_db(self, requested_db: float) -> float:
         """Return an error relative to what the beam passes that keeps `requested_db` of the image.
 
-        It is never below `BEST_DB`, for which `warn` warns.
+        It is never below `BEST_DB`. `warn` warns if the image is darker than that allows, but not
+        if only chance may make it so: predicted errors contain that.
         """
         return max(requested_db + in_db(self.least_brightness), min(requested_db, BEST_DB))
 
@@ -100,19 +101,13 @@ class Ambiguity:
             found_db = in_db(allowed + error_power)
             return f"the error may be {found_db:.0f} dB in place of {name} {requested_db:.3g} dB"
 
-        if requested_db + in_db(self.least_brightness) < BEST_DB - _CLOSE_DB:
-            dark_db, scatter_db = -in_db(self.brightness), in_db(self.scatter)
-            may_be = (
-                f"the error may be {BEST_DB + dark_db + scatter_db:.0f} dB in place of {name} "
-                f"{requested_db:.3g} dB"
-            )
+        if requested_db + in_db(self.brightness) < BEST_DB - _CLOSE_DB:
+            dark_db = -in_db(self.brightness)
             validate.warn(
                 f"the image is {dark_db:.0f} dB darker than what the beam passes, since most "
-                f"echoes come from where the beam hardly covers the grid: {may_be}; use a wider "
+                "echoes come from where the beam hardly covers the grid: the error may be "
+                f"{BEST_DB + dark_db:.0f} dB in place of {name} {requested_db:.3g} dB; use a wider "
                 "beam, or a grid that it covers"
-                if dark_db > scatter_db
-                else "the grid holds so few resolution cells that the power of the image may by "
-                f"chance be {scatter_db:.0f} dB less than expected: {may_be}; image more pixels"
             )
         if self.ends > _MOST * allowed:
             validate.warn(

@@ -232,7 +232,7 @@ _SCENES: dict[str, Callable[[], Known]] = {
     "closed track": lambda: extremes.closed(**_SMALL),
     "rings, on carrier": lambda: extremes.rings(**_SMALL),
     "bistatic": lambda: extremes.array(moving=False, **_SMALL),
-    "moving receivers": lambda: extremes.array(moving=True, **_SMALL),
+    "moving receivers": lambda: extremes.array(moving=True, shape=(48, 48)),
     "2 % and 10 m apart": lambda: extremes.apart(**_SMALL),
     "0.5 % and uneven velocities": lambda: extremes.uneven(**_SMALL),
     "headings under a Hann beam": lambda: extremes.headings(shape=(48, 48)),
