@@ -58,6 +58,9 @@ def replacing(path: str | os.PathLike) -> Iterator[Path]:
         if before is not None:
             os.fchmod(descriptor, stat.S_IMODE(before.st_mode))
         os.fsync(descriptor)
+        with suppress(OSError):  # some file systems have no locks
+            # From now on others may read it, and HDF5 shares a lock for that.
+            fcntl.flock(descriptor, fcntl.LOCK_SH)
         os.replace(temporary, path)
         sync_folder(path.parent)
 

@@ -1,6 +1,7 @@
 """Files appear whole or not at all; leftovers of killed writers are removed."""
 
 import errno
+import fcntl
 import os
 import signal
 import stat
@@ -9,6 +10,7 @@ import sys
 
 import pytest
 
+from clsas.core import atomic
 from clsas.core.atomic import creating, locked, replacing
 
 
@@ -35,6 +37,7 @@ def killed_in(statement, folder):
     program = f"""
 import os, signal
 from pathlib import Path
+from clsas.core import atomic
 from clsas.core.atomic import creating, locked, replacing, staging
 path = Path({str(folder / "a.h5")!r})
 with {statement} as part:
@@ -110,6 +113,21 @@ def test_contents_reach_the_disk_before_the_name(tmp_path, monkeypatch):
     with replacing(tmp_path / "a") as part:
         part.write_text("a")
     assert done == ["file", "name", "folder"]
+
+
+def test_a_file_may_be_read_under_a_lock_once_it_has_its_name(tmp_path, monkeypatch):
+    """As HDF5 does. The folder is still to reach the disk then."""
+    path, seen = tmp_path / "a", []
+
+    def read(_folder):
+        with path.open("rb") as file:
+            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+            seen.append(file.read())
+
+    monkeypatch.setattr(atomic, "sync_folder", read)
+    with atomic.replacing(path) as temporary:
+        temporary.write_bytes(b"contents")
+    assert seen == [b"contents"]
 
 
 def test_a_folder_that_another_made_meanwhile_stays(tmp_path):
