@@ -18,7 +18,7 @@ from clsas.core.geometry import pairwise_range_m
 from clsas.core.grid import Grid
 from clsas.core.lines import RangeLines, some_channels
 from clsas.signal.brightness import brightness
-from clsas.signal.scatter import scatter
+from clsas.signal.scatter import independent_pixels, scatter
 from clsas.signal.spectrum import NEEDED_OVERSAMPLING, Spectrum
 from clsas.sonar.beam import BeamWindow
 from clsas.sonar.visibility import sines
@@ -144,7 +144,7 @@ def ambiguity(
         spectrum.aliasing,
         spectrum.oversampling,
         brightness(lines, grid, spectrum, beam, along),
-        scatter(lines, grid, spectrum, energy, beam, along),
+        scatter(independent_pixels(lines, grid, spectrum, energy, beam, along)),
     )
 
 

@@ -26,32 +26,21 @@ _SPARE_DB = 1.0  # by which errors of most images fall short of their prediction
 _LEAST_WEIGHT = 1e-3  # mean weight of channels, up to which normalising beams raise pixels
 
 
-def scatter(
-    lines: RangeLines,
-    grid: Grid,
-    spectrum: Spectrum,
-    energy: NDArray[np.float64],
-    beam: BeamWindow | None,
-    along: NDArray[np.float64] | None,
-) -> float:
+def scatter(independent: float) -> float:
     """Return a factor of relative error power that 99.5 % of images of noise do not exceed.
 
     Parameters
     ----------
-    lines, grid, spectrum
-        What is imaged, and the spectrum of the lines.
-    energy : float64 [channels]
-        Energy of every line, in any unit.
-    beam, along : BeamWindow and float64 [channels, 3], or None
-        Weights of the channels, and the track's unit directions at these.
+    independent : float
+        Number of `independent_pixels` of the images.
 
     Notes
     -----
     The ratio of two mean powers over N independent complex Gaussian values has the F distribution
     of 2 N and 2 N degrees of freedom.
     """
-    degrees = 2 * independent_pixels(lines, grid, spectrum, energy, beam, along)
-    return max(float(scipy.special.fdtri(degrees, degrees, _KEPT)) / power(_SPARE_DB), 1.0)
+    quantile = scipy.special.fdtri(2 * independent, 2 * independent, _KEPT)
+    return max(float(quantile) / power(_SPARE_DB), 1.0)
 
 
 def independent_pixels(
@@ -63,6 +52,13 @@ def independent_pixels(
     along: NDArray[np.float64] | None,
 ) -> float:
     """Return how many pixels of an image of noise are independent, from 1 to 256.
+
+    Parameters
+    ----------
+    lines, grid, spectrum, beam, along
+        As of `clsas.signal.ambiguity.ambiguity`.
+    energy : float64 [channels]
+        Energy of every line, in any unit.
 
     Notes
     -----

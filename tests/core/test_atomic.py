@@ -37,7 +37,6 @@ def killed_in(statement, folder):
     program = f"""
 import os, signal
 from pathlib import Path
-from clsas.core import atomic
 from clsas.core.atomic import creating, locked, replacing, staging
 path = Path({str(folder / "a.h5")!r})
 with {statement} as part:

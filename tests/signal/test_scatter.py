@@ -132,7 +132,7 @@ def test_the_shape_of_a_grid_plays_no_part():
     ]
     assert found == pytest.approx([found[0]] * 4, rel=0.01)
     row = Grid.plane((-40.0, 40.0, 4096), (30.0, 30.0, 1))
-    assert scatter(lines, row, flat(), np.ones(60), None, None) < 1.2
+    assert scatter(independent_pixels(lines, row, flat(), np.ones(60), None, None)) < 1.2
 
 
 def test_one_pixel_scatters_most_and_large_images_do_not():
@@ -140,13 +140,14 @@ def test_one_pixel_scatters_most_and_large_images_do_not():
     one = Grid.points([[0.0, 30.0, 0.0]])
     arguments = flat(), np.ones(300), None, None
     assert independent_pixels(lines, one, *arguments) == 1
-    assert scatter(lines, one, *arguments) > 10
-    assert scatter(lines, grid(20.0, 20.0, count=400), *arguments) == 1
+    assert scatter(independent_pixels(lines, one, *arguments)) > 10
+    large = grid(20.0, 20.0, count=400)
+    assert scatter(independent_pixels(lines, large, *arguments)) == 1
 
 
 def test_silent_lines_and_beams_that_see_nothing_do_not_scatter():
     lines, image = straight(60, 4.0), grid(1.0, 0.4)
-    assert scatter(lines, image, flat(), np.zeros(60), None, None) == 1
+    assert scatter(independent_pixels(lines, image, flat(), np.zeros(60), None, None)) == 1
     along = np.tile([1.0, 0.0, 0.0], (60, 1))
     away = BeamWindow(10.0, "hann", 70.0)
-    assert scatter(lines, image, flat(), np.ones(60), away, along) == 1
+    assert scatter(independent_pixels(lines, image, flat(), np.ones(60), away, along)) == 1
