@@ -6,6 +6,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from clsas import plot
     from clsas.core.contrast import contrast, entropy
     from clsas.core.grid import Grid
     from clsas.core.image import Image
@@ -23,6 +24,13 @@ if TYPE_CHECKING:
     from clsas.files.hdf5 import FileFormatError
     from clsas.files.phase_histories import read_phase_history
     from clsas.files.xarrays import to_xarray
+    from clsas.inspection.inspection import inspect
+    from clsas.inspection.result import Inspection, PhaseSign
+    from clsas.measures.assessment import assess, survey_lines
+    from clsas.measures.assessment_result import Assessment, Effect
+    from clsas.measures.quality import measure_point
+    from clsas.measures.tradeoff import tradeoff
+    from clsas.measures.tradeoff_result import Tradeoff
     from clsas.mosaics.mosaic import Mosaic, Patch, mosaic
     from clsas.mosaics.store import Store
     from clsas.navigation.autofocus import Autofocus, autofocus
@@ -32,14 +40,6 @@ if TYPE_CHECKING:
     from clsas.planning.factorize import factorize
     from clsas.planning.planner import plan
     from clsas.processing.chain import Processed, process
-    from clsas.products import plot
-    from clsas.products.assessment import assess, survey_lines
-    from clsas.products.assessment_result import Assessment, Effect
-    from clsas.products.inspection import inspect
-    from clsas.products.inspection_result import Inspection, PhaseSign
-    from clsas.products.quality import measure_point
-    from clsas.products.tradeoff import tradeoff
-    from clsas.products.tradeoff_result import Tradeoff
     from clsas.signal.compression import compress
     from clsas.signal.echoes import Echoes
     from clsas.signal.full_matrix import from_full_matrix
@@ -138,6 +138,13 @@ _MODULES = {
     "files.hdf5": "FileFormatError",
     "files.phase_histories": "read_phase_history",
     "files.xarrays": "to_xarray",
+    "inspection.inspection": "inspect",
+    "inspection.result": "Inspection PhaseSign",
+    "measures.assessment": "assess survey_lines",
+    "measures.assessment_result": "Assessment Effect",
+    "measures.quality": "measure_point",
+    "measures.tradeoff": "tradeoff",
+    "measures.tradeoff_result": "Tradeoff",
     "mosaics.mosaic": "Mosaic Patch mosaic",
     "mosaics.store": "Store",
     "navigation.autofocus": "Autofocus autofocus",
@@ -147,13 +154,6 @@ _MODULES = {
     "planning.factorize": "factorize",
     "planning.planner": "plan",
     "processing.chain": "Processed process",
-    "products.assessment": "assess survey_lines",
-    "products.assessment_result": "Assessment Effect",
-    "products.inspection": "inspect",
-    "products.inspection_result": "Inspection PhaseSign",
-    "products.quality": "measure_point",
-    "products.tradeoff": "tradeoff",
-    "products.tradeoff_result": "Tradeoff",
     "signal.compression": "compress",
     "signal.echoes": "Echoes",
     "signal.full_matrix": "from_full_matrix",
@@ -173,7 +173,7 @@ _MODULE_OF = {name: module for module, names in _MODULES.items() for name in nam
 
 def __getattr__(name: str) -> Any:
     if name == "plot":
-        return importlib.import_module("clsas.products.plot")
+        return importlib.import_module("clsas.plot")
     if name not in _MODULE_OF:
         raise AttributeError(f"module 'clsas' has no attribute {name!r}")
     value = getattr(importlib.import_module(f"clsas.{_MODULE_OF[name]}"), name)

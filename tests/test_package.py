@@ -49,7 +49,7 @@ def test_every_public_name_is_there_and_known_to_type_checkers():
     seen = {name.name: node.module for node in checked.body for name in node.names}
     assert seen.keys() == set(clsas.__all__) == set(dir(clsas)) - {"__version__"}
     for name, module in seen.items():
-        there = importlib.import_module("clsas.products.plot" if name == "plot" else module)
+        there = importlib.import_module("clsas.plot" if name == "plot" else module)
         assert getattr(clsas, name) is (there if name == "plot" else getattr(there, name))
     with pytest.raises(AttributeError, match="'clsas' has no attribute 'imag'"):
         _ = clsas.imag
@@ -59,7 +59,7 @@ def test_every_public_name_is_there_and_known_to_type_checkers():
 def test_functions_keep_their_names_when_modules_of_these_are_imported():
     program = """
 import clsas
-import clsas.planning.planner, clsas.mosaics.mosaic, clsas.products.tradeoff
+import clsas.planning.planner, clsas.mosaics.mosaic, clsas.measures.tradeoff
 from clsas.simulation.simulator import simulate_lines
 assert all(callable(getattr(clsas, name)) for name in clsas.__all__ if name != "plot")
 from clsas import plan, simulate

@@ -31,9 +31,9 @@ from clsas.exact.backprojection import prepare
 from clsas.exact.run import execute
 from clsas.factorized.factorization import ExactImage
 from clsas.files.scene_tables import PLAN_KEYS
+from clsas.measures.tradeoff import summary
 from clsas.opencl.device import Device, KernelTimes, open_device
 from clsas.planning.planner import WORST_TOLERANCE_DB
-from clsas.products.tradeoff import summary
 from clsas.signal.interpolation import MOST_UPSAMPLING, TAPS
 
 
@@ -122,7 +122,7 @@ def image(
         seconds = time.perf_counter() - start
     clsas.save(output, formed.image)
     if picture is not None:
-        from clsas.products import plot
+        from clsas import plot
 
         plot.save(plot.image_db(formed.image, **levels), picture)
     planned = "" if planned_s is None else f", planned in {planned_s:.2f} s"

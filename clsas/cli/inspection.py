@@ -54,7 +54,7 @@ def inspect(
         element_length_m=None if sonar is None else sonar.element_length_m,
     )
     if picture is not None:
-        from clsas.products import plot
+        from clsas import plot
 
         plot.save(plot.inspection(found, grid), picture)
     numbers = {f.name: getattr(found, f.name) for f in fields(found) if f.name != "lines"}

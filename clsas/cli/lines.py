@@ -44,7 +44,7 @@ def simulate(scene_file: Path, output: Path, picture: Path | None, as_json: bool
         seconds = time.perf_counter() - start
     clsas.save(output, echoes)
     if picture is not None:
-        from clsas.products import plot
+        from clsas import plot
 
         plot.save(plot.geometry(echoes, scene.grid), picture)
     report(
@@ -99,7 +99,7 @@ def compress(
         seconds = time.perf_counter() - start
     clsas.save(output, lines)
     if picture is not None:
-        from clsas.products import plot
+        from clsas import plot
 
         plot.save(plot.range_lines(lines, **levels), picture)
     report(

@@ -16,10 +16,10 @@ from clsas.cli.outputs import json_able, print_json, printable, progress_bar, re
 from clsas.cli.parameters import HDF5, INPUT, POSITION, STAGES, Output
 from clsas.core import validate
 from clsas.files.scene_files import SceneFile
-from clsas.products.cuts import Cut
-from clsas.products.quality import PointResponse
-from clsas.products.shadows import DARKEST, dark_level_db
-from clsas.products.tradeoff import TOLERANCES_DB
+from clsas.measures.cuts import Cut
+from clsas.measures.quality import PointResponse
+from clsas.measures.shadows import DARKEST, dark_level_db
+from clsas.measures.tradeoff import TOLERANCES_DB
 
 
 @click.command()
@@ -78,7 +78,7 @@ def quality(
         results["point"] = response
         text.append(_describe(response))
         if picture is not None:
-            from clsas.products import plot
+            from clsas import plot
 
             plot.save(plot.cuts(response), picture)
     report(as_json, "\n".join(text), **results)
@@ -161,7 +161,7 @@ def tradeoff(
     if csv is not None:
         measured.save_csv(csv)
     if picture is not None:
-        from clsas.products import plot
+        from clsas import plot
 
         plot.save(plot.tradeoff(measured, title=title), picture)
     report(

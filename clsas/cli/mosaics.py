@@ -145,7 +145,7 @@ def mosaic(
     seconds = time.perf_counter() - start
     store = clsas.Store.opened(output)
     if picture is not None:
-        from clsas.products import plot
+        from clsas import plot
 
         plot.save(plot.mosaic(store, borders=borders, **levels), picture)
     words, figures = _results(formed, store.records())

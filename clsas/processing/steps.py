@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from clsas import plot
 from clsas.core.atomic import replacing, staging
 from clsas.core.digests import grid_digest
 from clsas.core.extras import install_command, is_installed
@@ -25,6 +26,7 @@ from clsas.files.hdf5 import save
 from clsas.files.process_tables import CORRECTIONS
 from clsas.files.scene_files import SceneFile
 from clsas.files.scene_tables import EXACT_KEYS
+from clsas.inspection.inspection import inspect
 from clsas.mosaics.mosaic import mosaic
 from clsas.mosaics.provenance import OtherInputsError, stored_digest
 from clsas.navigation.autofocus import Autofocus, autofocus
@@ -35,8 +37,6 @@ from clsas.planning.factorize import factorize
 from clsas.planning.planner import TOLERANCE_DB, plan
 from clsas.processing import numbers
 from clsas.processing.record import StepRecord
-from clsas.products import plot
-from clsas.products.inspection import inspect
 
 Progress = Callable[[int, int], None] | None
 

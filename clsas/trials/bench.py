@@ -17,12 +17,12 @@ from clsas.core.lines import RangeLines
 from clsas.exact import reference
 from clsas.exact.backprojection import form_exactly, prepare
 from clsas.exact.run import execute
+from clsas.measures.tradeoff import REFERENCE_DB
 from clsas.mosaics.mosaic import mosaic
 from clsas.mosaics.store import Record
 from clsas.opencl.device import Device, open_device
 from clsas.planning.factorize import factorize
 from clsas.planning.planner import plan
-from clsas.products.tradeoff import REFERENCE_DB
 from clsas.sonar.beam import BeamWindow
 from clsas.sonar.visibility import sines
 from clsas.trials import cases, wreck

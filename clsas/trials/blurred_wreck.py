@@ -14,7 +14,7 @@ import numpy as np
 
 from clsas.core.image import Image
 from clsas.core.lines import RangeLines
-from clsas.products.quality import measure_point
+from clsas.measures.quality import measure_point
 from clsas.signal.compression import compress
 from clsas.simulation.scenes import PointTargets
 from clsas.simulation.seabeds import wreck as seabed

@@ -12,15 +12,15 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from clsas import plot
 from clsas.core.grid import Grid
 from clsas.core.image import Image
 from clsas.core.lines import RangeLines
 from clsas.exact.backprojection import form_exactly
 from clsas.files.hdf5 import save
 from clsas.files.scene_files import SceneFile, built_in_scene, read_scene
+from clsas.measures.quality import PointResponse, measure_point
 from clsas.opencl.device import Device, open_device
-from clsas.products import plot
-from clsas.products.quality import PointResponse, measure_point
 from clsas.signal.compression import compress
 from clsas.simulation.scenes import PointTargets
 from clsas.simulation.simulator import simulate

@@ -20,9 +20,9 @@ from numpy.typing import NDArray
 from clsas.core.grid import Grid
 from clsas.core.lines import RangeLines
 from clsas.exact.backprojection import form_exactly
+from clsas.measures.quality import measure_point
 from clsas.navigation.micronavigation import Micronavigation, micronavigate
 from clsas.opencl.device import Device
-from clsas.products.quality import measure_point
 from clsas.signal.compression import compress
 from clsas.simulation.scenes import PointTargets
 from clsas.simulation.simulator import simulate

@@ -20,8 +20,8 @@ from clsas import plot
 from clsas.core.image_error import levels
 from clsas.exact.backprojection import prepare
 from clsas.exact.run import execute
+from clsas.measures.shadows import dark_level_db
 from clsas.opencl.device import open_device
-from clsas.products.shadows import dark_level_db
 from clsas.trials import bench, cases, wreck
 
 TOLERANCES_DB = {

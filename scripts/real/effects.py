@@ -25,8 +25,8 @@ import clsas
 from clsas.exact.backprojection import prepare
 from clsas.exact.run import execute
 from clsas.files import scene_files as config
+from clsas.measures.assessment_result import Assessment
 from clsas.opencl.device import open_device
-from clsas.products.assessment_result import Assessment
 
 AIRCRAFT_M_S = 100.0
 """About what the aircraft flew: its positions are known, their times are not."""

@@ -13,7 +13,7 @@ from recordings import parse_arguments
 
 import clsas
 from clsas import plot
-from clsas.products.quality import PointResponse
+from clsas.measures.quality import PointResponse
 
 RECORDINGS = [f"gotcha/data_3dsar_pass1_az{degree:03}_HH.mat" for degree in (1, 2, 3)]
 GRID = clsas.Grid.plane(x=(-50.0, 50.0, 1001), y=(-50.0, 50.0, 1001))

@@ -13,7 +13,7 @@ from recordings import parse_arguments
 
 import clsas
 from clsas import plot
-from clsas.products.quality import PointResponse
+from clsas.measures.quality import PointResponse
 
 RECORDING = "fmc_aluminium/contact_notch_aluminium.mat"
 SOUND_SPEED_M_S = 6320.0  # longitudinal waves in aluminium

@@ -24,7 +24,7 @@ import clsas
 from clsas import plot
 from clsas.factorized import thesis as nearest
 from clsas.opencl.device import Device, open_device
-from clsas.products.plot.canvas import with_fewer_colours
+from clsas.plot.canvas import with_fewer_colours
 from clsas.sonar.system import Sonar, line_array
 
 Stages = Sequence[tuple[int, int]]  # (QR, QI)

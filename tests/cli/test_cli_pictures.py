@@ -6,9 +6,9 @@ from cases import along_x, lines_over
 from click.testing import CliRunner
 
 import clsas
+from clsas import plot
 from clsas.cli import main
 from clsas.core.grid import Grid
-from clsas.products import plot
 
 pytest.importorskip("matplotlib")
 

@@ -8,7 +8,7 @@ import pytest
 
 import clsas
 from clsas.core import reprs
-from clsas.products.effects import KEYS
+from clsas.measures.effects import KEYS
 
 PULSE = clsas.Pulse(1e6, 1e5, 1e-3)
 SONAR = clsas.Sonar.thesis_wide_beam()

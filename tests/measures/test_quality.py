@@ -6,7 +6,7 @@ from clsas.core.grid import Grid
 from clsas.core.image import Image
 from clsas.core.image_error import relative_error_db
 from clsas.core.validate import ClsasWarning
-from clsas.products.quality import measure_point
+from clsas.measures.quality import measure_point
 
 # Closed forms of the point responses, in units of 1 / bandwidth.
 PEDESTALS = {"sinc": 1.0, "Hamming": 0.54}

@@ -11,11 +11,9 @@ from clsas.core import validate
 from clsas.core.grid import Grid
 from clsas.core.lines import RangeLines
 from clsas.core.pings import Transmissions
-from clsas.opencl.device import Device, open_device
-from clsas.products.inspection_result import Inspection, PhaseSign
-from clsas.products.phase_sign import check_sign, phase_sign
-from clsas.products.range_checks import check_ranges
-from clsas.products.recording_checks import (
+from clsas.inspection.phase_sign import check_sign, phase_sign
+from clsas.inspection.range_checks import check_ranges
+from clsas.inspection.recording_checks import (
     Levels,
     check_background,
     check_band,
@@ -23,7 +21,9 @@ from clsas.products.recording_checks import (
     check_levels,
     check_offset,
 )
-from clsas.products.track_checks import check_spacing, check_track
+from clsas.inspection.result import Inspection, PhaseSign
+from clsas.inspection.track_checks import check_spacing, check_track
+from clsas.opencl.device import Device, open_device
 from clsas.signal.compression import compress
 from clsas.signal.echoes import Echoes
 from clsas.signal.spectrum import Spectrum, measure_spectrum

@@ -13,7 +13,7 @@ from clsas.core import decibels
 from clsas.core.conditioning import DEAD_DB, are_dead
 from clsas.core.lines import RangeLines, some_channels
 from clsas.core.pings import Transmissions
-from clsas.products.inspection_result import runs
+from clsas.inspection.result import runs
 from clsas.signal.ambiguity import end_powers
 from clsas.signal.spectrum import NEEDED_OVERSAMPLING, Spectrum
 from clsas.sonar.sampling import Finding

@@ -16,7 +16,7 @@ from clsas.core.decibels import level_db
 from clsas.core.extras import is_installed
 from clsas.core.image import Image
 from clsas.core.lines import RangeLines
-from clsas.products.plot.canvas import (
+from clsas.plot.canvas import (
     axis_label,
     drawable,
     figure_class,
@@ -25,7 +25,7 @@ from clsas.products.plot.canvas import (
     plain_ticks,
     with_fewer_colours,
 )
-from clsas.products.plot.colours import COLOUR_MAP, colour_map
+from clsas.plot.colours import COLOUR_MAP, colour_map
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

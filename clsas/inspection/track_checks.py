@@ -9,7 +9,7 @@ from scipy.ndimage import median_filter
 from clsas.core.grid import Grid
 from clsas.core.lines import RangeLines
 from clsas.core.pings import STILL, Transmissions
-from clsas.products.inspection_result import runs
+from clsas.inspection.result import runs
 from clsas.sonar.beam import BeamWindow
 from clsas.sonar.sampling import Finding, check_sampling
 

@@ -14,8 +14,8 @@ from clsas.core.grid import Grid
 from clsas.core.image_error import relative_error_db
 from clsas.exact.reference import ideal
 from clsas.files import scene_files as config
-from clsas.products.assessment import assess, survey_lines
-from clsas.products.effects import BEAM, ENDS, KEYS, PATTERN, SINGLE, SWAY, track_errors_m
+from clsas.measures.assessment import assess, survey_lines
+from clsas.measures.effects import BEAM, ENDS, KEYS, PATTERN, SINGLE, SWAY, track_errors_m
 from clsas.sonar.beam import BeamWindow
 from clsas.sonar.simplify import APART, MOTION, RELIEF
 from clsas.sonar.system import line_array

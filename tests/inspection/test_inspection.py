@@ -14,8 +14,8 @@ from click.testing import CliRunner
 import clsas
 from clsas.cli import main
 from clsas.core.pings import Transmissions
-from clsas.products.inspection_result import runs
-from clsas.products.recording_checks import Levels, check_levels, check_offset
+from clsas.inspection.recording_checks import Levels, check_levels, check_offset
+from clsas.inspection.result import runs
 
 PINGS, ADVANCE_M = 200, 0.02
 GRID = clsas.Grid.plane((1.0, 3.0, 100), (18.0, 20.5, 120))
@@ -511,7 +511,7 @@ def test_errors_of_imaging_are_not_hidden(lines, monkeypatch):
     def broken(*_, **__):
         raise ValueError("a defect")
 
-    monkeypatch.setattr("clsas.products.phase_sign.backproject", broken)
+    monkeypatch.setattr("clsas.inspection.phase_sign.backproject", broken)
     with pytest.raises(ValueError, match="a defect"):
         clsas.inspect(lines, GRID)
 
@@ -596,7 +596,7 @@ def test_arguments_of_another_kind(lines):
 
 def test_the_guide_lists_every_finding():
     root = Path(__file__).parents[2]
-    files = [*(root / "clsas" / "products").glob("*.py"), root / "clsas/sonar/sampling.py"]
+    files = [*(root / "clsas" / "inspection").glob("*.py"), root / "clsas/sonar/sampling.py"]
     made = {name for file in files for name in re.findall(r'Finding\(\s*"(\w+)"', file.read_text())}
     table = (
         (root / "docs/how-to/recordings.md").read_text().split("| finding |")[1].split("\n\n")[0]

@@ -18,13 +18,8 @@ from clsas.exact.backprojection import prepare
 from clsas.exact.run import execute
 from clsas.factorized.factorization import Factorization
 from clsas.factorized.plan import Plan
-from clsas.opencl.device import Device, open_device
-from clsas.planning.costs import Costs
-from clsas.planning.factorize import factorize
-from clsas.planning.planner import BEST_TOLERANCE_DB, TOLERANCE_DB, WORST_TOLERANCE_DB, plan
-from clsas.planning.prediction import half_precision_error
-from clsas.products.assessment_result import Assessment, Effect
-from clsas.products.effects import (
+from clsas.measures.assessment_result import Assessment, Effect
+from clsas.measures.effects import (
     BEAM,
     KEYS,
     SINGLE,
@@ -34,6 +29,11 @@ from clsas.products.effects import (
     errors_without,
     track_errors_m,
 )
+from clsas.opencl.device import Device, open_device
+from clsas.planning.costs import Costs
+from clsas.planning.factorize import factorize
+from clsas.planning.planner import BEST_TOLERANCE_DB, TOLERANCE_DB, WORST_TOLERANCE_DB, plan
+from clsas.planning.prediction import half_precision_error
 from clsas.signal.compression import Window
 from clsas.signal.compression import check_options as check_compression
 from clsas.signal.spectrum import band_wavelength_m, measure_spectrum
@@ -105,7 +105,7 @@ def assess(
 
     Notes
     -----
-    `clsas.products.effects.errors_without` explains how errors are found.
+    `clsas.measures.effects.errors_without` explains how errors are found.
     """
     tolerance_db = validate.number(
         "tolerance_db", tolerance_db, "dB", least=BEST_TOLERANCE_DB, most=WORST_TOLERANCE_DB

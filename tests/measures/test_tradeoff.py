@@ -7,8 +7,8 @@ import pytest
 
 import clsas
 from clsas.core.grid import Grid
-from clsas.products.tradeoff import STAGES, summary
-from clsas.products.tradeoff_result import Response, Row, Tradeoff
+from clsas.measures.tradeoff import STAGES, summary
+from clsas.measures.tradeoff_result import Response, Row, Tradeoff
 
 # Far enough apart that their side lobes do not meet; the first one is the strongest.
 TARGETS = clsas.PointTargets([[0.02, 40.3, 0], [-0.25, 40.55, 0]], [1.0, 0.6])
@@ -132,7 +132,7 @@ def test_default_stages_leave_a_line_and_a_pixel(lines):
 )
 def test_bad_input_is_refused_before_any_image(lines, monkeypatch, error, message, given):
     for imager in ("factorize", "form_exactly"):
-        monkeypatch.setattr(sys.modules["clsas.products.tradeoff"], imager, pytest.fail)
+        monkeypatch.setattr(sys.modules["clsas.measures.tradeoff"], imager, pytest.fail)
     with pytest.raises(error, match=message):
         clsas.tradeoff(**{"lines": lines, "grid": GRID} | given)
 

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from clsas.core import reprs, validate
 from clsas.core.grid import Axis, Grid
 from clsas.core.image import Image
-from clsas.products.cuts import Cut, measure_cut
+from clsas.measures.cuts import Cut, measure_cut
 
 _SEARCH = 10  # pixels around the given position within which the peak is searched
 _REACH = 1024  # pixels on either side of the peak that enter a measurement, at most

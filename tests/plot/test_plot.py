@@ -8,7 +8,7 @@ from clsas import plot
 from clsas.core.grid import Grid
 from clsas.core.image import Image
 from clsas.core.lines import RangeLines
-from clsas.products.quality import measure_point
+from clsas.measures.quality import measure_point
 from clsas.signal.echoes import Echoes
 
 pytest.importorskip("matplotlib")

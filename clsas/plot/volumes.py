@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from clsas.core import validate
 from clsas.core.grid import Grid
 from clsas.core.image import Image
-from clsas.products.plot.canvas import axis_label, drawable, figure_class, length_unit
-from clsas.products.plot.levels import Scale, add_colour_bar, draw_levels, edges
+from clsas.plot.canvas import axis_label, drawable, figure_class, length_unit
+from clsas.plot.levels import Scale, add_colour_bar, draw_levels, edges
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

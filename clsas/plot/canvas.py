@@ -151,7 +151,7 @@ def drawable(name: str, value: object) -> str:
 
 def plain_ticks(axes: Axes) -> None:
     """Write coordinates in full, however far the origin is, and only as many as fit."""
-    from clsas.products.plot.ticks import FittingLocator
+    from clsas.plot.ticks import FittingLocator
 
     axes.ticklabel_format(style="plain", useOffset=False)
     axes.xaxis.set_major_locator(FittingLocator())

@@ -12,9 +12,9 @@ from clsas.core import validate
 from clsas.core.image import Image
 from clsas.navigation.autofocus import Autofocus
 from clsas.navigation.micronavigation import Micronavigation
-from clsas.products.plot.canvas import new_figure
-from clsas.products.plot.levels import FLAT, Scale, add_colour_bar, height_per_width
-from clsas.products.plot.levels import image as draw_image
+from clsas.plot.canvas import new_figure
+from clsas.plot.levels import FLAT, Scale, add_colour_bar, height_per_width
+from clsas.plot.levels import image as draw_image
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

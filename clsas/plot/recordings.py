@@ -12,10 +12,10 @@ from clsas.core.decibels import level_db
 from clsas.core.grid import Grid
 from clsas.core.lines import RangeLines
 from clsas.core.pings import Transmissions
-from clsas.products.inspection_result import Inspection
-from clsas.products.plot.canvas import axis_label, length_unit, new_figure, plain_ticks
-from clsas.products.plot.levels import Scale, draw_levels
-from clsas.products.plot.survey import outline as outline_of
+from clsas.inspection.result import Inspection
+from clsas.plot.canvas import axis_label, length_unit, new_figure, plain_ticks
+from clsas.plot.levels import Scale, draw_levels
+from clsas.plot.survey import outline as outline_of
 from clsas.signal.spectrum import power_spectrum
 
 if TYPE_CHECKING:

@@ -14,8 +14,8 @@ import clsas
 from clsas import plot
 from clsas.core.grid import Grid
 from clsas.core.image import Image
-from clsas.products.plot.colours import colour_map
-from clsas.products.tradeoff_result import Row, Tradeoff
+from clsas.measures.tradeoff_result import Row, Tradeoff
+from clsas.plot.colours import colour_map
 
 matplotlib = pytest.importorskip("matplotlib")
 

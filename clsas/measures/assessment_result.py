@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from clsas.core import reprs
 from clsas.core.tables import Report, Table
-from clsas.products.effects import ENDS, KEYS
+from clsas.measures.effects import ENDS, KEYS
 
 NONE_DB = -250.0
 """Errors below this level, dB, count as none."""

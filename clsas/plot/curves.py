@@ -8,16 +8,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from clsas.core import validate
-from clsas.products.cuts import Cut
-from clsas.products.plot.canvas import axis_label, drawable, length_unit, new_figure
-from clsas.products.quality import PointResponse
+from clsas.measures.cuts import Cut
+from clsas.measures.quality import PointResponse
+from clsas.plot.canvas import axis_label, drawable, length_unit, new_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
     from matplotlib.text import Annotation
 
-    from clsas.products.tradeoff_result import Row, Tradeoff
+    from clsas.measures.tradeoff_result import Row, Tradeoff
 
 _DISTANCES = (10, 18, 28, 40, 54, 70, 88, 108)  # from points to labels, tried in turn
 _ANGLES_DEG = (-45, 45, -90, 90, -20, 20, -135, 135, 180)
@@ -29,7 +29,7 @@ def cuts(response: PointResponse, *, floor_db: float = -60.0, resolutions: float
     Parameters
     ----------
     response : PointResponse
-        From `clsas.products.quality.measure_point`.
+        From `clsas.measures.quality.measure_point`.
     floor_db : float
         Lower end of the level axis, dB.
     resolutions : float
@@ -82,7 +82,7 @@ def tradeoff(measured: Tradeoff, *, title: str = "") -> Figure:
     TypeError
         If `measured` is of another type.
     """
-    from clsas.products.tradeoff_result import Tradeoff
+    from clsas.measures.tradeoff_result import Tradeoff
 
     validate.instance("measured", measured, Tradeoff)
     title = drawable("title", title)

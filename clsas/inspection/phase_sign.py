@@ -17,8 +17,8 @@ from clsas.core.lines import RangeLines, some_channels
 from clsas.core.validate import ClsasWarning
 from clsas.exact.backprojection import backproject
 from clsas.exact.checks import check_numbers
+from clsas.inspection.result import PhaseSign
 from clsas.opencl.device import Device
-from clsas.products.inspection_result import PhaseSign
 from clsas.sonar.sampling import Finding
 
 CLEAR = 1.5

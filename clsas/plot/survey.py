@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from clsas.core import validate
 from clsas.core.grid import Grid
 from clsas.core.lines import RangeLines
-from clsas.products.plot.canvas import axis_label, length_unit, new_figure, plain_ticks
+from clsas.plot.canvas import axis_label, length_unit, new_figure, plain_ticks
 from clsas.signal.echoes import Echoes
 
 if TYPE_CHECKING:

@@ -42,7 +42,7 @@ _COLUMNS = (
 
 @dataclass(frozen=True)
 class Response:
-    """A point's response along an axis; see `clsas.products.cuts.Cut`.
+    """A point's response along an axis; see `clsas.measures.cuts.Cut`.
 
     Attributes
     ----------
@@ -83,7 +83,7 @@ class Row:
         Response of the exact image's strongest point; None if it cannot be measured.
     dark_error_db : float
         Error in the darkest tenth of the exact image, relative to the level there; see
-        `clsas.products.shadows`.
+        `clsas.measures.shadows`.
     """
 
     label: str
@@ -204,9 +204,9 @@ class Tradeoff:
         OSError
             If the folder does not exist or the file cannot be written.
         """
-        from clsas.products import plot
+        import clsas  # the public face, which imports the room of pictures when it is used
 
-        plot.save_png(plot.tradeoff(self, title=title), path)
+        clsas.plot.save_png(clsas.plot.tradeoff(self, title=title), path)
 
 
 def _cells(row: Row, exact: Row) -> Iterator[str]:

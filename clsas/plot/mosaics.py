@@ -9,8 +9,8 @@ import numpy as np
 
 from clsas.core import validate
 from clsas.core.grid import Grid
-from clsas.products.plot.canvas import length_unit
-from clsas.products.plot.levels import image_db
+from clsas.plot.canvas import length_unit
+from clsas.plot.levels import image_db
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -1,0 +1,1 @@
+"""Inspections: what a recording says about its own geometry, clocks and conventions."""

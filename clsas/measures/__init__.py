@@ -1,0 +1,1 @@
+"""Measures of images and of the trade: quality, trade-offs, and assessments of effects."""

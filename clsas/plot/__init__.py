@@ -1,0 +1,43 @@
+"""Pictures: images, mosaics, volumes, points, geometry, lines, recordings, tracks, trade-offs.
+
+Functions that return a `matplotlib.figure.Figure` touch no window and no global state; `save`
+writes it as PNG, PDF or SVG. `image` draws into axes of your own, or into a new pyplot figure.
+"""
+
+from clsas.plot.canvas import save as save
+from clsas.plot.canvas import save_png as save_png
+from clsas.plot.curves import cuts as cuts
+from clsas.plot.curves import tradeoff as tradeoff
+from clsas.plot.levels import image as image
+from clsas.plot.levels import image_db as image_db
+from clsas.plot.levels import image_html as image_html
+from clsas.plot.levels import range_lines as range_lines
+from clsas.plot.mosaics import mosaic as mosaic
+from clsas.plot.mosaics import patch_borders as patch_borders
+from clsas.plot.navigation import before_and_after as before_and_after
+from clsas.plot.navigation import coherence as coherence
+from clsas.plot.navigation import corrections as corrections
+from clsas.plot.navigation import sharpness as sharpness
+from clsas.plot.recordings import inspection as inspection
+from clsas.plot.survey import geometry as geometry
+from clsas.plot.volumes import volume as volume
+
+__all__ = [
+    "before_and_after",
+    "coherence",
+    "corrections",
+    "cuts",
+    "geometry",
+    "image",
+    "image_db",
+    "image_html",
+    "inspection",
+    "mosaic",
+    "patch_borders",
+    "range_lines",
+    "save",
+    "save_png",
+    "sharpness",
+    "tradeoff",
+    "volume",
+]

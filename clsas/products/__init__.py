@@ -1,1 +1,0 @@
-"""Quality measures, trade-offs, effects and pictures of images."""
