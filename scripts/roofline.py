@@ -18,10 +18,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from peers import scenes
+from studies import tables
 
 import clsas
 from clsas.opencl.device import open_device
-from clsas.trials import cases, tables
+from clsas.trials import cases
 
 PROCESSORS = ("haswell", "znver3", "icelake-server")
 ITERATIONS = 200

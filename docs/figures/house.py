@@ -24,11 +24,18 @@ FLOORS = (
     (
         (
             ("navigation", "where was the sonar?\nmicronavigation, autofocus"),
-            ("files", "in and out\nHDF5, scene files"),
-            ("mosaics", "larger than memory\nsurvey, patches, store"),
-            ("products", "what does it show?\nquality, tradeoff, pictures"),
+            ("inspection", "is the recording sound?\nlevels, spacing, phase sign"),
+            ("measures", "how good is the image?\nquality, tradeoff, effects"),
         ),
         BLUE,
+    ),
+    (
+        (
+            ("files", "in and out\nHDF5, scene files"),
+            ("mosaics", "larger than memory\nsurvey, patches, store"),
+            ("plot", "what does it show?\nimages, tracks, trade-offs"),
+        ),
+        INK,
     ),
     (
         (
@@ -43,7 +50,8 @@ FLOWS = (
     "samples, positions, pixels",
     "directions, weights, spectra, buffers",
     "plans, images",
-    "images from files, measured figures",
+    "corrected lines, findings, figures",
+    "stored images, pictures",
 )
 WIDTH, HEIGHT, STEP = 9.6, 0.92, 1.4
 

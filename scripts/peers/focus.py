@@ -19,10 +19,10 @@ from numpy.typing import NDArray
 from peers import scenes
 from peers.codes import Code, installed
 from peers.workers import worker
+from studies import focusing, navigating, tables
 
 import clsas
 from clsas.core.lines import wavelength_m
-from clsas.trials import focusing, navigating, tables
 
 COLUMNS = (
     "scene",
@@ -148,7 +148,7 @@ class Trial:
 
 
 def sonar_trials(device: str) -> Iterator[Trial]:
-    """Yield the scenes of `clsas.trials.focusing` that lie on its small grid."""
+    """Yield the scenes of `studies.focusing` that lie on its small grid."""
     small = {name: each for name, each in focusing.SCENES.items() if each.grid is focusing.GRID}
     for name, scene in small.items():
         true, told = focusing.recorded(scene.targets, scene.sway_m)

@@ -11,12 +11,7 @@ import pytest
 from click.testing import CliRunner
 from scipy.ndimage import gaussian_filter1d
 from scipy.signal import resample
-
-import clsas
-from clsas.cli import main
-from clsas.core.validate import ClsasWarning
-from clsas.navigation.autofocus import autofocus
-from clsas.trials.focusing import (
+from studies.focusing import (
     GRID,
     PINGS,
     RADAR_ERRORS,
@@ -36,7 +31,12 @@ from clsas.trials.focusing import (
     swaying,
     white_m,
 )
-from clsas.trials.navigating import detrended
+from studies.navigating import detrended
+
+import clsas
+from clsas.cli import main
+from clsas.core.validate import ClsasWarning
+from clsas.navigation.autofocus import autofocus
 
 RECORDED = Path(__file__).parents[2] / "../shared/data/gotcha/data_3dsar_pass1_az001_HH.mat"
 CASES = "points-smooth", "points-beyond-resolution", "speckle-smooth"

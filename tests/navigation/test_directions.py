@@ -2,6 +2,13 @@
 
 import numpy as np
 import pytest
+from studies.navigating import (
+    SPACING_M,
+    WAVELENGTH_M,
+    overlapping_array,
+    said_to_be_on,
+    seabed,
+)
 
 import clsas
 from clsas.navigation.advance import surge
@@ -9,13 +16,6 @@ from clsas.navigation.directions import ALL, MIDDLE, ranges_m
 from clsas.navigation.displacement import Correlator
 from clsas.navigation.overlap import Array, overlap
 from clsas.navigation.swath import Swath
-from clsas.trials.navigating import (
-    SPACING_M,
-    WAVELENGTH_M,
-    overlapping_array,
-    said_to_be_on,
-    seabed,
-)
 
 NEAR_M, FAR_M = 12.0, 16.0
 

@@ -4,11 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-
-import clsas
-from clsas.navigation.echoes import block_products, independent_echoes
-from clsas.navigation.micronavigation import micronavigate
-from clsas.trials.navigating import (
+from studies.navigating import (
     WAVELENGTH_M,
     detrended,
     overlapping_array,
@@ -16,6 +12,10 @@ from clsas.trials.navigating import (
     seabed,
     with_noise,
 )
+
+import clsas
+from clsas.navigation.echoes import block_products, independent_echoes
+from clsas.navigation.micronavigation import micronavigate
 
 NEAR_M, FAR_M = 12.0, 16.0
 

@@ -4,6 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from studies.focusing import GRID, PINGS, SONAR, STEP_M, points, recorded, speckle
+from studies.navigating import said_to_be_on, with_noise
 
 import clsas
 from clsas.core.validate import ClsasWarning
@@ -12,8 +14,6 @@ from clsas.navigation.checks import mean_wavelength_m
 from clsas.navigation.halts import halt
 from clsas.navigation.responses import READ_DB, Passage, brightest, contributions
 from clsas.signal.readout import Readout
-from clsas.trials.focusing import GRID, PINGS, SONAR, STEP_M, points, recorded, speckle
-from clsas.trials.navigating import said_to_be_on, with_noise
 
 
 def found_halt(lines, grid):

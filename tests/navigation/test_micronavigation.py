@@ -7,13 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from click.testing import CliRunner
-
-import clsas
-from clsas.cli import main
-from clsas.core.validate import ClsasWarning
-from clsas.navigation.micronavigation import micronavigate
-from clsas.navigation.overlap import Array, overlap
-from clsas.trials.navigating import (
+from studies.navigating import (
     COHERENCES,
     SPACING_M,
     WAVELENGTH_M,
@@ -30,6 +24,12 @@ from clsas.trials.navigating import (
     straight_lines,
     voyage,
 )
+
+import clsas
+from clsas.cli import main
+from clsas.core.validate import ClsasWarning
+from clsas.navigation.micronavigation import micronavigate
+from clsas.navigation.overlap import Array, overlap
 
 RECORDED = Path(__file__).parents[2] / "../shared/data/fmc_aluminium/contact_notch_aluminium.mat"
 

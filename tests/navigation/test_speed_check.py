@@ -6,11 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from studies.focusing import GRID, PINGS, SONAR, points, recorded, smooth_m, speckle
 
 import clsas
 from clsas.core.validate import ClsasWarning
 from clsas.navigation.autofocus import autofocus
-from clsas.trials.focusing import GRID, PINGS, SONAR, points, recorded, smooth_m, speckle
 
 SPEED_M_S = 1500.0
 

@@ -7,9 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from studies import tables
 
 from clsas.sonar.beam import BeamWindow
-from clsas.trials import bench, cases, tables
+from clsas.trials import bench, cases
 
 SCRIPT = Path(__file__).parents[2] / "scripts" / "bench"
 SMALL = cases.Case(200, 8.25e-3, 1e6, 100e3, (-0.3, 0.3), (40.0, 40.6), 128)

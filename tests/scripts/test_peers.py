@@ -6,14 +6,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from peers import codes, compare, focus, scenes, workers
+from studies import focusing
 
 import clsas
 from clsas.exact import reference
-from clsas.trials import cases, focusing
+from clsas.trials import cases
 
 SCRIPTS = Path(__file__).parents[2] / "scripts"
-sys.path.append(str(SCRIPTS))
-from peers import codes, compare, focus, scenes, workers  # noqa: E402
 
 ECHO = """
 import os

@@ -12,7 +12,7 @@ import clsas
 
 pytest.importorskip("matplotlib")
 
-FOLDER = Path(__file__).parents[1] / "scripts" / "thesis"
+FOLDER = Path(__file__).parents[2] / "scripts" / "thesis"
 SCRIPTS = sorted(path.stem for path in FOLDER.glob("[fs]*_*.py"))
 COLUMNS = {
     "figure_18": {"stages", "seconds"},

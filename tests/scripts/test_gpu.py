@@ -9,7 +9,7 @@ import pytest
 
 from clsas.opencl.device import open_device
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 
 
 def run(*arguments, **variables):

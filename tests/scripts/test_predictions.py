@@ -1,12 +1,13 @@
 import re
 
 import pytest
+from studies import predictions
 
 from clsas.core.grid import Grid
 from clsas.opencl.device import open_device
 from clsas.planning import costs
 from clsas.planning.planner import plan
-from clsas.trials import cases, predictions
+from clsas.trials import cases
 from clsas.trials.cases import Case
 
 

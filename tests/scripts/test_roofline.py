@@ -3,15 +3,12 @@
 import platform
 import shutil
 import subprocess
-import sys
 from pathlib import Path
 
 import pytest
+import roofline
 
 SCRIPTS = Path(__file__).parents[2] / "scripts"
-sys.path.insert(0, str(SCRIPTS))
-
-import roofline  # noqa: E402
 
 needs_compiler = pytest.mark.skipif(
     platform.machine() != "x86_64" or not (shutil.which("gcc") and shutil.which("objdump")),

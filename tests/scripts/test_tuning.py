@@ -1,8 +1,9 @@
 import pytest
+from studies import tuning
 
 from clsas.factorized import run
 from clsas.opencl.device import open_device
-from clsas.trials import cases, tuning
+from clsas.trials import cases
 
 
 @pytest.mark.slow

@@ -1,11 +1,12 @@
 """The whole chain: the wreck, by an array on a track that nobody knows."""
 
 import pytest
+from studies import blurred_wreck
 
 import clsas
 from clsas.core.validate import ClsasWarning
 from clsas.files.scene_files import parse_scene
-from clsas.trials import blurred_wreck, wreck
+from clsas.trials import wreck
 
 pytest.importorskip("matplotlib")
 

@@ -10,7 +10,7 @@ pytest.importorskip("matplotlib")
 pytest.importorskip("zarr")
 pytest.importorskip("sarkit", reason="sarkit (extra radar) is not installed")
 
-ATTACK = Path(__file__).parents[1] / "scripts" / "attack"
+ATTACK = Path(__file__).parents[2] / "scripts" / "attack"
 EVERY = {"data": 4, "sonars": 6, "imaging": 40, "files": 30}
 """Groups that take little time, and of how many values one is tried."""
 

@@ -13,7 +13,7 @@ from clsas.opencl.device import Device
 from clsas.planning.factorize import factorize
 from clsas.planning.planner import plan
 from clsas.trials.cases import FFBP_2K, Case
-from clsas.trials.sensitivity import Constant
+from studies.sensitivity import Constant
 
 COLUMNS = ("constant", "set to", "exact, s", "over usual", "factorized, s", "over usual")
 FACTORS = (0.25, 0.5, 1.0, 2.0, 4.0)

@@ -18,7 +18,7 @@ from clsas.planning.factorize import factorize
 from clsas.planning.planner import plan
 from clsas.planning.visibility_model import VisibilityModel
 from clsas.trials import cases
-from clsas.trials.tables import TOLERANCES_DB
+from studies.tables import TOLERANCES_DB
 
 COLUMNS = ("case", "dB", "subimages", "predicted s", "measured s: median (min to max)", "ratio")
 ACCURACIES_DB = (-50.0, -80.0)

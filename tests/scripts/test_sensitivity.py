@@ -1,7 +1,9 @@
+from studies import sensitivity
+
 from clsas.opencl.device import open_device
 from clsas.planning import search
 from clsas.planning.costs import Costs
-from clsas.trials import cases, sensitivity
+from clsas.trials import cases
 
 
 def named(name):

@@ -26,7 +26,7 @@ from clsas.simulation.scenes import PointTargets
 from clsas.simulation.simulator import simulate
 from clsas.sonar.system import Pulse, Sonar
 from clsas.sonar.track import Track
-from clsas.trials.navigating import detrended, said_to_be_on
+from studies.navigating import detrended, said_to_be_on
 
 WAVELENGTH_M = 0.015
 PINGS, STEP_M = 400, 0.02

@@ -1,0 +1,1 @@
+"""Studies behind the tables and choices of the documentation; `scripts/bench` runs them."""
