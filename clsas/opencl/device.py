@@ -9,6 +9,7 @@ import os
 import re
 import statistics
 import threading
+import time
 import warnings
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
@@ -136,6 +137,15 @@ class Device:
             return self
         return replace(self, info=replace(self.info, width=self.info.stage_width))
 
+    @property
+    def build_seconds(self) -> float:
+        """Time that the driver took to build the kernels which the device holds.
+
+        Drivers that compile again when a kernel first runs, as PoCL does, take more in all.
+        """
+        with self._lock:
+            return sum(kernel.build_seconds for kernel in self._kernels.values())
+
     def kernel(self, name: str, **options: int) -> Kernel:
         """Return the kernel of `cl/<name>.cl`, built once per set of options.
 
@@ -168,13 +178,15 @@ class Device:
         definitions = [f"-D{option}={value}" for option, value in sorted(options.items())]
         text = whole_source(f"{name}.cl")
         parameters = kernel_parameters(text, name, options)
+        start = time.perf_counter()
         try:
             program = _built(self.context, text, ["-cl-mad-enable", *definitions])
         except cl.RuntimeError as error:
             what = f"{self.info.label} could not build {name}.cl with {' '.join(definitions)}"
             raise not_built(what, self.info.platform, error) from error
         # Not Program.all_kernels: PyOpenCL never releases what that returns.
-        return Kernel(name, parameters, cl.Kernel(program, name))
+        compiled = cl.Kernel(program, name)
+        return Kernel(name, parameters, compiled, build_seconds=time.perf_counter() - start)
 
     def run(
         self,

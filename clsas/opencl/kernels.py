@@ -128,11 +128,14 @@ class Kernel:
     parameters : dict of str to str
         Types by names, in order; see `kernel_parameters`.
     compiled : pyopencl.Kernel
+    build_seconds : float
+        Time that the driver took to build it.
     """
 
     name: str
     parameters: dict[str, str]
     compiled: cl.Kernel
+    build_seconds: float = 0.0
 
     def __post_init__(self) -> None:
         """Tell the driver the types; refuse a source that does not fit what was built."""

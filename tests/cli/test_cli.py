@@ -20,6 +20,7 @@ from interrupt import interrupted
 
 import clsas
 from clsas import cli
+from clsas.cli import images
 from clsas.core import validate
 from clsas.files.scene_files import built_in_scene, read_scene
 from clsas.planning import costs
@@ -97,6 +98,21 @@ def test_results_in_json(made):
     assert point["azimuth"]["resolution_m"] == pytest.approx(azimuth_m, rel=0.02)
     # Hamming's 1.3 c/2B, and a little more along the ground.
     assert point["range"]["resolution_m"] == pytest.approx(1.3 * 0.0125, rel=0.1)
+
+
+@pytest.mark.parametrize(
+    ("spent", "words"),
+    [
+        (
+            (2.0, 0.5, 0.25),
+            "2.00 s (0.50 s of that to build kernels, which the driver keeps), planned in 0.25 s",
+        ),
+        ((2.0, 0.1, None), "2.00 s"),
+        ((0.0, 0.0, None), "0.00 s"),
+    ],
+)
+def test_time_that_goes_into_kernels_is_reported(spent, words):
+    assert images._duration(*spent) == words
 
 
 @pytest.mark.slow
@@ -186,6 +202,7 @@ def test_a_plan_that_is_exact_is_as_accurate_as_asked_for(made, tmp_path):
     result = run_json("image", made[0] / "lines.h5", *few, "-o", output)
     assert result["method"] == "exact"
     assert result["interpolation_error_db"] < -70
+    assert 0 <= result["build_seconds"] < result["seconds"]
     text, _ = run("image", made[0] / "lines.h5", *few, "-o", output)
     assert "planned in " in text
     assert "(exact: nothing faster within -70 dB; " in text

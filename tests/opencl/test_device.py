@@ -151,6 +151,17 @@ def test_a_wish_goes_before_the_environment(monkeypatch):
         choose()
 
 
+def test_the_time_of_building_kernels_is_counted_once(platform):
+    device = open_device(platform.info.index)
+    built_s = device.build_seconds
+    options = {"WIDTH": 1, "BEAM": 0, "BISTATIC": 1, "MOVING": 0, "COUNTED": 1}
+    device.kernel("expand_tiles", **options)
+    first_s = device.build_seconds
+    assert first_s > built_s
+    device.kernel("expand_tiles", **options)
+    assert device.build_seconds == first_s
+
+
 def test_threads_do_not_set_each_others_arguments(platform):
     """Of a kernel that is slow to be handed them, as one is between two threads' turns."""
     entered, most = 0, 0
