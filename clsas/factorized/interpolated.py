@@ -7,7 +7,8 @@ interpolated from those of fewer, virtual channels; their lines are weighted sum
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NamedTuple, Protocol
+from collections.abc import Sequence
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +21,7 @@ from clsas.factorized import tree
 from clsas.factorized.dense_apertures import Shape
 from clsas.factorized.dense_channels import (
     SheetChannels,
+    SheetRates,
     first_on_sheet,
     later_on_sheet,
     strip_channels,
@@ -31,9 +33,6 @@ from clsas.factorized.tracks import MeanTrack
 from clsas.factorized.tree import VirtualChannels
 from clsas.signal.interpolation import Gain, Interpolator
 from clsas.sonar.beam import BeamWindow
-
-if TYPE_CHECKING:
-    from clsas.factorized.sector import Geometry
 
 BEAM_MARGIN = 1 / 16
 """Width of the beam by which a rectangle of leaves may widen what is visible from one of them."""
@@ -210,64 +209,63 @@ class InterpolatedAperture:
         last = np.searchsorted(place, stop[seen].max() + slack, "right")
         return slice(int(min(first, len(place) - 1)), int(max(last, first + 1)))
 
-    def virtual_channels(
+    def on_curves(
         self,
-        geometry: Geometry,
-        roots: NDArray[np.int64],
-        root_m: NDArray[np.float64],
-        place: NDArray[np.float64],
-        across: NDArray[np.float64] | None,
-        channels_m: NDArray[np.float64],
+        track: MeanTrack,
+        rates: NDArray[np.float64],
+        beam_rate: NDArray[np.float64] | None,
+        extents: Sequence[NDArray[np.float64]],
+        coordinate: NDArray[np.float64],
     ) -> list[VirtualChannels]:
-        """Return the virtual channels of some roots, stage by stage.
+        """Return the virtual channels of some roots, stage by stage, on one curve or on strips.
 
         Parameters
         ----------
-        geometry : Geometry
-        roots, root_m : [roots, 2], [roots, 3]
-            First pixels and centres.
-        place : float64 [roots, channels]
+        track : MeanTrack
+        rates : float64 [axes, roots, samples]
+            Largest phase rates of their subimages: see `cycles_per_extent`.
+        beam_rate : float64 [roots, samples] or None
+            Phase rates of the beam's weights, which count in the last stage.
+        extents : sequence of float64 [roots, axes]
+            Extents of the subimages, stage by stage.
+        coordinate : float64 [roots, channels]
             Aperture coordinates of the raw channels.
-        across : float64 [roots, channels] or None
-            Their coordinates across a sheet.
-        channels_m : float64 [channels, 3]
-            Their positions.
         """
-        sides, surface, track = geometry.factorization.sides, geometry.surface, geometry.track
-        if across is not None:
-            return self._on_sheet(geometry, roots, root_m, (place, across))
         interpolated = strip_channels if track.is_dense else tree.interpolated_channels
-        rates, nodes = geometry.phase_rates(roots, root_m), list[VirtualChannels]()
-        for oversampling, side in zip(self.oversampling, sides, strict=True):
-            extents = oversampling * surface.extents_in(side, sides[0], roots)
-            rate = np.einsum("ra,ars->rs", extents, rates)
-            if len(nodes) == len(sides) - 1 and geometry.beam is not None:
-                rate += self.beam_cycles * geometry.beam_rates(roots, root_m)
-            nodes.append(interpolated(track, rate, place, self.filter))
-            place = nodes[-1].coordinate
-        return nodes
+        found: list[VirtualChannels] = []
+        for oversampling, extent in zip(self.oversampling, extents, strict=True):
+            rate = np.einsum("ra,ars->rs", oversampling * extent, rates)
+            if beam_rate is not None and len(found) == len(extents) - 1:
+                rate += self.beam_cycles * beam_rate
+            found.append(interpolated(track, rate, coordinate, self.filter))
+            coordinate = found[-1].coordinate
+        return found
 
-    def _on_sheet(
+    def on_sheet(
         self,
-        geometry: Geometry,
-        roots: NDArray[np.int64],
-        root_m: NDArray[np.float64],
-        places: tuple[NDArray[np.float64], NDArray[np.float64]],
+        track: MeanTrack,
+        rates: SheetRates,
+        beam_rates: SheetRates | None,
+        extents: Sequence[NDArray[np.float64]],
+        coordinates: tuple[NDArray[np.float64], NDArray[np.float64]],
     ) -> list[VirtualChannels]:
-        """Return the virtual channels of a sheet, stage by stage."""
-        sides, surface, track = geometry.factorization.sides, geometry.surface, geometry.track
-        rates, nodes = geometry.sheet_rates(roots, root_m), list[VirtualChannels]()
+        """Return the virtual channels of some roots, stage by stage, on a sheet.
+
+        Parameters are those of `on_curves`, with rates along and across the sheet, and the
+        coordinates of the raw channels along and across it.
+        """
+        found: list[VirtualChannels] = []
         parent: SheetChannels | None = None
-        for oversampling, side in zip(self.oversampling, sides, strict=True):
-            own = rates.times(oversampling * surface.extents_in(side, sides[0], roots))
-            if len(nodes) == len(sides) - 1 and geometry.beam is not None:
-                own = own.plus(self.beam_cycles, geometry.sheet_beam_rates(roots, root_m))
+        for oversampling, extent in zip(self.oversampling, extents, strict=True):
+            rate = rates.times(oversampling * extent)
+            if beam_rates is not None and len(found) == len(extents) - 1:
+                rate = rate.plus(self.beam_cycles, beam_rates)
             if parent is not None:
-                virtual, parent = later_on_sheet(track, own, parent, self.filter)
+                virtual, parent = later_on_sheet(track, rate, parent, self.filter)
             else:
-                virtual, parent = first_on_sheet(track, own, *places, self.filter)
-            nodes.append(virtual)
-        return nodes
+                virtual, parent = first_on_sheet(track, rate, *coordinates, self.filter)
+            found.append(virtual)
+        return found
 
     def predicted_channels(
         self, phases: VisiblePhases, sides: tuple[tuple[int, int], ...]

@@ -27,6 +27,7 @@ from clsas.factorized.dense_channels import (
 from clsas.factorized.interpolated import BEAM_MARGIN
 from clsas.factorized.plan import Plan
 from clsas.factorized.surface import Surface
+from clsas.factorized.thesis import NearestBeams
 from clsas.factorized.tracks import MeanTrack
 from clsas.factorized.tree import ChannelRanges, Division, VirtualChannels
 from clsas.opencl.buffers import MARGIN
@@ -262,7 +263,7 @@ class Geometry:
         centres_m, some = self.phase_centres_m[channels], track.some(channels)
         own = None if self.own_drift is None else self.own_drift[channels]
         place, across = self._apparent(some, root_m, centres_m, own)
-        nodes = aperture.virtual_channels(self, roots, root_m, place, across, centres_m)
+        nodes = self._virtual_channels(roots, root_m, place, across, centres_m)
         if track.is_dense:
             needs = all_channels(nodes, place.shape[1], self._holding(inside))
         else:
@@ -290,29 +291,41 @@ class Geometry:
             result.insert(0, np.any(held, axis=-1))
         return result
 
-    def phase_rates(
-        self, roots: NDArray[np.int64], root_m: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
-        """Return the largest phase rates of subimages in some roots: see `cycles_per_extent`."""
+    def _virtual_channels(
+        self,
+        roots: NDArray[np.int64],
+        root_m: NDArray[np.float64],
+        coordinate: NDArray[np.float64],
+        across: NDArray[np.float64] | None,
+        centres_m: NDArray[np.float64],
+    ) -> list[VirtualChannels]:
+        """Return the virtual channels of some roots, stage by stage, from their raw channels."""
+        aperture, sides, track = self.factorization.aperture, self.factorization.sides, self.track
+        if isinstance(aperture, NearestBeams):
+            return aperture.beams(coordinate, centres_m)
+        extents = [self.surface.extents_in(side, sides[0], roots) for side in sides]
         boxes = self._boxes(roots, root_m)
-        return cycles_per_extent(self.track, *boxes, self.factorization.limits, self.along)
+        if across is not None:
+            rates, beam_rates = sheet_rates(track, *boxes), self._sheet_beam_rates(roots, root_m)
+            return aperture.on_sheet(track, rates, beam_rates, extents, (coordinate, across))
+        rates_along = cycles_per_extent(track, *boxes, self.factorization.limits, self.along)
+        beam = self._beam_rate(roots, root_m)
+        return aperture.on_curves(track, rates_along, beam, extents, coordinate)
 
-    def sheet_rates(self, roots: NDArray[np.int64], root_m: NDArray[np.float64]) -> SheetRates:
-        """Return the largest phase rates of subimages in some roots, along and across a sheet."""
-        return sheet_rates(self.track, *self._boxes(roots, root_m))
-
-    def beam_rates(
+    def _beam_rate(
         self, roots: NDArray[np.int64], root_m: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
+    ) -> NDArray[np.float64] | None:
         """Return the phase rates of the beam's weights in some roots: see `beam_rate`."""
-        assert self.beam is not None
-        assert self.along is not None
+        if self.beam is None or self.along is None:
+            return None
         return beam_rate(self.beam, self.track, self.along, root_m, self._sides_m(roots))
 
-    def sheet_beam_rates(self, roots: NDArray[np.int64], root_m: NDArray[np.float64]) -> SheetRates:
+    def _sheet_beam_rates(
+        self, roots: NDArray[np.int64], root_m: NDArray[np.float64]
+    ) -> SheetRates | None:
         """Return the phase rates of the beam's weights in some roots, along and across a sheet."""
-        assert self.beam is not None
-        assert self.directions is not None
+        if self.beam is None or self.directions is None:
+            return None
         sides_m = self._sides_m(roots)
         return sheet_beam_rates(self.beam, self.track, self.directions, root_m, sides_m)
 

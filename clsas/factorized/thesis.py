@@ -4,30 +4,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
-from clsas.core.geometry import pairwise_range_m
-from clsas.core.grid import Grid
-from clsas.core.lines import RangeLines
 from clsas.factorized import tree
-from clsas.factorized.aperture import mean_track
 from clsas.factorized.dense_apertures import Shape
 from clsas.factorized.estimates import StageChannels
 from clsas.factorized.fields import CONFIG, Whole
 from clsas.factorized.interpolated import VisiblePhases
-from clsas.factorized.surface import surface_of
-from clsas.factorized.tree import Division, VirtualChannels
+from clsas.factorized.tree import VirtualChannels
 from clsas.signal.interpolation import Gain, Interpolator
-from clsas.signal.spectrum import band_wavelength_m
-
-if TYPE_CHECKING:
-    from clsas.factorized.plan import Plan
-    from clsas.factorized.sector import Geometry
 
 Stages = Sequence[tuple[int, int]]
 """(QR, QI) of every stage: how many lines are summed, and the division of either image side."""
@@ -37,8 +27,7 @@ Stages = Sequence[tuple[int, int]]
 class NearestBeams:
     """Virtual channels that are sums of neighbours as they are, at their mean position [43].
 
-    Methods as those of `clsas.factorized.interpolated.InterpolatedAperture`, the other way to
-    choose virtual channels.
+    The alternative is `clsas.factorized.interpolated.InterpolatedAperture`.
 
     Attributes
     ----------
@@ -83,21 +72,23 @@ class NearestBeams:
         """Return all channels: which of them are neighbours does not depend on the sector."""
         return slice(0, len(place))
 
-    def virtual_channels(
-        self,
-        geometry: Geometry,
-        roots: NDArray[np.int64],
-        root_m: NDArray[np.float64],
-        place: NDArray[np.float64],
-        across: NDArray[np.float64] | None,
-        channels_m: NDArray[np.float64],
+    def beams(
+        self, coordinate: NDArray[np.float64], channels_m: NDArray[np.float64]
     ) -> list[VirtualChannels]:
-        """Return the beams of some roots, stage by stage."""
-        nodes, position_m = [], np.broadcast_to(channels_m, (*place.shape, 3))
+        """Return the beams of some roots, stage by stage.
+
+        Parameters
+        ----------
+        coordinate : float64 [roots, channels]
+            Aperture coordinates of the raw channels.
+        channels_m : float64 [channels, 3]
+            Their positions.
+        """
+        found, position_m = [], np.broadcast_to(channels_m, (*coordinate.shape, 3))
         for factor in self.factors:
-            nodes.append(tree.nearest_nodes(place, position_m, factor))
-            place, position_m = nodes[-1].coordinate, nodes[-1].position_m
-        return nodes
+            found.append(tree.nearest_nodes(coordinate, position_m, factor))
+            coordinate, position_m = found[-1].coordinate, found[-1].position_m
+        return found
 
     def predicted_channels(
         self, phases: VisiblePhases, sides: tuple[tuple[int, int], ...]
@@ -196,54 +187,3 @@ def operations(
         channels = math.ceil(channels / beams)
     counts.append(float(channels * pixels))
     return counts
-
-
-def plan_errors_m(
-    plan: Plan, lines: RangeLines, grid: Grid, pixels: ArrayLike
-) -> NDArray[np.float64]:
-    """Return the range errors that a plan of nearest beams makes, followed stage by stage.
-
-    Parameters
-    ----------
-    plan : Plan
-        Made with `stages`, at least one.
-    lines : RangeLines
-        Without motion during flight.
-    grid : Grid
-        A plane.
-    pixels : array_like of int, [n, 2]
-        Rows and columns.
-
-    Returns
-    -------
-    ndarray of float64, shape [n, channels]
-        The range at which a pixel takes a channel's line, less the right one; channels in order
-        along the track.
-
-    Notes
-    -----
-    [42] and [43] applied to every channel: in each stage its line is shifted so that the range of
-    the subimage's centre is right for the mean of its neighbours, which then stands for it.
-    """
-    image = plan.factorization
-    wavelength_m = band_wavelength_m(lines, image.resampling.centre_cycles_per_sample)
-    track = mean_track(lines, wavelength_m)
-    if track is None or not isinstance(image.aperture, NearestBeams) or not grid.is_planar:
-        raise ValueError("plan must be one of stages, for lines and a plane that it was made for")
-    order = np.argsort(track.coordinate, kind="stable")
-    ends_m = lines.tx_m[order], lines.rx_m[order]
-    division = Division(surface_of(grid), image.sides)
-    index = np.asarray(pixels, np.int64)
-    points_m = np.asarray(grid.origin_m) + index @ division.surface.steps_m
-    errors_m = -pairwise_range_m(points_m, *ends_m)
-    position_m = lines.phase_centres_m[order]
-    beam = np.arange(lines.channels)  # of the stage before, that holds each channel
-    for level, (side, beams) in enumerate(zip(image.sides, image.aperture.factors, strict=True)):
-        centres_m = division.centres_m(level, index // side * side)
-        errors_m += pairwise_range_m(centres_m, *ends_m)[:, beam]
-        starts = np.arange(0, len(position_m), beams)
-        counts = np.diff(np.append(starts, len(position_m)))
-        position_m = np.add.reduceat(position_m, starts) / counts[:, None]
-        beam, ends_m = beam // beams, (position_m, position_m)
-        errors_m -= pairwise_range_m(centres_m, *ends_m)[:, beam]
-    return errors_m + pairwise_range_m(points_m, *ends_m)[:, beam]

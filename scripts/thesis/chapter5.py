@@ -19,6 +19,7 @@ from itertools import product
 from pathlib import Path
 
 import numpy as np
+from range_errors import range_errors_m
 
 import clsas
 from clsas import plot
@@ -139,7 +140,7 @@ class Scene:
         pixels = random.integers(0, self.pixels, (1000, 2))
         ends = [0, self.pixels // 2 - 1, self.pixels // 2, self.pixels - 1]
         pixels = np.concatenate([pixels, list(product(ends, ends))])
-        return nearest.plan_errors_m(plan, self.lines, self.grid, pixels)
+        return range_errors_m(plan, self.lines, self.grid, pixels)
 
     def largest_error_m(self, plan: clsas.Plan) -> float:
         """Return the largest of them."""

@@ -15,6 +15,7 @@ from itertools import product
 from pathlib import Path
 
 import numpy as np
+from range_errors import range_errors_m
 from scipy.spatial.distance import cdist
 
 import clsas
@@ -131,7 +132,7 @@ class Scene:
         pixels = random.integers(0, grid.shape, (_PIXELS_LOOKED_AT, 2))
         ends = ([0, count // 2 - 1, count // 2, count - 1] for count in grid.shape)
         pixels = np.concatenate([pixels, list(product(*ends))])
-        errors_m = nearest.plan_errors_m(plan, lines, grid, pixels)
+        errors_m = range_errors_m(plan, lines, grid, pixels)
         # There channels are in the order of the track.
         order = np.argsort(lines.tx_m[:, 0] + lines.rx_m[:, 0], kind="stable")
         points_m = grid.positions_m()[tuple(pixels.T)]

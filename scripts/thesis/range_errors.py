@@ -1,0 +1,65 @@
+"""Range errors of nearest beams, followed channel by channel through the stages of a plan."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+import clsas
+from clsas.core.geometry import pairwise_range_m
+from clsas.factorized.aperture import mean_track
+from clsas.factorized.surface import surface_of
+from clsas.factorized.thesis import NearestBeams
+from clsas.factorized.tree import Division
+from clsas.signal.spectrum import band_wavelength_m
+
+
+def range_errors_m(
+    plan: clsas.Plan, lines: clsas.RangeLines, grid: clsas.Grid, pixels: ArrayLike
+) -> NDArray[np.float64]:
+    """Return the range errors that a plan of nearest beams makes, followed stage by stage.
+
+    Parameters
+    ----------
+    plan : Plan
+        Made with `stages`, at least one.
+    lines : RangeLines
+        Without motion during flight.
+    grid : Grid
+        A plane.
+    pixels : array_like of int, [n, 2]
+        Rows and columns.
+
+    Returns
+    -------
+    ndarray of float64, shape [n, channels]
+        The range at which a pixel takes a channel's line, less the right one; channels in order
+        along the track.
+
+    Notes
+    -----
+    [42] and [43] applied to every channel: in each stage its line is shifted so that the range of
+    the subimage's centre is right for the mean of its neighbours, which then stands for it.
+    """
+    image = plan.factorization
+    wavelength_m = band_wavelength_m(lines, image.resampling.centre_cycles_per_sample)
+    track = mean_track(lines, wavelength_m)
+    if track is None or not isinstance(image.aperture, NearestBeams) or not grid.is_planar:
+        raise ValueError("plan must be one of stages, for lines and a plane that it was made for")
+    order = np.argsort(track.coordinate, kind="stable")
+    ends_m = lines.tx_m[order], lines.rx_m[order]
+    division = Division(surface_of(grid), image.sides)
+    index = np.asarray(pixels, np.int64)
+    points_m = np.asarray(grid.origin_m) + index @ division.surface.steps_m
+    errors_m = -pairwise_range_m(points_m, *ends_m)
+    position_m = lines.phase_centres_m[order]
+    beam = np.arange(lines.channels)  # of the stage before, that holds each channel
+    for level, (side, beams) in enumerate(zip(image.sides, image.aperture.factors, strict=True)):
+        centres_m = division.centres_m(level, index // side * side)
+        errors_m += pairwise_range_m(centres_m, *ends_m)[:, beam]
+        starts = np.arange(0, len(position_m), beams)
+        counts = np.diff(np.append(starts, len(position_m)))
+        position_m = np.add.reduceat(position_m, starts) / counts[:, None]
+        beam, ends_m = beam // beams, (position_m, position_m)
+        errors_m -= pairwise_range_m(centres_m, *ends_m)[:, beam]
+    return errors_m + pairwise_range_m(points_m, *ends_m)[:, beam]
