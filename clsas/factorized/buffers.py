@@ -84,7 +84,7 @@ def stage_tables(
     ramps : bool
         True if phases of raw channels are turned along their lines.
     bands : int
-        Bands of channels: see `clsas.factorized.tree.Bands`.
+        Bands of channels: see `clsas.aperture.virtual_channels.Bands`.
     rows : bool
         True if virtual channels lie in the rows of a sheet.
     """

@@ -151,34 +151,6 @@ def backprojecting(
 
 
 @dataclass(frozen=True)
-class StageChannels:
-    """Predicted channels of a stage.
-
-    Attributes
-    ----------
-    used : float
-        Channels of the stage before that one subimage combines, on average.
-    count : float
-        Virtual channels of a subimage, on average.
-    summed : float
-        Channels that one virtual channel is a weighted sum of.
-    everywhere : float
-        Virtual channels of a root along the whole aperture, at most.
-    most : float
-        Virtual channels of a subimage, at most.
-    bands : int
-        Bands of the stage's channels, at most: see `clsas.factorized.tree.Bands`.
-    """
-
-    used: float
-    count: float
-    summed: float
-    everywhere: float
-    most: float
-    bands: int = 1
-
-
-@dataclass(frozen=True)
 class ErrorBudget:
     """Relative error powers that add up to the prediction, by cause.
 

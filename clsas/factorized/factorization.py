@@ -9,20 +9,12 @@ from typing import Annotated, ClassVar, Literal
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
+from clsas.aperture.interpolated import InterpolatedAperture
+from clsas.aperture.nearest import NearestBeams
 from clsas.core import reprs, validate
-from clsas.factorized.fields import (
-    CONFIG,
-    Count,
-    Number,
-    RangeFilter,
-    Size,
-    StoredResampling,
-    StoredUpsampler,
-    Whole,
-)
-from clsas.factorized.interpolated import InterpolatedAperture
-from clsas.factorized.thesis import NearestBeams
+from clsas.core.fields import CONFIG, Count, Number, Size, Whole
 from clsas.opencl.phases import TERMS
+from clsas.signal.fields import RangeFilter, StoredResampling, StoredUpsampler
 from clsas.signal.interpolation import PHASES
 
 

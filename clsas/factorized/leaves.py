@@ -10,6 +10,7 @@ import numpy as np
 import pyopencl as cl
 from numpy.typing import NDArray
 
+from clsas.aperture.mean_track import MeanTrack
 from clsas.core.decibels import power
 from clsas.core.lines import RangeLines, wavelength_m
 from clsas.exact.groups import Groups
@@ -17,7 +18,6 @@ from clsas.exact.lookup import lookup_options
 from clsas.exact.tiles import Tiles
 from clsas.factorized.buffers import Level, leaf_tables
 from clsas.factorized.sector import Geometry, Sector
-from clsas.factorized.tracks import MeanTrack
 from clsas.opencl.buffers import (
     Slot,
     beam_table,

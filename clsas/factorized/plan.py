@@ -15,20 +15,14 @@ from pydantic.dataclasses import dataclass
 
 from clsas.core import reprs, validate
 from clsas.core.digests import grid_digest, lines_digest
+from clsas.core.fields import CONFIG, Number, explained
 from clsas.core.grid import Grid
 from clsas.core.lines import RangeLines
 from clsas.core.reading import parse_json
 from clsas.factorized import report
 from clsas.factorized.estimates import ErrorBudget, Work
 from clsas.factorized.factorization import ExactImage, Factorization
-from clsas.factorized.fields import (
-    CONFIG,
-    Number,
-    StoredBeam,
-    StoredErrors,
-    StoredWork,
-    explained,
-)
+from clsas.factorized.fields import StoredBeam, StoredErrors, StoredWork
 from clsas.sonar.simplify import EFFECTS
 
 COVERAGE = ("reached", "warned")

@@ -13,6 +13,7 @@ import numpy as np
 import pyopencl as cl
 from numpy.typing import NDArray
 
+from clsas.aperture.dense_channels import band_table
 from clsas.core import validate
 from clsas.core.grid import Grid
 from clsas.core.image import Image, holds_any
@@ -20,7 +21,6 @@ from clsas.core.lines import RangeLines
 from clsas.exact.backprojection import form_exactly
 from clsas.exact.checks import check_numbers
 from clsas.factorized.buffers import CHUNK, Level, row_pitch, stage_lines, stage_tables
-from clsas.factorized.dense_channels import band_table
 from clsas.factorized.factorization import ExactImage
 from clsas.factorized.leaves import Finish
 from clsas.factorized.plan import Plan
@@ -108,7 +108,7 @@ class _Tables:
     strides : list of int
         Lines of a subimage, stage by stage.
     bands : list of int
-        Bands of channels, stage by stage: see `clsas.factorized.tree.Bands`.
+        Bands of channels, stage by stage: see `clsas.aperture.virtual_channels.Bands`.
     """
 
     slot: Slot

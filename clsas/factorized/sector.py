@@ -12,24 +12,20 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
+from clsas.aperture.beam_directions import BeamDirections, beam_rate
+from clsas.aperture.dense_channels import SheetRates, all_channels, sheet_beam_rates, sheet_rates
+from clsas.aperture.dense_tracks import mean_track_of
+from clsas.aperture.interpolated import BEAM_MARGIN
+from clsas.aperture.mean_track import MeanTrack
+from clsas.aperture.nearest import NearestBeams
+from clsas.aperture.phase_rates import cycles_per_extent, drift, own_drift, stretches
+from clsas.aperture.virtual_channels import ChannelRanges, VirtualChannels
 from clsas.core.geometry import pairwise_range_m
 from clsas.core.lines import RangeLines, antennas_of, some_channels
-from clsas.factorized import tree, visibility
-from clsas.factorized.aperture import cycles_per_extent, drift, own_drift, stretches
-from clsas.factorized.beam_directions import BeamDirections, beam_rate
-from clsas.factorized.dense_apertures import mean_track_of
-from clsas.factorized.dense_channels import (
-    SheetRates,
-    all_channels,
-    sheet_beam_rates,
-    sheet_rates,
-)
-from clsas.factorized.interpolated import BEAM_MARGIN
+from clsas.factorized import visibility
 from clsas.factorized.plan import Plan
 from clsas.factorized.surface import Surface
-from clsas.factorized.thesis import NearestBeams
-from clsas.factorized.tracks import MeanTrack
-from clsas.factorized.tree import ChannelRanges, Division, VirtualChannels
+from clsas.factorized.tree import Division, channel_ranges
 from clsas.opencl.buffers import MARGIN
 from clsas.signal.spectrum import band_wavelength_m
 
@@ -104,7 +100,7 @@ class Geometry:
         Lines in the order of the track.
     division : Division
     drift : float64 [3]
-        See `clsas.factorized.aperture.drift`.
+        See `clsas.aperture.phase_rates.drift`.
     ramps : bool
         True if the first stage turns the phase of channels along their lines.
     samples_per_m, cycles_per_m : float
@@ -267,7 +263,7 @@ class Geometry:
         if track.is_dense:
             needs = all_channels(nodes, place.shape[1], self._holding(inside))
         else:
-            needs = tree.channel_ranges(division, nodes, place, (begin, end), inside)
+            needs = channel_ranges(division, nodes, place, (begin, end), inside)
         return Sector(roots, root_m, channels, relative_m, nodes, needs, place, across)
 
     def _apparent(
@@ -337,12 +333,12 @@ class Geometry:
 
     def _boxes(
         self, roots: NDArray[np.int64], root_m: NDArray[np.float64]
-    ) -> tuple[Surface, NDArray[np.float64], NDArray[np.float64], float, float]:
-        """Return roots as boxes of `cycles_per_extent`: its surface to its nearest range."""
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], float, float]:
+        """Return roots as boxes of `cycles_per_extent`: its steps to its nearest range."""
         image, surface = self.factorization, self.surface
         extents = surface.extents_in(image.sides[0], image.sides[0], roots).max(axis=0)
         nearest_m = min(surface.radius_m(image.sides[-1]), image.closest_m)
-        return surface, root_m, extents, image.highest_cycles_per_m, nearest_m
+        return surface.steps_m, root_m, extents, image.highest_cycles_per_m, nearest_m
 
     def references(self, sector: Sector) -> dict[str, NDArray]:
         """Return how roots align the raw channels, in the order of their nodes, [roots, channels].

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from clsas.factorized.tracks import MeanTrack
+from clsas.aperture.mean_track import MeanTrack
 from clsas.sonar.visibility import BeamTrack, Boxes
 
 _STEP = 2  # visibility is evaluated at every second sample of the track

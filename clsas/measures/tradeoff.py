@@ -13,13 +13,13 @@ from typing import Any
 
 import numpy as np
 
+from clsas.aperture.filters import ALIGN_TAPS, APERTURE_TAPS
 from clsas.core import validate
 from clsas.core.grid import Grid
 from clsas.core.image import Image
 from clsas.core.image_error import relative_error_db
 from clsas.core.lines import RangeLines
 from clsas.exact.backprojection import ACCURACY_DB, form_exactly
-from clsas.factorized.filters import ALIGN_TAPS, APERTURE_TAPS
 from clsas.factorized.plan import Plan
 from clsas.measures.cuts import Cut
 from clsas.measures.quality import measure_point

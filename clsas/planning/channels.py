@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from clsas.aperture import phase_rates
+from clsas.aperture.mean_track import MeanTrack
 from clsas.core.geometry import pairwise_range_m
 from clsas.core.lines import SAMPLED_CHANNELS, antennas_of, some_channels, steepest
-from clsas.factorized import aperture
-from clsas.factorized.tracks import MeanTrack
 from clsas.planning.caching import cached, shared
 from clsas.planning.sample_pixels import SPREAD_POINTS
 from clsas.planning.subimages import Side
@@ -59,8 +59,8 @@ def track_error_m(model: VisibilityModel) -> NDArray[np.float64]:
 
 @shared
 def own_drift(model: VisibilityModel) -> NDArray[np.float64] | None:
-    """See `clsas.factorized.aperture.own_drift`."""
-    return aperture.own_drift(model.lines)
+    """See `clsas.aperture.phase_rates.own_drift`."""
+    return phase_rates.own_drift(model.lines)
 
 
 @shared

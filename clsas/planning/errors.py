@@ -11,12 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
+from clsas.aperture.nearest import stage_errors_m
+from clsas.aperture.phase_rates import drift, stretches
 from clsas.core.geometry import pairwise_range_m
 from clsas.core.lines import wavelength_m
 from clsas.exact.layout import ROUNDING
 from clsas.exact.tiles import BLOCKS
-from clsas.factorized.aperture import drift, stretches
-from clsas.factorized.thesis import stage_errors_m
 from clsas.opencl.device import Device
 from clsas.planning.caching import cached
 from clsas.planning.channels import SampledChannels, sampled_channels

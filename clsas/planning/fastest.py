@@ -11,10 +11,10 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field, replace
 
+from clsas.aperture.filters import FilterRates, Filters, steering_spectrum
+from clsas.aperture.interpolated import InterpolatedAperture
 from clsas.core.decibels import in_db, power
 from clsas.factorized.estimates import ErrorBudget
-from clsas.factorized.filters import FilterRates, Filters, steering_spectrum
-from clsas.factorized.interpolated import InterpolatedAperture
 from clsas.factorized.plan import Plan
 from clsas.opencl import phases
 from clsas.planning.beam_coverage import trimmed

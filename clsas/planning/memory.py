@@ -56,7 +56,7 @@ class BufferSizes:
     most_channels : tuple of int
         Virtual channels of a subimage, at most, stage by stage.
     bands : tuple of int
-        Bands of channels, stage by stage: see `clsas.factorized.tree.Bands`.
+        Bands of channels, stage by stage: see `clsas.aperture.virtual_channels.Bands`.
     line_pitch : int
         Samples of an upsampled line with zeros around it.
     filtered : bool

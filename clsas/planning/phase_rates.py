@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from clsas.factorized.aperture import cycles_per_extent
-from clsas.factorized.beam_directions import beam_rate
-from clsas.factorized.dense_channels import SheetRates, sheet_beam_rates, sheet_rates
+from clsas.aperture.beam_directions import beam_rate
+from clsas.aperture.dense_channels import SheetRates, sheet_beam_rates, sheet_rates
+from clsas.aperture.phase_rates import cycles_per_extent
 from clsas.planning.caching import cached
 from clsas.planning.sample_points import INNER_POINTS, trapezoidal_weights
 from clsas.planning.subimages import Side
@@ -101,7 +101,7 @@ def _along(
         return _of_sheet(model, extents, centres_m, every).along
     return cycles_per_extent(
         model.track,
-        model.surface,
+        model.surface.steps_m,
         centres_m,
         extents,
         model.highest_cycles_per_m,
@@ -121,7 +121,7 @@ def _of_sheet(
     def find() -> SheetRates:
         return sheet_rates(
             model.track,
-            model.surface,
+            model.surface.steps_m,
             centres_m,
             extents,
             model.highest_cycles_per_m,

@@ -9,17 +9,17 @@ from dataclasses import replace
 
 import numpy as np
 
+from clsas.aperture.dense_tracks import shapes_after
+from clsas.aperture.filters import ALIGN_TAPS
+from clsas.aperture.nearest import NearestBeams
 from clsas.core import validate
 from clsas.core.decibels import in_db, power
 from clsas.core.grid import Grid
 from clsas.core.lines import RangeLines
 from clsas.exact.backprojection import ACCURACY_DB
-from clsas.factorized.dense_apertures import shapes_after
 from clsas.factorized.estimates import ErrorBudget
-from clsas.factorized.filters import ALIGN_TAPS
 from clsas.factorized.left_out import with_left_out
 from clsas.factorized.plan import Plan
-from clsas.factorized.thesis import NearestBeams
 from clsas.opencl.device import Device, open_device
 from clsas.planning import costs as stored_costs
 from clsas.planning import scaling

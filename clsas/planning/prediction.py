@@ -9,13 +9,16 @@ from typing import Any
 
 import numpy as np
 
+from clsas.aperture.filters import LONGEST_UPSAMPLING_SHARE, UPSAMPLING_SHARE
+from clsas.aperture.interpolated import InterpolatedAperture
+from clsas.aperture.nearest import NearestBeams
+from clsas.aperture.predicted_channels import StageChannels
 from clsas.core.decibels import in_db, power
 from clsas.core.digests import grid_digest, lines_digest
 from clsas.exact.lookup import lookup_room
 from clsas.factorized.buffers import CHUNK, Level
 from clsas.factorized.estimates import (
     ErrorBudget,
-    StageChannels,
     Work,
     adding_in_rows,
     backprojecting_leaves,
@@ -23,10 +26,7 @@ from clsas.factorized.estimates import (
     upsampling,
 )
 from clsas.factorized.factorization import ExactImage, Factorization
-from clsas.factorized.filters import LONGEST_UPSAMPLING_SHARE, UPSAMPLING_SHARE
-from clsas.factorized.interpolated import InterpolatedAperture
 from clsas.factorized.plan import Plan, Prediction, Stage
-from clsas.factorized.thesis import NearestBeams
 from clsas.opencl import phases
 from clsas.opencl.buffers import padded_length
 from clsas.opencl.device import Device

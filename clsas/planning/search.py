@@ -14,6 +14,13 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
+from clsas.aperture.filters import (
+    ALIGN_TAPS,
+    APERTURE_TAPS,
+    LONGEST_UPSAMPLING_SHARE,
+    FilterRates,
+    choose,
+)
 from clsas.core.decibels import in_db, power
 from clsas.factorized.buffers import LEAST_BATCH
 from clsas.factorized.estimates import (
@@ -22,13 +29,6 @@ from clsas.factorized.estimates import (
     backprojecting_leaves,
     combining,
     upsampling,
-)
-from clsas.factorized.filters import (
-    ALIGN_TAPS,
-    APERTURE_TAPS,
-    LONGEST_UPSAMPLING_SHARE,
-    FilterRates,
-    choose,
 )
 from clsas.opencl.buffers import GUARD
 from clsas.opencl.device import Device

@@ -16,12 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
+from clsas.aperture.beam_directions import interpolated_directions
+from clsas.aperture.dense_channels import strip_channels
+from clsas.aperture.mean_track import MeanTrack
+from clsas.aperture.virtual_channels import VirtualChannels, interpolated_channels
 from clsas.core.decibels import power
 from clsas.core.lines import wavelength_m
-from clsas.factorized.beam_directions import interpolated_directions
-from clsas.factorized.dense_channels import strip_channels
-from clsas.factorized.tracks import MeanTrack
-from clsas.factorized.tree import VirtualChannels, interpolated_channels
 from clsas.planning import phase_rates
 from clsas.planning.caching import cached
 from clsas.planning.channels import carriers

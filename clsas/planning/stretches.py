@@ -13,8 +13,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from clsas.factorized.aperture import drift, stretches
-from clsas.factorized.filters import Gain
+from clsas.aperture.filters import Gain
+from clsas.aperture.phase_rates import drift, stretches
 from clsas.planning.channels import SampledChannels, sampled_channels
 from clsas.planning.subimages import SMALL
 from clsas.planning.visibility_model import VisibilityModel
@@ -95,7 +95,7 @@ def uncompensated(
     ratio : float
         Upsampled samples per sample.
     gain : callable
-        As of `clsas.factorized.filters.edges_gain`.
+        As of `clsas.aperture.filters.edges_gain`.
     """
     shares, spectrum = stretch_of(model).shares, model.spectrum
     if shares is None:

@@ -11,12 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
+from clsas.aperture.beam_directions import BeamDirections
+from clsas.aperture.dense_tracks import Shape, mean_track_of, simplest_track
+from clsas.aperture.mean_track import MeanTrack
 from clsas.core.grid import Grid
 from clsas.core.lines import RangeLines, some_channels
-from clsas.factorized.beam_directions import BeamDirections
-from clsas.factorized.dense_apertures import Shape, mean_track_of, simplest_track
 from clsas.factorized.surface import LEAST_SIDE, Surface, surface_of
-from clsas.factorized.tracks import MeanTrack
 from clsas.planning.caching import cached, shared
 from clsas.planning.sample_points import (
     over_points,
@@ -63,7 +63,7 @@ class VisibilityModel:
     limits : (low, high) or None
         Sines of the aspect angle between which channels are used for a subimage.
     shape : str
-        Shape of the mean track: see `clsas.factorized.dense_apertures`.
+        Shape of the mean track: see `clsas.aperture.dense_tracks`.
     track : MeanTrack or None
         None if all channels lie at one place. There is nothing of the following then.
     subimages : Subimages

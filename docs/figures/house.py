@@ -16,7 +16,8 @@ FLOORS = (
     (
         (
             ("exact", "the image, whatever it takes\ntiles, backprojection"),
-            ("factorized", "the image, fast\naperture, tree, stages, leaves"),
+            ("aperture", "which few stand for many?\nmean track, virtual channels"),
+            ("factorized", "the image, fast\ntree, stages, leaves, plans"),
             ("planning", "which way is the fastest?\nwork, errors, search, plan"),
         ),
         RED,

@@ -31,7 +31,7 @@ from clsas.planning.planner import plan
 from clsas.sonar.beam import BeamWindow
 from clsas.trials import cases
 
-ROOMS = ("planning", "factorized", "exact")
+ROOMS = ("planning", "factorized", "aperture", "exact")
 MODULES = ("clsas.signal.spectrum", "clsas.signal.ambiguity", "clsas.signal.interpolation")
 FIXED = {
     "clsas.planning.calibration": "it measures costs, which the cases are given",

@@ -23,7 +23,7 @@ from range_errors import range_errors_m
 
 import clsas
 from clsas import plot
-from clsas.factorized import thesis as nearest
+from clsas.aperture import nearest
 from clsas.opencl.device import Device, open_device
 from clsas.plot.canvas import with_fewer_colours
 from clsas.sonar.system import Sonar, line_array

@@ -19,7 +19,7 @@ from range_errors import range_errors_m
 from scipy.spatial.distance import cdist
 
 import clsas
-from clsas.factorized import thesis as nearest
+from clsas.aperture import nearest
 from clsas.opencl.device import Device, open_device
 from clsas.simulation import seabeds
 from clsas.sonar.visibility import BeamTrack, Boxes, sines

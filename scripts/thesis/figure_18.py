@@ -6,7 +6,7 @@ from functools import partial
 import chapter5
 from chapter5 import equal_stages
 
-from clsas.factorized import thesis as nearest
+from clsas.aperture import nearest
 
 TOLERANCES_DB = (-20, -30, -40, -50)
 

@@ -6,10 +6,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 import clsas
+from clsas.aperture.mean_track import mean_track
+from clsas.aperture.nearest import NearestBeams
 from clsas.core.geometry import pairwise_range_m
-from clsas.factorized.aperture import mean_track
 from clsas.factorized.surface import surface_of
-from clsas.factorized.thesis import NearestBeams
 from clsas.factorized.tree import Division
 from clsas.signal.spectrum import band_wavelength_m
 

@@ -3,7 +3,7 @@
 
 import chapter5
 
-from clsas.factorized import thesis as nearest
+from clsas.aperture import nearest
 
 STAGES = [(2, 2), (2, 2)]
 SAMPLES = (3757, 1990)  # that the thesis's subimages need in its two stages

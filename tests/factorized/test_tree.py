@@ -17,14 +17,16 @@ from factorizing import (
     swaying,
 )
 
+from clsas.aperture.beam_directions import BeamDirections
+from clsas.aperture.mean_track import mean_track
+from clsas.aperture.phase_rates import cycles_per_extent
+from clsas.aperture.virtual_channels import interpolated_channels, nearest_nodes
 from clsas.core.grid import Grid
 from clsas.core.image_error import relative_error_db
 from clsas.exact.backprojection import backproject
 from clsas.factorized import tree, visibility
-from clsas.factorized.aperture import cycles_per_extent, mean_track
-from clsas.factorized.beam_directions import BeamDirections
 from clsas.factorized.surface import surface_of
-from clsas.factorized.tree import Division, interpolated_channels, nearest_nodes
+from clsas.factorized.tree import Division
 from clsas.planning.factorize import factorize
 from clsas.planning.planner import plan
 from clsas.signal import interpolation
@@ -92,7 +94,9 @@ def interpolation_error_db(case, side, aperture, root=(128, 128)):
         middle_m = division.centres_m(0, corner[None])
         place = track.apparent_coordinates(middle_m, centres_m)
         extents, nearest_m = surface.extents(root), surface.radius_m(side)
-        rates = cycles_per_extent(track, surface, middle_m, extents, cycles_per_m, nearest_m)
+        rates = cycles_per_extent(
+            track, surface.steps_m, middle_m, extents, cycles_per_m, nearest_m
+        )
         rate = side[0] * rates[0] + side[1] * rates[1]
         nodes = interpolated_channels(track, rate, place, aperture)
         between = nodes.base[0][:, None] + np.arange(nodes.taps)
@@ -135,7 +139,7 @@ def any_nodes(shuffled=False):
     surface, side = surface_of(grid), (64, 64)
     middle_m = surface.middles_m(side, np.array([[0, 0], [64, 64]]))
     extents, cycles_per_m = surface.extents(side), lines.carrier_cycles_per_m
-    rates = cycles_per_extent(track, surface, middle_m, extents, cycles_per_m, 0.1)
+    rates = cycles_per_extent(track, surface.steps_m, middle_m, extents, cycles_per_m, 0.1)
     place = track.apparent_coordinates(middle_m, lines.phase_centres_m)
     aperture = interpolation.design(6, 2.0, FLAT)
     return place, interpolated_channels(track, 64 * rates.sum(axis=0), place, aperture)

@@ -19,9 +19,8 @@ from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
+from clsas.aperture.mean_track import APART, STRIP_SAMPLES, MeanTrack, mean_track
 from clsas.core.lines import RangeLines, some_channels
-from clsas.factorized.aperture import mean_track
-from clsas.factorized.tracks import APART, STRIP_SAMPLES, MeanTrack
 
 Shape = Literal["track", "strips", "sheet"]
 """Mean tracks of one curve, of several, or of a curve that moves sideways."""

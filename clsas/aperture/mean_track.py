@@ -14,7 +14,9 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import BSpline
+from scipy.interpolate import BSpline, make_lsq_spline
+
+from clsas.core.lines import RangeLines
 
 # What half and twice change, by `scripts/bench sensitivity`, where they change anything:
 _SAMPLES = 257  # of the track, at which rates are evaluated; half: errors 0.1 dB larger
@@ -29,6 +31,10 @@ STRIP_SAMPLES = 40
 APART = 16.0
 """Aperture coordinates from one strip to the next, more than samples go past the ends."""
 _SAME_PLACE_M = 1e-9  # within which channels lie on the mean track
+_CHANNELS_PER_KNOT = 16
+_MOST_INTERVALS = 64
+CLOSE_ENOUGH = 0.01
+"""Distance of phase centres from the mean track that needs no better one, wavelengths rms."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -317,3 +323,69 @@ def _polynomial(coefficients: NDArray[np.float64], at: NDArray[np.float64]) -> N
         slope = slope * inside + value
         value = value * inside + coefficients[..., power, :]
     return value + (at[..., None] - inside) * slope
+
+
+def mean_track(lines: RangeLines, wavelength_m: float) -> MeanTrack | None:
+    """Return a curve along the phase centres of lines, or None if they all coincide.
+
+    Channels may be in any order. Three orders are tried: as given, along the principal axis, and
+    around the middle. The one with the shortest path through the phase centres is taken. The
+    curve has as many intervals as it needs to follow them.
+    """
+    centres_m = lines.phase_centres_m
+    order, along = _order(centres_m)
+    if along[-1] == 0:
+        return None
+    position_m, along = centres_m[order], along / along[-1]
+    close_m = CLOSE_ENOUGH * wavelength_m
+    best, best_m, intervals = None, np.inf, 1
+    while intervals <= min(_MOST_INTERVALS, max(lines.channels // _CHANNELS_PER_KNOT, 1)):
+        spline = _fit(along, position_m, intervals)
+        off_m = np.sqrt(np.mean(np.sum((spline(along) - position_m) ** 2, axis=1)))
+        if off_m < 0.8 * best_m:
+            best, best_m = spline, off_m
+        if best_m <= close_m:
+            break
+        intervals *= 2
+    coordinate = np.empty(len(along))
+    coordinate[order] = along
+    track = MeanTrack(best, coordinate)
+    # Newton's steps towards the nearest point of the curve.
+    for _ in range(3):
+        tangent = track.tangents_m(coordinate)
+        off_m = centres_m - track.positions_m(coordinate)
+        square = np.maximum(np.einsum("ci,ci->c", tangent, tangent), 1e-30)
+        step = np.einsum("ci,ci->c", off_m, tangent) / square
+        coordinate = coordinate + np.clip(step, -0.1, 0.1)
+        track = MeanTrack(best, coordinate)
+    return track
+
+
+def _order(centres_m: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Return the order of phase centres along the track, and each one's distance along it, m."""
+    if len(centres_m) == 1:
+        return np.zeros(1, np.int64), np.zeros(1)
+    offset_m = centres_m - centres_m.mean(axis=0)
+    first, second = np.linalg.svd(offset_m, full_matrices=False)[2][:2] @ offset_m.T
+    candidates = (
+        np.arange(len(centres_m)),
+        np.argsort(first, kind="stable"),
+        np.argsort(np.arctan2(second, first), kind="stable"),
+    )
+    best, along_m = candidates[0], np.full(1, np.inf)
+    for order in candidates:
+        steps_m = np.linalg.norm(np.diff(centres_m[order], axis=0), axis=1)
+        if steps_m.sum() < 0.999 * along_m[-1]:
+            best, along_m = order, np.concatenate([[0.0], np.cumsum(steps_m)])
+    return best, along_m
+
+
+def _fit(along: NDArray[np.float64], position_m: NDArray[np.float64], intervals: int) -> BSpline:
+    """Return the least-squares cubic spline of positions [n, 3], with knots where channels are."""
+    distinct, index = np.unique(along, return_index=True)
+    degree = min(3, len(distinct) - 1)
+    inner = np.quantile(distinct, np.arange(1, intervals) / intervals)
+    knots = np.concatenate([[0.0] * (degree + 1), inner, [1.0] * (degree + 1)])
+    middle = position_m.mean(axis=0)
+    fitted = make_lsq_spline(distinct, position_m[index] - middle, knots, k=degree)
+    return BSpline(fitted.t, fitted.c + middle, degree)

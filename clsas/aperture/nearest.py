@@ -11,12 +11,10 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
-from clsas.factorized import tree
-from clsas.factorized.dense_apertures import Shape
-from clsas.factorized.estimates import StageChannels
-from clsas.factorized.fields import CONFIG, Whole
-from clsas.factorized.interpolated import VisiblePhases
-from clsas.factorized.tree import VirtualChannels
+from clsas.aperture.dense_tracks import Shape
+from clsas.aperture.predicted_channels import StageChannels, VisiblePhases
+from clsas.aperture.virtual_channels import VirtualChannels, nearest_nodes
+from clsas.core.fields import CONFIG, Whole
 from clsas.signal.interpolation import Gain, Interpolator
 
 Stages = Sequence[tuple[int, int]]
@@ -27,7 +25,7 @@ Stages = Sequence[tuple[int, int]]
 class NearestBeams:
     """Virtual channels that are sums of neighbours as they are, at their mean position [43].
 
-    The alternative is `clsas.factorized.interpolated.InterpolatedAperture`.
+    The alternative is `clsas.aperture.interpolated.InterpolatedAperture`.
 
     Attributes
     ----------
@@ -86,7 +84,7 @@ class NearestBeams:
         """
         found, position_m = [], np.broadcast_to(channels_m, (*coordinate.shape, 3))
         for factor in self.factors:
-            found.append(tree.nearest_nodes(coordinate, position_m, factor))
+            found.append(nearest_nodes(coordinate, position_m, factor))
             coordinate, position_m = found[-1].coordinate, found[-1].position_m
         return found
 

@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 from dense import TRACKS, WAVELENGTH, scene
 
-from clsas.factorized import dense_apertures
-from clsas.factorized.dense_apertures import mean_track_of, sheet, simplest_track, strips
-from clsas.factorized.dense_channels import SheetRates, first_on_sheet, later_on_sheet
-from clsas.factorized.tracks import APART
+from clsas.aperture import dense_tracks
+from clsas.aperture.dense_channels import SheetRates, first_on_sheet, later_on_sheet
+from clsas.aperture.dense_tracks import mean_track_of, sheet, simplest_track, strips
+from clsas.aperture.mean_track import APART
 from clsas.signal import interpolation
 from clsas.signal.spectrum import Spectrum
 
@@ -94,7 +94,7 @@ def test_only_channels_far_from_any_curve_begin_with_another_shape(monkeypatch):
     tx_m = np.linspace([0, 0, 0], [50, 0, 0], 4000)
     assert simplest_track(lines_at(tx_m), WAVELENGTH)[0] == "track"
     assert simplest_track(lines_at(20 * TRACKS["planar"]()), WAVELENGTH)[0] == "sheet"
-    monkeypatch.setattr(dense_apertures, "_SCREENED", 10000)
+    monkeypatch.setattr(dense_tracks, "_SCREENED", 10000)
     assert simplest_track(lines_at(20 * TRACKS["planar"]()), WAVELENGTH)[0] == "track"
 
 

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from dense import TRACKS, WAVELENGTH, scene, to_and_fro, turning
 
-from clsas.factorized.aperture import mean_track
-from clsas.factorized.beam_directions import BeamDirections, beam_rate
-from clsas.factorized.dense_apertures import mean_track_of
+from clsas.aperture.beam_directions import BeamDirections, beam_rate
+from clsas.aperture.dense_tracks import mean_track_of
+from clsas.aperture.mean_track import mean_track
 from clsas.sonar.beam import BeamWindow
 
 PAST_THE_ENDS = np.array([-0.1, -0.05, 0.3, 1.05, 1.1])

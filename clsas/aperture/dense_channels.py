@@ -9,11 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clsas.factorized.aperture import SampledLines, cycles_per_extent
-from clsas.factorized.beam_directions import BeamDirections, beam_rate
-from clsas.factorized.surface import Surface
-from clsas.factorized.tracks import ACROSS_AT, ALONG_AT, MeanTrack
-from clsas.factorized.tree import (
+from clsas.aperture.beam_directions import BeamDirections, beam_rate
+from clsas.aperture.mean_track import ACROSS_AT, ALONG_AT, MeanTrack
+from clsas.aperture.phase_rates import SampledLines, cycles_per_extent
+from clsas.aperture.virtual_channels import (
     Bands,
     ChannelRanges,
     Spacing,
@@ -114,7 +113,7 @@ class SheetRates:
 
 def sheet_rates(
     track: MeanTrack,
-    surface: Surface,
+    steps_m: NDArray[np.float64],
     centres_m: NDArray[np.float64],
     extents: NDArray[np.float64],
     cycles_per_m: float,
@@ -131,7 +130,7 @@ def sheet_rates(
     positions_m, tangents_m = (np.concatenate(each) for each in zip(*sampled, strict=True))
     rates = cycles_per_extent(
         SampledLines((positions_m, tangents_m)),
-        surface,
+        steps_m,
         centres_m,
         extents,
         cycles_per_m,

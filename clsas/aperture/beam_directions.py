@@ -8,8 +8,8 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from clsas.factorized.dense_apertures import smooth_over_sheet
-from clsas.factorized.tracks import MeanTrack
+from clsas.aperture.dense_tracks import smooth_over_sheet
+from clsas.aperture.mean_track import MeanTrack
 from clsas.sonar.beam import BeamWindow
 
 _END = 0.03  # of a curve: over so much, turning at an end is measured

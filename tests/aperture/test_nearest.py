@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from clsas.factorized.thesis import operations, range_error_m, stage_errors_m
+from clsas.aperture.nearest import operations, range_error_m, stage_errors_m
 
 SPACING_M, SIDE_M, NEAREST_M = 8.25e-3, 5.0, 40.0  # THESIS chapter 5
 

@@ -8,88 +8,34 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Annotated, Any, ClassVar, Literal, NamedTuple, Protocol
+from typing import Annotated, ClassVar, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
-from clsas.core import reprs
-from clsas.core.lines import RangeLines
-from clsas.factorized import tree
-from clsas.factorized.dense_apertures import Shape
-from clsas.factorized.dense_channels import (
+from clsas.aperture.dense_channels import (
     SheetChannels,
     SheetRates,
     first_on_sheet,
     later_on_sheet,
     strip_channels,
 )
-from clsas.factorized.estimates import StageChannels
-from clsas.factorized.fields import CONFIG, RangeFilter
-from clsas.factorized.filters import edges_gain
-from clsas.factorized.tracks import MeanTrack
-from clsas.factorized.tree import VirtualChannels
+from clsas.aperture.dense_tracks import Shape
+from clsas.aperture.filters import edges_gain
+from clsas.aperture.mean_track import MeanTrack
+from clsas.aperture.predicted_channels import StageChannels, VisiblePhases
+from clsas.aperture.virtual_channels import VirtualChannels, interpolated_channels
+from clsas.core import reprs
+from clsas.core.fields import CONFIG
+from clsas.signal.fields import RangeFilter
 from clsas.signal.interpolation import Gain, Interpolator
-from clsas.sonar.beam import BeamWindow
 
 BEAM_MARGIN = 1 / 16
 """Width of the beam by which a rectangle of leaves may widen what is visible from one of them."""
 
 _Cycles = Annotated[float, Field(ge=-0.5, le=0.5)]
-
-
-class VisibleChannels(Protocol):
-    """Channels whose beams touch subimages, as a `VisibilityModel` of the planner predicts them."""
-
-    @property
-    def lines(self) -> RangeLines:
-        """The lines."""
-
-    @property
-    def beam(self) -> BeamWindow | None:
-        """The beam."""
-
-    @property
-    def track(self) -> MeanTrack:
-        """The mean track."""
-
-    def visible(self, side: tuple[int, int]) -> NDArray[np.bool_]:
-        """Return which track samples touch a subimage with their beam."""
-
-    def visible_share(self, side: tuple[int, int]) -> float:
-        """Return the mean fraction of channels whose beam touches a subimage."""
-
-
-class VisiblePhases(Protocol):
-    """Phases of subimages, as `AperturePhases` of the planner predict them."""
-
-    @property
-    def model(self) -> VisibleChannels:
-        """Visibility of the same subimages."""
-
-    def beam_phase_cycles(self, visible: NDArray[np.bool_], *, most: bool = False) -> float:
-        """Return the cycles that a beam's weights count for, their mean or maximum; 0 without."""
-
-    def subimage_phase_cycles(
-        self, side: tuple[int, int], visible: NDArray[np.bool_], *, most: bool = False
-    ) -> float:
-        """Return the visible phase cycles of subimages of a size, their mean or maximum."""
-
-    def virtual_channels(self, taps: Any, density: float, phase_cycles: Any) -> Any:
-        """Return the number of virtual channels for some phase cycles."""
-
-    def rows(
-        self,
-        side: tuple[int, int],
-        taps: float,
-        density: float,
-        beam_density: float = 0.0,
-        *,
-        most: bool = False,
-    ) -> float:
-        """Return the number of rows of virtual channels across a sheet; 1 without one."""
 
 
 class _Overhang(NamedTuple):
@@ -231,7 +177,7 @@ class InterpolatedAperture:
         coordinate : float64 [roots, channels]
             Aperture coordinates of the raw channels.
         """
-        interpolated = strip_channels if track.is_dense else tree.interpolated_channels
+        interpolated = strip_channels if track.is_dense else interpolated_channels
         found: list[VirtualChannels] = []
         for oversampling, extent in zip(self.oversampling, extents, strict=True):
             rate = np.einsum("ra,ars->rs", oversampling * extent, rates)

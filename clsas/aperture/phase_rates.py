@@ -1,4 +1,4 @@
-"""Mean tracks of one curve, and phase rates along mean tracks."""
+"""Phase rates along mean tracks, and how ranges from channels grow faster than those from them."""
 
 from __future__ import annotations
 
@@ -8,57 +8,15 @@ from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import BSpline, make_lsq_spline
 
+from clsas.aperture.mean_track import MeanTrack
 from clsas.core.geometry import pairwise_range_m
 from clsas.core.grid import Grid
 from clsas.core.lines import RangeLines
-from clsas.factorized.surface import Surface
-from clsas.factorized.tracks import MeanTrack
 
 # What half and twice change, by `scripts/bench sensitivity`, where they change anything:
 _MOST_POINTS = 9  # along a side of a box, at which rates are evaluated
 _RATES_AT_ONCE = 1 << 15  # stay in a core's cache
-_CHANNELS_PER_KNOT = 16
-_MOST_INTERVALS = 64
-CLOSE_ENOUGH = 0.01
-"""Distance of phase centres from the mean track that needs no better one, wavelengths rms."""
-
-
-def mean_track(lines: RangeLines, wavelength_m: float) -> MeanTrack | None:
-    """Return a curve along the phase centres of lines, or None if they all coincide.
-
-    Channels may be in any order. Three orders are tried: as given, along the principal axis, and
-    around the middle. The one with the shortest path through the phase centres is taken. The
-    curve has as many intervals as it needs to follow them.
-    """
-    centres_m = lines.phase_centres_m
-    order, along = _order(centres_m)
-    if along[-1] == 0:
-        return None
-    position_m, along = centres_m[order], along / along[-1]
-    close_m = CLOSE_ENOUGH * wavelength_m
-    best, best_m, intervals = None, np.inf, 1
-    while intervals <= min(_MOST_INTERVALS, max(lines.channels // _CHANNELS_PER_KNOT, 1)):
-        spline = _fit(along, position_m, intervals)
-        off_m = np.sqrt(np.mean(np.sum((spline(along) - position_m) ** 2, axis=1)))
-        if off_m < 0.8 * best_m:
-            best, best_m = spline, off_m
-        if best_m <= close_m:
-            break
-        intervals *= 2
-    coordinate = np.empty(len(along))
-    coordinate[order] = along
-    track = MeanTrack(best, coordinate)
-    # Newton's steps towards the nearest point of the curve.
-    for _ in range(3):
-        tangent = track.tangents_m(coordinate)
-        off_m = centres_m - track.positions_m(coordinate)
-        square = np.maximum(np.einsum("ci,ci->c", tangent, tangent), 1e-30)
-        step = np.einsum("ci,ci->c", off_m, tangent) / square
-        coordinate = coordinate + np.clip(step, -0.1, 0.1)
-        track = MeanTrack(best, coordinate)
-    return track
 
 
 def stretches(
@@ -146,7 +104,7 @@ class SampledLines:
 
 def cycles_per_extent(
     track: MeanTrack | SampledLines,
-    surface: Surface,
+    steps_m: NDArray[np.float64],
     centres_m: NDArray[np.float64],
     extents: NDArray[np.float64],
     cycles_per_m: float,
@@ -166,7 +124,8 @@ def cycles_per_extent(
     Parameters
     ----------
     track : MeanTrack or SampledLines
-    surface : Surface
+    steps_m : float64 [axes, 3]
+        Steps of an extent of 1 along each axis, see `Surface`.
     centres_m : float64 [n, 3]
         Middles of boxes. The rates hold everywhere within these.
     extents : float64 [axes]
@@ -191,14 +150,13 @@ def cycles_per_extent(
     """
     limits = None if track.is_dense else limits
     position, tangent = (each[::every] for each in track.sampled_m)
-    steps = surface.steps_m
-    sides_m = extents[:, None] * steps
-    rates = np.zeros((len(steps), len(centres_m), len(position)))
+    sides_m = extents[:, None] * steps_m
+    rates = np.zeros((len(steps_m), len(centres_m), len(position)))
     # Products of the line of sight to a point of a box follow from those to its middle.
     sight = centres_m[:, None] - position
     square = np.einsum("psi,psi->ps", sight, sight)
     ahead = np.einsum("psi,si->ps", sight, tangent)
-    leaning = np.stack([sight @ step for step in steps])
+    leaning = np.stack([sight @ step for step in steps_m])
     if limits is not None and along is not None:
         (low, high), along = limits, along[::every]
         sideways = np.einsum("psi,si->ps", sight, along)
@@ -219,7 +177,7 @@ def cycles_per_extent(
             sine, reach = sideways + (offset_m @ along.T)[:, None], between_m * inverse
             sine *= inverse
             inverse[(sine + reach < low) | (sine - reach > high)] = 0  # as if infinitely far
-        for rate, step, lean in zip(rates, steps, leaning, strict=True):
+        for rate, step, lean in zip(rates, steps_m, leaning, strict=True):
             here = lean + (offset_m @ step)[:, None, None]
             here *= turn
             np.subtract(tangent @ step, here, out=here)
@@ -247,33 +205,3 @@ def cumulative_cycles(track: MeanTrack, rate: NDArray[np.float64]) -> NDArray[np
     """Return the phase at `track.samples`, cycles: the integral of rates [..., samples]."""
     steps = np.diff(track.samples) * (rate[..., 1:] + rate[..., :-1]) / 2
     return np.concatenate([np.zeros((*rate.shape[:-1], 1)), np.cumsum(steps, axis=-1)], axis=-1)
-
-
-def _order(centres_m: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return the order of phase centres along the track, and each one's distance along it, m."""
-    if len(centres_m) == 1:
-        return np.zeros(1, np.int64), np.zeros(1)
-    offset_m = centres_m - centres_m.mean(axis=0)
-    first, second = np.linalg.svd(offset_m, full_matrices=False)[2][:2] @ offset_m.T
-    candidates = (
-        np.arange(len(centres_m)),
-        np.argsort(first, kind="stable"),
-        np.argsort(np.arctan2(second, first), kind="stable"),
-    )
-    best, along_m = candidates[0], np.full(1, np.inf)
-    for order in candidates:
-        steps_m = np.linalg.norm(np.diff(centres_m[order], axis=0), axis=1)
-        if steps_m.sum() < 0.999 * along_m[-1]:
-            best, along_m = order, np.concatenate([[0.0], np.cumsum(steps_m)])
-    return best, along_m
-
-
-def _fit(along: NDArray[np.float64], position_m: NDArray[np.float64], intervals: int) -> BSpline:
-    """Return the least-squares cubic spline of positions [n, 3], with knots where channels are."""
-    distinct, index = np.unique(along, return_index=True)
-    degree = min(3, len(distinct) - 1)
-    inner = np.quantile(distinct, np.arange(1, intervals) / intervals)
-    knots = np.concatenate([[0.0] * (degree + 1), inner, [1.0] * (degree + 1)])
-    middle = position_m.mean(axis=0)
-    fitted = make_lsq_spline(distinct, position_m[index] - middle, knots, k=degree)
-    return BSpline(fitted.t, fitted.c + middle, degree)

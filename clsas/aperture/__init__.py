@@ -1,0 +1,1 @@
+"""The aperture: which few virtual channels stand for many channels."""

@@ -1,0 +1,266 @@
+"""Virtual channels: where they lie along the mean track, and which channels they stand for."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter1d
+
+from clsas.aperture.mean_track import MeanTrack
+from clsas.aperture.phase_rates import cumulative_cycles
+from clsas.signal.interpolation import Interpolator
+
+_SMOOTHED_CHANNELS = 2.5  # rms width, virtual channels, over which their spacing is smoothed
+_LEAST_RATE = 0.3  # of the mean phase rate over the track
+_LEAST_CHANNELS = 2.0  # virtual channels between the track's ends
+
+
+@dataclass(frozen=True, eq=False)
+class Bands:
+    """Channels that contribute to the same rows of virtual channels, in the order of these.
+
+    The virtual channels of a row follow each other; so do rows. Strips are rows of their own.
+
+    Attributes
+    ----------
+    bounds : int64 [roots, bands + 1]
+        First channel of each band, in the order in which channels are added, and the end.
+    first : int64 [roots, bands]
+        First virtual channel of the first row that a band contributes to.
+    width : int64 [roots, bands]
+        Virtual channels of these rows.
+    old : int64 [roots, bands]
+        Of the rows, the number that earlier bands contribute to.
+    between : float64 [roots, channels] or None
+        Position of each channel from the middle of its rows, -0.5 to 0.5; None with single rows.
+    """
+
+    bounds: NDArray[np.int64]
+    first: NDArray[np.int64]
+    width: NDArray[np.int64]
+    old: NDArray[np.int64]
+    between: NDArray[np.float64] | None
+
+
+@dataclass(frozen=True, eq=False)
+class VirtualChannels:
+    """Virtual channels of one stage, shared by all its subimages within a root, for some roots.
+
+    Attributes
+    ----------
+    coordinate : float64 [roots, virtual channels]
+        Aperture coordinate on the mean track; of a sheet, of its columns.
+    position_m : float64 [roots, virtual channels, 3]
+    order : int64 [roots, channels] or None
+        Order in which the channels of the stage before are added; None if it is theirs.
+    base : int64 [roots, channels]
+        First virtual channel to which each of these contributes, never decreasing.
+    between : float64 [roots, channels]
+        Position of each from the middle of the virtual channels to which it contributes, -0.5 to
+        0.5 of their spacing.
+    aperture : Interpolator or None
+        Filter that weights the contributions; None if each channel is added to a single one.
+    bands : Bands or None
+        The channels of strips, or of rows of a sheet; None for a single curve.
+    rows : float64 [roots, rows] or None
+        Coordinates across a sheet of the rows of virtual channels; None without one.
+    """
+
+    coordinate: NDArray[np.float64]
+    position_m: NDArray[np.float64]
+    order: NDArray[np.int64] | None
+    base: NDArray[np.int64]
+    between: NDArray[np.float64]
+    aperture: Interpolator | None
+    bands: Bands | None = None
+    rows: NDArray[np.float64] | None = None
+
+    @property
+    def across(self) -> NDArray[np.float64] | None:
+        """Coordinates across a sheet, [roots, virtual channels]; None without one."""
+        if self.rows is None:
+            return None
+        return np.repeat(self.rows, self.coordinate.shape[1] // self.rows.shape[1], axis=1)
+
+    @property
+    def taps(self) -> int:
+        """Number of virtual channels to which a channel contributes."""
+        return 1 if self.aperture is None else self.aperture.taps
+
+    @property
+    def weights(self) -> NDArray[np.float64]:
+        """Weights of channels in virtual channels, from `base` on, [roots, channels, taps]."""
+        if self.aperture is None:
+            return np.ones((*self.base.shape, 1))
+        return self.aperture.weights(self.between)
+
+    @property
+    def contributed(self) -> NDArray[np.int64]:
+        """Virtual channels to which channels contribute, counted on from root to root.
+
+        int64 [roots, channels, taps]; `weights` has their weights.
+        """
+        first = self.coordinate.shape[1] * np.arange(len(self.base))
+        return (first[:, None] + self.base)[..., None] + np.arange(self.taps)
+
+    def ordered(self, values: NDArray) -> NDArray:
+        """Return values of every channel, [roots, channels], in the order of `base`."""
+        return values if self.order is None else np.take_along_axis(values, self.order, axis=1)
+
+
+def interpolated_channels(
+    track: MeanTrack,
+    rate: NDArray[np.float64],
+    coordinate: NDArray[np.float64],
+    aperture: Interpolator,
+) -> VirtualChannels:
+    """Return virtual channels between which steering functions are interpolated.
+
+    They lie at equal steps of the phase. Over the phase every steering function is band-limited to
+    one cycle per unit, whatever the track. (A separable low-rank expansion serves the same end in
+    butterfly algorithms: Demanet et al. 2012.)
+
+    Parameters
+    ----------
+    track : MeanTrack
+    rate : float64 [roots, samples]
+        Largest phase rate at `track.samples`, cycles per unit of the aperture coordinate.
+    coordinate : float64 [roots, channels]
+        Apparent aperture coordinate of the channels.
+    aperture : Interpolator
+        Its `upsampling` is the oversampling of virtual channels.
+    """
+    spacing = Spacing.of(track, rate, aperture)
+    position, origin, taps = *spacing.positions(coordinate), aperture.taps
+    order = None
+    if (np.diff(position) < 0).any():
+        order = np.argsort(position, axis=1, kind="stable")
+        position = np.take_along_axis(position, order, axis=1)
+    lower = np.floor(position)
+    base = lower.astype(np.int64) - (taps // 2 - 1)
+    found = spacing.coordinates(origin + np.arange(base.max() + taps))
+    between = position - lower - 0.5
+    return VirtualChannels(found, track.positions_m(found), order, base, between, aperture)
+
+
+@dataclass(frozen=True, eq=False)
+class Spacing:
+    """Virtual channels along a curve, at equal steps of the phase.
+
+    Attributes
+    ----------
+    track : MeanTrack
+    phase : float64 [roots, samples]
+        The number of virtual channels up to `track.samples`.
+    taps : int
+        Of the filter between them.
+    """
+
+    track: MeanTrack
+    phase: NDArray[np.float64]
+    taps: int
+
+    @classmethod
+    def of(cls, track: MeanTrack, rate: NDArray[np.float64], aperture: Interpolator) -> Spacing:
+        """Return the spacing that phase rates ask for: see `interpolated_channels`."""
+        per_cycle = 2 * aperture.upsampling
+        rates = _smoothed_rates(track, rate, per_cycle)
+        return cls(track, per_cycle * cumulative_cycles(track, rates), aperture.taps)
+
+    def positions(
+        self, coordinate: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return positions among virtual channels, [roots, channels], and what number 0 is at."""
+        position = np.stack(
+            [
+                np.interp(c, self.track.samples, p)
+                for c, p in zip(coordinate, self.phase, strict=True)
+            ]
+        )
+        origin = np.floor(position.min(axis=1, keepdims=True)) - (self.taps // 2 - 1)
+        position -= origin
+        return position, origin
+
+    def coordinates(self, position: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the aperture coordinates of positions from the curve's first sample."""
+        return np.stack(
+            [np.interp(v, p, self.track.samples) for v, p in zip(position, self.phase, strict=True)]
+        )
+
+
+def _smoothed_rates(
+    track: MeanTrack, rate: NDArray[np.float64], per_cycle: float
+) -> NDArray[np.float64]:
+    """Phase rates whose change over the taps of a filter is small, [roots, samples].
+
+    Between virtual channels steering functions are band-limited only if the spacing is nearly
+    constant. The logarithms of the rates are therefore smoothed over some virtual channels. Where
+    the root is invisible (a rate of 0), beyond the track's ends and where phases nearly stand
+    still, the spacing nearby is continued.
+    """
+    on_track = np.flatnonzero(track.on_track)
+    inside = rate[:, on_track]
+    for root in np.flatnonzero((inside <= 0).any(axis=1)):
+        visible = np.flatnonzero(inside[root] > 0)
+        every = np.arange(len(on_track))
+        inside[root] = np.interp(every, visible, inside[root, visible]) if visible.size else 1.0
+    mean = inside.mean(axis=1, keepdims=True)
+    inside = np.maximum(inside, np.maximum(_LEAST_RATE * mean, _LEAST_CHANNELS / per_cycle))
+    channels_per_sample = per_cycle * inside.mean(axis=1) / (len(on_track) - 1)
+    # Roots of similar widths are smoothed together.
+    width = np.ceil(2 * np.log2(_SMOOTHED_CHANNELS / channels_per_sample)).astype(int)
+    inside = np.log(inside, out=inside)
+    for each in np.unique(width):
+        same = width == each
+        inside[same] = gaussian_filter1d(inside[same], 2 ** (each / 2), mode="nearest")
+    nearest = np.clip(np.arange(rate.shape[1]) - on_track[0], 0, len(on_track) - 1)
+    return np.exp(inside, out=inside)[:, nearest]
+
+
+def nearest_nodes(
+    place: NDArray[np.float64], position_m: NDArray[np.float64], factor: int
+) -> VirtualChannels:
+    """Return nodes as THESIS [43] has them: means of `factor` neighbours, which are summed.
+
+    Parameters
+    ----------
+    place : float64 [roots, channels]
+    position_m : float64 [roots, channels, 3]
+    """
+    roots, channels = place.shape
+    order = np.argsort(place, axis=1, kind="stable")
+    starts = np.arange(0, channels, factor)
+    counts = np.diff(np.append(starts, channels))
+    sorted_place = np.take_along_axis(place, order, axis=1)
+    sorted_m = np.take_along_axis(position_m, order[..., None], axis=1)
+    base = np.broadcast_to(np.arange(channels) // factor, (roots, channels))
+    return VirtualChannels(
+        np.add.reduceat(sorted_place, starts, axis=1) / counts,
+        np.add.reduceat(sorted_m, starts, axis=1) / counts[:, None],
+        order,
+        base,
+        np.zeros((roots, channels)),
+        None,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class ChannelRanges:
+    """The channels that each subimage of a stage needs, all int64 [roots, subimages].
+
+    Ranges are empty where no channel receives from the subimage.
+
+    Attributes
+    ----------
+    first, last
+        The subimage's virtual channels: the first, and the one after the last.
+    begin, end
+        Channels of the stage before that it uses: the first, and the one after the last.
+    """
+
+    first: NDArray[np.int64]
+    last: NDArray[np.int64]
+    begin: NDArray[np.int64]
+    end: NDArray[np.int64]

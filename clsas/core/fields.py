@@ -1,0 +1,111 @@
+"""Types of fields that JSON holds: the values they may have, and how they are stored.
+
+Everything that sizes a buffer or an index has bounds, so that no file makes a kernel read what is
+not there. Pydantic checks them when an object is made or read.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BeforeValidator, ConfigDict, Field, GetCoreSchemaHandler, ValidationError
+from pydantic_core import CoreSchema, core_schema
+
+from clsas.core import validate
+
+CONFIG = ConfigDict(strict=True, extra="forbid", arbitrary_types_allowed=True)
+
+Whole = Annotated[int, Field(ge=1, lt=2**31)]
+Count = Annotated[int, Field(ge=0, lt=2**31)]
+Number = Annotated[float, Field(lt=math.inf)]  # no NaN either, which fails every comparison
+Amount = Annotated[float, Field(ge=0.0, lt=math.inf)]
+Size = tuple[Whole, Whole]
+
+
+@dataclass(frozen=True)
+class StoredAs:
+    """Annotation of a class of another room, which JSON holds as a table of its fields.
+
+    Attributes
+    ----------
+    table : type
+        What pydantic checks the table with: a dataclass of the same fields, or a dict.
+    """
+
+    table: Any
+
+    def __get_pydantic_core_schema__(self, kind: type, handler: GetCoreSchemaHandler) -> CoreSchema:
+        """Return pydantic's schema: instances are taken as they are, tables are built."""
+
+        def build(value: Any, check: Any) -> Any:
+            if isinstance(value, kind):
+                return value
+            table = check(value)
+            try:
+                return kind(**(table if isinstance(table, dict) else vars(table)))
+            except TypeError as error:
+                raise ValueError(str(error)) from None
+
+        return core_schema.no_info_wrap_validator_function(
+            build,
+            handler.generate_schema(self.table),
+            serialization=core_schema.plain_serializer_function_ser_schema(_plain),
+        )
+
+
+def _plain(stored: Any) -> dict[str, Any] | None:
+    """Return the fields of an instance as numbers, texts and lists."""
+    if stored is None:
+        return None
+    fields = {field.name: getattr(stored, field.name) for field in dataclasses.fields(stored)}
+    return {
+        name: value.tolist() if isinstance(value, (np.ndarray, np.generic)) else value
+        for name, value in fields.items()
+    }
+
+
+def _finite(value: Any) -> NDArray[np.float64]:
+    try:
+        array = np.array(value, np.float64)
+    except (TypeError, ValueError):
+        raise ValueError("must be an array of numbers") from None
+    if not np.isfinite(array).all():
+        raise ValueError("must be an array of finite numbers")
+    return array
+
+
+Array = Annotated[Any, BeforeValidator(_finite)]
+
+
+def explained(error: ValidationError, values: Any) -> str:
+    """Return the first mistake that pydantic found in the values of a JSON text.
+
+    It names the field, what is allowed, and what was given.
+    """
+    mistake = error.errors(include_url=False)[0]
+    path, here = [], values
+    for part in mistake["loc"]:  # which also names the members of unions
+        try:
+            here = here[part]
+        except (KeyError, IndexError, TypeError):
+            continue
+        path.append(part)
+    where = ".".join(map(str, path)) or "it"
+    if mistake["type"] in ("missing", "missing_argument"):
+        return f"{where} lacks {mistake['loc'][-1]!r}"
+    if mistake["type"] == "unexpected_keyword_argument":
+        return f"{where} is unknown"
+    if mistake["type"] == "value_error":
+        return f"{where}: {mistake['msg'].removeprefix('Value error, ')}"
+    given, allowed = mistake["input"], mistake["msg"].removeprefix("Input should be ")
+    if mistake["type"].startswith("union_tag"):
+        where, given = f"{where}.method", dict(given).get("method")
+        allowed = mistake["ctx"].get("expected_tags", "given")
+    elif given != given:
+        allowed = "a number"
+    return f"{where} must be {allowed}, got {validate.shown(given)}"
