@@ -152,12 +152,12 @@ def test_a_wish_goes_before_the_environment(monkeypatch):
 
 
 def test_the_time_of_building_kernels_is_counted_once(platform):
-    device = open_device(platform.info.index)
-    built_s = device.build_seconds
-    options = {"WIDTH": 1, "BEAM": 0, "BISTATIC": 1, "MOVING": 0, "COUNTED": 1}
+    device = dataclasses.replace(platform, _kernels={})
+    assert device.build_seconds == 0
+    options = {"WIDTH": 1, "BEAM": 0, "BISTATIC": 1, "MOVING": 0}
     device.kernel("expand_tiles", **options)
     first_s = device.build_seconds
-    assert first_s > built_s
+    assert first_s > 0
     device.kernel("expand_tiles", **options)
     assert device.build_seconds == first_s
 
