@@ -1,4 +1,4 @@
-"""Phase rates along mean tracks, and how ranges from channels grow faster than those from them."""
+"""Phase rates along mean tracks, and the motion and stretch of range lines relative to them."""
 
 from __future__ import annotations
 

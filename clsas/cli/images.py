@@ -116,13 +116,13 @@ def image(
     if profile:
         profiling = opened.profile()
     with progress_bar("imaging") as progress, profiling as kernels:
-        built_s, start = -opened.build_seconds, time.perf_counter()
+        built_before_s, start = opened.build_seconds, time.perf_counter()
         if chosen is None or chosen.is_exact:
             formed = _exactly(lines, grid, beam, opened, request, chosen, progress)
         else:
             formed = _factorized(lines, grid, opened, chosen, progress)
         seconds = time.perf_counter() - start
-        built_s += opened.build_seconds
+        built_s = opened.build_seconds - built_before_s
     clsas.save(output, formed.image)
     if picture is not None:
         from clsas import plot
