@@ -52,6 +52,8 @@ class Preparation:
         Error power that this adds.
     is_reached : bool
         False if no line reaches any pixel: the image is zero, and `layout` that of a single pixel.
+    band : (centre, half width)
+        Band, in cycles per sample, that the interpolation is made for.
     """
 
     device: Device
@@ -70,6 +72,7 @@ class Preparation:
     left_out: tuple[str, ...] = ()
     left_out_error: float = 0.0
     is_reached: bool = True
+    band: tuple[float, float] = (0.0, 0.5)
 
     @property
     def predicted_error_db(self) -> float:

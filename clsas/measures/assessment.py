@@ -16,8 +16,6 @@ from clsas.core.grid import Grid
 from clsas.core.lines import RangeLines
 from clsas.exact.backprojection import prepare
 from clsas.exact.run import execute
-from clsas.factorized.factorization import Factorization
-from clsas.factorized.plan import Plan
 from clsas.measures.assessment_result import Assessment, Effect
 from clsas.measures.effects import (
     BEAM,
@@ -34,6 +32,8 @@ from clsas.planning.costs import Costs
 from clsas.planning.factorize import factorize
 from clsas.planning.planner import BEST_TOLERANCE_DB, TOLERANCE_DB, WORST_TOLERANCE_DB, plan
 from clsas.planning.prediction import half_precision_error
+from clsas.plans.factorization import Factorization
+from clsas.plans.plan import Plan
 from clsas.signal.compression import Window
 from clsas.signal.compression import check_options as check_compression
 from clsas.signal.spectrum import band_wavelength_m, measure_spectrum
@@ -119,7 +119,8 @@ def assess(
     seconds = {name: image.plan.predicted_seconds for name, image in images.items()}
     if repeats:
         if full.half_precision:
-            images[SINGLE] = replace(images[_FULL], plan=full.changed(half_precision=False))
+            single = replace(full, method=replace(full.factorization, half_precision=False))
+            images[SINGLE] = replace(images[_FULL], plan=single)
         seconds = _measured(images, device, repeats)
     errors, modelled = errors_without(survey), survey.modelled
     if not full.is_exact and device.info.half_precision:
@@ -273,16 +274,16 @@ class _Image:
     full_model: bool
 
     def form(self, device: Device) -> None:
-        """Form the image with a fresh copy of the plan, which has kept nothing of earlier runs."""
-        image = self.plan.image
-        if isinstance(image, Factorization):
-            factorize(self.lines, self.grid, replace(self.plan), device=device)
+        """Form the image."""
+        method = self.plan.method
+        if isinstance(method, Factorization):
+            factorize(self.lines, self.grid, self.plan, device=device)
             return
         preparation = prepare(
             self.lines,
             self.grid,
             device=device,
-            accuracy_db=image.accuracy_db,
+            accuracy_db=method.accuracy_db,
             beam=self.beam,
             full_model=self.full_model,
         )

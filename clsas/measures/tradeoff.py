@@ -20,7 +20,6 @@ from clsas.core.image import Image
 from clsas.core.image_error import relative_error_db
 from clsas.core.lines import RangeLines
 from clsas.exact.backprojection import ACCURACY_DB, form_exactly
-from clsas.factorized.plan import Plan
 from clsas.measures.cuts import Cut
 from clsas.measures.quality import measure_point
 from clsas.measures.shadows import DARKEST, dark_level_db
@@ -28,6 +27,7 @@ from clsas.measures.tradeoff_result import Response, Row, Tradeoff
 from clsas.opencl.device import Device, open_device
 from clsas.planning.factorize import factorize
 from clsas.planning.planner import BEST_TOLERANCE_DB, WORST_TOLERANCE_DB, checked_pairs, plan
+from clsas.plans.plan import Plan
 from clsas.sonar.beam import BeamWindow
 
 TOLERANCES_DB = (-20.0, -30.0, -40.0, -50.0, -60.0, -70.0)

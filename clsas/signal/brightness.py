@@ -17,8 +17,8 @@ from clsas.signal.spectrum import Spectrum
 from clsas.sonar.beam import BeamWindow
 from clsas.sonar.visibility import sines
 
-# Channels summed coherently. With half as many, echoes from beside a pixel cancel less, and images of
-# points at the beam's edge look 3 dB brighter than they are; twice as many change them by 1 dB.
+# Channels summed coherently. With half as many, echoes from beside a pixel cancel less, and images
+# of points at the edge of the beam look 3 dB brighter than they are; twice as many change 1 dB.
 _GROUP = 64
 _LEAST_GROUP = 32
 _GROUPS = 8  # spread evenly along the lines
