@@ -35,6 +35,8 @@ autodoc_member_order = "bysource"
 autodoc_typehints = "none"  # docstrings state types and shapes
 add_module_names = False  # what users import is `clsas.NAME`; modules are private
 numpydoc_show_class_members = False  # autodoc shows them
+numpydoc_xref_param_type = True  # links types of parameters that are public classes
+numpydoc_xref_ignore = "all"  # other types stay text: the site links to no other site's objects
 
 autosummary_generate = True  # one page per public name, in docs/reference/generated
 autosummary_ignore_module_all = False
@@ -77,6 +79,27 @@ def as_plain_text(*event: Any) -> None:
     lines[:] = [re.sub(r"(`[^`]*`)|([|*])", lambda m: m[1] or f"\\{m[2]}", line) for line in lines]
 
 
+def with_links(*event: Any) -> None:
+    """Link public classes, and names that begin with `clsas.`, in the text of docstrings."""
+
+    def linked(match: re.Match[str]) -> str:
+        prefix, name, rest = match.groups(default="")
+        if name not in clsas.__all__ or (name.islower() and not prefix):
+            return match[0]
+        return f":py:obj:`{prefix}{name}{rest} <clsas.{name}{rest}>`"
+
+    lines: list[str] = event[-1]
+    pattern = re.compile(r"(?<![\w`:])`(clsas\.)?(\w+)((?:\.\w+)*)`(?!`)")
+    lines[:] = [pattern.sub(linked, line) for line in lines]
+
+
+def only_own_types(app: Any) -> None:
+    """Replace numpydoc's links to Python's and NumPy's types by those to public classes."""
+    app.config.numpydoc_xref_aliases_complete = {
+        name: f"clsas.{name}" for name in clsas.__all__ if not name.islower()
+    }
+
+
 def without_private_arguments(*event: Any) -> tuple[str, str] | None:
     """Leave arguments that begin with an underscore out of signatures."""
     signature, returned = event[-2:]
@@ -86,6 +109,8 @@ def without_private_arguments(*event: Any) -> tuple[str, str] | None:
 def setup(app: Any) -> None:
     """Connect the functions above, and draw equations as MathML, which needs no script."""
     app.connect("autodoc-process-docstring", as_plain_text, priority=100)  # before numpydoc
+    app.connect("autodoc-process-docstring", with_links, priority=900)  # after numpydoc
+    app.connect("builder-inited", only_own_types)
     app.connect("autodoc-process-signature", without_private_arguments)
 
     def inline(writer: Any, node: nodes.Element) -> None:
