@@ -57,7 +57,7 @@ def inspection(found: Inspection, grid: Grid | None = None) -> Figure:
     _draw_steps(figure.add_subplot(places[1, 1]), found)
     _draw_track(figure.add_subplot(places[1, 2]), found, grid)
     names = ", ".join(each.name.replace("_", " ") for each in found.findings)
-    figure.suptitle(f"Found: {names}" if names else "Nothing found that is wrong", fontsize=11)
+    figure.suptitle(f"Found: {names}" if names else "No defects found", fontsize=11)
     return figure
 
 
