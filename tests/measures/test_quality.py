@@ -212,7 +212,10 @@ def test_takes_the_greatest_pixel_within_the_search():
         ({"near": (np.nan, AT[1])}, "near must be finite"),
         ({"near": AT[0]}, r"near must have shape \(2\)"),
         ({"pixels": np.zeros(GRID.shape, complex)}, r"image is zero around near"),
-        ({"pixels": point(at=(X[0], AT[1])), "near": (X[0], AT[1])}, "at the border of the image .x ="),
+        (
+            {"pixels": point(at=(X[0], AT[1])), "near": (X[0], AT[1])},
+            "at the border of the image .x =",
+        ),
         (
             {"pixels": point(at=(AT[0], Y[-1])), "near": (AT[0], Y[-1])},
             "at the border of the image .y =",
