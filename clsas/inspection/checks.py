@@ -15,7 +15,7 @@ from scipy.ndimage import median_filter
 
 from clsas.core import decibels
 from clsas.core.conditioning import DEAD_DB, are_dead
-from clsas.core.lines import some_channels
+from clsas.core.lines import RangeLines, some_channels
 from clsas.core.pings import STILL
 from clsas.inspection.phase_sign import CLEAR
 from clsas.inspection.recording import (
@@ -258,8 +258,6 @@ def check_background(recording: Recording) -> Iterator[Finding]:
 
 def check_ends(recording: Recording) -> Iterator[Finding]:
     """Yield ends of lines that do not fade."""
-    if recording.is_silent:
-        return
     lines = recording.moving
     found_db = decibels.in_db(max(end_powers(lines)))
     if found_db > _ENDS_DB:
@@ -279,7 +277,7 @@ def check_ends(recording: Recording) -> Iterator[Finding]:
 def check_oversampling(recording: Recording) -> Iterator[Finding]:
     """Yield a band that fills the whole sampled band."""
     oversampling, least = recording.spectrum.oversampling, NEEDED_OVERSAMPLING
-    if oversampling < least and not recording.is_silent:
+    if oversampling < least:
         message = (
             f"oversampling is {oversampling:.3g}; it should be at least {least:g}. The signal "
             "fills the whole sampled band, and its edges may be aliased"
@@ -295,7 +293,8 @@ def check_band(recording: Recording) -> Iterator[Finding]:
     """Yield a band that is wider than its carrier allows."""
     carrier_hz, (low_hz, high_hz) = recording.lines.carrier_hz, recording.band_hz
     width_hz = high_hz - low_hz
-    if carrier_hz and width_hz > 2 * carrier_hz and not recording.is_silent:
+    is_wide = carrier_hz and width_hz > 2 * carrier_hz
+    if is_wide and recording.moving.samples.any():  # silent lines have no band
         message = (
             f"the band of {measured(width_hz, 'Hz')} is wider than twice the carrier of "
             f"{measured(carrier_hz, 'Hz')}, and so reaches below 0 Hz"
@@ -328,11 +327,10 @@ def check_first_range(recording: Recording) -> Iterator[Finding]:
     """Yield ranges that no recording can have, or echoes closer than the antennas allow."""
     lines = recording.lines
     first_m, last_m = float(lines.first_range_m.min()), float(lines.last_range_m.max())
-    if _beyond_any_range(recording):
-        limit_m = _FARTHEST * recording.extent_m if last_m > 0 else 0.0
-        limit = "no range is positive"
-        if limit_m:
-            length = measured(recording.extent_m, "m")
+    if _beyond_any_range(lines):
+        limit_m, limit = 0.0, "no range is positive"
+        if last_m > 0:
+            limit_m, length = _FARTHEST * _extent_m(lines), measured(_extent_m(lines), "m")
             limit = f"more than {_FARTHEST:g} times their length of {length}"
         message = f"the lines begin at {first_m:.6g} m and end at {last_m:.6g} m: {limit}"
         remedy = (
@@ -360,17 +358,20 @@ def check_first_range(recording: Recording) -> Iterator[Finding]:
         yield Finding("range_offset", message, share, _TOO_EARLY, remedy)
 
 
-def _beyond_any_range(recording: Recording) -> bool:
+def _beyond_any_range(lines: RangeLines) -> bool:
     """Return True if no range is positive, or all lie far beyond those of any recording."""
-    lines = recording.lines
     nearest_m = float(np.abs(lines.first_range_m).min())
-    return bool(lines.last_range_m.max() <= 0) or nearest_m > _FARTHEST * recording.extent_m
+    return bool(lines.last_range_m.max() <= 0) or nearest_m > _FARTHEST * _extent_m(lines)
+
+
+def _extent_m(lines: RangeLines) -> float:
+    return max(lines.length - 1, 1) * lines.range_step_m
 
 
 def check_grid(recording: Recording) -> Iterator[Finding]:
     """Yield that parts of the grid lie beyond all lines, and the slip that may explain it."""
     lines, grid = recording.lines, recording.grid
-    if grid is None or _beyond_any_range(recording):
+    if grid is None or _beyond_any_range(lines):
         return
     share = covered(lines, grid)
     if share >= 1 - _OUTSIDE:

@@ -76,10 +76,7 @@ def phase_sign(
     if not lines.samples.any():
         return None, "the lines are silent, or the same in all pings"
     if not lines.carrier_hz:
-        return None, (
-            "the lines still have their carrier, so that conjugate lines give an equally sharp "
-            "image"
-        )
+        return None, "the lines still have their carrier: images of conjugates are as sharp"
     try:
         targets = _beside_track(lines, cell_m) if grid is None else _on_grid(lines, grid, cell_m)
     except _UndeterminedError as error:
@@ -94,9 +91,9 @@ def phase_sign(
             signs.append(_compared(part, patch, target.position_m, device))
     if not signs:
         return None, reasons[0]
-    sharp = [sign for sign in signs if _sharpness(sign) >= _SHARP]
+    sharp = [sign for sign in signs if _best_sharpness(sign) >= _SHARP]
     clear = [sign for sign in sharp if not 1 / CLEAR < sign.ratio < CLEAR]
-    best = max(clear or signs, key=_sharpness)
+    best = max(clear or signs, key=_best_sharpness)
     if not sharp:
         return best, f"no patch is in focus, with a sharpness of {_SHARP:g} (speckle has 2)"
     if not clear:
@@ -106,7 +103,7 @@ def phase_sign(
     return best, ""
 
 
-def _sharpness(sign: PhaseSign) -> float:
+def _best_sharpness(sign: PhaseSign) -> float:
     return max(sign.as_given, sign.conjugate)
 
 
@@ -115,7 +112,7 @@ def _compared(
 ) -> PhaseSign:
     """Return the sharpness of a patch with both signs of the phase."""
     conjugate = replace(part, samples=part.samples.conj())
-    with warnings.catch_warnings():  # about accuracy, which hardly matters here
+    with warnings.catch_warnings():  # about accuracy, which is not needed here
         warnings.simplefilter("ignore", ClsasWarning)
         as_given, of_conjugate = (
             _sharpness_along(backproject(each, patch, device=device, accuracy_db=_ACCURACY_DB))
@@ -187,8 +184,7 @@ def _on_grid(lines: RangeLines, grid: Grid, cell_m: float) -> list[_Target]:
         brightest = int(left.argmax())
         if not left[brightest] > 0:
             break
-        target = energy.target(points_m[brightest], pitch_m)
-        targets.append(energy.refined(target, pitch_m, cell_m))
+        targets.append(energy.target(points_m[brightest], pitch_m, cell_m))
         left[np.linalg.norm(points_m - points_m[brightest], axis=1) < 3 * pitch_m] = 0
     if not targets:
         raise _UndeterminedError("no echoes come from the grid")
@@ -221,26 +217,25 @@ class _Energy:
         found: NDArray[np.float32] = power[np.arange(len(power)), index] * inside
         return found
 
-    def target(self, position_m: NDArray[np.float64], pitch_m: float) -> _Target:
-        """Return a position as a target."""
+    def channel(self, position_m: NDArray[np.float64], pitch_m: float) -> int:
+        """Return the channel by which half of the energy of a position has arrived."""
         arrived = np.cumsum(self.around(position_m[None], pitch_m)[0])
-        middle = int(np.searchsorted(arrived, arrived[-1] / 2))
-        return _Target(position_m, int(self.some[middle]), is_located=True)
+        return int(self.some[np.searchsorted(arrived, arrived[-1] / 2)])
 
-    def refined(self, target: _Target, pitch_m: float, cell_m: float) -> _Target:
-        """Return the brightest position near a target, to a resolution cell in range."""
-        position_m = target.position_m
-        along = _course(self.lines.phase_centres_m)
-        across = _across(position_m - self.lines.phase_centres_m[target.channel], along)
+    def target(self, position_m: NDArray[np.float64], pitch_m: float, cell_m: float) -> _Target:
+        """Return the brightest position near a point of a grid, to a resolution cell in range."""
+        centres_m = self.lines.phase_centres_m
+        channel, along = self.channel(position_m, pitch_m), _course(centres_m)
+        across = _across(position_m - centres_m[channel], along)
         if across is None:
-            return target
+            return _Target(position_m, channel, is_located=True)
         while pitch_m > cell_m:
             pitch_m /= _FINER
             offsets_m = pitch_m * np.arange(1 - _FINER, _FINER)
             moves_m = offsets_m[:, None, None] * across + offsets_m[:, None] * along
             tried_m = position_m + moves_m.reshape(-1, 3)
             position_m = tried_m[int(self.around(tried_m, pitch_m).sum(axis=1).argmax())]
-        return self.target(position_m, cell_m)
+        return _Target(position_m, self.channel(position_m, cell_m), is_located=True)
 
 
 def _patch(

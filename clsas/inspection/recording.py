@@ -89,16 +89,6 @@ class Recording:
         counts = self.pings.receivers
         return None if np.ptp(counts) else int(counts[0])
 
-    @property
-    def is_silent(self) -> bool:
-        """True if all samples of the moving lines are zero."""
-        return not self.moving.samples.any()
-
-    @property
-    def extent_m(self) -> float:
-        """Length of the lines, or one step if they have a single sample."""
-        return max(self.lines.length - 1, 1) * self.lines.range_step_m
-
     @cached_property
     def spectrum(self) -> Spectrum:
         """Mean power spectrum of the moving lines."""
