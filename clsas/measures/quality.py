@@ -110,17 +110,17 @@ def measure_point(
 
     Examples
     --------
-    A point whose image is a product of two sinc functions. At -3 dB, they are 0.886 times as wide
-    as the distance to their first zero:
+    A point whose image is a product of two sinc functions, whose first zeros are 20 mm from the
+    peak along x and 40 mm along y. The resolution is 0.886 times these distances:
 
     >>> import clsas
     >>> import numpy as np
     >>> grid = clsas.Grid.plane(x=(0.0, 2.0, 201), y=(40.0, 41.5, 151))
     >>> x, y = grid.axes_m
-    >>> pixels = np.sinc((x - 0.803) / 0.02) * np.sinc((y - 40.6) / 0.04)[:, None] + 0j
+    >>> pixels = np.outer(np.sinc((y - 40.6) / 0.04), np.sinc((x - 0.803) / 0.02)) + 0j
     >>> point = clsas.measure_point(clsas.Image(pixels, grid), near=(0.8, 40.6))
-    >>> print(f"x = {point.x_m:.3f} m, {1e3 * point.azimuth.resolution_m:.1f} mm wide")
-    x = 0.803 m, 17.7 mm wide
+    >>> print(f"x = {point.x_m:.3f} m, resolution {point.azimuth.resolution_m:.4f} m")
+    x = 0.803 m, resolution 0.0177 m
     """
     validate.instance("image", image, Image)
     across, upward = axes = image.grid.sides

@@ -31,7 +31,7 @@ from clsas.sonar.beam import BeamWindow
 
 TOLERANCES_DB = (-20.0, -30.0, -40.0, -50.0, -60.0, -70.0)
 STAGES = (*(((2, 2),) * count for count in range(1, 6)), ((2, 4),) * 2)
-"""Stages of the thesis (chapter 4): 1 to 5 of QR = QI = 2, and 2 of QR = 2 and QI = 4."""
+"""Stages of Ødegaard (2004), chapter 4: 1 to 5 of QR = QI = 2, and 2 of QR = 2 and QI = 4."""
 
 STUDIED_TAPS = tuple(product(ALIGN_TAPS, APERTURE_TAPS))
 STUDIED_DEPTHS = (1, 2, 3, 4)
@@ -67,8 +67,8 @@ def tradeoff(
     tolerances_db : sequence of float
         Tolerances as for `clsas.plan`.
     stages : sequence of sequences of (QR, QI), optional
-        Stages of the thesis's method, as for `clsas.plan`; an empty sequence for none. By default
-        all of `STAGES` that lines and grid allow.
+        Stages of the method of Ødegaard (2004), as for `clsas.plan`; an empty sequence for none.
+        By default all of `STAGES` that lines and grid allow.
     beam : BeamWindow, optional
         Weights of the channels, also for the exact image.
     device : Device, str or int, optional
@@ -99,6 +99,10 @@ def tradeoff(
     --------
     plot.tradeoff : Draw the result.
     plan : The fastest image within a tolerance.
+
+    References
+    ----------
+    Ødegaard (2004), "Fast time domain beamforming for synthetic aperture sonar", chapter 4.
 
     Examples
     --------

@@ -41,6 +41,17 @@ def cuts(response: PointResponse, *, floor_db: float = -60.0, resolutions: float
     TypeError, ValueError
         If an argument has the wrong type, `floor_db` is not negative, or `resolutions` is not
         positive.
+
+    Examples
+    --------
+    >>> import clsas
+    >>> import numpy as np
+    >>> grid = clsas.Grid.plane(x=(0.0, 2.0, 201), y=(40.0, 41.5, 151))
+    >>> x, y = grid.axes_m
+    >>> pixels = np.outer(np.sinc((y - 40.6) / 0.04), np.sinc((x - 0.8) / 0.02)) + 0j
+    >>> figure = clsas.plot.cuts(clsas.measure_point(clsas.Image(pixels, grid), (0.8, 40.6)))
+    >>> [axes.get_xlabel() for axes in figure.axes]
+    ['Along-track from the peak (mm)', 'Across-track from the peak (mm)']
     """
     validate.instance("response", response, PointResponse)
     floor_db = validate.number("floor_db", floor_db, "dB", below=0.0)

@@ -35,6 +35,17 @@ def geometry(lines: RangeLines | Echoes, grid: Grid | None = None) -> Figure:
         If matplotlib is not installed.
     TypeError
         If `lines` or `grid` has another type.
+
+    Examples
+    --------
+    >>> import clsas
+    >>> import numpy as np
+    >>> tx_m = np.outer(np.arange(8), [0.02, 0, 0])
+    >>> point = clsas.PointTargets([[0.1, 20.0, 0.0]], [1.0])
+    >>> lines = clsas.simulate_lines(tx_m, tx_m, point, carrier_hz=100e3, bandwidth_hz=20e3)
+    >>> figure = clsas.plot.geometry(lines, clsas.Grid.plane((0.0, 0.2, 21), (19.0, 21.0, 21)))
+    >>> [line.get_label() for line in figure.axes[0].get_lines()]
+    ['Receiver (8 positions)', 'Transmitter (8 positions)', 'Grid 21 × 21']
     """
     validate.instance("lines", lines, RangeLines, Echoes)
     if grid is not None:
