@@ -51,9 +51,9 @@ autosummary_filename_map = {
 autosummary_filename_map |= {
     f"clsas.{path}": f"clsas.{path.rpartition('.')[2]}"
     for path in (
-        "factorized.factorization.ExactImage",
-        "factorized.factorization.Factorization",
-        "factorized.plan.Prediction",
+        "plans.factorization.ExactImage",
+        "plans.factorization.Factorization",
+        "plans.predictions.Prediction",
         "measures.cuts.Cut",
         "measures.quality.PointResponse",
         "mosaics.record.Record",
