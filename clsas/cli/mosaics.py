@@ -48,7 +48,7 @@ _LISTED = 3  # patches that are listed for each kind of defect
 )  # fmt: skip
 @click.option(
     "-o", "--output", type=Store(),
-    help="Zarr store to write or to continue. [default: SCENE.zarr]",
+    help="Zarr store to write or to continue. [default: SCENE.zarr beside the scene]",
 )  # fmt: skip
 @options.axes
 @options.method
@@ -73,7 +73,7 @@ _LISTED = 3  # patches that are listed for each kind of defect
 )  # fmt: skip
 @click.option(
     "--verify", is_flag=True,
-    help="Only compare all of the store with its checksums; -o suffices without a scene.",
+    help="Only compare the whole store with its checksums.",
 )  # fmt: skip
 @options.picture("an overview in dB")
 @options.levels
@@ -101,12 +101,13 @@ def mosaic(
     as_json: bool,
     **given: Any,
 ) -> None:
-    """Form an image of any size patch by patch, into a Zarr store.
+    """Form an image of any size, patch by patch.
 
-    Grid, method and beam are those of `clsas image`. After an interruption, by Ctrl-C or anything
-    else, the same command continues, and mends what is damaged. With --verify it only lists
-    damage; the exit code is 1 if there is any. Without --lines the scene is simulated
-    first.
+    The patches go into a Zarr store. Grid, method and beam are those of `clsas image`. Without
+    --lines, the scene is simulated first. Without a scene, --lines, --x, --y and -o are required.
+
+    After an interruption, by Ctrl-C or anything else, the same command continues, and forms damaged
+    patches again. With --verify it only lists damage; the exit code is then 1 if there is any.
 
     \b
     Example:  clsas mosaic scene.toml --lines lines.h5 -o image.zarr --picture image.png
@@ -115,7 +116,7 @@ def mosaic(
         _verify(_store_to_verify(scene, output), as_json)
         return
     if scene is None:
-        raise click.UsageError("SCENE.TOML is missing: clsas mosaic SCENE.TOML --lines LINES.H5")
+        _check_without_scene(given["x"] is not None, lines_path, output)
     _check_combination(bool(device), workers, scheduler, follow, idle_s)
     levels = read_levels(dynamic_range_db, percentiles, colour_map)
     described, grid = read_grid(scene, given, memory=False)
@@ -124,7 +125,7 @@ def mosaic(
     warn_of_sampling(described, grid)
     devices = [open_device(name) for name in device] or None
     in_scene = described.mosaic
-    output = output or in_scene.get("store") or _default_store(scene)
+    output = output or in_scene.get("store") or _store_beside(scene)
     memory_mib = memory_mib or in_scene.get("memory_mib")
     patches = patches or in_scene.get("patches")
     if patches is not None:
@@ -132,7 +133,10 @@ def mosaic(
     recorded = lines_path or in_scene.get("lines")
     _check_paths(output, picture, recorded, follow)
     check_place(output.resolve())  # before anything is simulated
-    lines_path = recorded or _simulated(described, scene, output, picture, quiet=as_json)
+    lines_path = recorded
+    if scene is not None and lines_path is None:
+        lines_path = _simulated(described, scene, output, picture, quiet=as_json)
+    assert lines_path is not None  # without a scene, --lines has been required
     start = time.perf_counter()
     with _cluster(workers, scheduler) as client:
         formed = clsas.mosaic(
@@ -156,6 +160,14 @@ def mosaic(
     report(
         as_json, f"{printable(output)}: {''.join(words)}", file=output, picture=picture, **figures
     )
+
+
+def _check_without_scene(has_grid: bool, lines_path: Path | None, output: Path | None) -> None:
+    """Raise UsageError, with what is missing, unless options replace the scene."""
+    wanted = {"--lines": lines_path, "--x and --y": has_grid or None, "-o": output}
+    missing = [option for option, value in wanted.items() if value is None]
+    if missing:
+        raise click.UsageError(f"without SCENE.TOML, give {', '.join(missing)} too")
 
 
 def _check_combination(
@@ -249,7 +261,10 @@ def _described_flags(flagged: dict[tuple[int, int], tuple[str, ...]]) -> list[st
     return lines
 
 
-def _default_store(scene: Path) -> Path:
+def _store_beside(scene: Path | None) -> Path:
+    """Return the default store of a scene; a usage error without a scene."""
+    if scene is None:
+        raise click.UsageError("a store is required: -o STORE.zarr, or a scene")
     return scene.with_suffix(".zarr")
 
 
@@ -259,7 +274,7 @@ def _store_to_verify(scene: Path | None, output: Path | None) -> Path:
         return output
     if scene is None:
         raise click.UsageError("--verify requires a store: clsas mosaic --verify -o STORE.zarr")
-    return read_scene(scene).mosaic.get("store") or _default_store(scene)
+    return read_scene(scene).mosaic.get("store") or _store_beside(scene)
 
 
 def _verify(path: Path, as_json: bool) -> None:
