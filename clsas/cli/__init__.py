@@ -17,8 +17,8 @@ import click
 
 import clsas
 
-# Module and first sentence of the help of every command, by the heading of `clsas --help`. Importing
-# the module of a command takes up to a second, so --help, --version and completion do without.
+# Module and first sentence of the help of every command, under the headings of `clsas --help`.
+# Importing the module of a command takes up to a second: --help, --version and completion do not.
 _GROUPS = {
     "Recordings": {
         "simulate": ("lines", "Simulate the echoes that a scene file describes."),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
@@ -24,7 +23,7 @@ from clsas.cli.inputs import (
     warn_of_sampling,
 )
 from clsas.cli.outputs import printable, progress_bar, report, say
-from clsas.cli.parameters import COUNTS, INPUT, File, Store, keep_apart
+from clsas.cli.parameters import COUNTS, INPUT, File, Store, keep_apart, keep_out
 from clsas.core.extras import install_command
 from clsas.core.threads import uninterrupted
 from clsas.exact.backprojection import ACCURACY_DB
@@ -185,10 +184,7 @@ def _check_combination(
 def _check_paths(output: Path, picture: Path | None, lines_path: Path | None, follow: bool) -> None:
     """Raise UsageError if files would overwrite each other, or --follow has no folder."""
     keep_apart("--picture", picture, "the store", output)
-    if picture is not None and Path(os.path.realpath(picture)).is_relative_to(
-        os.path.realpath(output)
-    ):
-        raise click.UsageError(f"--picture must not lie in the store, got {str(picture)!r}")
+    keep_out("--picture", picture, "the store", output)
     keep_apart("the range lines", lines_path, "the store", output)
     if follow and (lines_path is None or not lines_path.is_dir()):
         raise click.UsageError("--follow requires --lines with a folder")

@@ -81,21 +81,23 @@ def _together(*options: Callable) -> Callable:
 
 
 as_json = click.option("--json", "as_json", is_flag=True, help="Print results as JSON.")
+dynamic_range = click.option(
+    "--dynamic-range-db", "--db", "dynamic_range_db", type=float,
+    help="Dynamic range of the picture, dB. [default: 60]",
+    callback=checked(partial(validate.positive, "dynamic_range_db", unit="dB")),
+)  # fmt: skip
+colour_map = click.option(
+    "--colour-map", "--colours", "colour_map",
+    help="Colours of the picture: sonar (black, copper, cream), gray, cividis or any other of "
+    "matplotlib's. [default: inferno]",
+)  # fmt: skip
 levels = _together(
-    click.option(
-        "--dynamic-range-db", type=float,
-        help="Dynamic range of the picture, below the largest level. [default: 60]",
-        callback=checked(partial(validate.positive, "dynamic_range_db", unit="dB")),
-    ),
+    dynamic_range,
     click.option(
         "--percentiles", type=PERCENTILES,
         help="Show levels between these percentiles of all pixels instead, such as 1,99.5.",
     ),
-    click.option(
-        "--colour-map",
-        help="Colours of the picture: sonar (black, copper, cream), gray, cividis or any other of "
-        "matplotlib's. [default: inferno]",
-    ),
+    colour_map,
 )  # fmt: skip
 scene = click.option("--scene", type=INPUT, help="Scene file for values without an option.")
 device = click.option(

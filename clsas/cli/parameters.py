@@ -199,6 +199,12 @@ def keep_apart(one: str, path: Path | None, other: str, path_of_other: Path | No
         raise click.UsageError(f"{one} and {other} must be two files, got {str(path)!r}")
 
 
+def keep_out(option: str, path: Path | None, what: str, folder: Path) -> None:
+    """End the command if the file of an option lies in a folder, such as "the store"."""
+    if path is not None and Path(os.path.realpath(path)).is_relative_to(os.path.realpath(folder)):
+        raise click.UsageError(f"{option} must not lie in {what}, got {str(path)!r}")
+
+
 def written_to(ctx: click.Context) -> dict[str, Path]:
     """Return the files that the running command writes, by option."""
     outputs = [p for p in ctx.command.params if isinstance(p.type, File) and p.type.written]

@@ -71,6 +71,9 @@ class GridTable(Table):
                 raise ValueError(f"missing key {name!r}{other}")
         if self.x is not None and self.y is not None:
             return Grid.plane(self.x.build(), self.y.build(), self.z_m)
-        assert self.origin_m and self.row_step_m and self.column_step_m and self.shape  # as checked
+        assert self.origin_m is not None  # all four have been checked
+        assert self.row_step_m is not None
+        assert self.column_step_m is not None
+        assert self.shape is not None
         rows, columns = self.shape
         return Grid.oriented(self.origin_m, self.row_step_m, self.column_step_m, (rows, columns))

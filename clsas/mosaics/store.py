@@ -142,6 +142,23 @@ class Store:
             raise ValueError(f"{self.path} is damaged: its grid is not the one that was written")
         return grid
 
+    @property
+    def plane(self) -> Grid:
+        """Plane of the pixels, without the heights of a height map, which are not read.
+
+        Raises
+        ------
+        ValueError
+            As for `grid`.
+        """
+        attributes = read_document(self.path)
+        if not has_height(self.path, attributes):
+            return self.grid
+        plane, found = _arrays().compared(self.path, attributes, False)
+        if plane is None or found:
+            raise ValueError(f"{self.path} is damaged: {describe_arrays(found)}{_MENDED}")
+        return plane
+
     def array_damage(self) -> dict[str, str]:
         """Compare metadata, coordinates and heights with what was written.
 
@@ -335,17 +352,46 @@ class Store:
         window = self.grid.window(rows, columns)
         return Image(self.read(rows, columns), window)
 
-    def overview(self, most: int = _OVERVIEW) -> Image:
+    def overview(
+        self,
+        most: int = _OVERVIEW,
+        rows: slice = slice(None),
+        columns: slice = slice(None),
+    ) -> Image:
         """Return the mosaic at fewer pixels, each with the mean power of those it covers.
+
+        About one patch at a time is read, so the mosaic may be larger than memory. A height map
+        becomes a plane.
+
+        Parameters
+        ----------
+        most : int
+            Largest number of pixels along the longer side of the overview.
+        rows, columns : slice
+            Part of the mosaic; by default all of it.
 
         Raises
         ------
+        TypeError
+            If `rows` or `columns` is not a slice of whole numbers.
         ValueError
-            If a finished patch is damaged.
+            If nothing is selected, or a finished patch is damaged.
         """
         validate.count("most", most)
-        rows, columns = self.pixels.chunks
-        return reduced(self.grid, (rows, columns), self.read, most)
+        parts = [
+            range(count)[validate.selection(name, given, ascending=True)]
+            for name, given, count in zip(
+                ("rows", "columns"), (rows, columns), self.pixels.shape, strict=True
+            )
+        ]
+        part = self.plane.window(rows, columns)
+
+        def read(*within: slice) -> NDArray[np.complex64]:
+            chosen = (whole[each] for whole, each in zip(parts, within, strict=True))
+            return self.read(*(slice(each.start, each.stop, each.step) for each in chosen))
+
+        height, width = self.pixels.chunks
+        return reduced(part, (height, width), read, most)
 
     def _compared(self) -> tuple[Grid | None, dict[str, str]]:
         attributes = read_document(self.path)

@@ -1,4 +1,4 @@
-"""Pictures: images, mosaics, volumes, points, geometry, lines, recordings, tracks, trade-offs.
+"""Pictures of images, mosaics, volumes, points, geometry, recordings, tracks, plans, trade-offs.
 
 Functions that return a `matplotlib.figure.Figure` touch no window and no global state; `save`
 writes it as PNG, PDF or SVG. `image` draws into axes of your own, or into a new pyplot figure.
@@ -8,6 +8,7 @@ from clsas.plot.canvas import save as save
 from clsas.plot.canvas import save_png as save_png
 from clsas.plot.curves import cuts as cuts
 from clsas.plot.curves import tradeoff as tradeoff
+from clsas.plot.echoes import echoes as echoes
 from clsas.plot.levels import image as image
 from clsas.plot.levels import image_db as image_db
 from clsas.plot.levels import image_html as image_html
@@ -18,6 +19,8 @@ from clsas.plot.navigation import before_and_after as before_and_after
 from clsas.plot.navigation import coherence as coherence
 from clsas.plot.navigation import corrections as corrections
 from clsas.plot.navigation import sharpness as sharpness
+from clsas.plot.plans import plan as plan
+from clsas.plot.points import points as points
 from clsas.plot.recordings import inspection as inspection
 from clsas.plot.survey import geometry as geometry
 from clsas.plot.volumes import volume as volume
@@ -27,6 +30,7 @@ __all__ = [
     "coherence",
     "corrections",
     "cuts",
+    "echoes",
     "geometry",
     "image",
     "image_db",
@@ -34,6 +38,8 @@ __all__ = [
     "inspection",
     "mosaic",
     "patch_borders",
+    "plan",
+    "points",
     "range_lines",
     "save",
     "save_png",
