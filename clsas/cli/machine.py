@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 def devices(as_json: bool) -> None:
     """List OpenCL devices, and show which one is used and why.
 
-    Also shown are the origin and the age of each device's costs, from which plans predict times.
+    Plans predict times from the costs of a device; their origin and age are listed too.
 
     \b
     Example:  CLSAS_DEVICE=0 clsas devices
@@ -102,7 +102,7 @@ def measure_costs(device: str | None, as_json: bool) -> None:
 @click.command()
 @click.option(
     "--out", type=File(file_okay=False), default="clsas-demo",
-    show_default=True, help="Folder for the files, new or from an earlier demo.",
+    show_default=True, help="Folder for the files: a new one, or that of an earlier demo.",
 )  # fmt: skip
 @options.device
 @options.as_json
@@ -115,7 +115,7 @@ def demo(out: Path, device: str | None, as_json: bool) -> None:
     Example:  clsas demo --out my-demo
     """
     need_matplotlib()
-    tell = (lambda line: None) if as_json else say
-    results = demonstration.run(out, device=device, say=tell, progress=progress_bar)
+    show_line = (lambda line: None) if as_json else say
+    results = demonstration.run(out, device=device, say=show_line, progress=progress_bar)
     if as_json:
         print_json(results)

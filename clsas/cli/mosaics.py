@@ -34,16 +34,16 @@ from clsas.mosaics.patches import patch_shape_of
 from clsas.mosaics.record import Record
 from clsas.opencl.device import open_device
 
-_SCHEDULER_S = 10  # time for a scheduler to answer
+_SCHEDULER_S = 10  # how long a scheduler may take to answer; arbitrary
 _IDLE_S = 60.0  # default of --idle-s
-_LISTED = 3  # patches that are listed for each kind of defect
+_LISTED = 3  # patches that are listed for each flag; arbitrary
 
 
 @click.command()
 @click.argument("scene", metavar="[SCENE.TOML]", type=INPUT, required=False)
 @click.option(
     "--lines", "lines_path", type=File(exists=True),
-    help="File of range lines, or a folder of such files. [default: simulated from the scene]",
+    help="File of range lines, or folder of such files. [default: simulated from the scene]",
 )  # fmt: skip
 @click.option(
     "-o", "--output", type=Store(),
@@ -51,15 +51,17 @@ _LISTED = 3  # patches that are listed for each kind of defect
 )  # fmt: skip
 @options.axes
 @options.method
-@click.option("--exact", is_flag=True, help="Form exact patches; --accuracy-db implies it.")
+@click.option(
+    "--exact", is_flag=True, help="Form exact patches. --accuracy-db implies this option."
+)
 @click.option(
     "--accuracy-db", type=float, callback=options.check_accuracy_db,
-    help="Relative rms error of exact patches, dB. [default: -60]",
+    help="Relative rms error of exact patches (dB). [default: -60]",
 )  # fmt: skip
 @options.beam
 @click.option("--patches", type=COUNTS, help="Number of patches along y and x, such as 8x8.")
 @click.option(
-    "--memory-mib", type=click.IntRange(1), help="Memory of one patch, MiB. [default: 1024]"
+    "--memory-mib", type=click.IntRange(1), help="Memory for one patch (MiB). [default: 1024]"
 )
 @click.option("--device", multiple=True, help="Device to use; repeat the option to use several.")
 @click.option("--workers", type=click.IntRange(1), help="Number of worker processes.")
@@ -67,8 +69,8 @@ _LISTED = 3  # patches that are listed for each kind of defect
 @click.option("--follow", is_flag=True, help="Wait for files to be added to the folder --lines.")
 @click.option(
     "--idle-s", type=float, callback=options.check_idle_s,
-    help="With --follow, stop after this many seconds without a new file, or when a file named "
-    "`end` appears. [default: 60]",
+    help="With --follow, stop after this many seconds without a new file. A file named `end` stops "
+    "it at once. [default: 60]",
 )  # fmt: skip
 @click.option(
     "--verify", is_flag=True,
@@ -76,7 +78,7 @@ _LISTED = 3  # patches that are listed for each kind of defect
 )  # fmt: skip
 @options.picture("an overview in dB")
 @options.levels
-@click.option("--borders", is_flag=True, help="Draw the borders of the patches into the picture.")
+@click.option("--borders", is_flag=True, help="Draw the borders between patches into the picture.")
 @options.as_json
 @options.refusing_unreached
 def mosaic(
@@ -172,7 +174,7 @@ def _check_without_scene(has_grid: bool, lines_path: Path | None, output: Path |
 def _check_combination(
     has_device: bool, workers: int | None, scheduler: str | None, follow: bool, idle_s: float | None
 ) -> None:
-    """Raise UsageError for options that exclude or need each other."""
+    """Raise UsageError for options that exclude or require each other."""
     if workers is not None and scheduler is not None:
         raise click.UsageError("give only one of --workers and --scheduler")
     if has_device and (workers or scheduler):
@@ -182,7 +184,7 @@ def _check_combination(
 
 
 def _check_paths(output: Path, picture: Path | None, lines_path: Path | None, follow: bool) -> None:
-    """Raise UsageError if files would overwrite each other, or --follow has no folder."""
+    """Raise UsageError if files would replace each other, or --follow has no folder."""
     keep_apart("--picture", picture, "the store", output)
     keep_out("--picture", picture, "the store", output)
     keep_apart("the range lines", lines_path, "the store", output)
@@ -191,7 +193,7 @@ def _check_paths(output: Path, picture: Path | None, lines_path: Path | None, fo
 
 
 def _read_request(described: SceneFile, given: dict[str, Any], exact: bool) -> dict[str, Any]:
-    """Return the request for every patch: a plan's, or an accuracy."""
+    """Return the request for every patch, which is one of `PLAN_KEYS` or an accuracy."""
     request = read_request(described, given, exact)
     if set(request) - {*PLAN_KEYS, "accuracy_db"}:
         raise ValueError(
@@ -201,27 +203,27 @@ def _read_request(described: SceneFile, given: dict[str, Any], exact: bool) -> d
 
 
 def _form(formed: clsas.Mosaic, name: str, *, quiet: bool) -> tuple[int, int]:
-    """Form the patches that are not finished; return their number and that of their pixels.
+    """Form the patches that are not finished; return the number of patches and of their pixels.
 
-    A line is printed for each unless `quiet`.
+    Unless `quiet`, a line is printed for every patch.
     """
     new, pixels = 0, 0
-    with _patch_progress(name, len(formed), len(formed.finished)) as tell:
+    with _patch_progress(name, len(formed), len(formed.finished)) as show_patch:
         for patch in formed:
             new, pixels = new + 1, pixels + patch.grid.size
             if not quiet:
-                tell(patch)
+                show_patch(patch)
     return new, pixels
 
 
 def _results(
     formed: clsas.Mosaic, records: dict[tuple[int, int], Record]
 ) -> tuple[list[str], dict[str, Any]]:
-    """Return patches, errors and defects of a mosaic: in words, and in types of JSON.
+    """Return patches, errors and flags of a mosaic: in words, and in types of JSON.
 
-    The first of the words are the patches.
+    The first item of the words describes the patches.
     """
-    # Errors are relative to the image, so that a patch of zeros has none.
+    # Errors are relative to the image, so they are undefined for a patch of zeros.
     errors = [record.predicted_error_db for record in records.values() if record.has_pixels]
     worst = max((error for error in errors if error is not None), default=None)
     zero = bool(records) and not any(record.has_pixels for record in records.values())
@@ -246,7 +248,7 @@ def _results(
 
 
 def _described_flags(flagged: dict[tuple[int, int], tuple[str, ...]]) -> list[str]:
-    """Return one line for every kind of defect, with the patches that have it."""
+    """Return one line for every flag, with the patches that have it."""
     alike: dict[str, list[str]] = {}
     for (row, column), flags in flagged.items():
         alike.setdefault(printable("; ".join(flags)), []).append(f"{row},{column}")
@@ -274,7 +276,7 @@ def _store_to_verify(scene: Path | None, output: Path | None) -> Path:
 
 
 def _verify(path: Path, as_json: bool) -> None:
-    """Report which patches and arrays of a store are damaged; exit with 1 if any is."""
+    """Report which patches and arrays of a store are damaged; exit with code 1 if any is."""
     store = clsas.Store.opened(path)
     arrays, has_digests = store.array_damage(), store.has_digests
     # Without the metadata of pixels, patches cannot be read.
@@ -293,7 +295,7 @@ def _verify(path: Path, as_json: bool) -> None:
     if not has_digests:
         lines.append(
             "  The store has no digests of its metadata, since an earlier version of clsas wrote "
-            "it: changed\n  names and units of its arrays are not noticed. clsas mosaic with the "
+            "it. Changed\n  names and units of its arrays are not noticed. clsas mosaic with the "
             "same inputs adds digests."
         )
     report(
@@ -313,9 +315,9 @@ def _beside(output: Path, scene: Path) -> Path:
 def _simulated(
     described: SceneFile, scene: Path, output: Path, picture: Path | None, *, quiet: bool
 ) -> Path:
-    """Return the file of a scene's range lines, beside the store; simulate them if it is not there.
+    """Return the file of a scene's range lines beside the store; simulate it if it is missing.
 
-    A line tells which, unless `quiet`.
+    Unless `quiet`, a line reports which of the two was done.
     """
     path = _beside(output, scene)
     keep_apart("--picture", picture, "the simulated range lines", path)
@@ -362,7 +364,9 @@ def _cluster(workers: int | None, scheduler: str | None) -> Iterator[Any]:
         try:
             yield client
         except KilledWorker as error:
-            raise click.ClickException(f"workers died repeatedly on one patch: {error}") from None
+            raise click.ClickException(
+                f"workers ended unexpectedly several times on one patch: {error}"
+            ) from None
 
 
 @contextmanager
@@ -378,7 +382,7 @@ def _patch_progress(name: str, total: int, done: int) -> Iterator[Callable[[clsa
     ) as bar:
         task = bar.add_task(printable(name), total=total, completed=done)
 
-        def tell(patch: clsas.Patch) -> None:
+        def show_patch(patch: clsas.Patch) -> None:
             record = patch.record
             parts = [f"{record.seconds:.2f} s", f"{record.channels} channels"]
             if not record.has_pixels:
@@ -389,4 +393,4 @@ def _patch_progress(name: str, total: int, done: int) -> Iterator[Callable[[clsa
             console.print(printable(line), markup=False)
             bar.advance(task)
 
-        yield tell
+        yield show_patch

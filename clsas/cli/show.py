@@ -76,7 +76,8 @@ def show(
     levels = read_levels(dynamic_range_db, None, colour_map)
     need_matplotlib()
     output = output or _beside(file)
-    keep_out("--output", output, "the store", file)
+    if file.is_dir():
+        keep_out("--output", output, "the store", file)
     shown = _read(file)
     given = {
         "--dynamic-range-db": dynamic_range_db,
@@ -103,9 +104,9 @@ def _beside(file: Path) -> Path:
     """Return the default picture of a file, which must be one that can be written."""
     context = click.get_current_context()
     (option,) = (each for each in context.command.params if each.name == "output")
-    name = file.resolve().name if file.name in ("", "..") else file.name
-    stem = Path(name).stem if Path(name).suffix.lower() in _ENDINGS else name
-    return option.type.convert(file.parent / f"{stem}.png", option, context)
+    path = file.resolve() if file.name in ("", "..") else file
+    name = path.stem if path.suffix.lower() in _ENDINGS else path.name
+    return option.type.convert(path.with_name(f"{name}.png"), option, context)
 
 
 def _read(path: Path) -> Shown:
@@ -128,7 +129,7 @@ def _read(path: Path) -> Shown:
         )
     found = clsas.load(path)
     if isinstance(found, clsas.Grid):
-        raise ValueError(f"{path} must hold an image, range lines or echoes, got a Grid")
+        raise ValueError(f"{path} must hold an image, range lines or echoes, got only a Grid")
     return found
 
 
@@ -186,7 +187,7 @@ def _overview(
     """Return a mosaic, or the part around a position, at the pixels of a picture."""
     from clsas.plot.windows import window_around
 
-    window = () if near is None else window_around(store.plane, near, extent_m)
+    window = () if near is None else window_around(store.grid, near, extent_m)
     return store.overview(_MOST_PIXELS, *window)
 
 

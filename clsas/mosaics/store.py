@@ -142,23 +142,6 @@ class Store:
             raise ValueError(f"{self.path} is damaged: its grid is not the one that was written")
         return grid
 
-    @property
-    def plane(self) -> Grid:
-        """Plane of the pixels, without the heights of a height map, which are not read.
-
-        Raises
-        ------
-        ValueError
-            As for `grid`.
-        """
-        attributes = read_document(self.path)
-        if not has_height(self.path, attributes):
-            return self.grid
-        plane, found = _arrays().compared(self.path, attributes, False)
-        if plane is None or found:
-            raise ValueError(f"{self.path} is damaged: {describe_arrays(found)}{_MENDED}")
-        return plane
-
     def array_damage(self) -> dict[str, str]:
         """Compare metadata, coordinates and heights with what was written.
 
@@ -360,7 +343,7 @@ class Store:
     ) -> Image:
         """Return the mosaic at fewer pixels, each with the mean power of those it covers.
 
-        About one patch at a time is read, so the mosaic may be larger than memory. A height map
+        About one patch at a time is read, so the pixels may take more than memory. A height map
         becomes a plane.
 
         Parameters
@@ -384,7 +367,7 @@ class Store:
                 ("rows", "columns"), (rows, columns), self.pixels.shape, strict=True
             )
         ]
-        part = self.plane.window(rows, columns)
+        part = self.grid.window(rows, columns)
 
         def read(*within: slice) -> NDArray[np.complex64]:
             chosen = (whole[each] for whole, each in zip(parts, within, strict=True))

@@ -59,7 +59,7 @@ def mosaic(
     most = validate.count("most", most)
     figure = image_db(store.overview(most), **options)
     if borders and store.patch_shape is not None:
-        patch_borders(figure.axes[0], store.plane, store.patch_shape)
+        patch_borders(figure.axes[0], store.grid, store.patch_shape)
     return figure
 
 

@@ -11,6 +11,7 @@ from clsas.core.grid import Grid
 from clsas.measures.quality import on_axes
 
 _AROUND = 32  # pixels on either side by default, along the coarser axis
+_ROUNDING = 1e-6  # of a step, so that a pixel at the very end is drawn
 
 
 def window_around(
@@ -49,7 +50,7 @@ def window_around(
                 f"near must be inside the image: {axis.name} from {ends_m[0]:g} to "
                 f"{ends_m[1]:g} m, got {at_m:g} m"
             )
-        inside = np.flatnonzero(distance_m <= extent_m)
+        inside = np.flatnonzero(distance_m <= extent_m + _ROUNDING * step_m)
         first, last = (inside[0], inside[-1]) if len(inside) else (nearest, nearest)
         parts.append(slice(int(first), int(last) + 1))
     columns, rows = parts
