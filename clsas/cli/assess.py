@@ -12,6 +12,8 @@ from clsas.cli import options
 from clsas.cli.inputs import load, read_beam, read_grid, read_request
 from clsas.cli.outputs import json_able, report
 from clsas.cli.parameters import INPUT
+from clsas.files.cphd import START as CPHD
+from clsas.files.matlab import is_matlab
 from clsas.planning.planner import (
     BEST_TOLERANCE_DB,
     TOLERANCE_DB,
@@ -52,8 +54,9 @@ def assess(
     Example:  clsas assess scene.toml --tolerance-db -40
               clsas assess lines.h5 --scene scene.toml --repeats 5
     """
-    with open(file, "rb") as opened:
-        is_lines = opened.read(4) == _HDF5
+    with file.open("rb") as opened:
+        start = opened.read(128)
+    is_lines = start.startswith((_HDF5, CPHD)) or is_matlab(start)
     if not is_lines:
         if scene is not None:
             raise click.UsageError(

@@ -128,7 +128,7 @@ def known_points(
     default=1.0,
     show_default=True,
     callback=_positive("yaw_sd_deg", "degrees"),
-    help="Standard deviation of their yaw (degrees).",
+    help="Standard deviation of the yaw in the navigation data (degrees).",
 )
 @click.option(
     "--surge-sd-m",
@@ -136,7 +136,7 @@ def known_points(
     default=0.1,
     show_default=True,
     callback=_positive("surge_sd_m", "m"),
-    help="Standard deviation of their surge (m).",
+    help="Standard deviation of the surge in the navigation data (m).",
 )
 @click.option(
     "--unknown",

@@ -956,3 +956,10 @@ def test_shells_complete_commands_options_and_choices(typed, expected):
     *args, incomplete = typed
     completion = ShellComplete(cli.main, {}, "clsas", "_CLSAS_COMPLETE")
     assert [item.value for item in completion.get_completions(args, incomplete)] == expected
+
+
+def test_recordings_that_are_no_hdf5_are_assessed(made, tmp_path):
+    pytest.importorskip("sarkit")
+    lines = clsas.load(made[0] / "lines.h5")
+    clsas.save(tmp_path / "lines.cphd", replace(lines, rx_velocity_m_s=None))
+    assert "needed" in run_json("assess", tmp_path / "lines.cphd", *GRID)
