@@ -134,10 +134,7 @@ def mosaic(
     recorded = lines_path or in_scene.get("lines")
     _check_paths(output, picture, recorded, follow)
     check_place(output.resolve())  # before anything is simulated
-    lines_path = recorded
-    if scene is not None and lines_path is None:
-        lines_path = _simulated(described, scene, output, picture, quiet=as_json)
-    assert lines_path is not None  # without a scene, --lines has been required
+    lines_path = recorded or _simulated(described, scene, output, picture, quiet=as_json)
     start = time.perf_counter()
     with _cluster(workers, scheduler) as client:
         formed = clsas.mosaic(
@@ -313,12 +310,13 @@ def _beside(output: Path, scene: Path) -> Path:
 
 
 def _simulated(
-    described: SceneFile, scene: Path, output: Path, picture: Path | None, *, quiet: bool
+    described: SceneFile, scene: Path | None, output: Path, picture: Path | None, *, quiet: bool
 ) -> Path:
     """Return the file of a scene's range lines beside the store; simulate it if it is missing.
 
     Unless `quiet`, a line reports which of the two was done.
     """
+    assert scene is not None  # without one, --lines is required
     path = _beside(output, scene)
     keep_apart("--picture", picture, "the simulated range lines", path)
     if path.exists():

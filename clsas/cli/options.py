@@ -146,7 +146,9 @@ method = _together(
     ),
 )  # fmt: skip
 beam = _together(
-    click.option("--beam-deg", type=float, help="Weigh channels by a beam of this width (degrees)."),
+    click.option(
+        "--beam-deg", type=float, help="Weigh channels by a beam of this full width (degrees)."
+    ),
     click.option(
         "--beam-shape", type=click.Choice(SHAPES),
         help="Shape of the beam. Images with 'hann' are the fastest. [default: rectangular]",

@@ -48,7 +48,7 @@ def read_heights(path: str | os.PathLike, shape: tuple[int, ...]) -> NDArray[np.
     if heights.dtype.kind not in "iuf":
         raise ValueError(f"must hold real numbers, got {heights.dtype} in {path}")
     validate.memory(str(path), 8 * heights.size)
-    heights = np.array(heights, np.float64)  # reads what is still only mapped
+    heights = np.array(heights, np.float64)  # a mapped array is read here
     if not np.isfinite(heights).all():
         raise ValueError(f"must hold finite heights, got NaN or infinity in {path}")
     return heights

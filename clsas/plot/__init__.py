@@ -8,7 +8,6 @@ from clsas.plot.canvas import save as save
 from clsas.plot.canvas import save_png as save_png
 from clsas.plot.curves import cuts as cuts
 from clsas.plot.curves import tradeoff as tradeoff
-from clsas.plot.echoes import echoes as echoes
 from clsas.plot.levels import image as image
 from clsas.plot.levels import image_db as image_db
 from clsas.plot.levels import image_html as image_html
@@ -20,8 +19,9 @@ from clsas.plot.navigation import coherence as coherence
 from clsas.plot.navigation import corrections as corrections
 from clsas.plot.navigation import sharpness as sharpness
 from clsas.plot.plans import plan as plan
-from clsas.plot.points import points as points
+from clsas.plot.raw_echoes import echoes as echoes
 from clsas.plot.recordings import inspection as inspection
+from clsas.plot.scattered_points import points as points
 from clsas.plot.survey import geometry as geometry
 from clsas.plot.volumes import volume as volume
 

@@ -76,9 +76,7 @@ def pictures(folder: Path) -> dict[str, Call]:
             kinds=text,
             accepts=accepts,
         ),
-        "plot.plan": Call(
-            plot.plan, {"plan": clsas.plan(s.lines, s.grid, -40.0), **title}, kinds=text
-        ),
+        "plot.plan": Call(plot.plan, {"plan": s.plan, **title}, kinds=text),
         "plot.volume": Call(
             plot.volume,
             {"image": volume, "kind": "slices", "at": (1.0, 2.0, 1.0), **title},
