@@ -409,7 +409,7 @@ def test_it_says_whether_times_are_of_this_device(chosen, monkeypatch, tmp_path)
     monkeypatch.setenv("CLSAS_CACHE", str(tmp_path))
     usual = plan(lines, grid, stages=[])
     assert usual.prediction.cost_source == "default"
-    words = "Times follow from default costs, not from any measured on this device: `clsas calib"
+    words = "Times follow from default costs, not from any measured on this device: `clsas measure"
     assert words in usual.describe()
     device = open_device()
     costs.save(device, costs.defaults(device), "scaled")
