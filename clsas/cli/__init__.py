@@ -1,4 +1,4 @@
-"""The `clsas` command: a thin layer over the library, one function per subcommand.
+"""The `clsas` command: a thin layer over the library, with one function per subcommand.
 
 Results go to standard output, progress and warnings to standard error. Exit codes: 0 done, 1 error
 (one `Error:` message), 2 wrong usage, 130 interrupted.
@@ -6,6 +6,7 @@ Results go to standard output, progress and warnings to standard error. Exit cod
 
 from __future__ import annotations
 
+import difflib
 import importlib
 import warnings
 from collections.abc import Callable
@@ -16,61 +17,48 @@ import click
 
 import clsas
 
-# Module and first sentence of the help of every command. Importing a command's module takes a
-# second, so --help and --version do without.
-_COMMANDS = {
-    "devices": ("machine", "List OpenCL devices, and show which one is used and why."),
-    "simulate": ("lines", "Simulate the echoes of a scene file."),
-    "compress": ("lines", "Compress echoes into range lines."),
-    "convert": (
-        "lines",
-        "Convert a file: recordings to range lines in HDF5, range lines to CPHD and back.",
-    ),
-    "inspect": (
-        "inspection",
-        "Show what a recording looks like, and what is wrong with it.",
-    ),
-    "image": ("images", "Form the image of range lines, fast to a tolerance or exactly."),
-    "plan": (
-        "images",
-        "Show the plan of an image, with its predicted time and error.",
-    ),
-    "assess": (
-        "assess",
-        "Show which effects an image needs, the error of leaving each out, and its cost.",
-    ),
-    "known-points": (
-        "navigation",
-        "Correct time offset, sound speed and lever arm by reflectors at known positions.",
-    ),
-    "navigate": ("navigation", "Correct an array's track by displaced phase centres."),
-    "focus": ("navigation", "Correct a track by the bright responses of an image (autofocus)."),
-    "process": (
-        "processing",
-        "Take a recording to a focused image, by the steps of a scene file.",
-    ),
-    "mosaic": ("mosaics", "Form an image of any size patch by patch, into a Zarr store."),
-    "quality": (
-        "measures",
-        "Measure an image: contrast, response of a point, error against another image.",
-    ),
-    "tradeoff": (
-        "measures",
-        "Measure speed against accuracy: one image with many tolerances, timed and compared.",
-    ),
-    "bench": (
-        "measures",
-        "Time a benchmark case and measure its error.",
-    ),
-    "demo": (
-        "machine",
-        "Run the thesis's wide-beam case, from simulation to a measured image.",
-    ),
+# Module and first sentence of the help of every command, under the headings of `clsas --help`.
+# Importing the module of a command takes up to a second: --help, --version and completion do not.
+_GROUPS = {
+    "Recordings": {
+        "simulate": ("lines", "Simulate the echoes that a scene file describes."),
+        "compress": ("lines", "Compress echoes into range lines."),
+        "convert": ("lines", "Convert a recording to HDF5 or CPHD."),
+        "inspect": ("inspection", "Show what a recording contains, and what is wrong with it."),
+        "known-points": (
+            "navigation",
+            "Correct timing, sound speed and lever arm by known points.",
+        ),
+        "navigate": ("navigation", "Correct the track of an array by micronavigation."),
+        "focus": ("navigation", "Correct a track by autofocus on bright responses."),
+    },
+    "Images": {
+        "process": ("processing", "Take a recording to a focused image, step by step."),
+        "plan": ("images", "Show how an image would be formed, its time and its error."),
+        "image": ("images", "Form an image of range lines, to a tolerance or exactly."),
+        "mosaic": ("mosaics", "Form an image of any size, patch by patch."),
+        "show": ("show", "Draw an image, range lines, a plan, a recording or a mosaic."),
+    },
+    "Measures": {
+        "quality": ("measures", "Measure the contrast, a point or the error of an image."),
+        "assess": ("assess", "Show which effects an image needs, and what each costs."),
+        "tradeoff": ("measures", "Measure time and error of one image at many tolerances."),
+    },
+    "Machine": {
+        "devices": ("machine", "List OpenCL devices, and show which one is used and why."),
+        "measure-costs": ("machine", "Measure what imaging costs on a device, for planning."),
+        "selftest": ("selftest", "Test the accuracy of a device, in about a minute."),
+        "bench": ("measures", "Time benchmark cases, and measure their errors."),
+        "demo": ("machine", "Simulate, image and measure the thesis's wide-beam case."),
+    },
+}
+_COMMANDS = {name: entry for group in _GROUPS.values() for name, entry in group.items()}
+# What to do instead of a command of an earlier version.
+_RENAMED = {
     "calibrate": (
-        "machine",
-        "Measure the costs of imaging steps on a device, and store them for planning.",
+        "The command 'calibrate' is now 'measure-costs': it measures a device. To calibrate a "
+        "sonar, use 'known-points', or the step 'calibrate' of 'process'."
     ),
-    "selftest": ("selftest", "Test this device's accuracy at the extremes, in about a minute."),
 }
 
 
@@ -88,9 +76,36 @@ class _Commands(click.Group):
             imported = importlib.import_module(f"clsas.cli.{module}")
         return getattr(imported, cmd_name.replace("-", "_"))
 
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        try:
+            return super().resolve_command(ctx, args)
+        except click.UsageError as error:
+            if args[0] in _RENAMED:
+                error.message = _RENAMED[args[0]]  # type: ignore[misc]
+            elif close := difflib.get_close_matches(args[0], _COMMANDS):
+                guesses = " or ".join(map(repr, close))
+                error.message += f" Did you mean {guesses}?"  # type: ignore[misc]
+            raise
+
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        with formatter.section("Commands"):
-            formatter.write_dl([(name, what) for name, (_, what) in _COMMANDS.items()])
+        width = max(map(len, _COMMANDS))
+        for heading, group in _GROUPS.items():
+            with formatter.section(heading):
+                formatter.write_dl(
+                    [(f"{name:<{width}}", what) for name, (_, what) in group.items()]
+                )
+
+    def shell_complete(self, ctx: click.Context, incomplete: str) -> list[Any]:
+        from click.shell_completion import CompletionItem
+
+        commands = [
+            CompletionItem(name, help=what)
+            for name, (_, what) in _COMMANDS.items()
+            if name.startswith(incomplete)
+        ]
+        return commands + click.Command.shell_complete(self, ctx, incomplete)  # and the options
 
     def make_context(self, *arguments: Any, **options: Any) -> click.Context:
         try:
@@ -114,7 +129,7 @@ class _Commands(click.Group):
                 error.message = _printable(error.message)  # type: ignore[misc]
                 raise
             except BrokenPipeError:
-                raise  # click handles this: the reader of our output has left
+                raise  # the reader of our output has gone; click handles this
             except KeyboardInterrupt as interrupt:
                 raise _interrupted() from interrupt
             except _errors() as error:
@@ -124,7 +139,7 @@ class _Commands(click.Group):
 
 
 def _errors() -> tuple[type[Exception], ...]:
-    """Return errors of users, and limits of their machines."""
+    """Return the exceptions that users or their machines cause, not faults of clsas."""
     import pyopencl
 
     ours = ValueError, TypeError, clsas.DeviceError, OSError, ImportError, MemoryError
@@ -144,13 +159,14 @@ def main(traceback: bool) -> None:
     A first try:     clsas demo
     Step by step:    clsas simulate scene.toml -o echoes.h5
                      clsas compress echoes.h5 -o lines.h5
-                     clsas image lines.h5 --scene scene.toml -o image.h5 --picture image.png
+                     clsas image lines.h5 --scene scene.toml -o image.h5
+                     clsas show image.h5
                      clsas quality image.h5 --near 0,42.5
     """
 
 
 def _importing() -> AbstractContextManager[None]:
-    """Let Ctrl-C wait for imports: some extension modules would answer it by aborting."""
+    """Delay Ctrl-C until imports are done, since it makes some extension modules abort."""
     from clsas.core.threads import uninterrupted  # imports NumPy, which is slow
 
     return uninterrupted()
@@ -162,7 +178,7 @@ def _interrupted() -> click.exceptions.Exit:
 
 
 def _showing(others: Callable[..., None]) -> Callable[..., None]:
-    """Return a function that shows clsas's warnings as messages and others as Python does."""
+    """Return a function that prints warnings of clsas as messages, and others as Python does."""
 
     def show(message: Warning | str, category: type[Warning], *where: Any, **options: Any) -> None:
         if issubclass(category, clsas.ClsasWarning):
@@ -174,7 +190,7 @@ def _showing(others: Callable[..., None]) -> Callable[..., None]:
 
 
 def _printable(text: str) -> str:
-    """Return a message whose text may have come from outside."""
+    """Return a message with control characters escaped, since parts may come from a file."""
     from clsas.core import validate  # imports NumPy, which is slow
 
     return validate.printable(text)

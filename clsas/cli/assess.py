@@ -1,4 +1,4 @@
-"""Command for the effects that an image needs: assess."""
+"""Command that finds the effects an image needs: assess."""
 
 from __future__ import annotations
 
@@ -12,6 +12,8 @@ from clsas.cli import options
 from clsas.cli.inputs import load, read_beam, read_grid, read_request
 from clsas.cli.outputs import json_able, report
 from clsas.cli.parameters import INPUT
+from clsas.files.cphd import START as CPHD
+from clsas.files.matlab import is_matlab
 from clsas.planning.planner import (
     BEST_TOLERANCE_DB,
     TOLERANCE_DB,
@@ -30,7 +32,7 @@ _HDF5 = b"\x89HDF"
 @options.device
 @click.option(
     "--repeats", type=click.IntRange(0), default=0, show_default=True,
-    help="Also time this many images with and without every effect.",
+    help="Also time the image with and without every effect, this many times.",
 )  # fmt: skip
 @options.as_json
 def assess(
@@ -41,19 +43,20 @@ def assess(
     as_json: bool,
     **given: Any,
 ) -> None:
-    """Show which effects an image needs, the error of leaving each out, and its cost.
+    """Show which effects an image needs, and what each costs.
 
-    Assess a scene before anything is simulated, or range lines with a grid from --scene or from
-    --x, --y and --z. With the scene's sonar and track, element patterns are assessed too, and the
-    receivers' motion if the lines have no velocities. Grid, beam and tolerance are those of
-    `clsas image`.
+    For every effect the error without it is given. Assess a scene before anything is simulated, or
+    range lines with a grid from --scene or from --x, --y and --z. If the scene describes sonar and
+    track, element patterns are assessed too, and the motion of the receivers even if the lines have
+    no velocities. Grid, beam and tolerance are those of `clsas image`.
 
     \b
     Example:  clsas assess scene.toml --tolerance-db -40
               clsas assess lines.h5 --scene scene.toml --repeats 5
     """
-    with open(file, "rb") as opened:
-        is_lines = opened.read(4) == _HDF5
+    with file.open("rb") as opened:
+        start = opened.read(128)
+    is_lines = start.startswith((_HDF5, CPHD)) or is_matlab(start)
     if not is_lines:
         if scene is not None:
             raise click.UsageError(
@@ -66,7 +69,7 @@ def assess(
     if is_lines:
         lines = load(file, clsas.RangeLines)
         sonar, track = described.sonar, described.track
-        # If the scene describes another survey than the lines do, use only its grid and beam.
+        # A scene that describes another survey than the lines provides only grid and beam.
         if sonar and track and sonar.receivers * track.pings == lines.channels:
             known = {"sonar": sonar, "track": track}
     else:
@@ -102,9 +105,9 @@ def assess(
 
 
 def _tolerance_db(request: dict[str, Any]) -> float:
-    """Return the tolerance of a request; for an exact image this is its accuracy."""
+    """Return the tolerance of a request, dB; for an exact image, its accuracy."""
     if request.get("stages") is not None:
-        raise click.UsageError("--stages has no tolerance: give --tolerance-db")
+        raise click.UsageError("--stages implies no tolerance: use --tolerance-db instead")
     tolerance_db = tolerance_in_db(
         request.get("tolerance_db"), request.get("tolerance_wavelengths")
     )

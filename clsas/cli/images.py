@@ -1,4 +1,4 @@
-"""Commands that form an image of range lines or plan it: image, plan."""
+"""Commands that plan an image of range lines, or form it: image, plan."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ from clsas.planning.planner import WORST_TOLERANCE_DB
 from clsas.plans.factorization import UNREACHED, ExactImage
 from clsas.signal.interpolation import MOST_UPSAMPLING, TAPS
 
-_BUILD_SHARE = 0.1  # of an image's time, from which building kernels is reported
+_BUILD_SHARE = 0.1  # of an image's time; if building kernels takes more, it is reported
 
 
 @click.command()
@@ -45,26 +45,26 @@ _BUILD_SHARE = 0.1  # of an image's time, from which building kernels is reporte
 @options.grid
 @options.method
 @click.option(
-    "--exact", is_flag=True, help="Form an exact image; the three options below imply it."
+    "--exact", is_flag=True, help="Form an exact image. The three options below imply this one."
 )
 @click.option(
     "--accuracy-db",
     type=float,
     callback=options.check_accuracy_db,
-    help="Relative rms error of the exact image, dB. [default: -60]",
+    help="Relative rms error of the exact image (dB). [default: -60]",
 )
 @click.option(
     "--taps",
     type=int,
     callback=options.checked(partial(validate.one_of, "taps", allowed=TAPS)),
-    help="Fix the interpolator's taps: 2, 4, 6 or 8.",
+    help="Number of taps of the interpolator: 2, 4, 6 or 8. [default: the fastest]",
 )
 @click.option(
     "--upsampling", type=float,
     callback=options.checked(
         partial(validate.number, "upsampling", least=1.0, most=MOST_UPSAMPLING)
     ),
-    help="Fix the upsampling factor of the lines.",
+    help="Factor by which lines are upsampled before interpolation. [default: the fastest]",
 )  # fmt: skip
 @options.beam
 @options.device
@@ -87,12 +87,12 @@ def image(
     as_json: bool,
     **given: Any,
 ) -> None:
-    """Form the image of range lines, fast to a tolerance or exactly.
+    """Form an image of range lines, to a tolerance or exactly.
 
-    The grid is that of --scene, or given by --x, --y and --z. Choose the method with one of
-    --tolerance-db, --tolerance-wavelengths, --stages and --exact, or with [image] of the scene. The
-    default is a tolerance of -50 dB against the exact image. The image is exact if no faster method
-    keeps the tolerance.
+    The grid is that of --scene, or given by --x, --y and --z. Choose the method by one of
+    --tolerance-db, --tolerance-wavelengths, --stages and --exact, or by [image] of the scene. The
+    default is a tolerance of -50 dB against the exact image. If no faster method keeps the
+    tolerance, the image is formed exactly. LINES.H5 may also be a recording of another kind.
 
     \b
     Example:  clsas image lines.h5 --x -2.5:2.5:1024 --y 40:45:1024 -o image.h5 --picture image.png
@@ -143,18 +143,18 @@ def image(
 
 @dataclass(frozen=True, eq=False)
 class _Formed:
-    """An image with a description of how it was formed.
+    """An image, and how it was formed.
 
     Attributes
     ----------
     image : Image
     how : str
-        The method, for people.
+        The method in words.
     predicted_error_db : float
     left_out : tuple of str
-        Effects that were left out.
+        Effects that the image does not model, since their error lies far below the tolerance.
     figures : dict
-        More about the method, in types of JSON.
+        Further results about the method, in types of JSON.
     """
 
     image: clsas.Image
@@ -165,12 +165,12 @@ class _Formed:
 
     @cached_property
     def is_zero(self) -> bool:
-        """True if all pixels are zero. No error is then predicted: it is relative to the image."""
+        """True if all pixels are zero; a relative error is then undefined."""
         return not holds_any(self.image.pixels)
 
     @property
     def summary(self) -> str:
-        """How the image was formed, in a line."""
+        """The method, the predicted error and what was left out, in a line."""
         error = f"predicted error {self.predicted_error_db:.0f} dB"
         parts = [self.how, "all pixels are zero" if self.is_zero else error]
         if self.left_out:
@@ -179,7 +179,7 @@ class _Formed:
 
     @property
     def results(self) -> dict[str, Any]:
-        """How the image was formed, in types of JSON."""
+        """The same in types of JSON."""
         error_db = None if self.is_zero else self.predicted_error_db
         return {
             **self.figures,
@@ -218,7 +218,7 @@ def _exactly(
     chosen: clsas.Plan | None,
     progress: Callable[[int, int], None] | None,
 ) -> _Formed:
-    """Form an exact image as requested, or because a plan chose it."""
+    """Form an exact image, because it was requested or because a plan chose it."""
     why, warned = "", False
     if chosen is not None and isinstance(chosen.method, ExactImage):
         request = {"accuracy_db": chosen.method.accuracy_db}
@@ -244,7 +244,7 @@ def _exactly(
 
 
 def _duration(seconds: float, built_s: float, planned_s: float | None) -> str:
-    """Return the time of an image in words, with what a later image of its kind does not take."""
+    """Return the time of an image in words, with the parts that later images do not repeat."""
     words = f"{seconds:.2f} s"
     if built_s > _BUILD_SHARE * seconds:
         words += f" ({built_s:.2f} s of that to build kernels, which the driver keeps)"
@@ -252,7 +252,7 @@ def _duration(seconds: float, built_s: float, planned_s: float | None) -> str:
 
 
 def _table(kernels: dict[str, KernelTimes]) -> str:
-    """Return one line for every kernel, each after a line break."""
+    """Return the times of every kernel, each on a line of its own."""
     return "".join(
         f"\n  {name}: {times.count} runs of {1e3 * times.minimum_s:.3g} to "
         f"{1e3 * times.maximum_s:.3g} ms, median {1e3 * times.median_s:.3g} ms"
@@ -269,7 +269,7 @@ def _table(kernels: dict[str, KernelTimes]) -> str:
 @options.as_json
 @click.option(
     "--filters", is_flag=True,
-    help="With --json, include the filters' coefficients, for clsas.Plan.from_json.",
+    help="With --json, include the coefficients of the filters. The plan is then complete.",
 )  # fmt: skip
 def plan(
     lines_file: Path,
@@ -279,11 +279,11 @@ def plan(
     filters: bool,
     **given: Any,
 ) -> None:
-    """Show the plan of an image, with its predicted time and error.
+    """Show how an image would be formed, its time and its error.
 
     Grid, method and beam are those of `clsas image`. If the scene requests an exact image, a
-    tolerance of -50 dB is used instead. With --json and --filters the plan is complete, for
-    clsas.Plan.from_json.
+    tolerance of -50 dB is used instead. With --json and --filters the plan is complete: `clsas
+    show` draws it, and clsas.Plan.from_json reads it.
 
     \b
     Example:  clsas plan lines.h5 --x -2.5:2.5:1024 --y 40:45:1024 --tolerance-db -40
@@ -302,10 +302,10 @@ def plan(
 
 
 def _warn_of_error(chosen: clsas.Plan) -> None:
-    """Warn if the error of the thesis's method may be as large as the image."""
+    """Warn if the error of the thesis's method may be about as large as the image."""
     if chosen.tolerance_db is None and chosen.predicted_error_db > WORST_TOLERANCE_DB:
         warn(
             "with these stages the error may be as large as "
-            f"{chosen.predicted_error_db:.0f} dB, too large for an image to be of use: sum fewer "
-            "lines (QR), or divide more (QI)"
+            f"{chosen.predicted_error_db:.0f} dB, too large for a useful image: sum fewer lines "
+            "(QR), or divide more (QI)"
         )

@@ -1,4 +1,4 @@
-"""Inputs of commands: files, grid, beam, and the requested accuracy or method."""
+"""Inputs of commands: files, grid, beam, levels of pictures, and how to form an image."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ DEFAULT_REQUEST = {"tolerance_db": TOLERANCE_DB}
 
 
 def load(path: Path, *kinds: type) -> Any:
-    """Return the object in a file; raise ValueError unless it is of one of the types `kinds`."""
+    """Return what a file holds; raise ValueError unless it is of one of the types `kinds`."""
     obj = clsas.load(path)
     if isinstance(obj, kinds):
         return obj
@@ -36,7 +36,7 @@ def load(path: Path, *kinds: type) -> Any:
 
 
 def read_scene(path: Path) -> SceneFile:
-    """Return a scene; the command may not overwrite a file that the scene refers to."""
+    """Return a scene; raise UsageError if the command would replace a file that it refers to."""
     described = config.read_scene(path)
     for key, file in described.files.items():
         for option, written in written_to(click.get_current_context()).items():
@@ -49,7 +49,7 @@ def read_grid(
 ) -> tuple[SceneFile, clsas.Grid]:
     """Return the scene, empty if there is none, and the grid of the options or of the scene.
 
-    With `memory`, raise ValueError if the image does not fit into memory.
+    If `memory`, raise ValueError if an image on the grid does not fit into memory.
     """
     x, y, z = (given[name] for name in ("x", "y", "z"))
     if (x is None) != (y is None) or (z is not None and x is None):
@@ -66,9 +66,9 @@ def read_grid(
 def read_request(
     described: SceneFile, given: dict[str, Any], exact: bool = False
 ) -> dict[str, Any]:
-    """Return the request of the options or of the scene: a plan's (one of `PLAN_KEYS`) or exact.
+    """Return the request of the options, or else of the scene, or else the default tolerance.
 
-    Exact requests are empty or have some of `EXACT_KEYS`.
+    It has one of `PLAN_KEYS`; or, for an exact image, some or none of `EXACT_KEYS`.
     """
     planned, exactly = (
         {name: given[name] for name in names if given.get(name) is not None}
@@ -85,7 +85,7 @@ def read_request(
         )
     if len(exactly) == len(EXACT_KEYS):
         raise click.UsageError(
-            "--accuracy-db has no effect with both --taps and --upsampling: leave one out"
+            "--accuracy-db has no effect beside both --taps and --upsampling: leave one of them out"
         )
     if planned:
         return planned
@@ -96,7 +96,7 @@ def read_request(
 
 
 def read_beam(described: SceneFile, given: dict[str, Any]) -> clsas.BeamWindow | None:
-    """Return the beam of the options, or the scene's beam with the options' changes."""
+    """Return the beam of the scene as changed by the options, or that of the options alone."""
     beam = described.image.get("beam")
     options = {"width_deg": "beam_deg", "shape": "beam_shape", "squint_deg": "squint_deg"}
     options |= {"element_length_m": "element_length_m", "track_pings": "track_pings"}
@@ -123,7 +123,7 @@ def read_levels(
     percentiles: tuple[float, float] | None,
     colour_map: str | None,
 ) -> dict[str, Any]:
-    """Return the arguments of `clsas.plot.image` that say which levels a picture shows, checked."""
+    """Return the arguments of `clsas.plot.image` for levels and colours, checked."""
     if dynamic_range_db is not None and percentiles is not None:
         raise click.UsageError("--dynamic-range-db and --percentiles exclude each other")
     given = {
@@ -141,7 +141,7 @@ def read_levels(
 
 
 def warn_of_sampling(scene: SceneFile, grid: clsas.Grid | None = None) -> None:
-    """Warn if a scene's survey violates a sampling limit, for its own grid or another."""
+    """Warn of every sampling limit that a scene breaks, on its own grid or another one."""
     grid = scene.grid if grid is None else grid
     if scene.sonar is None or scene.track is None or grid is None:
         return

@@ -1,4 +1,4 @@
-"""Command that looks at a recording before it is imaged: inspect."""
+"""Command that checks a recording before it is imaged: inspect."""
 
 from __future__ import annotations
 
@@ -31,11 +31,11 @@ def inspect(
     as_json: bool,
     **given: Any,
 ) -> None:
-    """Show what a recording looks like, and what is wrong with it.
+    """Show what a recording contains, and what is wrong with it.
 
-    FILE is any that `clsas image` reads, or echoes. Every finding comes with its number and what to
-    do. Grid, beam and element length of --scene, or of the options, are compared with the lines.
-    `clsas convert` has options that drop, filter and fade what is wrong.
+    FILE is a recording that `clsas image` reads, or a file of echoes. Every finding comes with a
+    measured value and advice. The grid, the beam and the element length, of --scene or of the
+    options, are checked against the recording. `clsas convert` has options that remove faults.
 
     \b
     Example:  clsas inspect recording.h5 --scene scene.toml --picture recording.png

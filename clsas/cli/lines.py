@@ -1,4 +1,4 @@
-"""Commands that make range lines: simulate, compress, convert."""
+"""Commands that make and convert range lines: simulate, compress, convert."""
 
 from __future__ import annotations
 
@@ -29,7 +29,9 @@ from clsas.simulation.simulator import check_size
 @options.picture("track and grid")
 @options.as_json
 def simulate(scene_file: Path, output: Path, picture: Path | None, as_json: bool) -> None:
-    """Simulate the echoes of a scene file.
+    """Simulate the echoes that a scene file describes.
+
+    A warning is printed for every limit of sampling that the survey breaks.
 
     \b
     Example:  clsas simulate scene.toml -o echoes.h5
@@ -61,11 +63,11 @@ def simulate(scene_file: Path, output: Path, picture: Path | None, as_json: bool
 @options.output("Range lines")
 @options.scene
 @click.option(
-    "--window", help="Window over the band: none, hamming, taylor, ... [default: none]",
+    "--window", help="Window over the band, such as hamming or taylor. [default: none]",
     callback=options.checked(lambda window: check_options(window=window)),
 )  # fmt: skip
 @click.option(
-    "--oversampling", type=float, help="Sample rate over bandwidth. [default: 2]",
+    "--oversampling", type=float, help="Samples per bandwidth. [default: 2]",
     callback=options.checked(lambda rate: check_options(oversampling=rate)),
 )  # fmt: skip
 @options.picture("the lines")
@@ -84,6 +86,8 @@ def compress(
     as_json: bool,
 ) -> None:
     """Compress echoes into range lines.
+
+    Window and oversampling are those of the options, or else of --scene.
 
     \b
     Example:  clsas compress echoes.h5 -o lines.h5 --window hamming
@@ -117,23 +121,23 @@ def compress(
 @click.option(
     "--without-still-pings",
     is_flag=True,
-    help="Drop pings taken standing still.",
+    help="Drop pings that were taken while the sonar stood still.",
 )
 @click.option(
     "--without-background",
     type=click.Choice(STATISTICS),
-    help="Subtract what all pings have in common.",
+    help="Subtract this statistic of all pings from every ping.",
 )
 @click.option(
     "--high-pass-hz",
     type=float,
-    help="Remove frequencies of the recorded signal below this (Hz).",
+    help="Remove frequencies of the recorded signal below this one (Hz).",
     callback=options.checked(partial(validate.positive, "high_pass_hz", unit="Hz")),
 )
 @click.option(
     "--taper-m",
     type=float,
-    help="Fade this range at either end of the lines (m).",
+    help="Fade the lines over this range at either end (m).",
     callback=options.checked(partial(validate.positive, "taper_m", unit="m")),
 )
 @options.as_json
@@ -146,11 +150,12 @@ def convert(
     taper_m: float | None,
     as_json: bool,
 ) -> None:
-    """Convert a file: recordings to range lines in HDF5, range lines to CPHD and back.
+    """Convert a recording to HDF5 or CPHD.
 
-    The name of OUTPUT says what it becomes: HDF5 (.h5) or CPHD (.cphd). FILE is HDF5 of clsas or
-    AirSAS, CPHD, or a MATLAB file with a radar's phase history or a full matrix capture. The
-    options mend what `clsas inspect` finds, in the order in which they are listed.
+    FILE is an HDF5 file of clsas or AirSAS, a CPHD file, or a MATLAB file with a radar's phase
+    history or a full matrix capture. The suffix of OUTPUT decides what is written: HDF5 (.h5) or
+    CPHD (.cphd). The options remove faults that `clsas inspect` finds. They are applied in the
+    order of this list.
 
     \b
     Example:  clsas convert lines.h5 lines.cphd
@@ -181,5 +186,5 @@ def convert(
 
 
 def _overridden(described: dict[str, Any], **given: Any) -> dict[str, Any]:
-    """Return a scene file's settings, overridden by the options."""
+    """Return the settings of a scene file, with those replaced that options give."""
     return described | {name: value for name, value in given.items() if value is not None}

@@ -1,4 +1,4 @@
-"""Commands for a new machine: devices, calibrate, demo."""
+"""Commands for a new machine: devices, measure-costs, demo."""
 
 from __future__ import annotations
 
@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 @options.as_json
 def devices(as_json: bool) -> None:
     """List OpenCL devices, and show which one is used and why.
+
+    Plans predict times from the costs of a device; their origin and age are listed too.
 
     \b
     Example:  CLSAS_DEVICE=0 clsas devices
@@ -56,29 +58,35 @@ def devices(as_json: bool) -> None:
 
 
 def _origin(known: KnownCosts) -> str:
-    """Return where costs come from, and how old they are."""
+    """Return the origin of costs and their age, in words."""
     if known.source == "default":
-        return "defaults, until the first plan with a tolerance measures the device in 0.3 to 0.6 s"
-    how = {"scaled": "defaults, scaled by a short measurement", "calibrated": "calibrated"}
+        return "defaults; the first plan with a tolerance measures the device for 0.3 to 0.6 s"
+    how = {
+        "scaled": "defaults, scaled by a short measurement",
+        "calibrated": "measured by `clsas measure-costs`",
+    }
     days = (datetime.now(UTC) - datetime.fromisoformat(known.measured)).days
     age = "today" if days < 1 else f"{days} day{'s' * (days > 1)} ago"
     return f"{how[known.source]}, on {known.measured[:10]} ({age})"
 
 
-@click.command()
+@click.command("measure-costs")
 @options.device
 @options.as_json
-def calibrate(device: str | None, as_json: bool) -> None:
-    """Measure the costs of imaging steps on a device, and store them for planning.
+def measure_costs(device: str | None, as_json: bool) -> None:
+    """Measure what imaging costs on a device, for planning.
+
+    The costs of all steps of imaging are measured in about a minute, and stored for later plans.
+    They are not stored if the times vary too much, as on a busy machine.
 
     \b
-    Example:  clsas calibrate --device 0
+    Example:  clsas measure-costs --device 0
     """
     from clsas.planning import costs
     from clsas.planning.calibration import calibrate as measure
 
     opened = open_device(device)
-    with progress_bar("calibrating") as progress:
+    with progress_bar("measuring costs") as progress:
         found = measure(opened, progress=progress)
     stored = costs.load(opened).costs == found
     parts = "".join(f"\n{getattr(found, part.name):>12.4g}  {part.name}" for part in fields(found))
@@ -94,18 +102,20 @@ def calibrate(device: str | None, as_json: bool) -> None:
 @click.command()
 @click.option(
     "--out", type=File(file_okay=False), default="clsas-demo",
-    show_default=True, help="Folder for the files, new or from an earlier demo.",
+    show_default=True, help="Folder for the files: a new one, or that of an earlier demo.",
 )  # fmt: skip
 @options.device
 @options.as_json
 def demo(out: Path, device: str | None, as_json: bool) -> None:
-    """Run the thesis's wide-beam case, from simulation to a measured image.
+    """Simulate, image and measure the thesis's wide-beam case.
+
+    The folder then holds the scene file, the files of every step, and pictures.
 
     \b
     Example:  clsas demo --out my-demo
     """
     need_matplotlib()
-    tell = (lambda line: None) if as_json else say
-    results = demonstration.run(out, device=device, say=tell, progress=progress_bar)
+    show_line = (lambda line: None) if as_json else say
+    results = demonstration.run(out, device=device, say=show_line, progress=progress_bar)
     if as_json:
         print_json(results)

@@ -30,14 +30,14 @@ from clsas.measures.tradeoff import TOLERANCES_DB
     help="Measure the point near this position on the image's axes, or near x, y, z (m).",
 )
 @click.option(
-    "--search-m", type=float, help="Largest distance of the point's peak from there (m).",
+    "--search-m", type=float, help="Largest distance of the peak from --near (m).",
     callback=options.checked(partial(validate.positive, "search_m", unit="m")),
 )  # fmt: skip
 @click.option(
-    "--extent-m", type=float, help="Distance from the peak up to which side lobes count (m).",
+    "--extent-m", type=float, help="Distance from the peak within which side lobes count (m).",
     callback=options.checked(partial(validate.positive, "extent_m", unit="m")),
 )  # fmt: skip
-@click.option("--reference", type=INPUT, help="Exact image, to measure the relative error.")
+@click.option("--reference", type=INPUT, help="Exact image, against which to measure the error.")
 @options.picture("cuts through the point")
 @options.as_json
 def quality(
@@ -49,7 +49,10 @@ def quality(
     picture: Path | None,
     as_json: bool,
 ) -> None:
-    """Measure an image: contrast, response of a point, error against another image.
+    """Measure the contrast, a point or the error of an image.
+
+    With --near, resolution and side lobes of a point are measured. With --reference, the error
+    relative to an exact image is measured, over all pixels and in the darkest tenth of them.
 
     \b
     Example:  clsas quality image.h5 --near 0,42.5 --picture cuts.png
@@ -86,14 +89,16 @@ def quality(
 
 @click.command()
 @click.argument("lines_file", metavar="[LINES.H5]", type=HDF5, required=False)
-@click.option("--case", help="Use a case of `clsas bench`: ffbp-thesis, ffbp-2k, ...")
+@click.option(
+    "--case", help="Use lines and grid of a case of `clsas bench`: ffbp-thesis, ffbp-2k, ..."
+)
 @options.grid
 @click.option(
     "--tolerance-db",
     type=float,
     multiple=True,
     callback=options.check_tolerance_db,
-    help="Tolerance, dB; repeat the option for several. "
+    help="Tolerance (dB); repeat the option for several. "
     f"[default: {' '.join(f'{db:g}' for db in TOLERANCES_DB)}]",
 )
 @click.option(
@@ -105,7 +110,7 @@ def quality(
     "[default: 1 to 5 of 2x2, 2 of 2x4]",
 )
 @click.option(
-    "--study", is_flag=True, help="Also vary the taps of the filters and the number of stages."
+    "--study", is_flag=True, help="Also vary the taps of the filters, and the number of stages."
 )
 @options.beam
 @options.device
@@ -127,10 +132,11 @@ def tradeoff(
     as_json: bool,
     **given: Any,
 ) -> None:
-    """Measure speed against accuracy: one image with many tolerances, timed and compared.
+    """Measure time and error of one image at many tolerances.
 
-    Use your own range lines with a grid as for `clsas image`, or a built-in case. Resolution and
-    side lobes are those of the strongest point.
+    Use your own range lines with a grid as for `clsas image`, or the lines and grid of --case. The
+    errors are relative to the exact image. Resolution and side lobes are those of the strongest
+    point.
 
     \b
     Example:  clsas tradeoff --case ffbp-thesis --csv tradeoff.csv --picture tradeoff.png
@@ -167,8 +173,9 @@ def tradeoff(
     report(
         as_json,
         f"{measured.channels} lines, {' x '.join(map(str, measured.pixels))} pixels on "
-        f"{measured.device}, median of {repeats} runs; resolutions over those of the exact "
-        f"image; its darkest tenth at {measured.dark_level_db:.1f} dB\n{measured.describe()}",
+        f"{measured.device}, median of {repeats} runs; resolutions are relative to those of the "
+        f"exact image, whose darkest tenth is at {measured.dark_level_db:.1f} dB\n"
+        f"{measured.describe()}",
         **json_able(measured),
     )  # fmt: skip
 
@@ -180,11 +187,11 @@ def tradeoff(
     "--accuracy-db",
     type=float,
     callback=options.check_accuracy_db,
-    help="Accuracy of exact cases, dB. [default: -50]",
+    help="Accuracy of exact cases (dB). [default: -50]",
 )
 @click.option(
     "--tolerance-db", type=float, callback=options.check_tolerance_db,
-    help="Tolerance of factorized cases, dB. [default: -50; mosaic: -40]",
+    help="Tolerance of factorized cases (dB). [default: -50; mosaic: -40]",
 )  # fmt: skip
 @click.option("--repeats", type=click.IntRange(1), default=5, show_default=True, help="Timed runs.")
 @options.as_json
@@ -196,12 +203,12 @@ def bench(
     repeats: int,
     as_json: bool,
 ) -> None:
-    """Time a benchmark case and measure its error.
+    """Time benchmark cases, and measure their errors.
 
-    Without CASE all cases run, for minutes. Cases bp-... are exact imaging. Cases ffbp-... are
-    factorized imaging, compared with exact imaging. mosaic-wreck is a mosaic, compared with exact
-    imaging with and without a beam; its lines are simulated once, which takes minutes. With --json
-    every case is one line.
+    Without CASE, all cases run, which takes minutes. Cases bp-... form an image exactly. Cases
+    ffbp-... form a factorized image, and compare it with the exact one. mosaic-wreck forms a
+    mosaic, and compares it with exact images with and without a beam; its lines are simulated once,
+    which takes minutes. With --json every case is one line.
 
     \b
     Example:  clsas bench ffbp-2k --tolerance-db -40 --json

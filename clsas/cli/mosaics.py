@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
@@ -24,7 +23,7 @@ from clsas.cli.inputs import (
     warn_of_sampling,
 )
 from clsas.cli.outputs import printable, progress_bar, report, say
-from clsas.cli.parameters import COUNTS, INPUT, File, Store, keep_apart
+from clsas.cli.parameters import COUNTS, INPUT, File, Store, keep_apart, keep_out
 from clsas.core.extras import install_command
 from clsas.core.threads import uninterrupted
 from clsas.exact.backprojection import ACCURACY_DB
@@ -35,32 +34,34 @@ from clsas.mosaics.patches import patch_shape_of
 from clsas.mosaics.record import Record
 from clsas.opencl.device import open_device
 
-_SCHEDULER_S = 10  # time for a scheduler to answer
+_SCHEDULER_S = 10  # how long a scheduler may take to answer; arbitrary
 _IDLE_S = 60.0  # default of --idle-s
-_LISTED = 3  # patches that are listed for each kind of defect
+_LISTED = 3  # patches that are listed for each flag; arbitrary
 
 
 @click.command()
 @click.argument("scene", metavar="[SCENE.TOML]", type=INPUT, required=False)
 @click.option(
     "--lines", "lines_path", type=File(exists=True),
-    help="File of range lines, or a folder of such files. [default: simulated from the scene]",
+    help="File of range lines, or folder of such files. [default: simulated from the scene]",
 )  # fmt: skip
 @click.option(
     "-o", "--output", type=Store(),
-    help="Zarr store to write or to continue. [default: SCENE.zarr]",
+    help="Zarr store to write or to continue. [default: SCENE.zarr beside the scene]",
 )  # fmt: skip
 @options.axes
 @options.method
-@click.option("--exact", is_flag=True, help="Form exact patches; --accuracy-db implies it.")
+@click.option(
+    "--exact", is_flag=True, help="Form exact patches. --accuracy-db implies this option."
+)
 @click.option(
     "--accuracy-db", type=float, callback=options.check_accuracy_db,
-    help="Relative rms error of exact patches, dB. [default: -60]",
+    help="Relative rms error of exact patches (dB). [default: -60]",
 )  # fmt: skip
 @options.beam
 @click.option("--patches", type=COUNTS, help="Number of patches along y and x, such as 8x8.")
 @click.option(
-    "--memory-mib", type=click.IntRange(1), help="Memory of one patch, MiB. [default: 1024]"
+    "--memory-mib", type=click.IntRange(1), help="Memory for one patch (MiB). [default: 1024]"
 )
 @click.option("--device", multiple=True, help="Device to use; repeat the option to use several.")
 @click.option("--workers", type=click.IntRange(1), help="Number of worker processes.")
@@ -68,16 +69,16 @@ _LISTED = 3  # patches that are listed for each kind of defect
 @click.option("--follow", is_flag=True, help="Wait for files to be added to the folder --lines.")
 @click.option(
     "--idle-s", type=float, callback=options.check_idle_s,
-    help="With --follow, stop after this many seconds without a new file, or when a file named "
-    "`end` appears. [default: 60]",
+    help="With --follow, stop after this many seconds without a new file. A file named `end` stops "
+    "it at once. [default: 60]",
 )  # fmt: skip
 @click.option(
     "--verify", is_flag=True,
-    help="Only compare all of the store with its checksums; -o suffices without a scene.",
+    help="Only compare the whole store with its checksums.",
 )  # fmt: skip
 @options.picture("an overview in dB")
 @options.levels
-@click.option("--borders", is_flag=True, help="Draw the borders of the patches into the picture.")
+@click.option("--borders", is_flag=True, help="Draw the borders between patches into the picture.")
 @options.as_json
 @options.refusing_unreached
 def mosaic(
@@ -101,12 +102,13 @@ def mosaic(
     as_json: bool,
     **given: Any,
 ) -> None:
-    """Form an image of any size patch by patch, into a Zarr store.
+    """Form an image of any size, patch by patch.
 
-    Grid, method and beam are those of `clsas image`. After an interruption, by Ctrl-C or anything
-    else, the same command continues, and mends what is damaged. With --verify it only lists
-    damage; the exit code is 1 if there is any. Without --lines the scene is simulated
-    first.
+    The patches go into a Zarr store. Grid, method and beam are those of `clsas image`. Without
+    --lines, the scene is simulated first. Without a scene, --lines, --x, --y and -o are required.
+
+    After an interruption, by Ctrl-C or anything else, the same command continues, and forms damaged
+    patches again. With --verify it only lists damage; the exit code is then 1 if there is any.
 
     \b
     Example:  clsas mosaic scene.toml --lines lines.h5 -o image.zarr --picture image.png
@@ -115,7 +117,7 @@ def mosaic(
         _verify(_store_to_verify(scene, output), as_json)
         return
     if scene is None:
-        raise click.UsageError("SCENE.TOML is missing: clsas mosaic SCENE.TOML --lines LINES.H5")
+        _check_without_scene(given["x"] is not None, lines_path, output)
     _check_combination(bool(device), workers, scheduler, follow, idle_s)
     levels = read_levels(dynamic_range_db, percentiles, colour_map)
     described, grid = read_grid(scene, given, memory=False)
@@ -124,7 +126,7 @@ def mosaic(
     warn_of_sampling(described, grid)
     devices = [open_device(name) for name in device] or None
     in_scene = described.mosaic
-    output = output or in_scene.get("store") or _default_store(scene)
+    output = output or in_scene.get("store") or _store_beside(scene)
     memory_mib = memory_mib or in_scene.get("memory_mib")
     patches = patches or in_scene.get("patches")
     if patches is not None:
@@ -158,10 +160,18 @@ def mosaic(
     )
 
 
+def _check_without_scene(has_grid: bool, lines_path: Path | None, output: Path | None) -> None:
+    """Raise UsageError, with what is missing, unless options replace the scene."""
+    wanted = {"--lines": lines_path, "--x and --y": has_grid or None, "-o": output}
+    missing = [option for option, value in wanted.items() if value is None]
+    if missing:
+        raise click.UsageError(f"without SCENE.TOML, give {', '.join(missing)} too")
+
+
 def _check_combination(
     has_device: bool, workers: int | None, scheduler: str | None, follow: bool, idle_s: float | None
 ) -> None:
-    """Raise UsageError for options that exclude or need each other."""
+    """Raise UsageError for options that exclude or require each other."""
     if workers is not None and scheduler is not None:
         raise click.UsageError("give only one of --workers and --scheduler")
     if has_device and (workers or scheduler):
@@ -171,19 +181,16 @@ def _check_combination(
 
 
 def _check_paths(output: Path, picture: Path | None, lines_path: Path | None, follow: bool) -> None:
-    """Raise UsageError if files would overwrite each other, or --follow has no folder."""
+    """Raise UsageError if files would replace each other, or --follow has no folder."""
     keep_apart("--picture", picture, "the store", output)
-    if picture is not None and Path(os.path.realpath(picture)).is_relative_to(
-        os.path.realpath(output)
-    ):
-        raise click.UsageError(f"--picture must not lie in the store, got {str(picture)!r}")
+    keep_out("--picture", picture, "the store", output)
     keep_apart("the range lines", lines_path, "the store", output)
     if follow and (lines_path is None or not lines_path.is_dir()):
         raise click.UsageError("--follow requires --lines with a folder")
 
 
 def _read_request(described: SceneFile, given: dict[str, Any], exact: bool) -> dict[str, Any]:
-    """Return the request for every patch: a plan's, or an accuracy."""
+    """Return the request for every patch, which is one of `PLAN_KEYS` or an accuracy."""
     request = read_request(described, given, exact)
     if set(request) - {*PLAN_KEYS, "accuracy_db"}:
         raise ValueError(
@@ -193,27 +200,27 @@ def _read_request(described: SceneFile, given: dict[str, Any], exact: bool) -> d
 
 
 def _form(formed: clsas.Mosaic, name: str, *, quiet: bool) -> tuple[int, int]:
-    """Form the patches that are not finished; return their number and that of their pixels.
+    """Form the patches that are not finished; return the number of patches and of their pixels.
 
-    A line is printed for each unless `quiet`.
+    Unless `quiet`, a line is printed for every patch.
     """
     new, pixels = 0, 0
-    with _patch_progress(name, len(formed), len(formed.finished)) as tell:
+    with _patch_progress(name, len(formed), len(formed.finished)) as show_patch:
         for patch in formed:
             new, pixels = new + 1, pixels + patch.grid.size
             if not quiet:
-                tell(patch)
+                show_patch(patch)
     return new, pixels
 
 
 def _results(
     formed: clsas.Mosaic, records: dict[tuple[int, int], Record]
 ) -> tuple[list[str], dict[str, Any]]:
-    """Return patches, errors and defects of a mosaic: in words, and in types of JSON.
+    """Return patches, errors and flags of a mosaic: in words, and in types of JSON.
 
-    The first of the words are the patches.
+    The first item of the words describes the patches.
     """
-    # Errors are relative to the image, so that a patch of zeros has none.
+    # Errors are relative to the image, so they are undefined for a patch of zeros.
     errors = [record.predicted_error_db for record in records.values() if record.has_pixels]
     worst = max((error for error in errors if error is not None), default=None)
     zero = bool(records) and not any(record.has_pixels for record in records.values())
@@ -238,7 +245,7 @@ def _results(
 
 
 def _described_flags(flagged: dict[tuple[int, int], tuple[str, ...]]) -> list[str]:
-    """Return one line for every kind of defect, with the patches that have it."""
+    """Return one line for every flag, with the patches that have it."""
     alike: dict[str, list[str]] = {}
     for (row, column), flags in flagged.items():
         alike.setdefault(printable("; ".join(flags)), []).append(f"{row},{column}")
@@ -249,7 +256,10 @@ def _described_flags(flagged: dict[tuple[int, int], tuple[str, ...]]) -> list[st
     return lines
 
 
-def _default_store(scene: Path) -> Path:
+def _store_beside(scene: Path | None) -> Path:
+    """Return the default store of a scene; a usage error without a scene."""
+    if scene is None:
+        raise click.UsageError("a store is required: -o STORE.zarr, or a scene")
     return scene.with_suffix(".zarr")
 
 
@@ -259,11 +269,11 @@ def _store_to_verify(scene: Path | None, output: Path | None) -> Path:
         return output
     if scene is None:
         raise click.UsageError("--verify requires a store: clsas mosaic --verify -o STORE.zarr")
-    return read_scene(scene).mosaic.get("store") or _default_store(scene)
+    return read_scene(scene).mosaic.get("store") or _store_beside(scene)
 
 
 def _verify(path: Path, as_json: bool) -> None:
-    """Report which patches and arrays of a store are damaged; exit with 1 if any is."""
+    """Report which patches and arrays of a store are damaged; exit with code 1 if any is."""
     store = clsas.Store.opened(path)
     arrays, has_digests = store.array_damage(), store.has_digests
     # Without the metadata of pixels, patches cannot be read.
@@ -282,7 +292,7 @@ def _verify(path: Path, as_json: bool) -> None:
     if not has_digests:
         lines.append(
             "  The store has no digests of its metadata, since an earlier version of clsas wrote "
-            "it: changed\n  names and units of its arrays are not noticed. clsas mosaic with the "
+            "it. Changed\n  names and units of its arrays are not noticed. clsas mosaic with the "
             "same inputs adds digests."
         )
     report(
@@ -300,12 +310,13 @@ def _beside(output: Path, scene: Path) -> Path:
 
 
 def _simulated(
-    described: SceneFile, scene: Path, output: Path, picture: Path | None, *, quiet: bool
+    described: SceneFile, scene: Path | None, output: Path, picture: Path | None, *, quiet: bool
 ) -> Path:
-    """Return the file of a scene's range lines, beside the store; simulate them if it is not there.
+    """Return the file of a scene's range lines beside the store; simulate it if it is missing.
 
-    A line tells which, unless `quiet`.
+    Unless `quiet`, a line reports which of the two was done.
     """
+    assert scene is not None  # without one, --lines is required
     path = _beside(output, scene)
     keep_apart("--picture", picture, "the simulated range lines", path)
     if path.exists():
@@ -351,7 +362,9 @@ def _cluster(workers: int | None, scheduler: str | None) -> Iterator[Any]:
         try:
             yield client
         except KilledWorker as error:
-            raise click.ClickException(f"workers died repeatedly on one patch: {error}") from None
+            raise click.ClickException(
+                f"workers ended unexpectedly several times on one patch: {error}"
+            ) from None
 
 
 @contextmanager
@@ -367,7 +380,7 @@ def _patch_progress(name: str, total: int, done: int) -> Iterator[Callable[[clsa
     ) as bar:
         task = bar.add_task(printable(name), total=total, completed=done)
 
-        def tell(patch: clsas.Patch) -> None:
+        def show_patch(patch: clsas.Patch) -> None:
             record = patch.record
             parts = [f"{record.seconds:.2f} s", f"{record.channels} channels"]
             if not record.has_pixels:
@@ -378,4 +391,4 @@ def _patch_progress(name: str, total: int, done: int) -> Iterator[Callable[[clsa
             console.print(printable(line), markup=False)
             bar.advance(task)
 
-        yield tell
+        yield show_patch

@@ -1,4 +1,4 @@
-"""Commands that correct a track by the echoes: known-points, navigate, focus."""
+"""Commands that correct a track from the echoes: known-points, navigate, focus."""
 
 from __future__ import annotations
 
@@ -35,21 +35,21 @@ def _positive(name: str, unit: str) -> Any:
     multiple=True,
     required=True,
     type=POSITION,
-    help="Position of a reflector (m), at z = 0 unless given; repeat the option.",
+    help="Position of a reflector (m), at z = 0 by default; repeat the option for several.",
 )
 @click.option(
     "--unknown",
     "unknowns",
     multiple=True,
     type=click.Choice(CALIBRATED),
-    help="What to solve for, the most important first; repeat the option. "
+    help="Unknown to solve for, the most important first; repeat the option for several. "
     "[default: time_offset and sound_speed]",
 )
 @click.option(
     "--search-m",
     type=float,
     callback=_positive("search_m", "m"),
-    help="Largest error of a range that is looked for (m). [default: 50 resolution cells]",
+    help="Largest error of a range that is searched (m). [default: 50 resolution cells]",
 )
 @options.as_json
 def known_points(
@@ -60,10 +60,11 @@ def known_points(
     search_m: float | None,
     as_json: bool,
 ) -> None:
-    """Correct time offset, sound speed and lever arm by reflectors at known positions.
+    """Correct timing, sound speed and lever arm by known points.
 
-    Ranges of all reflectors are measured in all channels, and fitted together. The lever arm
-    (forward, port, up) is a displacement along, across and above the track.
+    The ranges of all reflectors are measured in all channels and fitted together. The lever arm
+    (forward, port, up) is a displacement along, across and above the track. LINES.H5 may also be a
+    recording of another kind.
 
     \b
     Example:  clsas known-points lines.h5 --point 3,12 --point 5,19,-1 -o corrected.h5
@@ -80,7 +81,7 @@ def known_points(
     seen = ", ".join(map(str, results["seen"]))
     report(
         as_json,
-        f"{printable(output)}: {found.describe()}\n  seen in {seen} channels; ± holds noise and "
+        f"{printable(output)}: {found.describe()}\n  seen in {seen} channels; ± covers noise and "
         "errors that change along the track, but no displacement or bend of the whole track",
         file=output,
         **results,
@@ -95,21 +96,23 @@ def known_points(
     "--window-m",
     type=float,
     callback=_positive("window_m", "m"),
-    help="Length of a window of range (m). [default: about 150 resolution cells]",
+    help="Length of a window in range (m). [default: about 150 resolution cells]",
 )
 @click.option(
     "--side",
     type=click.Choice(("port", "starboard")),
     default="port",
     show_default=True,
-    help="Side of the array on which the seabed lies.",
+    help="Side on which the seabed lies.",
 )
-@click.option("--seabed-z-m", type=float, help="Height of the seabed, for rays that slope (m).")
+@click.option(
+    "--seabed-z-m", type=float, help="Height of the seabed (m). [default: rays are horizontal]"
+)
 @click.option(
     "--element-length-m",
     type=float,
     callback=_positive("element_length_m", "m"),
-    help="Length of the elements: needed where the beam is wide (m).",
+    help="Length of the elements (m); required if the beam is wide.",
 )
 @click.option(
     "--sway-sd-m",
@@ -117,7 +120,7 @@ def known_points(
     default=0.1,
     show_default=True,
     callback=_positive("sway_sd_m", "m"),
-    help="Accuracy of the navigation's sway (m).",
+    help="Standard deviation of the sway in the navigation data (m).",
 )
 @click.option(
     "--yaw-sd-deg",
@@ -125,7 +128,7 @@ def known_points(
     default=1.0,
     show_default=True,
     callback=_positive("yaw_sd_deg", "degrees"),
-    help="Accuracy of its yaw (degrees).",
+    help="Standard deviation of the yaw in the navigation data (degrees).",
 )
 @click.option(
     "--surge-sd-m",
@@ -133,14 +136,14 @@ def known_points(
     default=0.1,
     show_default=True,
     callback=_positive("surge_sd_m", "m"),
-    help="Accuracy of its surge (m).",
+    help="Standard deviation of the surge in the navigation data (m).",
 )
 @click.option(
     "--unknown",
     "unknowns",
     multiple=True,
     type=click.Choice(NAVIGATED),
-    help="What to find; repeat the option. [default: sway, yaw and surge]",
+    help="Unknown to solve for; repeat the option for several. [default: sway, yaw, surge]",
 )
 @options.as_json
 def navigate(
@@ -151,10 +154,11 @@ def navigate(
     as_json: bool,
     **given: Any,
 ) -> None:
-    """Correct an array's track by displaced phase centres.
+    """Correct the track of an array by micronavigation.
 
-    Phase centres of the array must overlap from ping to ping. Sway, yaw and surge between pings
-    are measured from the echoes that both have in common, and fused with the navigation.
+    The phase centres of the array must overlap from ping to ping (displaced phase centres). Sway,
+    yaw and surge between pings are measured from the echoes that both pings share, and combined
+    with the navigation data.
 
     \b
     Example:  clsas navigate lines.h5 --range-m 30:60 --element-length-m 0.015 -o corrected.h5
@@ -168,7 +172,7 @@ def navigate(
     clsas.save(output, found.lines)
     results = numbers.of_navigation(found)
     shape_m = results["shape_sd_m"]
-    shape = "unknown" if np.isnan(shape_m) else f"{1e3 * shape_m:.3g} mm or less"
+    shape = "unknown" if np.isnan(shape_m) else f"at most {1e3 * shape_m:.3g} mm"
     report(
         as_json,
         f"{printable(output)}: {results['pings']} pings, {results['overlap']} overlapping phase "
@@ -192,7 +196,7 @@ def navigate(
     "unknowns",
     multiple=True,
     type=click.Choice(FOCUSED),
-    help="Displacement to solve for; repeat the option. [default: sway]",
+    help="Displacement to solve for; repeat the option for several. [default: sway]",
 )
 @options.beam
 @options.device
@@ -206,10 +210,10 @@ def focus(
     as_json: bool,
     **given: Any,
 ) -> None:
-    """Correct a track by the bright responses of an image (autofocus).
+    """Correct a track by autofocus on bright responses.
 
-    The grid, of --scene or given by --x, --y and --z, should hold some dozen bright responses. A
-    shift and a linear trend of the track are not observable and stay as they are.
+    The grid, of --scene or of --x, --y and --z, should contain some dozen bright responses. A
+    shift and a linear trend of the track cannot be observed, and stay as they are.
 
     \b
     Example:  clsas focus lines.h5 --x 2:10:512 --y 28:32:320 -o focused.h5

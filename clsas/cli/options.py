@@ -43,15 +43,15 @@ def output(kind: str) -> Callable:
 
 
 def picture(what: str) -> Callable:
-    """Return the option for a picture of the result; --png is its name of earlier versions."""
+    """Return the option for a picture of the result; earlier versions called it --png."""
     return click.option(
         "--picture", "--png", "picture", type=Output(*PICTURES),
-        help=f"Also draw {what}, as PNG, PDF or SVG after the file's name.",
+        help=f"Also draw {what}; the suffix decides between PNG, PDF and SVG.",
     )  # fmt: skip
 
 
 def refusing_unreached(command: Callable) -> Callable:
-    """Let a command refuse grids that no line reaches, unless --allow-unreached is given."""
+    """Return a command that refuses grids which no line reaches, or takes --allow-unreached."""
 
     @functools.wraps(command)
     def run(*args: Any, allow_unreached: bool, **given: Any) -> Any:
@@ -65,7 +65,7 @@ def refusing_unreached(command: Callable) -> Callable:
 
     return click.option(
         "--allow-unreached", is_flag=True,
-        help="Form the image even if no line reaches any pixel: it is then zero.",
+        help="Form the image even if no line reaches any pixel; all pixels are then zero.",
     )(run)  # fmt: skip
 
 
@@ -81,27 +81,29 @@ def _together(*options: Callable) -> Callable:
 
 
 as_json = click.option("--json", "as_json", is_flag=True, help="Print results as JSON.")
+dynamic_range = click.option(
+    "--dynamic-range-db", "--db", "dynamic_range_db", type=float,
+    help="Dynamic range of the picture, dB. [default: 60]",
+    callback=checked(partial(validate.positive, "dynamic_range_db", unit="dB")),
+)  # fmt: skip
+colour_map = click.option(
+    "--colour-map", "--colours", "colour_map",
+    help="Colours of the picture: sonar (black, copper, cream), gray, cividis or any other of "
+    "matplotlib's. [default: inferno]",
+)  # fmt: skip
 levels = _together(
-    click.option(
-        "--dynamic-range-db", type=float,
-        help="Dynamic range of the picture, below the largest level. [default: 60]",
-        callback=checked(partial(validate.positive, "dynamic_range_db", unit="dB")),
-    ),
+    dynamic_range,
     click.option(
         "--percentiles", type=PERCENTILES,
         help="Show levels between these percentiles of all pixels instead, such as 1,99.5.",
     ),
-    click.option(
-        "--colour-map",
-        help="Colours of the picture: sonar (black, copper, cream), gray, cividis or any other of "
-        "matplotlib's. [default: inferno]",
-    ),
+    colour_map,
 )  # fmt: skip
-scene = click.option("--scene", type=INPUT, help="Scene file for values without an option.")
+scene = click.option("--scene", type=INPUT, help="Scene file. Options override its values.")
 device = click.option(
     "--device",
-    help="Index, kind (cpu, gpu), platform (pocl, intel, nvidia) or part of the name, as "
-    "`clsas devices` shows them.",
+    help="Device to use: its index, kind (cpu, gpu), platform (pocl, intel, nvidia) or part of its "
+    "name, as `clsas devices` lists them.",
 )
 axes = _together(
     click.option(
@@ -110,7 +112,7 @@ axes = _together(
     click.option("--y", type=AXIS, help="The same along y."),
     click.option(
         "--z", type=float, callback=checked(partial(validate.number, "z", unit="m")),
-        help="Height of the plane (m), with --x and --y. [default: 0]",
+        help="With --x and --y, the height of the plane (m). [default: 0]",
     ),
 )  # fmt: skip
 grid = _together(scene, axes)
@@ -126,7 +128,7 @@ check_idle_s = checked(partial(validate.positive, "idle_s", unit="s"))
 method = _together(
     click.option(
         "--tolerance-db", type=float, callback=check_tolerance_db,
-        help="Largest relative rms error against the exact image, dB. [default: -50]",
+        help="Largest relative rms error against the exact image (dB). [default: -50]",
     ),
     click.option(
         "--tolerance-wavelengths", type=RATIO,
@@ -136,30 +138,32 @@ method = _together(
                 least=wavelengths(BEST_TOLERANCE_DB), most=wavelengths(WORST_TOLERANCE_DB),
             )
         ),
-        help="The tolerance as a range error in wavelengths, such as 1/30.",
+        help="The same as a range error in wavelengths, such as 1/30.",
     ),
     click.option(
         "--stages", type=STAGES, metavar="QRxQI,...",
-        help="Use the thesis's method with QR and QI of every stage, such as 2x2,2x2.",
+        help="Use the thesis's method with these QR and QI of its stages, such as 2x2,2x2.",
     ),
 )  # fmt: skip
 beam = _together(
-    click.option("--beam-deg", type=float, help="Use only a beam of this full width, degrees."),
+    click.option(
+        "--beam-deg", type=float, help="Weigh channels by a beam of this full width (degrees)."
+    ),
     click.option(
         "--beam-shape", type=click.Choice(SHAPES),
-        help="Shape of the beam; 'hann' is the fastest. [default: rectangular]",
+        help="Shape of the beam. Images with 'hann' are the fastest. [default: rectangular]",
     ),
     click.option(
         "--squint-deg", type=float,
-        help="Squint angle of the beam's axis, positive forward. [default: 0]",
+        help="Squint of the beam's axis, positive forward (degrees). [default: 0]",
     ),
     click.option(
         "--element-length-m", type=float,
-        help="Element length for the shape 'inverse', which divides by the two-way pattern.",
+        help="Element length (m) for the shape 'inverse', which divides by the two-way pattern.",
     ),
     click.option(
         "--track-pings", type=int,
-        help="Pings over which the track's direction is smoothed. [default: a quarter, at most "
-        "101]",
+        help="Number of pings over which the direction of the track is smoothed. [default: a "
+        "quarter of all, at most 101]",
     ),
 )  # fmt: skip

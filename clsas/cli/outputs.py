@@ -26,7 +26,7 @@ from clsas.core.json_types import json_able
 
 @contextmanager
 def progress_bar(what: str) -> Iterator[Callable[[int, int], None] | None]:
-    """Yield a callback that moves a progress bar, or None without a terminal."""
+    """Yield a callback that moves a progress bar, or None if there is no terminal."""
     with step_bar() as progress:
         if progress is not None:
             progress(what, 0, None)  # show it before the first step is done
@@ -35,7 +35,7 @@ def progress_bar(what: str) -> Iterator[Callable[[int, int], None] | None]:
 
 @contextmanager
 def step_bar() -> Iterator[Callable[[str, int, int | None], None] | None]:
-    """Yield a callback that moves the bar of the step it names, or None without a terminal."""
+    """Yield a callback that moves the bar of a named step, or None if there is no terminal."""
     if not sys.stderr.isatty():
         yield None
         return
@@ -45,12 +45,12 @@ def step_bar() -> Iterator[Callable[[str, int, int | None], None] | None]:
     with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
         tasks: dict[str, TaskID] = {}
 
-        def tell(step: str, done: int, total: int | None) -> None:
+        def show(step: str, done: int, total: int | None) -> None:
             if step not in tasks:
                 tasks[step] = bar.add_task(step, total=None)
             bar.update(tasks[step], completed=done, total=total)
 
-        yield tell
+        yield show
 
 
 def report(as_json: bool, text: str, **results: Any) -> None:
@@ -62,15 +62,16 @@ def report(as_json: bool, text: str, **results: Any) -> None:
 
 
 def say(text: str, *, err: bool = False) -> None:
-    """Print a text that may contain names and words from outside, to standard error if `err`.
+    """Print a text with control characters escaped; to standard error if `err`.
 
-    Control characters are escaped. Names within it need `printable`, so that they cannot add lines.
+    Pass names of files, and words read from them, through `printable` first: otherwise their line
+    breaks could look like messages of clsas.
     """
     click.echo(validate.escaped(text), err=err)
 
 
 def printable(name: object) -> str:
-    """Return the name of a file, or words of one, for a text that is printed."""
+    """Return the name of a file, or words read from one, on a single line for `say`."""
     return validate.printable(str(name))
 
 
@@ -80,5 +81,5 @@ def warn(message: str) -> None:
 
 
 def print_json(results: Any, indent: int | None = 2) -> None:
-    """Print results as JSON; on one line if `indent` is None."""
+    """Print results as JSON, on a single line if `indent` is None."""
     click.echo(json.dumps(json_able(results), indent=indent, allow_nan=False))

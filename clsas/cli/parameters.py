@@ -1,4 +1,4 @@
-"""Types of options and arguments for click."""
+"""Types of options and arguments: parsed values, and files that are checked before any work."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ class Parsed(click.ParamType):
     Parameters
     ----------
     name : str
-        The form of the text in --help.
+        Form of the text, as --help shows it.
     parse : callable
-        Returns the value; raises ValueError or ArithmeticError if the text is wrong.
+        Returns the value; raises ValueError or ArithmeticError if the text has another form.
     expected : str
-        The form of the text in messages.
+        Form of the text in messages, after "must be".
     """
 
     def __init__(self, name: str, parse: Callable[[str], Any], expected: str) -> None:
@@ -36,7 +36,7 @@ class Parsed(click.ParamType):
         self._expected = expected
 
     def convert(self, value: str, param: Any, ctx: Any) -> Any:
-        """Return the value; a wrong text is a usage error."""
+        """Return the value of a text; a usage error if the text has another form."""
         try:
             return self._parse(value)
         except (ValueError, ArithmeticError):
@@ -113,7 +113,7 @@ class File(click.Path):
         super().__init__(**allowed, path_type=Path)
 
     def convert(self, value: Any, param: Any, ctx: Any) -> Path:
-        """Return the path; using one file twice is a usage error."""
+        """Return the path; a usage error if it is both read and written."""
         if not os.fspath(value):
             self.fail("must be a path, got an empty one", param, ctx)
         path: Any = super().convert(value, param, ctx)
@@ -123,7 +123,7 @@ class File(click.Path):
             except ValueError as error:
                 self.fail(str(error), param, ctx)
         for other in ctx.command.params:
-            # The second of the two on the command line finds the first one here.
+            # Of two parameters, the second one to be converted finds the first one here.
             if other is not param and isinstance(other.type, File):
                 taken = ctx.params.get(other.name)
                 if self.written or other.type.written:
@@ -132,7 +132,7 @@ class File(click.Path):
 
 
 class Output(File):
-    """A file to write. The command checks that it can be written before it does any work."""
+    """A file to write, which is checked to be writable before any work."""
 
     written = True
 
@@ -141,7 +141,7 @@ class Output(File):
         self._suffixes = suffixes
 
     def convert(self, value: Any, param: Any, ctx: Any) -> Path:
-        """Return the path; a file that cannot be written is a usage error."""
+        """Return the path; a usage error if the file cannot be written."""
         path = super().convert(value, param, ctx)
         try:
             validate.suffix("the file's name", path, *self._suffixes)
@@ -163,19 +163,19 @@ class Output(File):
 
 
 class Store(File):
-    """A Zarr store, which is a folder, to write."""
+    """A Zarr store to write, which is a folder."""
 
     written = True
 
 
 class Hdf5(File):
-    """An HDF5 file to read. A scene file in its place is refused with the usual command."""
+    """An HDF5 file to read. If it is a scene file, the message shows the usual command."""
 
     def __init__(self) -> None:
         super().__init__(exists=True, dir_okay=False)
 
     def convert(self, value: Any, param: Any, ctx: Any) -> Path:
-        """Return the path; a scene file is a usage error."""
+        """Return the path; a usage error if it is a scene file."""
         path = super().convert(value, param, ctx)
         if path.suffix.lower() != ".toml":
             return path
@@ -194,13 +194,19 @@ HDF5 = Hdf5()
 
 
 def keep_apart(one: str, path: Path | None, other: str, path_of_other: Path | None) -> None:
-    """End the command if two of its files, whose names are `one` and `other`, are the same."""
+    """Raise UsageError if two files, which messages call `one` and `other`, are the same."""
     if path and path_of_other and os.path.realpath(path) == os.path.realpath(path_of_other):
         raise click.UsageError(f"{one} and {other} must be two files, got {str(path)!r}")
 
 
+def keep_out(option: str, path: Path | None, what: str, folder: Path) -> None:
+    """Raise UsageError if the file of an option lies in a folder, which messages call `what`."""
+    if path is not None and Path(os.path.realpath(path)).is_relative_to(os.path.realpath(folder)):
+        raise click.UsageError(f"{option} must not lie in {what}, got {str(path)!r}")
+
+
 def written_to(ctx: click.Context) -> dict[str, Path]:
-    """Return the files that the running command writes, by option."""
+    """Return the paths that the running command writes, by option."""
     outputs = [p for p in ctx.command.params if isinstance(p.type, File) and p.type.written]
     paths = {_option_name(param): ctx.params.get(param.name) for param in outputs}
     return {shown: path for shown, path in paths.items() if path is not None}
@@ -212,7 +218,7 @@ def _option_name(param: click.Parameter) -> str:
 
 
 def _exists(path: Path) -> bool:
-    """Return whether a path exists; raises OSError if it is not possible (a long name)."""
+    """Return whether a path exists; raise OSError if it cannot, as with too long a name."""
     try:
         path.stat()
     except FileNotFoundError:
@@ -221,6 +227,6 @@ def _exists(path: Path) -> bool:
 
 
 def need_matplotlib() -> None:
-    """End the command if pictures cannot be drawn."""
+    """Raise ClickException if matplotlib is not installed."""
     if not is_installed("matplotlib"):
         raise click.ClickException(f"pictures need matplotlib: {install_command('plot')}")

@@ -23,15 +23,15 @@ from clsas.processing.record import StepRecord
     "-o",
     "--output",
     type=click.Path(file_okay=False, path_type=Path),
-    help="Folder for the results. [default: that of the scene, or the name of its file]",
+    help="Folder for the results. [default: `output` of the scene, or the name of its file]",
 )
 @click.option(
     "--step",
     "steps",
     multiple=True,
     type=click.Choice(STEPS),
-    help="Bring only this step up to date, and those of the scene that correct the lines before "
-    "it; repeat the option.",
+    help="Bring only this step up to date, and the steps before it that correct its lines; repeat "
+    "the option for several.",
 )
 @options.device
 @options.as_json
@@ -44,12 +44,12 @@ def process(
     device: str | None,
     as_json: bool,
 ) -> None:
-    """Take a recording to a focused image, by the steps of a scene file.
+    """Take a recording to a focused image, step by step.
 
     The table [process] of the scene names the recording and the steps: inspect, calibrate,
-    navigate, focus, image and mosaic. Results go into one folder, with a record of inputs, versions
-    and numbers in process.json. The same command continues after an interruption, and runs again
-    only what has changed. It replaces only files of that record, which belongs to one scene.
+    navigate, focus, image and mosaic. The results go into one folder, where process.json records
+    inputs, versions and results of every step. After an interruption the same command continues. It
+    repeats a step only if something changed, and replaces only files that its record lists.
 
     \b
     Example:  clsas process scene.toml --lines lines.h5 -o processed
@@ -73,14 +73,14 @@ def process(
 
 
 def _row(step: StepRecord, is_new: bool) -> str:
-    """Return a line about a step."""
+    """Return the description of a step in a line."""
     done = f"{step.seconds:.2f} s" if is_new else "unchanged"
     files = f": {', '.join(step.files)}" if step.files else ""
     return f"{step.name}, {done}{files}{_in_words(step)}"
 
 
 def _in_words(step: StepRecord) -> str:
-    """Return the most important numbers of a step."""
+    """Return the most important results of a step, in words."""
     numbers = step.numbers
     if step.name == "inspect":
         count = len(numbers["findings"])

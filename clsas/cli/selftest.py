@@ -1,4 +1,4 @@
-"""Command that tests accuracy on the user's own device: selftest."""
+"""Command that tests the accuracy of a device: selftest."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ if TYPE_CHECKING:
 @options.as_json
 @click.pass_context
 def selftest(ctx: click.Context, device: str | None, as_json: bool) -> None:
-    """Test this device's accuracy at the extremes, in about a minute.
+    """Test the accuracy of a device, in about a minute.
 
-    Every imager forms images of scenes whose ideal image is known analytically. The exit code is 1
-    if the error of any image exceeds its bound, or an image cannot be formed.
+    Every imager forms images of extreme scenes whose ideal image is known analytically. The exit
+    code is 1 if the error of any image exceeds its bound, or an image cannot be formed.
 
     \b
     Example:  clsas selftest --device 0

@@ -51,8 +51,8 @@ class SceneFile:
         Paths that `clsas process` reads (`lines`) and writes (`output`), its `steps`, and keyword
         arguments of its steps: `calibrate`, `navigate` and `focus`.
     files : dict
-        Paths of the files that the scene refers to, by key: "track.file", "mosaic.lines",
-        "process.lines".
+        Paths of the files that the scene refers to, by key: "track.file", "grid.height_file",
+        "mosaic.lines", "process.lines".
     """
 
     name: str

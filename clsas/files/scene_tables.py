@@ -15,8 +15,8 @@ import numpy as np
 from pydantic import Field
 
 from clsas.core import validate
-from clsas.core.grid import Grid
 from clsas.exact.backprojection import BEST_ACCURACY_DB
+from clsas.files.grid_tables import GridTable
 from clsas.files.process_tables import ProcessTable
 from clsas.files.survey_tables import SonarTable, TrackTable
 from clsas.files.tables import Table, Vector, located
@@ -66,25 +66,6 @@ class _Seabed(Table):
                         f"{name} must be left out with the scene {validate.shown(self.scene)}"
                     )
             return make(**options)
-
-
-class _Axis(Table):
-    start_m: float
-    stop_m: float
-    count: int
-
-    def build(self) -> tuple[float, float, int]:
-        return self.start_m, self.stop_m, self.count
-
-
-class _Grid(Table):
-    x: _Axis
-    y: _Axis
-    z_m: float = 0.0
-
-    def build(self) -> Grid:
-        with located("[grid]"):
-            return Grid.plane(self.x.build(), self.y.build(), self.z_m)
 
 
 class _Pointing(Table):
@@ -218,7 +199,7 @@ class SceneTables(Table):
     track: TrackTable | None = None
     targets: list[_Target] | None = None
     seabed: _Seabed | None = None
-    grid: _Grid | None = None
+    grid: GridTable | None = None
     simulate: _Simulate = _Simulate()
     compress: _Compress = _Compress()
     image: _Image = _Image()
@@ -246,6 +227,7 @@ class SceneTables(Table):
             parts.append(self.seabed.build())
         paths = {
             "track.file": self.track and self.track.file,
+            "grid.height_file": self.grid and self.grid.height_file,
             "mosaic.lines": self.mosaic.lines,
             "process.lines": self.process.lines,
         }
@@ -253,7 +235,7 @@ class SceneTables(Table):
             sonar=self.sonar.build() if self.sonar else None,
             track=self.track.build(folder) if self.track else None,
             targets=tuple(parts) if len(parts) > 1 else parts[0] if parts else None,
-            grid=self.grid.build() if self.grid else None,
+            grid=self.grid.build(folder) if self.grid else None,
             simulate=self.simulate.build(),
             compress=self.compress.build(),
             image=self.image.build(),

@@ -132,7 +132,7 @@ def measure_point(
     dx, dy = across.step_m, upward.step_m
     if extent_m is not None:
         validate.number("extent_m", extent_m, "m", least=max(abs(dx), abs(dy)))
-    near_m = _on_axes(image.grid, axes, near)
+    near_m = on_axes(image.grid, axes, near)
     peak_row, peak_column = _find_peak(image.pixels, axes, near_m, search_m)
 
     top, left = max(peak_row - _REACH, 0), max(peak_column - _REACH, 0)
@@ -205,7 +205,7 @@ def _find_peak(
     return row, column
 
 
-def _on_axes(grid: Grid, axes: tuple[Axis, Axis], near: Sequence[float]) -> NDArray[np.float64]:
+def on_axes(grid: Grid, axes: tuple[Axis, Axis], near: Sequence[float]) -> NDArray[np.float64]:
     """Return the coordinates on the axes, in metres, of two numbers or of a position."""
     position_m = validate.array("near", near, np.float64, None)
     if position_m.shape != (3,):

@@ -335,17 +335,46 @@ class Store:
         window = self.grid.window(rows, columns)
         return Image(self.read(rows, columns), window)
 
-    def overview(self, most: int = _OVERVIEW) -> Image:
+    def overview(
+        self,
+        most: int = _OVERVIEW,
+        rows: slice = slice(None),
+        columns: slice = slice(None),
+    ) -> Image:
         """Return the mosaic at fewer pixels, each with the mean power of those it covers.
+
+        About one patch at a time is read, so the pixels may take more than memory. A height map
+        becomes a plane.
+
+        Parameters
+        ----------
+        most : int
+            Largest number of pixels along the longer side of the overview.
+        rows, columns : slice
+            Part of the mosaic; by default all of it.
 
         Raises
         ------
+        TypeError
+            If `rows` or `columns` is not a slice of whole numbers.
         ValueError
-            If a finished patch is damaged.
+            If nothing is selected, or a finished patch is damaged.
         """
         validate.count("most", most)
-        rows, columns = self.pixels.chunks
-        return reduced(self.grid, (rows, columns), self.read, most)
+        parts = [
+            range(count)[validate.selection(name, given, ascending=True)]
+            for name, given, count in zip(
+                ("rows", "columns"), (rows, columns), self.pixels.shape, strict=True
+            )
+        ]
+        part = self.grid.window(rows, columns)
+
+        def read(*within: slice) -> NDArray[np.complex64]:
+            chosen = (whole[each] for whole, each in zip(parts, within, strict=True))
+            return self.read(*(slice(each.start, each.stop, each.step) for each in chosen))
+
+        height, width = self.pixels.chunks
+        return reduced(part, (height, width), read, most)
 
     def _compared(self) -> tuple[Grid | None, dict[str, str]]:
         attributes = read_document(self.path)

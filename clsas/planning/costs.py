@@ -102,8 +102,8 @@ class KnownCosts:
     ----------
     costs : Costs
     source : str
-        "given" by the caller; "calibrated" by `clsas.calibrate`; "scaled" from the defaults by a
-        short measurement; or "default".
+        "given" by the caller; "calibrated" by `clsas measure-costs`; "scaled" from the defaults by
+        a short measurement; or "default".
     measured : str
         Time of the measurement, UTC, in ISO 8601; "" without one.
     """

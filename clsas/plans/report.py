@@ -12,13 +12,13 @@ _HEADINGS = (
 )  # fmt: skip
 _COSTS = {
     "given": "costs that were given.",
-    "calibrated": "costs that `clsas calibrate` measured on this device{when}.",
+    "calibrated": "costs that `clsas measure-costs` measured on this device{when}.",
     "scaled": (
-        "default costs, scaled to this device by a short measurement{when}: `clsas calibrate` "
+        "default costs, scaled to this device by a short measurement{when}: `clsas measure-costs` "
         "measures each."
     ),
     "default": (
-        "default costs, not from any measured on this device: `clsas calibrate` measures them."
+        "default costs, not from any measured on this device: `clsas measure-costs` measures them."
     ),
 }
 

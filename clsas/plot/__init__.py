@@ -1,4 +1,4 @@
-"""Pictures of images, mosaics, volumes, points, geometry, lines, recordings, tracks and trade-offs.
+"""Pictures of images, mosaics, volumes, points, geometry, recordings, tracks, plans, trade-offs.
 
 Most functions return a `matplotlib.figure.Figure` that belongs to no window and changes no global
 state; `save` writes it as PNG, PDF or SVG. `image` draws into axes of your own, or into a new
@@ -19,7 +19,10 @@ from clsas.plot.navigation import before_and_after as before_and_after
 from clsas.plot.navigation import coherence as coherence
 from clsas.plot.navigation import corrections as corrections
 from clsas.plot.navigation import sharpness as sharpness
+from clsas.plot.plans import plan as plan
+from clsas.plot.raw_echoes import echoes as echoes
 from clsas.plot.recordings import inspection as inspection
+from clsas.plot.scattered_points import points as points
 from clsas.plot.survey import geometry as geometry
 from clsas.plot.volumes import volume as volume
 
@@ -28,6 +31,7 @@ __all__ = [
     "coherence",
     "corrections",
     "cuts",
+    "echoes",
     "geometry",
     "image",
     "image_db",
@@ -35,6 +39,8 @@ __all__ = [
     "inspection",
     "mosaic",
     "patch_borders",
+    "plan",
+    "points",
     "range_lines",
     "save",
     "save_png",

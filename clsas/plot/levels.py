@@ -29,6 +29,7 @@ from clsas.plot.colours import COLOUR_MAP, colour_map
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.collections import PathCollection
     from matplotlib.colors import Colormap
     from matplotlib.figure import Figure
     from matplotlib.image import AxesImage
@@ -96,6 +97,17 @@ class Scale:
             return -DYNAMIC_RANGE_DB, 0.0
         low, high = np.percentile(some, self.percentiles).tolist()
         return min(low, high - 1.0), high  # colours need a range even if all pixels are equal
+
+
+def amplitude_at(values: NDArray, percentile: float) -> float | None:
+    """Return a percentile of the amplitudes that are not 0, or None if all are 0.
+
+    Of very many values, some all over the array are taken.
+    """
+    flat = values.reshape(-1)
+    some = np.abs(flat[:: -(-flat.size // _COUNTED)])
+    some = some[some > 0]
+    return float(np.percentile(some, percentile)) if some.size else None
 
 
 def image(
@@ -242,6 +254,7 @@ def range_lines(
     *,
     dynamic_range_db: float | None = None,
     percentiles: tuple[float, float] | None = None,
+    reference: float | None = None,
     colour_map: str | Colormap = COLOUR_MAP,
     title: str = "",
 ) -> Figure:
@@ -251,8 +264,8 @@ def range_lines(
     ----------
     lines : RangeLines
         Lines to draw; each is drawn at its own ranges.
-    dynamic_range_db, percentiles, colour_map, title
-        As for `image`. Levels are relative to the largest sample.
+    dynamic_range_db, percentiles, reference, colour_map, title
+        As for `image`. By default, levels are relative to the largest sample.
 
     Raises
     ------
@@ -262,13 +275,13 @@ def range_lines(
         If an argument has the wrong type or is out of bounds.
     """
     validate.instance("lines", lines, RangeLines)
-    scale = Scale(dynamic_range_db, percentiles, None, colour_map)
+    scale = Scale(dynamic_range_db, percentiles, reference, colour_map)
     title = drawable("title", title)
-    amplitude, first_m, last_m = _aligned(lines)
+    amplitude, first_m, last_m = aligned(lines.samples, lines.first_range_m, lines.range_step_m)
     extent = (-0.5, lines.channels - 0.5, first_m, last_m)
     figure = new_figure(_WIDTH_IN, 6.0)
     axes = figure.subplots()
-    draw_levels(axes, level_db(amplitude), extent, scale)
+    draw_levels(axes, level_db(amplitude, reference), extent, scale)
     axes.set(xlabel="Channel", ylabel="Range (m)", title=title, aspect="auto")
     return figure
 
@@ -304,7 +317,7 @@ def draw_levels(
 
 
 def add_colour_bar(
-    drawn: AxesImage, scale: Scale, level: NDArray[np.float32], **where: Any
+    drawn: AxesImage | PathCollection, scale: Scale, level: NDArray[np.float32], **where: Any
 ) -> None:
     """Draw a colour bar. An end is pointed if there are levels beyond it."""
     pointed = {(True, True): "both", (True, False): "min", (False, True): "max"}
@@ -356,11 +369,24 @@ def _check_axes(axes: object) -> None:
     validate.instance("axes", axes, Axes)
 
 
-def _aligned(lines: RangeLines) -> tuple[NDArray, float, float]:
-    """Return amplitudes [range, channel] on a common range axis, and its outer edges."""
-    first_m, step_m = lines.first_range_m.min(), lines.range_step_m
-    start = np.rint((lines.first_range_m - first_m) / step_m).astype(int)
-    amplitude = np.zeros((start.max() + lines.length, lines.channels), np.float32)
-    for channel, (at, samples) in enumerate(zip(start, lines.samples, strict=True)):
-        amplitude[at : at + lines.length, channel] = np.abs(samples)
-    return amplitude, first_m - step_m / 2, first_m + (len(amplitude) - 0.5) * step_m
+def aligned(
+    samples: NDArray, first: NDArray[np.float64], step: float
+) -> tuple[NDArray[np.float32], float, float]:
+    """Return amplitudes [range or time, channel] on one axis, and that axis's outer edges.
+
+    Parameters
+    ----------
+    samples : ndarray, [channels, length]
+    first : ndarray, [channels]
+        Range or time of the first sample of every channel.
+    step : float
+        Range or time between samples.
+    """
+    channels, length = samples.shape
+    start = np.rint((first - first.min()) / step).astype(int)
+    rows = int(start.max()) + length
+    validate.memory("the picture", 12 * rows * channels)  # amplitudes, and levels with a copy
+    amplitude = np.zeros((rows, channels), np.float32)
+    for channel, (at, each) in enumerate(zip(start, samples, strict=True)):
+        amplitude[at : at + length, channel] = np.abs(each)
+    return amplitude, first.min() - step / 2, first.min() + (rows - 0.5) * step

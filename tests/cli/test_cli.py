@@ -15,6 +15,7 @@ from pathlib import Path
 import click
 import numpy as np
 import pytest
+from click.shell_completion import ShellComplete
 from click.testing import CliRunner
 from interrupt import interrupted
 
@@ -329,17 +330,17 @@ def test_tradeoff_of_a_built_in_case(monkeypatch):
     assert (seen[1][2]["beam"].width_deg, seen[1][2]["beam"].shape) == (1.0, "hann")
 
 
-def test_calibrate(monkeypatch):
+def test_costs_are_measured(monkeypatch):
     measured = costs.Costs(pixel_ns=0.7)
     monkeypatch.setattr("clsas.planning.calibration.calibrate", lambda device, progress: measured)
-    assert not run_json("calibrate", "--device", 0)["stored"]
-    assert ", not stored in " in run("calibrate", "--device", 0)[0]
+    assert not run_json("measure-costs", "--device", 0)["stored"]
+    assert ", not stored in " in run("measure-costs", "--device", 0)[0]
     monkeypatch.setattr(costs, "load", lambda device: costs.KnownCosts(measured, "calibrated"))
-    result = run_json("calibrate", "--device", 0)
+    result = run_json("measure-costs", "--device", 0)
     assert result["stored"]
     assert result["costs"]["pixel_ns"] == 0.7
     assert result["file"] == str(costs.path())
-    text, _ = run("calibrate", "--device", 0)
+    text, _ = run("measure-costs", "--device", 0)
     assert result["device"] in text
     assert str(costs.path()) in text
     assert re.search(r"^ +0\.7  pixel_ns$", text, re.MULTILINE)
@@ -369,7 +370,8 @@ def test_devices(monkeypatch):
     assert {each["source"] for each in result["costs"].values()} == {"calibrated"}
     assert result["costs_file"] == str(costs.path())
     text, _ = run("devices")
-    assert re.search(r"^   costs: calibrated, on \d{4}-\d\d-\d\d \(today\)$", text, re.MULTILINE)
+    costs_of = r"^   costs: measured by `clsas measure-costs`, on \d{4}-\d\d-\d\d \(today\)$"
+    assert re.search(costs_of, text, re.MULTILINE)
     assert f"Costs are stored in {costs.path()}" in text
     assert all(info.label in text and info.driver in text for info in infos)
     assert f"Used: {result['used']} ({result['reason']})" in text
@@ -569,7 +571,10 @@ FIXED = ["--taps", "4", "--upsampling", "2"]
         (["quality", "image.h5", "--near", "0"], 2, "must be X,Y or X,Y,Z in metres"),
         (["quality", "image.h5", "--png", "new.png"], 2, "require --near"),
         (["bench", "bp-nothing"], 2, "'bp-nothing' is not one of bp-thesis, "),
-        (["imagine"], 2, "No such command 'imagine'"),
+        (["imagine"], 2, "No such command 'imagine'. Did you mean 'image'?"),
+        (["calibrate"], 2, "'calibrate' is now 'measure-costs'"),
+        (["image", "lines.h5", *GRID, "--tolerence-db", "-40"], 2, "'--tolerance-db'"),
+        (["--trace", "devices"], 2, "Did you mean '--traceback'?"),
     ],
 )
 def test_errors_are_one_message_and_leave_nothing(made, monkeypatch, args, code, message):
@@ -924,3 +929,36 @@ def test_warnings_of_others_are_not_shown_as_clsas_own(monkeypatch, tmp_path):
     _, stderr = run("simulate", tmp_path / "scene.toml", "-o", tmp_path / "out.h5", code=1)
     assert "Warning: of clsas\\x1b\n" in stderr
     assert "\nWarning: of another" not in f"\n{stderr}"
+
+
+def test_help_lists_every_command_once_on_a_line_in_four_groups():
+    lines = run("--help")[0].splitlines()
+    listed = "\n".join(lines[lines.index("Recordings:") :])
+    groups = re.findall(r"^(\w+):\n((?:  .+\n?)+)", listed, re.MULTILINE)
+    assert [heading for heading, _ in groups] == ["Recordings", "Images", "Measures", "Machine"]
+    rows = [row for _, body in groups for row in body.splitlines()]
+    context = cli.main.make_context("clsas", ["devices"])
+    assert [row.split()[0] for row in rows] == cli.main.list_commands(context)
+    assert all(re.fullmatch(r"  [\w-]+ +[A-Z].*\.", row) for row in rows)
+
+
+@pytest.mark.parametrize(
+    ("typed", "expected"),
+    [
+        (["m"], ["mosaic", "measure-costs"]),
+        (["--tr"], ["--traceback"]),
+        (["image", "--tol"], ["--tolerance-db", "--tolerance-wavelengths"]),
+        (["process", "--step", "f"], ["focus"]),
+    ],
+)
+def test_shells_complete_commands_options_and_choices(typed, expected):
+    *args, incomplete = typed
+    completion = ShellComplete(cli.main, {}, "clsas", "_CLSAS_COMPLETE")
+    assert [item.value for item in completion.get_completions(args, incomplete)] == expected
+
+
+def test_recordings_that_are_no_hdf5_are_assessed(made, tmp_path):
+    pytest.importorskip("sarkit")
+    lines = clsas.load(made[0] / "lines.h5")
+    clsas.save(tmp_path / "lines.cphd", replace(lines, rx_velocity_m_s=None))
+    assert "needed" in run_json("assess", tmp_path / "lines.cphd", *GRID)

@@ -201,7 +201,25 @@ def test_a_store_is_verified_without_its_scene(made):
     _, stderr = run("mosaic", "--verify", code=2)
     assert "--verify requires a store: clsas mosaic --verify -o STORE.zarr" in stderr
     _, stderr = run("mosaic", "-o", store, code=2)
-    assert "SCENE.TOML is missing" in stderr
+    assert "without SCENE.TOML, give --lines, --x and --y too" in stderr
+
+
+@pytest.mark.slow
+def test_options_replace_the_scene(made, tmp_path):
+    grid = "--x", "-2:2:80", "--y", "56:61:100"
+    options = *grid, "--patches", "1x2", "--tolerance-db", "-40", "-o", tmp_path / "a.zarr"
+    stdout, stderr = run("mosaic", "--lines", lines_of(made), *options)
+    assert "1 x 2 patches of 100 x 40 pixels, 2 formed" in stdout
+    assert "simulated" not in stderr
+    assert clsas.Store.opened(tmp_path / "a.zarr").grid.shape == (100, 80)
+    for missing, args in (
+        ("--lines", [*grid, "-o", tmp_path / "b.zarr"]),
+        ("--x and --y", ["--lines", lines_of(made), "-o", tmp_path / "b.zarr"]),
+        ("-o", ["--lines", lines_of(made), *grid]),
+        ("--lines, --x and --y, -o", []),
+    ):
+        assert f"without SCENE.TOML, give {missing} too" in run("mosaic", *args, code=2)[1]
+    assert [path.name for path in tmp_path.iterdir()] == ["a.zarr"]
 
 
 @pytest.mark.slow

@@ -93,3 +93,38 @@ def test_borders_of_patches_on_request(folder, figures):
     run(*command, "--picture", "a.png")
     run(*command, "--picture", "b.png", "--borders")
     assert [len(figure.axes[0].get_lines()) for figure in figures] == [0, 3]
+
+
+@pytest.mark.parametrize("command", ["image", "mosaic"])
+def test_grids_of_scene_files(folder, command):
+    """Slanted planes and height maps, as the library makes them."""
+    if command == "mosaic":
+        pytest.importorskip("zarr")
+    heights = np.linspace(-0.1, 0.1, 33 * 40).reshape(33, 40)
+    np.save("heights.npy", heights)
+    plain = (folder / "scene.toml").read_text()
+    slanted = (
+        "[grid]\norigin_m = [-1, 20, 0]\nrow_step_m = [0, 0.06, 0.01]\n"
+        "column_step_m = [0.05, 0, 0]\nshape = [33, 40]\n"
+    )
+    slope = Grid.oriented([-1, 20, 0], [0, 0.06, 0.01], [0.05, 0, 0], (33, 40))
+    with_heights = "height_file = 'heights.npy'\n"
+    relief = Grid.height_map((-1, 1, 40), (20, 22, 33), heights)
+    for number, (table, grid) in enumerate(
+        [
+            (plain.replace("[grid]\n", f"[grid]\n{with_heights}"), relief),
+            (slanted, slope),
+            (slanted + with_heights, slope.with_height(heights)),
+        ]
+    ):
+        (folder / "grid.toml").write_text(table)
+        if command == "image":
+            run("image", "lines.h5", "--scene", "grid.toml", "--exact", "-o", "i.h5",
+                "--picture", "i.png")  # fmt: skip
+            formed = clsas.load("i.h5")
+        else:
+            store = f"{number}.zarr"
+            run("mosaic", "grid.toml", "--lines", "lines.h5", "--exact", "-o", store)
+            formed = clsas.Store.opened(store).image()
+        np.testing.assert_allclose(formed.grid.positions_m(), grid.positions_m(), atol=1e-12)
+        assert clsas.relative_error_db(formed, clsas.backproject(LINES, grid)) < -55

@@ -1,3 +1,4 @@
+import io
 import re
 import tomllib
 from pathlib import Path
@@ -32,6 +33,13 @@ GRID = """
 x = { start_m = 0, stop_m = 1, count = 3 }
 y = { start_m = 5, stop_m = 8, count = 4 }
 """
+SLANTED = """
+[grid]
+origin_m = [0, 20, -1]
+row_step_m = [0, 0.1, 0.02]
+column_step_m = [0.1, 0, 0]
+shape = [2, 3]
+"""
 SONAR = """
 [sonar]
 rx_m = [[0, 0, 0], [0.1, 0, 0]]
@@ -43,6 +51,13 @@ duration_s = 1e-3
 
 def parse(text, folder=Path()):
     return config.parse_scene(text.encode(), name="scene.toml", folder=folder)
+
+
+def saved(array):
+    """Bytes of a NumPy file."""
+    file = io.BytesIO()
+    np.save(file, array, allow_pickle=True)
+    return file.getvalue()
 
 
 def refused(text, folder=Path()):
@@ -366,6 +381,14 @@ def test_a_track_file_that_is_no_text(tmp_path):
         (GRID.replace("count = 3", "count = 0"), "[grid] x"),
         (GRID.replace("count = 3", "n = 3"), "unknown key 'n' in [grid.x]"),
         (GRID.replace("x =", "z ="), "unknown key 'z' in [grid]: did you mean 'z_m'?"),
+        (
+            "[grid]\nx = { start_m = 0, stop_m = 1, count = 3 }",
+            "[grid] missing key 'y' (or 'origin_m'",
+        ),
+        (SLANTED.replace("shape = [2, 3]", ""), "[grid] missing key 'shape'"),
+        (SLANTED + "z_m = 2", "[grid] z_m and column_step_m exclude each other: give x, y and z_m"),
+        (SLANTED.replace("0.1, 0.02]", "0, 0]"), "[grid] row_step_m must not be zero"),
+        (SLANTED.replace("[2, 3]", "[2, 3, 4]"), "[grid] shape must be a list of 2"),
         ("[simulate]\nrange_m = [1]", "[simulate] range_m must be a list of 2, got [1]"),
         ("[simulate]\nspreading = 1", "[simulate] spreading must be true or false, got 1"),
         (
@@ -419,9 +442,60 @@ def test_mistakes_are_named_with_their_place(text, message):
 def test_a_mistyped_key_is_one_mistake_and_every_mistake_is_told():
     told = refused("[sonar.pulse]\ncarier_hz = 1e6\nduration_s = '1 ms'\n[grid]\nx = 1")
     lines = told.splitlines()
-    assert len(lines) == 4  # carrier, duration, x, the missing y
+    assert len(lines) == 3  # carrier, duration, x
     assert all(line.strip().startswith("scene.toml: ") for line in lines)
     assert "missing key 'carrier_hz'" not in told
+
+
+def test_a_plane_of_any_direction():
+    grid = parse(SLANTED).grid
+    assert grid.shape == (2, 3)
+    np.testing.assert_allclose(
+        grid.positions_m()[[0, 1], [0, 2]], [[0, 20, -1], [0.2, 20.1, -0.98]]
+    )
+
+
+@pytest.mark.parametrize("name", ["heights.csv", "heights.npy"])
+@pytest.mark.parametrize("table", [SLANTED, GRID], ids=["slanted", "horizontal"])
+def test_heights_are_read_from_a_file(tmp_path, table, name):
+    plane = parse(table).grid
+    heights = np.random.default_rng(1).normal(size=plane.shape)
+    if name == "heights.csv":
+        np.savetxt(tmp_path / name, heights, delimiter=",", fmt="%.17g")
+    else:
+        np.save(tmp_path / name, heights)
+    scene = parse(f"{table}height_file = '{name}'", tmp_path)
+    np.testing.assert_array_equal(scene.grid.height_m, heights)
+    np.testing.assert_array_equal(scene.grid.positions_m()[..., :2], plane.positions_m()[..., :2])
+    assert scene.files == {"grid.height_file": tmp_path / name}
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("none.npy", None, "must be readable: No such file or directory"),
+        ("heights.txt", b"1", "must end in .csv or .npy"),
+        ("heights.npy", b"nothing of NumPy's", "must be an intact NumPy file"),
+        ("heights.npy", saved(np.zeros((2, 3)))[:-1], "must be an intact NumPy file"),
+        ("heights.npy", saved(np.zeros((2, 3), object)), "must be an intact NumPy file"),
+        ("heights.npy", saved(np.zeros((2, 3), complex)), "must hold real numbers, got complex128"),
+        ("heights.npy", saved(np.zeros((3, 2))), "must hold 2 x 3 heights (rows x columns of the"),
+        ("heights.npy", saved(np.array(1.0)), "got one in"),
+        ("heights.csv", b"1,2,3\n4,5,six\n", "must hold numbers separated by commas"),
+        ("heights.csv", b"1,2,3\n4,5\n", "must hold numbers separated by commas"),
+        ("heights.csv", b"\xff\xfe", "must hold numbers separated by commas"),
+        ("heights.csv", b"1,2,3\n4,5,nan\n", "must hold finite heights"),
+        ("heights.csv", b"1,2,3\n", "got 1 x 3 in"),
+        ("heights.csv", b"\n", "must hold numbers separated by commas: the file is empty"),
+    ],
+)
+def test_heights_that_cannot_be_used_are_refused(tmp_path, name, content, message):
+    if content is not None:
+        (tmp_path / name).write_bytes(content)
+    told = refused(f"{SLANTED}height_file = '{name}'", tmp_path)
+    assert told.startswith("scene.toml: [grid] height_file must ")
+    assert message in told
+    assert told.count("\n") == 0
 
 
 def test_missing_tables_are_named():

@@ -354,7 +354,7 @@ def test_lines_are_assessed_with_the_scene_that_made_them(scene, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
-        (["--stages", "2x2"], "--stages has no tolerance"),
+        (["--stages", "2x2"], "--stages implies no tolerance"),
         (["--scene", "SCENE"], "--scene requires LINES.H5"),
         (["--repeats", "-1"], "--repeats"),
     ],

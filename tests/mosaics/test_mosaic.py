@@ -115,6 +115,11 @@ def test_the_overview_keeps_power_and_place(file, tmp_path, exact):
     np.testing.assert_allclose(np.abs(overview.pixels) ** 2, blocks.mean(axis=(1, 3)), rtol=1e-2)
     expected = GRID.positions_m().reshape(15, 4, 20, 4, 3).mean(axis=(1, 3))
     np.testing.assert_allclose(overview.grid.positions_m(), expected, atol=1e-9)
+    part = Store.opened(tmp_path / "image.zarr").overview(10, slice(20, 44), slice(8, 48))
+    np.testing.assert_allclose(np.abs(part.pixels), np.abs(overview.pixels[5:11, 2:12]), rtol=1e-6)
+    np.testing.assert_allclose(
+        part.grid.positions_m(), overview.grid.positions_m()[5:11, 2:12], atol=1e-9
+    )
 
 
 def test_the_directions_are_those_of_the_whole_track():

@@ -430,7 +430,7 @@ def test_it_says_whether_times_are_of_this_device(chosen, monkeypatch, tmp_path)
     monkeypatch.setenv("CLSAS_CACHE", str(tmp_path))
     usual = plan(lines, grid, stages=[])
     assert usual.prediction.cost_source == "default"
-    words = "Times follow from default costs, not from any measured on this device: `clsas calib"
+    words = "Times follow from default costs, not from any measured on this device: `clsas measure"
     assert words in usual.describe()
     device = open_device()
     costs.save(device, costs.defaults(device), "scaled")
@@ -443,7 +443,8 @@ def test_it_says_whether_times_are_of_this_device(chosen, monkeypatch, tmp_path)
     costs.save(device, costs.defaults(device))
     measured = plan(lines, grid, tolerance_db=-50)
     assert measured.prediction.cost_source == "calibrated"
-    assert f"costs that `clsas calibrate` measured on this device on {day}" in measured.describe()
+    words = f"costs that `clsas measure-costs` measured on this device on {day}"
+    assert words in measured.describe()
     assert "default costs" not in measured.describe()
     given = plan(lines, grid, tolerance_db=-50, costs=costs.Costs())
     assert "Times follow from costs that were given." in given.describe()

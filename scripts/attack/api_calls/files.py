@@ -86,7 +86,9 @@ def files(folder: Path) -> dict[str, Call]:
         ),
         "Store.read": Call(opened.read, {"rows": slice(0, 4), "columns": slice(1, 5)}),
         "Store.image": Call(opened.image, {"rows": slice(0, 4), "columns": slice(1, 5)}),
-        "Store.overview": Call(opened.overview, {"most": 8}),
+        "Store.overview": Call(
+            opened.overview, {"most": 8, "rows": slice(0, 4), "columns": slice(1, 5)}
+        ),
         "Store.records": Call(opened.records, {}),
         "Store.array_damage": Call(opened.array_damage, {}),
         "Store.damage": Call(opened.damage, {"tell": nothing}, accepts={"tell": optional}),

@@ -60,10 +60,23 @@ def pictures(folder: Path) -> dict[str, Call]:
         ),
         "plot.range_lines": Call(
             plot.range_lines,
-            {"lines": s.lines, **levels, "colour_map": "gray", **title},
+            {"lines": s.lines, **levels, "reference": 1.0, "colour_map": "gray", **title},
             kinds=text,
             accepts=accepts,
         ),
+        "plot.echoes": Call(
+            plot.echoes,
+            {"echoes": s.echoes, **levels, "reference": 1.0, "colour_map": "gray", **title},
+            kinds=text,
+            accepts=accepts,
+        ),
+        "plot.points": Call(
+            plot.points,
+            {"image": volume, **levels, "reference": 1.0, "colour_map": "gray", **title},
+            kinds=text,
+            accepts=accepts,
+        ),
+        "plot.plan": Call(plot.plan, {"plan": s.plan, **title}, kinds=text),
         "plot.volume": Call(
             plot.volume,
             {"image": volume, "kind": "slices", "at": (1.0, 2.0, 1.0), **title},

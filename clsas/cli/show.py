@@ -1,0 +1,215 @@
+"""Command that draws a file of any kind: show."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+import click
+
+import clsas
+from clsas.cli import options
+from clsas.cli.inputs import read_levels
+from clsas.cli.outputs import printable, report
+from clsas.cli.parameters import POSITION, File, Output, keep_out, need_matplotlib
+from clsas.core import reading, validate
+from clsas.files.formats import SUFFIXES
+from clsas.plot.canvas import SUFFIXES as PICTURES
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+Shown: TypeAlias = clsas.Image | clsas.RangeLines | clsas.Echoes | clsas.Plan | clsas.Store
+
+_ENDINGS = (*SUFFIXES, ".mat", ".json", ".zarr")  # that the picture's name does without
+_MOST_PIXELS = 1024  # of a mosaic, along its longer side; a picture has as many dots
+_JSON = b"{"
+
+
+@click.command()
+@click.argument("file", metavar="FILE", type=File(exists=True))
+@click.option(
+    "-o", "--output", type=Output(*PICTURES),
+    help="Picture to write, as PNG, PDF or SVG. [default: FILE with the suffix .png]",
+)  # fmt: skip
+@options.dynamic_range
+@click.option(
+    "--percentile", type=float,
+    callback=options.checked(
+        lambda value: validate.number("percentile", value, above=0.0, most=100.0)
+    ),
+    help="Percentile of the amplitudes that are not 0 to draw at 0 dB. [default: 100, the largest]",
+)  # fmt: skip
+@options.colour_map
+@click.option(
+    "--near", type=POSITION,
+    help="Draw the part around this position on the image's axes, or around x, y, z (m).",
+)  # fmt: skip
+@click.option(
+    "--extent-m", type=float,
+    callback=options.checked(lambda value: validate.positive("extent_m", value, "m")),
+    help="With --near, the distance on either side that is drawn (m). [default: 32 pixels]",
+)  # fmt: skip
+@options.as_json
+def show(
+    file: Path,
+    output: Path | None,
+    dynamic_range_db: float | None,
+    percentile: float | None,
+    colour_map: str | None,
+    near: tuple[float, ...] | None,
+    extent_m: float | None,
+    as_json: bool,
+) -> None:
+    """Draw an image, range lines, a plan, a recording or a mosaic.
+
+    FILE is any file that clsas writes or reads: an image, range lines or echoes in HDF5; a
+    recording as CPHD, AirSAS or MATLAB; a plan that `clsas plan --json --filters` printed; or the
+    Zarr store of a mosaic, which is read patch by patch and may be larger than memory. Its contents
+    decide, not its name.
+
+    \b
+    Example:  clsas show image.h5 --near 0,42.5 --extent-m 0.2 --db 40
+    """
+    if extent_m is not None and near is None:
+        raise click.UsageError("--extent-m requires --near")
+    levels = read_levels(dynamic_range_db, None, colour_map)
+    need_matplotlib()
+    output = output or _beside(file)
+    if file.is_dir():
+        keep_out("--output", output, "the store", file)
+    shown = _read(file)
+    given = {
+        "--dynamic-range-db": dynamic_range_db,
+        "--percentile": percentile,
+        "--colour-map": colour_map,
+        "--near": near,
+        "--extent-m": extent_m,
+    }
+    _check_options(shown, {option for option, value in given.items() if value is not None})
+    from clsas import plot
+
+    title = printable(file.name).replace("$", r"\$")  # matplotlib would read mathematics
+    if percentile is not None:
+        title += f" (0 dB: percentile {percentile:g})"
+    figure, words = _drawn(shown, near, extent_m, percentile, title, levels)
+    plot.save(figure, output)
+    kind = "mosaic" if isinstance(shown, clsas.Store) else type(shown).__name__
+    report(
+        as_json, f"{printable(output)}: {printable(words)}", file=file, picture=output, kind=kind
+    )
+
+
+def _beside(file: Path) -> Path:
+    """Return the default picture of a file, which must be one that can be written."""
+    context = click.get_current_context()
+    (option,) = (each for each in context.command.params if each.name == "output")
+    path = file.resolve() if file.name in ("", "..") else file
+    name = path.stem if path.suffix.lower() in _ENDINGS else path.name
+    return option.type.convert(path.with_name(f"{name}.png"), option, context)
+
+
+def _read(path: Path) -> Shown:
+    """Return what a file holds; raise ValueError if it cannot be drawn."""
+    if path.is_dir():
+        return clsas.Store.opened(path)
+    with path.open("rb") as opened:
+        is_json = opened.read(64).lstrip().startswith(_JSON)
+    if is_json:
+        try:
+            return clsas.Plan.from_json(reading.read_bytes(path).decode())
+        except ValueError as error:
+            reason = str(error).removeprefix("text must be a plan as of Plan.to_json: ")
+            raise ValueError(
+                f"{path} must be a plan of `clsas plan --json --filters`: {reason}"
+            ) from None
+    if path.suffix.lower() == ".toml":
+        raise ValueError(
+            f"{path} is a scene, which has nothing to draw yet: clsas simulate {path} -o ECHOES.H5"
+        )
+    found = clsas.load(path)
+    if isinstance(found, clsas.Grid):
+        raise ValueError(f"{path} must hold an image, range lines or echoes, got only a Grid")
+    return found
+
+
+def _check_options(shown: Shown, given: set[str]) -> None:
+    """Raise UsageError for options that have no effect on an object of this kind."""
+    if isinstance(shown, clsas.Plan):
+        refused, what = given, "a plan"
+    elif isinstance(shown, clsas.RangeLines | clsas.Echoes):
+        refused, what = given & {"--near", "--extent-m"}, "range lines or echoes"
+    elif isinstance(shown, clsas.Image) and shown.grid.points_m is not None:
+        is_box = shown.grid.points_m.ndim == 4
+        refused = given & ({"--extent-m"} if is_box else {"--near", "--extent-m"})
+        what = "an image on points"
+    else:
+        return
+    if refused:
+        raise click.UsageError(f"{', '.join(sorted(refused))} cannot be used with {what}")
+
+
+def _drawn(
+    shown: Shown,
+    near: tuple[float, ...] | None,
+    extent_m: float | None,
+    percentile: float | None,
+    title: str,
+    levels: dict[str, Any],
+) -> tuple[Figure, str]:
+    """Return the picture of an object, and what it shows in words."""
+    from clsas import plot
+    from clsas.plot.levels import amplitude_at
+
+    if isinstance(shown, clsas.Plan):
+        return plot.plan(shown, title=title), repr(shown)
+    if isinstance(shown, clsas.Store):
+        shown = _overview(shown, near, extent_m)
+    elif isinstance(shown, clsas.Image) and shown.grid.points_m is None:
+        shown = _part(shown, near, extent_m)
+    values = shown.pixels if isinstance(shown, clsas.Image) else shown.samples
+    reference = None if percentile is None else amplitude_at(values, percentile)
+    how = {**levels, "reference": reference, "title": title}
+    if isinstance(shown, clsas.RangeLines):
+        figure = plot.range_lines(shown, **how)
+    elif isinstance(shown, clsas.Echoes):
+        figure = plot.echoes(shown, **how)
+    elif shown.grid.points_m is None:
+        figure = plot.image_db(shown, **how)
+    else:
+        figure = _of_points(shown, near, how)
+    return figure, repr(shown)
+
+
+def _overview(
+    store: clsas.Store, near: tuple[float, ...] | None, extent_m: float | None
+) -> clsas.Image:
+    """Return a mosaic, or the part around a position, at the pixels of a picture."""
+    from clsas.plot.windows import window_around
+
+    window = () if near is None else window_around(store.grid, near, extent_m)
+    return store.overview(_MOST_PIXELS, *window)
+
+
+def _part(
+    image: clsas.Image, near: tuple[float, ...] | None, extent_m: float | None
+) -> clsas.Image:
+    """Return an image, or the part around a position."""
+    from clsas.plot.windows import window_around
+
+    if near is None:
+        return image
+    rows, columns = window_around(image.grid, near, extent_m)
+    return clsas.Image(image.pixels[rows, columns], image.grid.window(rows, columns))
+
+
+def _of_points(image: clsas.Image, near: tuple[float, ...] | None, how: dict[str, Any]) -> Figure:
+    """Draw a volume, with slices through a position or without, or other points from above."""
+    from clsas import plot
+
+    if near is not None:
+        return plot.volume(image, kind="slices", at=near, **how)
+    try:
+        return plot.volume(image, **how)
+    except ValueError:  # the points form no regular box
+        return plot.points(image, **how)

@@ -1,0 +1,57 @@
+"""Parts of images around a position, for pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from clsas.core import validate
+from clsas.core.grid import Grid
+from clsas.measures.quality import on_axes
+
+_AROUND = 32  # pixels on either side by default, along the coarser axis
+_ROUNDING = 1e-6  # of a step, so that a pixel at the very end is drawn
+
+
+def window_around(
+    grid: Grid, near: Sequence[float], extent_m: float | None = None
+) -> tuple[slice, slice]:
+    """Return the rows and columns of a grid within a distance of a position.
+
+    Parameters
+    ----------
+    grid : Grid
+        A plane or height map.
+    near : (float, float) or (float, float, float)
+        Coordinates on the axes of the grid, along columns and rows, or a position x, y, z; metres.
+    extent_m : float, optional
+        Distance on either side of it, metres; 32 pixels by default.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If `near` lies outside the grid or is not two or three numbers, or `extent_m` is not
+        positive.
+    """
+    axes = grid.sides
+    place_m = on_axes(grid, axes, near)
+    if extent_m is None:
+        extent_m = _AROUND * max(abs(axis.step_m) for axis in axes) or 1.0
+    extent_m = validate.positive("extent_m", extent_m, "m")
+    parts = []
+    for axis, at_m in zip(axes, place_m, strict=True):
+        distance_m = np.abs(axis.places_m - at_m)
+        nearest = int(distance_m.argmin())
+        ends_m = sorted((axis.places_m[0], axis.places_m[-1]))
+        step_m = abs(axis.step_m)
+        if not ends_m[0] - step_m / 2 <= at_m <= ends_m[1] + step_m / 2:
+            raise ValueError(
+                f"near must be inside the image: {axis.name} from {ends_m[0]:g} to "
+                f"{ends_m[1]:g} m, got {at_m:g} m"
+            )
+        inside = np.flatnonzero(distance_m <= extent_m + _ROUNDING * step_m)
+        first, last = (inside[0], inside[-1]) if len(inside) else (nearest, nearest)
+        parts.append(slice(int(first), int(last) + 1))
+    columns, rows = parts
+    return rows, columns
