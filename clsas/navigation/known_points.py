@@ -20,7 +20,7 @@ from clsas.core.lines import RangeLines
 from clsas.navigation.range_fit import MOST_CONDITION, Alike, Fit, fitted
 from clsas.navigation.range_model import Model
 from clsas.navigation.reflectors import LEAST_SNR, Reader
-from clsas.navigation.responses import directions
+from clsas.navigation.responses import displacement_axes
 from clsas.signal.readout import Readout
 from clsas.sonar.track import Track
 
@@ -275,7 +275,7 @@ def _axes(lines: RangeLines, names: tuple[str, ...], track: Track | None) -> NDA
     if not set(names) & set(UNKNOWNS[2:]):
         return np.zeros((3, lines.channels, 3))
     try:
-        return directions(lines, ("surge", "sway", "heave"))[:, ping]
+        return displacement_axes(lines, ("surge", "sway", "heave"))[:, ping]
     except ValueError as error:
         raise ValueError(
             f"track must be given, with the platform's attitude, for a lever arm: the lines' "
