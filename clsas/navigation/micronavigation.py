@@ -277,7 +277,7 @@ def _result(
     _check_coherence(found)
     count = len(found.moved)
     misfit = max(float(found.misfit[found.coherent].mean()), _contradiction(found), 1.0)
-    # A reflector stays in the beam for many pings, and all blocks may share the same few directions.
+    # A reflector stays in the beam for many pings, and all blocks may share a few directions.
     lasting = float(found.lasting[found.coherent].mean()) * int(found.coherent.sum())
     persist = max(persistence(found.scatter[found.coherent]), lasting)
     steps: list[Step | None] = [None] * count

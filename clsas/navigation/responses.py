@@ -79,11 +79,11 @@ class Passage:
         return math.sqrt(self.wavelength_m * float(np.median(found.range_m)) / 2)
 
     def by_ping(self, values: NDArray) -> NDArray:
-        """Return the sums of values, [channels, ...], over the channels of each ping, [pings, ...]."""
+        """Return sums of values, [channels, ...], over the channels of each ping, [pings, ...]."""
         return np.add.reduceat(values, self.lines.ping_starts, axis=0)
 
     def mean_by_ping(self, values: NDArray) -> NDArray:
-        """Return the means of values, [channels, n], over the channels of each ping, [pings, n]."""
+        """Return means of values, [channels, n], over the channels of each ping, [pings, n]."""
         return self.by_ping(values) / np.bincount(self.ping)[:, None]
 
     def vectors_m(self, moved_m: NDArray[np.float64]) -> NDArray[np.float64]:
