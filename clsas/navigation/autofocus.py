@@ -58,12 +58,13 @@ pings, responses of speckle disagree by at least 0.044, and bright ones by 0.011
 _DRIFTS = 3  # most estimates of drift
 _NEIGHBOURHOODS = (3.0, 2.0, 1.0)  # lengths along the track around responses, Fresnel lengths
 _SWEEPS = 2  # most estimates from single pings
+# Most responses that are used, and those that are used first, to check the geometry.
 _RESPONSES, _FIRST_RESPONSES = 200, 40
 # Mean number of responses that a ping receives among those from which drift is estimated. With too
 # few, a stretch of a long track may stay off by half a wavelength. With too many, some responses
 # are side lobes, not echoes.
 _RECEIVED_FOR_DRIFT = 18
-_OFFSETS = np.arange(-4.0, 5.0)  # offsets in range of the images from which drift is estimated
+_OFFSETS = np.arange(-4.0, 5.0)  # offsets in range of the images that drift compares, samples
 _LEAST_RESPONSES = 8  # responses that are needed to compare two halves
 _LEAST_GRADIENT = 0.05  # smallest rms change in range per displacement
 _MOST_CONDITION = 1e3  # largest condition number at which unknowns are distinguishable
@@ -211,7 +212,7 @@ def autofocus(
     >>> xyz_m = np.random.default_rng(0).uniform([0.6, 9.5, 0], [2.4, 11, 0], (30, 3))
     >>> points = clsas.PointTargets(xyz_m, np.ones(30))
     >>> course = (0, 0, 0), (0.02, 0, 0), 150, 1.0
-    >>> sway_m = 3e-3 * np.sin(np.arange(150) / 30)
+    >>> sway_m = 3e-3 * np.sin(np.arange(150) / 20)
     >>> true = clsas.Track.straight(*course, sway_m=sway_m)
     >>> lines = clsas.compress(clsas.simulate(sonar, true, points, range_m=(9, 12)))
     >>> navigated = clsas.channels(sonar, clsas.Track.straight(*course))

@@ -287,7 +287,7 @@ class _Beam:
 
 def _estimator(
     steering: NDArray[np.complex128], target: NDArray[np.complex128], power: NDArray[np.float64]
-) -> NDArray[np.complex128]:
+) -> NDArray:
     """Return the filter that estimates `target` from the channels, [pairs, pairs].
 
     `steering` and `target` are what the channels receive and should receive, [pairs, angles], and

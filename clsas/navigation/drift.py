@@ -125,7 +125,7 @@ class _Subapertures:
 
 def _image(
     values: NDArray[np.complex64], taper: NDArray[np.float64], cycles: NDArray[np.float64]
-) -> NDArray[np.float32]:
+) -> NDArray:
     """Return the intensities of small images around points, [points, frequencies, offsets].
 
     `values` are contributions, [channels, points, offsets], `taper` weighs the channels, and
