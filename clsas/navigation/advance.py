@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from clsas.navigation.displacement import Correlator
+from clsas.navigation.correlation import Correlator
 from clsas.navigation.echoes import Window
 from clsas.navigation.pair_geometry import PairGeometry
 

@@ -19,8 +19,8 @@ _TRIED = 9  # displacements tried within half a wavelength: 4 per cycle of the s
 _NEWTON = 3  # Newton steps from the best of them
 _SWEEPS = 2  # sweeps over all pings
 _DEVIATION_PER_MEDIAN = 1.4826  # standard deviation over median magnitude of normal errors
-# Blocks of pings, each of which moves at once. There are enough of them that the sum over the other
-# pings changes little.
+# Blocks of pings that move together. With fewer blocks, the sum over the other pings would change
+# too much while a block moves.
 _BLOCKS = 16
 
 

@@ -15,7 +15,7 @@ from clsas.core.conditioning import DEAD_DB
 from clsas.core.lines import RangeLines
 from clsas.navigation.accuracy import Accuracy, check_plausible
 from clsas.navigation.checks import check_navigation, mean_wavelength_m
-from clsas.navigation.displacement import Correlator
+from clsas.navigation.correlation import Correlator
 from clsas.navigation.overlap import Array, moved
 from clsas.navigation.passes import LEAST_ECHOES, Displacements, measured
 from clsas.navigation.smoother import Step, persistence, shape_deviation_m, smooth

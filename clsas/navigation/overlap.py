@@ -54,7 +54,7 @@ class Array:
         counts = np.diff(starts)
         if len(counts) < 2:
             raise ValueError(
-                "lines must hold at least 2 pings, got one (all channels share one transmitter "
+                "lines must have at least 2 pings, got one (all channels share one transmitter "
                 "position)"
             )
         if counts.min() < 2:

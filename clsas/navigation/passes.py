@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 
 from clsas.core.lines import RangeLines
 from clsas.navigation.advance import surge
+from clsas.navigation.correlation import Correlator
 from clsas.navigation.directions import ALL, MIDDLE
-from clsas.navigation.displacement import Correlator, Displacement, displacement
+from clsas.navigation.displacement import Displacement, displacement
 from clsas.navigation.overlap import Array, Overlap, moved, overlap
 from clsas.navigation.pair_geometry import PairGeometry
 from clsas.navigation.smoother import Step, integrated

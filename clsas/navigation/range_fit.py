@@ -112,7 +112,7 @@ def distinguishable(
 
 @dataclass(frozen=True, eq=False)
 class _Problem:
-    """What is fitted.
+    """Model, measurements and unknowns of a fit.
 
     Attributes
     ----------
