@@ -88,12 +88,13 @@ def displacement(found: Correlation, *, first: bool, yaw: bool) -> Displacement:
     coherence = np.sqrt(np.mean(found.coherence[:, :, lag] ** 2, axis=0))
     of_few = _variance_of_few_echoes(found)
     variance = phase_variance(coherence, found.independent) + of_few
-    line = _Line.through(phase, variance, np.stack([-turns, -steer][: 1 + yaw], axis=-1))
+    columns = [-turns, -steer] if yaw else [-turns]
+    line = _Line.through(phase, variance, np.stack(columns, axis=-1))
     spread = line.spread(coherence, found.aligned)
     expected = phase.size - float(np.trace(line.inverse @ spread))
     lasting = float(np.average(of_few / variance, weights=1 / variance))
     covariance = np.zeros((2, 2))
-    covariance[: 1 + yaw, : 1 + yaw] = line.covariance(spread, lasting, found.aligned)
+    covariance[: len(columns), : len(columns)] = line.covariance(spread, lasting, found.aligned)
     return Displacement(
         sway_m=sway_m + float(line.solution[0]),
         yaw_rad=slope + (float(line.solution[1]) if yaw else 0.0),
