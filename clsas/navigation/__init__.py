@@ -1,1 +1,1 @@
-"""Corrections of the track by the echoes themselves: micronavigation and autofocus."""
+"""Corrections of the track from the echoes: known points, micronavigation, and autofocus."""

@@ -1,4 +1,4 @@
-"""Accuracy of the navigation that lines come with, and what is found beside it."""
+"""Accuracy of the navigation that is to be corrected, and a check of the corrections against it."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from clsas.core import validate
 
-_LEAST_DEVIATION = 1e-9  # of a navigation, metres or radians
+_LEAST_DEVIATION = 1e-9  # smallest standard deviation accepted, metres or radians
 _MOST_DEVIATION_M = 1e3
-_IMPLAUSIBLE = 3.0  # standard deviations of the navigation, rms over the pings
+_IMPLAUSIBLE = 3.0  # rms correction above which a warning is given, in standard deviations
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,7 +24,7 @@ class Accuracy:
     deviations : float64 [pings, 3]
         Standard deviations of sway (m), yaw (rad) and surge (m).
     correlation_pings : float
-        Pings over which errors persist.
+        Number of pings over which errors persist.
     """
 
     deviations: NDArray[np.float64]
@@ -39,11 +39,16 @@ class Accuracy:
         surge_sd_m: ArrayLike,
         correlation_pings: float | None,
     ) -> Accuracy:
-        """Return checked deviations; errors persist over the whole recording unless given."""
+        """Return the accuracy that the arguments of `micronavigate` describe, after checking them.
+
+        By default, errors persist over the whole recording.
+        """
         if correlation_pings is None:
             correlation_pings = pings
-        persist = validate.number("correlation_pings", correlation_pings, "pings", least=0.5)
-        found = []
+        correlation_pings = validate.number(
+            "correlation_pings", correlation_pings, "pings", least=0.5
+        )
+        deviations = []
         for name, value, unit, most in (
             ("sway_sd_m", sway_sd_m, "m", _MOST_DEVIATION_M),
             ("yaw_sd_rad", yaw_sd_rad, "rad", math.pi),
@@ -51,25 +56,25 @@ class Accuracy:
         ):
             checked = validate.array(name, value, np.float64, (pings,), broadcast=True)
             if checked.min() < _LEAST_DEVIATION or checked.max() > most:
-                wrong = checked.min() if checked.min() < _LEAST_DEVIATION else checked.max()
+                outside = checked.min() if checked.min() < _LEAST_DEVIATION else checked.max()
                 raise ValueError(
                     f"{name} must be from {_LEAST_DEVIATION:g} to {most:.4g} {unit}, "
-                    f"got {wrong:g} {unit}"
+                    f"got {outside:g} {unit}"
                 )
-            found.append(checked)
-        return cls(np.stack(found, axis=1), persist)
+            deviations.append(checked)
+        return cls(np.stack(deviations, axis=1), correlation_pings)
 
 
 def check_plausible(states: NDArray[np.float64], accuracy: Accuracy) -> None:
-    """Warn of corrections far beyond the accuracy of the navigation; `states` are [pings, 3]."""
-    beyond = np.sqrt(np.mean((states / accuracy.deviations) ** 2, axis=0))
-    worst = int(np.argmax(beyond))
-    if beyond[worst] > _IMPLAUSIBLE:
+    """Warn if corrections, [pings, 3], are far larger than the navigation's standard deviations."""
+    ratio = np.sqrt(np.mean((states / accuracy.deviations) ** 2, axis=0))
+    worst = int(np.argmax(ratio))
+    if ratio[worst] > _IMPLAUSIBLE:
         name, option = (("sway", "sway_sd_m"), ("yaw", "yaw_sd_rad"), ("surge", "surge_sd_m"))[
             worst
         ]
         validate.warn(
-            f"the {name} found is {beyond[worst]:.3g} times the accuracy given for the navigation "
-            f"({option}), rms over the pings. Check that accuracy, side, element_length_m, and the "
-            "sign of phase: `clsas inspect` tells conjugated samples"
+            f"the {name} found is {ratio[worst]:.3g} times the accuracy given for the navigation "
+            f"({option}), rms over the pings. Check {option}, side and element_length_m, and run "
+            "`clsas inspect`, which detects samples with the wrong sign of phase"
         )

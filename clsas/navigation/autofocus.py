@@ -1,28 +1,35 @@
-"""Autofocus in the time domain: the track that brings an image's brightest responses into focus.
+"""Autofocus in the time domain: correct a track with the brightest responses of an image.
 
-An image is formed, and its brightest local maxima are taken as responses. Every ping's contribution
-to each is read from the lines along the present track. From these come errors of the track, from
-coarse to fine: the drift of responses between subapertures (`clsas.navigation.drift`), their phase
-steps from ping to ping, and the sharpness over each single ping (`clsas.navigation.gradient`). Each
-is solved as a *position* of the sonar, so that the beam may be wide and the grid and track of any
-kind. Each is kept only where the image gets sharper.
+An image is formed, and its brightest local maxima are taken as responses. The contribution of each
+ping to each response is read from the lines along the current track. Errors of the track are
+estimated from coarse to fine: from the drift of responses between subapertures
+(`clsas.navigation.drift`), from their phase steps between pings, and from their sharpness as a
+function of each ping (`clsas.navigation.gradient`). Each estimate is a *position* of the sonar, not
+a phase, so that the beam may be wide and the grid and track may have any shape. A correction is
+kept only if it makes the image sharper.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from clsas.core import reprs, validate
+from clsas.core import validate
 from clsas.core.contrast import contrast
 from clsas.core.grid import Grid
 from clsas.core.image import Image
 from clsas.core.lines import RangeLines
-from clsas.navigation.checks import check_navigation, mean_wavelength_m
+from clsas.navigation.autofocus_result import Autofocus
+from clsas.navigation.checks import (
+    check_navigation,
+    checked_unknowns,
+    mean_wavelength_m,
+    range_cell_m,
+)
 from clsas.navigation.drift import drift_m
 from clsas.navigation.gradient import disagreement_m, phase_gradient_m, sharpest_m
 from clsas.navigation.halts import halt
@@ -44,68 +51,32 @@ from clsas.sonar.beam import BeamWindow
 UNKNOWNS = ("sway", "heave", "surge")
 
 IMAGE_TOLERANCE_DB = -30.0
-"""Tolerance of the images in between: errors far below responses."""
+"""Tolerance of the images formed on the way. Their errors are far below the responses."""
 MOST_DISAGREEMENT = 1 / 40
-"""Wavelengths of range that halves of the responses may disagree about single pings. Responses of
-speckle disagree by 0.044 and more, bright ones by 0.011 to 0.016 (400 pings)."""
+"""Wavelengths of range by which halves of the responses may disagree about single pings. Over 400
+pings, responses of speckle disagree by at least 0.044, and bright ones by 0.011 to 0.016."""
 
-_DRIFTS = 3  # times that drift is measured at most
-_NEIGHBOURHOODS = (3.0, 2.0, 1.0)  # Fresnel lengths around responses, along the track
-_SWEEPS = 2  # times that single pings are moved at most
+_DRIFTS = 3  # most estimates of drift
+_NEIGHBOURHOODS = (3.0, 2.0, 1.0)  # lengths along the track around responses, Fresnel lengths
+_SWEEPS = 2  # most estimates from single pings
+# Most responses that are used, and those that are used first, to check the geometry.
 _RESPONSES, _FIRST_RESPONSES = 200, 40
-# Responses that a ping receives, on average, of those that drift is measured by. On a long track
-# too few leave a stretch off by half a wavelength; too many are no echoes, but side lobes.
+# Mean number of responses that a ping receives among those from which drift is estimated. With too
+# few, a stretch of a long track may stay off by half a wavelength. With too many, some responses
+# are side lobes, not echoes.
 _RECEIVED_FOR_DRIFT = 18
-_OFFSETS = np.arange(-4.0, 5.0)  # samples in range, of which drift sees images
-_LEAST_RESPONSES = 8  # halves of which can agree
-_LEAST_GRADIENT = 0.05  # of range per displacement, rms
-_APART = 4.0  # range resolution cells between responses
-_GAIN = 1.02  # of sharpness, for which a step is repeated
-_LARGE_CHANGE = 1 / 8  # wavelengths rms, likewise: finer steps find what smaller ones leave
-# Wavelengths rms, for which an image is formed. Less changes the sharpness by 0.2 % at most.
+_OFFSETS = np.arange(-4.0, 5.0)  # offsets in range of the images that drift compares, samples
+_LEAST_RESPONSES = 8  # responses that are needed to compare two halves
+_LEAST_GRADIENT = 0.05  # smallest rms change in range per displacement
+_MOST_CONDITION = 1e3  # largest condition number at which unknowns are distinguishable
+_APART = 4.0  # least distance between responses, range resolution cells
+# A step is repeated if it increases the sharpness by this factor and also moves the track by this
+# many wavelengths rms. Finer steps find smaller errors.
+_GAIN, _LARGE_CHANGE = 1.02, 1 / 8
+# Wavelengths rms by which a step must move the track for an image to be formed. Smaller steps
+# change the sharpness by 0.2 % at most.
 _LEAST_CHANGE = 1 / 400
 _NO_RESPONSES = "the scene has no bright responses to focus on"
-
-
-@dataclass(frozen=True, eq=False)
-class Autofocus:
-    """Result of autofocus.
-
-    Attributes
-    ----------
-    lines : RangeLines
-        The lines given, with corrected positions.
-    correction_m : float64 [channels, 3]
-        By how much transmitters and receivers were moved.
-    correction_sd_m : float64 [channels]
-        Standard deviation of the correction's change from ping to ping. A shift and a linear trend
-        of the track are not observable and stay as they were.
-    sharpness_before, sharpness_after : float
-        Mean squared intensity over the squared mean: 2 for speckle, the more the sharper.
-    sharpness : tuple of (step, float)
-        Sharpness after each step that was tried.
-    focused : bool
-        False where the scene has no responses to focus on, or the platform stood still. The lines
-        are then as they were.
-    """
-
-    lines: RangeLines
-    correction_m: NDArray[np.float64]
-    correction_sd_m: NDArray[np.float64]
-    sharpness_before: float
-    sharpness_after: float
-    sharpness: tuple[tuple[str, float], ...]
-    focused: bool
-
-    def __repr__(self) -> str:
-        """Return the size of the correction and both sharpnesses."""
-        rms_m = float(np.sqrt(np.mean(np.sum(self.correction_m**2, axis=1))))
-        return reprs.summary(
-            self,
-            f"correction {reprs.quantity(rms_m, 'm')} rms",
-            f"sharpness {self.sharpness_before:.3g} to {self.sharpness_after:.3g}",
-            None if self.focused else "not focused",
-        )
 
 
 def autofocus(
@@ -117,19 +88,20 @@ def autofocus(
     device: Device | str | int | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Autofocus:
-    """Correct a track by the bright responses of an image.
+    """Return lines whose track is corrected by the bright responses of an image.
 
     Parameters
     ----------
     lines : RangeLines
-        At least ten pings, monostatic, bistatic or of an array.
+        At least ten pings, monostatic, bistatic, or of an array.
     grid : Grid
-        Where responses are looked for: a part of the scene with some dozen bright ones is enough.
+        Pixels among which responses are searched. Part of the scene is enough if it has a few dozen
+        bright responses.
     beam : BeamWindow, optional
         Weights of the channels.
     unknowns : sequence of {"sway", "heave", "surge"}
-        Displacements to solve for, across the track, up and along it. Responses must see the sonar
-        from different directions to tell several apart.
+        Displacements to solve for: across the track, up, and along it. To solve for several, the
+        responses must see the sonar from different directions.
     device : Device, str or int, optional
         See `clsas.opencl.device.choose`.
     progress : callable, optional
@@ -142,8 +114,8 @@ def autofocus(
     Raises
     ------
     TypeError, ValueError
-        If an argument is of the wrong kind, there are too few pings, or the geometry does not tell
-        the unknowns apart.
+        If an argument has the wrong type, there are too few pings, or the unknowns cannot be
+        distinguished in this geometry.
     DeviceError
         If there is no such device.
 
@@ -151,16 +123,68 @@ def autofocus(
     -----
     ClsasWarning
         If the scene has no responses, or pings receive the same echoes although the navigation
-        moves: the lines are then returned as they are. If the correction is one that a wrong sound
-        speed explains. If pings repeat a position: they are corrected as one. If the track turns
+        moves; the lines are then returned unchanged. If a wrong sound speed explains the
+        correction. If pings repeat a position; they are corrected as one ping. If the track turns
         back, so that pings may be out of order.
+
+    See Also
+    --------
+    micronavigate : Corrects the track of an array from overlapping phase centres.
+    calibrate_track : Corrects timing, sound speed and lever arm from known reflectors.
+
+    Notes
+    -----
+    Each of the following steps displaces the pings. It is kept if the image becomes sharper.
+
+    1. Images of short subapertures are compared. The drift of responses between them shows errors
+       beyond the range resolution, as in map drift [1]_.
+    2. The phase steps of responses from ping to ping are made linear, as in phase-gradient
+       autofocus [2]_, within smaller and smaller neighbourhoods of the responses.
+    3. The sharpness of the responses is maximised over the position of every single ping, as in
+       closed-form backprojection autofocus [3]_.
+
+    References
+    ----------
+    .. [1] Carrara, Goodman, Majewski, "Spotlight synthetic aperture radar: signal processing
+       algorithms", Artech House, 1995, chapter 6.
+    .. [2] Wahl, Eichel, Ghiglia, Jakowatz, "Phase gradient autofocus - a robust tool for high
+       resolution SAR phase correction", IEEE Transactions on Aerospace and Electronic Systems 30,
+       1994.
+    .. [3] Ash, "An autofocus method for backprojection imagery in synthetic aperture radar", IEEE
+       Geoscience and Remote Sensing Letters 9, 2012.
+
+    Examples
+    --------
+    A sonar passes some points and sways by millimetres, and its navigation does not contain the
+    sway:
+
+    >>> from dataclasses import replace
+    >>> import numpy as np
+    >>> from scipy.signal import detrend
+    >>> import clsas
+    >>> pulse = clsas.Pulse(carrier_hz=100e3, bandwidth_hz=30e3, duration_s=1e-3)
+    >>> sonar = clsas.Sonar(pulse, [[0, 0, 0]], tx_length_m=0.06, rx_length_m=0.06)
+    >>> xyz_m = np.random.default_rng(0).uniform([0.6, 9.5, 0], [2.4, 11, 0], (30, 3))
+    >>> points = clsas.PointTargets(xyz_m, np.ones(30))
+    >>> course = (0, 0, 0), (0.02, 0, 0), 150, 1.0
+    >>> sway_m = 3e-3 * np.sin(np.arange(150) / 20)
+    >>> true = clsas.Track.straight(*course, sway_m=sway_m)
+    >>> lines = clsas.compress(clsas.simulate(sonar, true, points, range_m=(9, 12)))
+    >>> navigated = clsas.channels(sonar, clsas.Track.straight(*course))
+    >>> lines = replace(lines, tx_m=navigated.tx_m, rx_m=navigated.rx_m)
+    >>> grid = clsas.Grid.plane(x=(0.4, 2.6, 100), y=(9.3, 11.2, 120))
+    >>> found = clsas.autofocus(lines, grid)
+    >>> found.focused, found.sharpness_after > 2 * found.sharpness_before
+    (True, True)
+    >>> bool(np.std(detrend(found.correction_m[:, 1] - sway_m)) < 1e-4)
+    True
     """
     validate.instance("lines", lines, RangeLines)
     validate.instance("grid", grid, Grid)
     if beam is not None:
         validate.instance("beam", beam, BeamWindow)
     validate.progress(progress)
-    names = _checked_unknowns(unknowns)
+    names = checked_unknowns(unknowns, UNKNOWNS)
     check_navigation(lines, 10, "autofocus", may_stand=True)
     readout = Readout.of(_of_unit_level(lines), READ_DB)
     passage = Passage.of(lines, names, mean_wavelength_m(readout))
@@ -171,24 +195,17 @@ def autofocus(
 
 
 def _of_unit_level(lines: RangeLines) -> RangeLines:
-    """Return lines whose largest sample is about 1: single precision holds squared intensities."""
+    """Return lines scaled to about 1, so that squared intensities stay within float32."""
     largest = float(np.abs(lines.samples).max())
     if not largest:
         return lines
-    # A power of two changes no sample's digits.
+    # Scaling by a power of two leaves the digits of all samples unchanged.
     scale = np.float32(2.0 ** -np.clip(math.frexp(largest)[1], -126, 126))
     return replace(lines, samples=lines.samples * scale)
 
 
-def _checked_unknowns(unknowns: Sequence[str]) -> tuple[str, ...]:
-    names = validate.named("unknowns", unknowns, UNKNOWNS)
-    if not names or len(set(names)) < len(names):
-        raise ValueError(f"unknowns must be one or several of {UNKNOWNS}, got {names}")
-    return names
-
-
 class _Focus:
-    """Lines on their way into focus."""
+    """Lines, their image, and the correction found so far."""
 
     def __init__(
         self,
@@ -205,10 +222,9 @@ class _Focus:
         self.moved_m = np.zeros((len(passage.axes), passage.pings))
         self.deviation_m = np.full(passage.pings, np.inf)
         self.for_drift = _FIRST_RESPONSES
-        oversampling = self.readout.spectrum.oversampling
-        self.cell_m = lines.range_step_m * min(max(oversampling, 1.0), 64.0)
+        self.cell_m = range_cell_m(readout)
         self.steps: list[tuple[str, float]] = []
-        # The track changes little between images, so that one plan does for all of them.
+        # The track changes little between images, so that one plan serves all of them.
         self.plan = plan(lines, grid, tolerance_db=IMAGE_TOLERANCE_DB, beam=beam, device=device)
         image = self._form(self.moved_m)
         self.found: Contributions | None
@@ -216,36 +232,40 @@ class _Focus:
         self._keep(self.moved_m, image, self.before)
 
     def check_geometry(self, names: tuple[str, ...]) -> None:
-        """Refuse unknowns that the responses do not tell apart; see how far along they are seen."""
+        """Refuse unknowns that the responses do not determine.
+
+        Also choose how many responses are needed to estimate drift.
+        """
         found = self._contributions(self.points_m[:_FIRST_RESPONSES])
         self.for_drift = math.ceil(_RECEIVED_FOR_DRIFT / received_share(found))
         weights = np.abs(found.values[..., 0]) ** 2
         total = max(float(weights.sum()), 1e-300)
         for name, gradient in zip(names, found.gradient, strict=True):
-            seen = math.sqrt(float(np.sum(weights * gradient**2)) / total)
-            if weights.any() and seen < _LEAST_GRADIENT:
+            change = math.sqrt(float(np.sum(weights * gradient**2)) / total)
+            if weights.any() and change < _LEAST_GRADIENT:
                 raise ValueError(
-                    f"unknowns must change the range to the responses; {name} of 1 m changes it "
-                    f"by {seen:.2g} m rms, at least {_LEAST_GRADIENT:g} m is needed"
+                    f"unknowns must change the range to the responses, but {name} of 1 m changes "
+                    f"it by {change:.2g} m rms; at least {_LEAST_GRADIENT:g} m is needed"
                 )
         if len(names) == 1:
             return
         normal = np.einsum("ucp,vcp,cp->uv", found.gradient, found.gradient, weights)
         scale = np.sqrt(np.diag(normal))
-        likeness = normal / np.maximum(np.outer(scale, scale), 1e-300)
-        condition = float(np.linalg.cond(likeness))
-        if not condition < 1e3:
+        correlation = normal / np.maximum(np.outer(scale, scale), 1e-300)
+        condition = float(np.linalg.cond(correlation))
+        if not condition < _MOST_CONDITION:
             raise ValueError(
-                f"unknowns {', '.join(names)} cannot be told apart: all responses see them from "
-                f"nearly one direction (condition number {condition:.3g}, at most 1000)"
+                f"unknowns {', '.join(names)} cannot be distinguished: all responses see the sonar "
+                f"from nearly the same direction (condition number {condition:.3g}, at most "
+                f"{_MOST_CONDITION:g})"
             )
 
     def result(self) -> Autofocus:
-        """Focus, and return what was found."""
+        """Estimate the track from coarse to fine, and return the result."""
         responses = len(self.points_m) if self.before else 0
         if responses < _LEAST_RESPONSES:
             return self._unfocused(
-                f"{_NO_RESPONSES}: the grid shows {responses} responses, at least "
+                f"{_NO_RESPONSES}: the grid has {responses} responses, and at least "
                 f"{_LEAST_RESPONSES} are needed"
             )
         stood = halt(self.passage, self.readout, self._responses)
@@ -253,11 +273,11 @@ class _Focus:
             return self._unfocused(
                 f"pings {stood[0]} to {stood[1]} receive the same echoes, although the navigation "
                 "moves: the platform stood still, or the scene is the same all along the track (a "
-                "wall, a pipe, a background of all pings)"
+                "wall, a pipe, or a background that all pings share)"
             )
         stages, dropped = list(self._stages()), ""
         for number, (name, find) in enumerate(stages, start=1):
-            # Nothing is gained twice from the same image, and little where little was.
+            # A step that gained little would gain little again.
             if name != dropped and not self._try(name, find):
                 dropped = name
             if self.progress is not None:
@@ -265,22 +285,22 @@ class _Focus:
         apart = disagreement_m(self.passage, self._responses) / self.passage.wavelength_m
         if apart > MOST_DISAGREEMENT:
             return self._unfocused(
-                f"{_NO_RESPONSES}: one half of the responses and the other want the pings moved by "
-                f"displacements that differ by {apart:.2g} wavelengths rms, at most "
-                f"{MOST_DISAGREEMENT:g}"
+                f"{_NO_RESPONSES}: two halves of the responses give displacements of single pings "
+                f"that differ by {apart:.2g} wavelengths rms, and at most {MOST_DISAGREEMENT:g} is "
+                "expected"
             )
         check_speed(self.passage, self._responses, self.moved_m)
         return self._outcome(focused=True)
 
     def _unfocused(self, why: str) -> Autofocus:
-        """Warn that the track cannot be told, and why, and return the lines as they were."""
-        validate.warn(f"{why}; the lines are left as they were")
+        """Warn that the track cannot be estimated, and why, and return the lines unchanged."""
+        validate.warn(f"{why}. The lines are left as they were")
         self.moved_m = np.zeros_like(self.moved_m)
         self.deviation_m = np.full_like(self.deviation_m, np.inf)
         return self._outcome(focused=False)
 
     def _outcome(self, *, focused: bool) -> Autofocus:
-        """Return the lines as far as they were moved."""
+        """Return the result for the current correction."""
         vectors_m = self.passage.vectors_m(self.moved_m)
         return Autofocus(
             lines=self._lines(self.moved_m),
@@ -293,7 +313,7 @@ class _Focus:
         )
 
     def _stages(self) -> Iterator[tuple[str, Callable[[], NDArray[np.float64] | None]]]:
-        """Yield what is tried, from coarse to fine."""
+        """Yield the names of the steps and the functions that estimate displacements."""
         for _ in range(_DRIFTS):
             yield "drift between subapertures", self._drift
         yield "phase gradients", self._gradients
@@ -301,11 +321,13 @@ class _Focus:
             yield "sharpness of single pings", self._pings
 
     def _drift(self) -> NDArray[np.float64] | None:
+        """Return displacements from the drift between subapertures, if there are enough of them."""
         offsets_m = self.given.range_step_m * _OFFSETS
         found = self._contributions(self.points_m[: self.for_drift], offsets_m)
         return drift_m(self.passage, found)
 
     def _gradients(self) -> NDArray[np.float64]:
+        """Return displacements from the phase steps between pings."""
         found, total_m = self._responses, np.zeros_like(self.moved_m)
         for neighbourhood in _NEIGHBOURHOODS:
             if total_m.any():
@@ -315,12 +337,13 @@ class _Focus:
         return total_m
 
     def _pings(self) -> NDArray[np.float64]:
+        """Return displacements that maximise the sharpness ping by ping."""
         found_m, self.deviation_m = sharpest_m(self.passage, self._responses)
         return found_m
 
     @property
     def _responses(self) -> Contributions:
-        """Contributions to the brightest responses of the present image."""
+        """Contributions to the brightest responses of the current image."""
         if self.found is None:
             self.found = self._contributions(self.points_m)
         return self.found
@@ -331,12 +354,12 @@ class _Focus:
         offsets_m: NDArray[np.float64] | None = None,
         moved_m: NDArray[np.float64] | None = None,
     ) -> Contributions:
-        """Return contributions to points along the present track, or along another."""
+        """Return contributions to points for the current track, or for displacements `moved_m`."""
         lines = self._lines(self.moved_m if moved_m is None else moved_m)
         return contributions(self.passage, self.readout, lines, points_m, self.beam, offsets_m)
 
     def _try(self, name: str, find: Callable[[], NDArray[np.float64] | None]) -> bool:
-        """Keep a correction if it makes the image sharper; return whether it is worth another."""
+        """Keep a correction if it makes the image sharper; return whether to repeat the step."""
         found_m = find()
         if found_m is None:
             return False
@@ -354,7 +377,7 @@ class _Focus:
         return reached > _GAIN * before and change > _LARGE_CHANGE
 
     def _keep(self, moved_m: NDArray[np.float64], image: Image, reached: float) -> None:
-        """Hold a track, its image and its brightest responses."""
+        """Set the current track, and find the brightest responses of its image."""
         self.moved_m, self.sharpness, self.found = moved_m, reached, None
         self.points_m = brightest(image, _RESPONSES, _APART * self.cell_m)
         if not len(self.points_m):
@@ -376,7 +399,7 @@ def sharpness(image: Image) -> float:
 
 
 def _detrended(moved_m: NDArray[np.float64], along_m: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return displacements without a shift and a linear trend along the track."""
+    """Return displacements without their mean and linear trend along the track."""
     design = np.stack([np.ones_like(along_m), along_m - along_m.mean()], axis=1)
     fitted = np.linalg.lstsq(design, moved_m.T, rcond=None)[0]
     return moved_m - (design @ fitted).T

@@ -1,6 +1,8 @@
-"""Checks of the navigation that lines come with, before anything is corrected."""
+"""Checks of lines and arguments before a track is corrected, and figures of the lines' band."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -10,24 +12,39 @@ from clsas.core.pings import Transmissions
 from clsas.signal.readout import Readout
 from clsas.signal.spectrum import band_wavelength_m, is_about_zero
 
+_MOST_OVERSAMPLING = 64.0  # limits the range resolution of lines that are almost constant
 _REMEDY = "lines.without_still_pings() drops them"
 
 
 def mean_wavelength_m(readout: Readout) -> float:
-    """Return the wavelength at the centre of the lines' band, which may hold the carrier still.
+    """Return the wavelength at the centre of the lines' band, which may still have its carrier.
 
     Raises
     ------
     ValueError
-        If the lines tell no wavelength.
+        If neither `carrier_hz` nor the samples determine the wavelength.
     """
     lines, centre = readout.lines, readout.spectrum.centre
     if is_about_zero(lines, centre):
         raise ValueError(
-            "carrier_hz must be that of the lines, or their samples must hold the carrier still; "
-            f"got {lines.carrier_hz:g} Hz, and samples about 0 Hz"
+            "carrier_hz must be that of the lines, unless their samples still have their carrier; "
+            f"got {lines.carrier_hz:g} Hz, and samples whose band is about 0 Hz"
         )
     return band_wavelength_m(lines, centre)
+
+
+def range_cell_m(readout: Readout) -> float:
+    """Return the range resolution of the lines."""
+    oversampling = min(max(readout.spectrum.oversampling, 1.0), _MOST_OVERSAMPLING)
+    return readout.lines.range_step_m * oversampling
+
+
+def checked_unknowns(unknowns: Sequence[str], allowed: Sequence[str]) -> tuple[str, ...]:
+    """Return the names of unknowns; refuse none at all, repeated ones and those not allowed."""
+    names = validate.named("unknowns", unknowns, allowed)
+    if not names or len(set(names)) < len(names):
+        raise ValueError(f"unknowns must be one or several of {tuple(allowed)}, got {names}")
+    return names
 
 
 def check_navigation(lines: RangeLines, least_pings: int, purpose: str, *, may_stand: bool) -> None:
@@ -37,47 +54,49 @@ def check_navigation(lines: RangeLines, least_pings: int, purpose: str, *, may_s
     ----------
     lines : RangeLines
     least_pings : int
-        Fewest pings at different places.
+        Fewest pings at different positions.
     purpose : str
         Name of the method, for messages.
     may_stand : bool
-        True if pings may repeat the place of the one before. They are then corrected as one ping,
-        with a warning; else they are refused.
+        Whether pings may repeat the position of the ping before. If so, a warning says that they
+        are corrected as one ping. If not, they are refused.
 
     Raises
     ------
     ValueError
-        If all channels lie at one place, or there are fewer pings than needed.
+        If all channels have one position, or there are fewer pings than needed.
 
     Warns
     -----
     ClsasWarning
-        If the track turns back between pings, or pings repeat the place of the one before.
+        If the track turns back between pings, or pings repeat the position of the ping before.
     """
     pings = Transmissions.of(lines)
-    places = len(lines.ping_starts)
-    if places < least_pings:
-        got = f"got {places}"
-        if pings.count > places:
+    positions = len(lines.ping_starts)
+    if positions < least_pings:
+        got = f"got {positions}"
+        if pings.count > positions:
             got = (
-                f"got {pings.count} transmissions from {places} place{'s' * (places > 1)}: "
-                "positions are missing, or the platform stood still"
+                f"got {pings.count} transmissions from {positions} position"
+                f"{'s' * (positions > 1)}: positions are missing, or the platform stood still"
             )
-        elif places == 1:
+        elif positions == 1:
             got = "got one (all channels share one transmitter position)"
-        raise ValueError(f"lines must hold at least {least_pings} pings for {purpose}, {got}")
-    if pings.count > places:
+        raise ValueError(f"lines must have at least {least_pings} pings for {purpose}, {got}")
+    if pings.count > positions:
         repeated = np.flatnonzero(~np.isin(pings.starts[:-1], lines.ping_starts))
         many = f"{len(repeated)} pings repeat" if len(repeated) > 1 else "1 ping repeats"
-        words = f"{many} the position of the ping before (the first is ping {repeated[0]})"
+        fault = f"{many} the position of the ping before (the first is ping {repeated[0]})"
         if not may_stand:
-            raise ValueError(f"lines must hold pings at different places for {purpose}: {words}; "
-                             f"{_REMEDY}")  # fmt: skip
-        validate.warn(f"{words}: they are corrected as one ping with it; {_REMEDY}")
+            raise ValueError(
+                f"lines must have pings at different positions for {purpose}, but {fault}; "
+                f"{_REMEDY}"
+            )
+        validate.warn(f"{fault}: they are corrected as one ping with it; {_REMEDY}")
     turns = pings.turns
     if turns.size:
         validate.warn(
             f"the track turns back {turns.size} time{'s' * (turns.size > 1)} (first after ping "
-            f"{turns[0]}): pings may be out of order. They are taken in the order of the lines; "
+            f"{turns[0]}): pings may be out of order. They are used in the order of the lines; "
             "lines.select(order) sorts them"
         )

@@ -1,15 +1,16 @@
-"""Echoes from all directions of a beam, as two pings of one common geometry would receive them.
+"""Alignment of two pings for echoes from every direction of a wide beam.
 
-Pairs of channels share a phase centre, but not their transmitter and receiver. For an echo at an
-angle a off broadside their ranges differ by about u A sin(a)^2/R, for an advance A, a range R and a
-distance u along the overlap. That looks like a yaw, of milliradians where beams are wide. Its mean
-over the beam depends on where the echoes come from, which no scene spreads evenly. Therefore the
-channels of either ping are combined along the overlap: every direction of the beam then arrives
-with the phase that it would have with the mean of both geometries. This holds for each direction by
-itself, however strong its echoes are.
+The channels of a pair share a phase centre, but not their transmitter and receiver. For an echo at
+an angle a off broadside, their ranges differ by about u A sin(a)^2/R, where A is the advance, R the
+range and u the distance along the overlap. This difference looks like a yaw, of milliradians if the
+beam is wide. Its mean over the beam depends on where the echoes come from, and no scene spreads
+them evenly. The channels of each ping are therefore combined along the overlap by linear filters,
+so that an echo from any direction arrives with the phase that it would have at the mean of both
+geometries. This holds for each direction by itself, however strong its echoes are.
 
-Uniform arrays cannot tell directions apart whose sines differ by half a wavelength over the spacing
-of the phase centres. Filters may let only the middle of the beam pass, whose partners are weak.
+A uniform array cannot distinguish directions whose sines differ by half a wavelength over the
+spacing of the phase centres. The filters can be restricted to the middle of the beam, where the
+ambiguous directions receive little power.
 """
 
 from __future__ import annotations
@@ -21,74 +22,50 @@ import numpy as np
 import scipy.fft
 from numpy.typing import NDArray
 
-from clsas.core.geometry import bistatic_range_m
-from clsas.core.lines import RangeLines
-from clsas.navigation.overlap import Array, Overlap
-from clsas.navigation.swath import Swath
+from clsas.navigation.pair_geometry import PairGeometry
 from clsas.sonar.system import element_pattern
 
 ALL, MIDDLE = 1.0, 0.25
-"""Half width of what passes, in periods of ambiguous directions: all of them, or the middle of the
-beam. The middle has the least error where there is little noise; noise wants all echoes."""
+"""Half widths of the passband of the filters, in periods of ambiguous directions: the whole beam,
+or its middle. The middle gives the smaller error if there is little noise. With much noise, the
+echoes of the whole beam are needed."""
 
-_BANDS = 6  # of the spectrum, with filters of their own
-_EDGE = 0.03  # of that period: how gradually
-# Exponent of the even beam's power, by which filters weigh directions. With 1 strong echoes at the
-# edge of the beam pass too: 1.7 times the error in a scene of few scatterers, beside 0.25.
+_BANDS = 6  # parts of the spectrum, each with its own filters
+_EDGE = 0.03  # width of the edges of the passband, in the same periods
+# The filters weigh directions by the power that an even seabed would return, raised to this
+# exponent. With an exponent of 1, strong echoes from the edge of the beam pass the filters, and
+# the error in a scene of few scatterers is 1.7 times that with 0.25.
 _PRIOR = 0.25
-_NOISE = 0.01  # power over the echoes', against which filters are regularised
-_TURN = 0.1  # cycles by which a direction's phase may change from one node in range to the next
-_MOST_NODES = 16
-_WIDEST = math.radians(75)  # half of the beam that is considered
+_NOISE = 0.01  # assumed noise power over the echoes' power, which regularises the filters
+_MOST_TURN = 0.1  # most cycles by which a direction's phase changes between reference ranges
+_MOST_RANGES = 16
+_WIDEST = math.radians(75)  # largest half width of the beam that is considered
 _LEAST_ANGLES = 65
-_PADDING = 16  # samples of zeros beyond the lines: filters delay by less
-
-
-@dataclass(frozen=True, eq=False)
-class Frame:
-    """Geometry of an overlap: the pairs' phase centres, and the rays to the seabed.
-
-    Attributes
-    ----------
-    centre_m : float64 [pairs, 3]
-        Phase centres, means of both channels'.
-    forward, outward : float64 [3]
-        Horizontal unit vectors along the array and to the seabed.
-    """
-
-    centre_m: NDArray[np.float64]
-    forward: NDArray[np.float64]
-    outward: NDArray[np.float64]
-
-    def rays(self, swath: Swath, range_m: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return unit vectors from phase centres to the seabed at ranges, [pairs, n, 3]."""
-        across, up = swath.slopes(self.centre_m[:, 2:], range_m)
-        shape = len(self.centre_m), len(range_m)
-        rays = np.broadcast_to(across, shape)[..., None] * self.outward
-        rays[..., 2] += up
-        return rays
+_PADDING = 16  # samples of zeros appended to the lines; the filters delay by less
 
 
 @dataclass(frozen=True, eq=False)
 class Alignment:
-    """Filters along an overlap that bring both pings to one geometry.
+    """Filters along an overlap that convert both pings to one common geometry.
 
     Attributes
     ----------
-    range_m : float64 [nodes]
-        Ranges that filters are made for. They change linearly with the inverse of range between.
+    range_m : float64 [ranges]
+        Reference ranges for which filters are designed. Between them, filters are interpolated
+        linearly in the inverse of range.
     cycles_per_m : float64 [bands]
         Phase per metre of range in the middle of each band.
-    first, second : complex128 [nodes, bands, pairs, pairs]
-        Filters of either ping: rows give channels of the common geometry.
-    sensitivity : float64 [nodes, pairs]
+    first, second : complex128 [ranges, bands, pairs, pairs]
+        Filters of each ping. Each row yields one channel of the common geometry.
+    sensitivity : float64 [ranges, pairs]
         Decrease in range per metre of sway, a mean over the directions that pass.
     echoes, noise : complex128 [pairs, pairs]
-        Correlation that filtered channels have of an even seabed, and of white noise.
+        Correlation between filtered channels, for echoes of an even seabed and for white noise.
     coherence : float
-        Of both pings over an even seabed: filters leave differences.
-    uneven_rad : float64 [pairs]
-        Phases of echoes from the middle of the beam alone, beside those of an even seabed.
+        Coherence of both pings over an even seabed. It is below 1 because the filters leave
+        differences between the pings.
+    middle_rad : float64 [pairs]
+        Phases of echoes from the middle of the beam alone, relative to those of an even seabed.
     """
 
     range_m: NDArray[np.float64]
@@ -99,7 +76,7 @@ class Alignment:
     echoes: NDArray[np.complex128]
     noise: NDArray[np.complex128]
     coherence: float
-    uneven_rad: NDArray[np.float64]
+    middle_rad: NDArray[np.float64]
 
     def apply(
         self,
@@ -107,212 +84,217 @@ class Alignment:
         range_m: NDArray[np.float64],
         cycles_per_m: float,
     ) -> tuple[NDArray[np.complex128], NDArray[np.complex128]]:
-        """Return channels of both pings in the common geometry, [pairs, ranges].
+        """Return the channels of both pings in the common geometry, [pairs, samples].
 
-        `values` are read along rays, at `range_m`; `cycles_per_m` is the phase that was left out.
+        `values` are the samples along the rays at `range_m`, and `cycles_per_m` is the phase per
+        metre of range that was removed from them.
         """
         count = len(range_m)
         step_m = float(range_m[1] - range_m[0])
         length = scipy.fft.next_fast_len(count + _PADDING)
-        at = cycles_per_m + scipy.fft.fftfreq(length, step_m)
-        band = np.argmin(np.abs(at[:, None] - self.cycles_per_m), axis=1)
+        frequency_per_m = cycles_per_m + scipy.fft.fftfreq(length, step_m)
+        band = np.argmin(np.abs(frequency_per_m[:, None] - self.cycles_per_m), axis=1)
         members = [np.flatnonzero(band == each) for each in range(len(self.cycles_per_m))]
-        shares = self.shares(range_m)
-        found = []
-        for each, filters in zip(values, (self.first, self.second), strict=True):
-            spectrum = scipy.fft.fft(each, length, axis=1)
-            total = np.zeros_like(each)
-            for share, node in zip(shares, filters, strict=True):
+        weights = self.weights(range_m)
+        aligned = []
+        for samples, filters in zip(values, (self.first, self.second), strict=True):
+            spectrum = scipy.fft.fft(samples, length, axis=1)
+            total = np.zeros_like(samples)
+            for weight, of_range in zip(weights, filters, strict=True):
                 filtered = np.empty_like(spectrum)
-                for some, matrix in zip(members, node, strict=True):
+                for some, matrix in zip(members, of_range, strict=True):
                     filtered[:, some] = matrix @ spectrum[:, some]
-                total += share * scipy.fft.ifft(filtered, axis=1)[:, :count]
-            found.append(total)
-        return found[0], found[1]
+                total += weight * scipy.fft.ifft(filtered, axis=1)[:, :count]
+            aligned.append(total)
+        return aligned[0], aligned[1]
 
-    def shared(self, coherence: float) -> NDArray[np.float64]:
-        """Return how pairs' phase errors correlate, [pairs, pairs].
+    def phase_correlation(self, coherence: float) -> NDArray[np.float64]:
+        """Return the correlation of the phase errors of pairs, [pairs, pairs].
 
-        A phase errs by products of one channel's echoes with the other's noise, and of both noises.
-        Neighbours share some of both, once filtered.
+        A phase error stems from products of one channel's echoes with the other's noise, and of
+        both noises. Filtered neighbours have a part of both in common.
         """
         echoes, noise = coherence, 1 - coherence
         products = 2 * echoes * (self.echoes.conj() * self.noise).real
         products += noise * np.abs(self.noise) ** 2
         return products / (2 * echoes + noise)
 
-    def shares(self, range_m: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the weights of nodes at ranges, [nodes, ranges]."""
-        nodes = np.arange(len(self.range_m), dtype=np.float64)
-        # Inverse ranges fall, np.interp wants them to rise.
-        place = np.interp(-1 / range_m, -1 / self.range_m, nodes)
-        return np.maximum(1 - np.abs(place - nodes[:, None]), 0.0)
+    def weights(self, range_m: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the interpolation weights of the reference ranges, [ranges, samples]."""
+        index = np.arange(len(self.range_m), dtype=np.float64)
+        # np.interp needs rising values, and inverse ranges fall.
+        at = np.interp(-1 / range_m, -1 / self.range_m, index)
+        return np.maximum(1 - np.abs(at - index[:, None]), 0.0)
 
 
-def ranges_m(
-    lines: RangeLines, channels: NDArray[np.int64], points_m: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Return ranges of points [channels or 1, n, 3] in channels, [channels, n]."""
-    velocity = lines.rx_velocity_m_s
-    return bistatic_range_m(
-        points_m,
-        lines.tx_m[channels, None],
-        lines.rx_m[channels, None],
-        None if velocity is None else velocity[channels, None],
-        lines.sound_speed_m_s,
-    )
+def alignment(geometry: PairGeometry, band: NDArray[np.float64], half_width: float) -> Alignment:
+    """Return the filters that convert the channels of two pings to one geometry.
 
+    Each filter is the linear least-mean-square-error estimate of the channels that the mean
+    geometry would have, for an even seabed under the beam.
 
-def alignment(
-    lines: RangeLines,
-    array: Array,
-    pairs: Overlap,
-    frame: Frame,
-    swath: Swath,
-    band: NDArray[np.float64],
-    half_width: float,
-) -> Alignment:
-    """Return the filters that bring the channels of two pings to one geometry.
-
-    A filter is the linear estimate with the least mean square error, over an even seabed under the
-    beam, of the channels that the mean geometry would have. `band` is the phase per metre of range
-    at frequencies that stand for equal shares of the power, ascending; `half_width` is `ALL` or
-    `MIDDLE`.
+    Parameters
+    ----------
+    geometry : PairGeometry
+        The swath must have element lengths.
+    band : float64 [frequencies]
+        Phase per metre of range at frequencies that represent equal shares of the power, ascending.
+    half_width : float
+        `ALL` or `MIDDLE`.
     """
     cycles_per_m = band.reshape(_BANDS, -1).mean(axis=1)
-    beam = _Beam(lines, array, pairs, frame, swath, cycles_per_m, half_width)
-    near_m, far_m = swath.edges_m[[0, -1]]
-    range_m = 1 / np.linspace(1 / near_m, 1 / far_m, beam.nodes(near_m, far_m))
+    beam = _Beam(geometry, cycles_per_m, half_width)
+    near_m, far_m = geometry.swath.edges_m[[0, -1]]
+    range_m = 1 / np.linspace(1 / near_m, 1 / far_m, beam.range_count(near_m, far_m))
     made = [beam.filters(each) for each in range_m]
-    first, second, sensitivity, echoes, noise, coherence, uneven_rad = (
-        np.stack(each) for each in zip(*made, strict=True)
-    )
     return Alignment(
-        range_m,
-        cycles_per_m,
-        first,
-        second,
-        sensitivity,
-        _normalised(echoes.mean(axis=0)),
-        _normalised(noise.mean(axis=0)),
-        float(coherence.mean()),
-        uneven_rad.mean(axis=0),
+        range_m=range_m,
+        cycles_per_m=cycles_per_m,
+        first=np.stack([each.first for each in made]),
+        second=np.stack([each.second for each in made]),
+        sensitivity=np.stack([each.sensitivity for each in made]),
+        echoes=_normalised(np.stack([each.echoes for each in made]).mean(axis=0)),
+        noise=_normalised(np.stack([each.noise for each in made]).mean(axis=0)),
+        coherence=float(np.stack([each.coherence for each in made]).mean()),
+        middle_rad=np.stack([each.middle_rad for each in made]).mean(axis=0),
     )
 
 
 def _normalised(covariance: NDArray[np.complex128]) -> NDArray[np.complex128]:
-    """Return the correlations of a covariance."""
+    """Return the correlation matrix of a covariance matrix."""
     size = np.sqrt(np.diag(covariance).real)
     return covariance / np.outer(size, size)
 
 
+@dataclass(frozen=True, eq=False)
+class _RangeFilters:
+    """Filters for one range, with the attributes of an `Alignment` at that range.
+
+    `echoes` and `noise` are covariances here, [pairs, pairs].
+    """
+
+    first: NDArray[np.complex128]
+    second: NDArray[np.complex128]
+    sensitivity: NDArray[np.float64]
+    echoes: NDArray[np.complex128]
+    noise: NDArray[np.complex128]
+    coherence: np.float64
+    middle_rad: NDArray[np.float64]
+
+
 class _Beam:
-    """Directions of a beam, and the phases with which two pings receive them."""
+    """Directions of a beam, and the phases with which two pings receive their echoes."""
 
     def __init__(
-        self,
-        lines: RangeLines,
-        array: Array,
-        pairs: Overlap,
-        frame: Frame,
-        swath: Swath,
-        cycles_per_m: NDArray[np.float64],
-        half_width: float,
+        self, geometry: PairGeometry, cycles_per_m: NDArray[np.float64], half_width: float
     ) -> None:
-        assert swath.element_length_m is not None
-        self.lines, self.pairs, self.frame, self.swath = lines, pairs, frame, swath
-        self.cycles_per_m, self.lengths_m = cycles_per_m, swath.element_length_m
-        self.half_width = half_width
-        self.headings = [
-            array.forward[int(np.searchsorted(array.starts, each[0], "right")) - 1]
-            for each in (pairs.first, pairs.second)
-        ]
+        lengths_m = geometry.swath.element_length_m
+        assert lengths_m is not None
+        self.geometry, self.lengths_m = geometry, lengths_m
+        self.cycles_per_m, self.half_width = cycles_per_m, half_width
         highest = float(np.abs(cycles_per_m).max())
-        longest_m = max(self.lengths_m) * highest / 2
+        longest_m = max(lengths_m) * highest / 2
         widest = math.sin(min(math.asin(min(1 / longest_m, 1.0)), _WIDEST))
-        # Phases of the outermost channels must not turn by half a cycle between directions.
-        turns = 2 * widest * highest * float(np.ptp(pairs.along_m))
+        # Between neighbouring directions, the phases of the outermost channels must change by less
+        # than half a cycle.
+        turns = 2 * widest * highest * float(np.ptp(geometry.pairs.along_m))
         self.sine = np.linspace(-widest, widest, max(_LEAST_ANGLES, 2 * int(turns) + 1))
 
-    def nodes(self, near_m: float, far_m: float) -> int:
-        """Return the number of ranges that filters must be made for."""
+    def range_count(self, near_m: float, far_m: float) -> int:
+        """Return the number of reference ranges that are needed."""
         turn = []
-        for each in (near_m, far_m):
-            first, second, _ = self._late_m(each)
-            turn.append((second - first) * np.abs(self.cycles_per_m).max())
+        for range_m in (near_m, far_m):
+            first_m, second_m, _ = self._excess_m(range_m)
+            turn.append((second_m - first_m) * np.abs(self.cycles_per_m).max())
         change = np.abs(turn[1] - turn[0]) * self._passed(float(np.abs(self.cycles_per_m).mean()))
-        return min(2 + int(float(change.max()) / _TURN), _MOST_NODES)
+        return min(2 + int(float(change.max()) / _MOST_TURN), _MOST_RANGES)
 
-    def filters(self, range_m: float) -> tuple[NDArray, ...]:
-        """Return what an `Alignment` holds at a range, from filters to `uneven_rad`."""
-        first_m, second_m, rays = self._late_m(range_m)
+    def filters(self, range_m: float) -> _RangeFilters:
+        """Return the filters for echoes at a range."""
+        first_m, second_m, rays = self._excess_m(range_m)
         count, bands = len(first_m), len(self.cycles_per_m)
         filters = np.zeros((2, bands, count, count), np.complex128)
-        expected, of_middle = (np.zeros(count, np.complex128) for _ in range(2))
-        seen = np.zeros(len(self.sine))
+        products, of_middle = (np.zeros(count, np.complex128) for _ in range(2))
+        passed_power = np.zeros(len(self.sine))
         echoes, noise = (np.zeros((count, count), np.complex128) for _ in range(2))
         energy = np.zeros((2, count))
         for band, cycles_per_m in enumerate(self.cycles_per_m):
             power = self._power(rays, cycles_per_m)
             passed = self._passed(cycles_per_m)
             target = passed * np.exp(-1j * np.pi * cycles_per_m * (first_m + second_m))
-            arrived = []
-            for ping, late_m in enumerate((first_m, second_m)):
-                steering = np.exp(-2j * np.pi * cycles_per_m * late_m)
-                weighted = (power**_PRIOR * steering).conj().T
-                covariance = steering @ weighted
-                covariance += _NOISE * np.sum(power**_PRIOR) * np.eye(count)
-                # The covariance is Hermitian: solving from the left gives the filter's transpose.
-                matrix = np.linalg.solve(covariance.conj(), (target @ weighted).T).T
+            aligned = []
+            for ping, excess_m in enumerate((first_m, second_m)):
+                steering = np.exp(-2j * np.pi * cycles_per_m * excess_m)
+                matrix = _estimator(steering, target, power**_PRIOR)
                 filters[ping, band] = matrix
-                arrived.append(matrix @ steering)
-                energy[ping] += np.abs(arrived[-1]) ** 2 @ power
-                echoes += (power * arrived[-1]) @ arrived[-1].conj().T
+                aligned.append(matrix @ steering)
+                energy[ping] += np.abs(aligned[-1]) ** 2 @ power
+                echoes += (power * aligned[-1]) @ aligned[-1].conj().T
                 noise += matrix @ matrix.conj().T
-            products = power * arrived[1].conj() * arrived[0]
-            expected += products.sum(axis=1)
-            of_middle += products[:, self._periods(cycles_per_m) <= MIDDLE].sum(axis=1)
-            seen += power * passed**2
-        # Few channels leave a phase, which an even seabed's mean tells.
-        filters[1] *= (expected / np.maximum(np.abs(expected), 1e-300))[:, None]
-        port = self.swath.side * self.frame.outward
-        sensitivity = np.full(count, float(np.average(rays @ port, weights=seen)))
-        square = np.mean(np.abs(expected) ** 2 / np.maximum(energy[0] * energy[1], 1e-300))
-        uneven_rad = np.angle(of_middle * expected.conj())
-        return filters[0], filters[1], sensitivity, echoes, noise, np.sqrt(square), uneven_rad
+            product = power * aligned[1].conj() * aligned[0]
+            products += product.sum(axis=1)
+            of_middle += product[:, self._periods(cycles_per_m) <= MIDDLE].sum(axis=1)
+            passed_power += power * passed**2
+        # With few channels a phase difference remains. Its mean over an even seabed is removed.
+        filters[1] *= (products / np.maximum(np.abs(products), 1e-300))[:, None]
+        port = self.geometry.swath.side * self.geometry.outward
+        square = np.mean(np.abs(products) ** 2 / np.maximum(energy[0] * energy[1], 1e-300))
+        return _RangeFilters(
+            first=filters[0],
+            second=filters[1],
+            sensitivity=np.full(count, float(np.average(rays @ port, weights=passed_power))),
+            echoes=echoes,
+            noise=noise,
+            coherence=np.sqrt(square),
+            middle_rad=np.angle(of_middle * products.conj()),
+        )
 
-    def _late_m(self, range_m: float) -> tuple[NDArray, NDArray, NDArray]:
-        """Return ranges of directions beyond those of channels' own rays, and the directions.
+    def _excess_m(self, range_m: float) -> tuple[NDArray, NDArray, NDArray]:
+        """Return the excess ranges of directions over the channels' own rays, and the directions.
 
-        Both pings' are [pairs, angles]; directions are seen from the middle of the overlap.
+        The excess ranges of both pings are [pairs, angles]. Directions, [angles, 3], start from the
+        middle of the overlap.
         """
-        frame = self.frame
-        own = frame.rays(self.swath, np.array([range_m]))
-        ray = own.mean(axis=0)
-        rays = np.sqrt(1 - self.sine**2)[:, None] * ray + self.sine[:, None] * frame.forward
-        points_m = (range_m * rays + frame.centre_m.mean(axis=0))[None]
-        own_m = range_m * own + frame.centre_m[:, None]
-        late_m = [
-            ranges_m(self.lines, each, points_m) - ranges_m(self.lines, each, own_m)
-            for each in (self.pairs.first, self.pairs.second)
-        ]
-        return late_m[0], late_m[1], rays
+        geometry = self.geometry
+        own_rays = geometry.rays(np.array([range_m]))
+        ray = own_rays.mean(axis=0)
+        rays = np.sqrt(1 - self.sine**2)[:, None] * ray + self.sine[:, None] * geometry.forward
+        points_m = (range_m * rays + geometry.centre_m.mean(axis=0))[None]
+        own_m = range_m * own_rays + geometry.centre_m[:, None]
+        first_m, second_m = (
+            geometry.ranges_m(each, points_m) - geometry.ranges_m(each, own_m)
+            for each in (geometry.pairs.first, geometry.pairs.second)
+        )
+        return first_m, second_m, rays
 
     def _passed(self, cycles_per_m: float) -> NDArray[np.float64]:
-        """Return the amplitude with which directions pass."""
+        """Return the amplitude with which each direction passes."""
         return 1 / (1 + np.exp((self._periods(cycles_per_m) - self.half_width) / _EDGE))
 
     def _periods(self, cycles_per_m: float) -> NDArray[np.float64]:
-        """Return directions in periods of those that the array cannot tell apart."""
-        steps_m = np.diff(np.sort(self.pairs.along_m))
-        spacing_m = float(np.median(steps_m)) if len(steps_m) else 0.0
-        return np.abs(self.sine) * abs(cycles_per_m) * spacing_m
+        """Return the sines of the directions over the period at which they are ambiguous."""
+        return np.abs(self.sine) * abs(cycles_per_m) * self.geometry.pairs.spacing_m
 
     def _power(self, rays: NDArray[np.float64], cycles_per_m: float) -> NDArray[np.float64]:
-        """Return the power that an even seabed returns from directions."""
-        weights = 1 / np.sqrt(1 - self.sine**2)  # sines are evenly spaced, not angles
-        for heading in self.headings:
+        """Return the power that an even seabed returns from each direction."""
+        weights = 1 / np.sqrt(1 - self.sine**2)  # because sines are evenly spaced, not angles
+        for heading in self.geometry.headings:
             for length_m in self.lengths_m:
                 sine = rays @ heading
                 weights = weights * element_pattern(length_m, sine, 1.0, 2 / abs(cycles_per_m))
         return np.abs(weights)
+
+
+def _estimator(
+    steering: NDArray[np.complex128], target: NDArray[np.complex128], power: NDArray[np.float64]
+) -> NDArray:
+    """Return the filter that estimates `target` from the channels, [pairs, pairs].
+
+    `steering` and `target` are what the channels receive and should receive, [pairs, angles], and
+    `power` weighs the directions, [angles].
+    """
+    weighted = (power * steering).conj().T
+    covariance = steering @ weighted
+    covariance += _NOISE * np.sum(power) * np.eye(len(steering))
+    # The covariance is Hermitian, so solving from the left gives the transpose of the filter.
+    return np.linalg.solve(covariance.conj(), (target @ weighted).T).T

@@ -1,4 +1,4 @@
-"""How many echoes decide a displacement, how they are weighed, and how certain their phases are."""
+"""Weights of echoes, their number, and the uncertainty of their phases."""
 
 from __future__ import annotations
 
@@ -9,25 +9,29 @@ from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
 
 Window = tuple[NDArray[np.complex128], NDArray[np.complex128]]
-"""Samples of both channels of all pairs in a window of range, [pairs, n] each."""
+"""Samples of the first and second channels of all pairs in a window of range, [pairs, n] each."""
 
-_HIGHLIGHT = 3.0  # times the median power, from which on echoes are weakened
-# Power of side lobes and slopes over that of the strongest echo. Where all between the echoes is
-# below it, the usual echo is none: with 0, yaw over one point errs by 7 times as much.
+_HIGHLIGHT = 3.0  # power over the median above which echoes are weakened
+# Power of side lobes and slopes of echoes over that of the strongest echo. If everything between
+# the echoes is weaker than this, the median is no measure of echoes. With 0, the error of yaw over
+# a single point is 7 times as large.
 _SIDE_LOBES = 3e-3
-_SMOOTHED = 9  # samples over which power is a mean
-_EMPTY = 1e-3  # power over that of the strongest echo of a window, or a window's over all others
-_MAIN_LOBE = 8.0  # independent samples, down to the former
-_SPECKLE = 2.0  # mean square of speckle's power over the squared mean
-_BLOCK_CELLS = 8.0  # independent samples of a block: neighbours share few echoes
+_SMOOTHED = 9  # samples over which power is averaged
+# Power below which a sample counts as empty, relative to the strongest echo of its window, and a
+# window relative to the strongest echo of all windows.
+_EMPTY = 1e-3
+_MAIN_LOBE = 8.0  # length of an echo down to that level, independent samples
+_SPECKLE = 2.0  # mean square of the power of speckle over its squared mean
+_BLOCK_CELLS = 8.0  # independent samples in a block: neighbouring blocks share few echoes
 
 
 def without_highlights(window: Window, largest: float) -> Window:
-    """Return samples of both channels of all pairs, with strong echoes weakened.
+    """Return a window in which strong echoes are weakened.
 
-    The stronger an echo, the less is left of it: it then weighs less than what is usual. A strong
-    echo comes from one direction only. It would decide the mean phase, which is expected of echoes
-    from all over the beam. `largest` is the power of the strongest echo of all windows.
+    The stronger an echo is, the less of it remains, so that it weighs less than a usual one. A
+    strong echo comes from a single direction. It would dominate the mean phase, whose expectation
+    is that of echoes from the whole beam. `largest` is the power of the strongest echo of all
+    windows.
     """
     power = uniform_filter1d(_power(window), _SMOOTHED, mode="nearest")
     usual = max(_HIGHLIGHT * float(np.median(power)), _SIDE_LOBES * largest)
@@ -36,21 +40,21 @@ def without_highlights(window: Window, largest: float) -> Window:
 
 
 def strongest(windows: list[Window]) -> float:
-    """Return the largest power, a mean over the pairs."""
+    """Return the largest power of all windows, averaged over the pairs."""
     return max(float(_power(each).max()) for each in windows)
 
 
 def independent_echoes(
     window: Window, weakened: Window, independent: float, largest: float
 ) -> float:
-    """Return how many of the `independent` samples of a window hold echoes of their own.
+    """Return how many of the `independent` samples of a window contain echoes of their own.
 
-    Speckle fills a window: all of them. A few reflectors leave most of it empty but for the slopes
-    of their echoes: were m of them anywhere, each F samples long, a share exp(-m F/n) of n samples
-    would stay empty. Where some echoes are far stronger than others in the `weakened` window, these
-    decide.
+    Speckle fills a window, so all samples count. A few reflectors leave most of it empty, except
+    for the slopes of their echoes: if m echoes, each F samples long, lie at random positions among
+    n samples, a share exp(-m F/n) of the samples stays empty. If some echoes are much stronger than
+    others in the `weakened` window, only these count.
     """
-    power, left = _power(window), _power(weakened)
+    power, remaining = _power(window), _power(weakened)
     count = len(power)
     length = _SMOOTHED + _MAIN_LOBE * count / independent
     if float(power.max()) <= _EMPTY * largest:
@@ -58,7 +62,8 @@ def independent_echoes(
     smoothed = uniform_filter1d(power, _SMOOTHED, mode="nearest")
     empty = float(np.mean(smoothed < _EMPTY * float(power.max())))
     reflectors = math.inf if not empty else -count / length * math.log(empty)
-    even = _SPECKLE * float(np.sum(left)) ** 2 / max(count * float(np.sum(left**2)), 1e-300)
+    square = max(count * float(np.sum(remaining**2)), 1e-300)
+    even = _SPECKLE * float(np.sum(remaining)) ** 2 / square
     return max(min(independent * min(even, 1.0), reflectors), 1.0)
 
 
@@ -83,10 +88,10 @@ def block_products(window: Window, lag: int, independent: float) -> NDArray[np.c
 def phase_variance(
     coherence: NDArray[np.float64], independent: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return the variance of a correlation's phase, rad^2.
+    """Return the variance of the phase of a correlation, rad^2.
 
-    (1 - g^2)/(2 L g^2) for a coherence g over L independent samples; `coherence` is a sample's,
-    which noise alone makes 1/sqrt(L).
+    It is (1 - g^2)/(2 L g^2) for a coherence g over L independent samples. `coherence` is the
+    sample coherence, which is 1/sqrt(L) for noise alone.
     """
     square = np.clip((independent * coherence**2 - 1) / (independent - 1), 1e-6, 1 - 1e-9)
     return (1 - square) / (2 * independent * square)

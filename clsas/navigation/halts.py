@@ -1,9 +1,9 @@
-"""Pings that a platform took standing still while its navigation moved.
+"""Pings that a platform recorded standing still while its navigation moved.
 
-All pings of a halt receive the same echoes. Of a platform that moves, those of a stretch of several
-Fresnel lengths have little in common: every echo's phase turns by cycles. The navigation tells how
-much they should have in common. A wall or a pipe along the track gives the same echoes everywhere,
-too, and nothing then tells a halt from a passage.
+All pings of a halt receive the same echoes. If a platform moves, pings of a stretch of several
+Fresnel lengths have little in common, because the phase of every echo turns by cycles. The
+navigation predicts how much they should have in common. A wall or a pipe along the track also gives
+the same echoes everywhere, and a halt cannot then be distinguished from a passage.
 """
 
 from __future__ import annotations
@@ -17,34 +17,35 @@ from clsas.navigation.responses import Contributions, Passage
 from clsas.signal.readout import Readout
 
 _STRETCH = 4.0
-"""Fresnel lengths of a stretch. An echo from broadside has 1/16 of its power in common over it, one
-from elsewhere less; over half of it 1/5."""
-_LEAST_PINGS = 8  # of a stretch
-_READ_PINGS, _READ_RECEIVERS = 32, 4  # of a stretch, at most
+"""Length of a stretch in Fresnel lengths. Over it, an echo from broadside has 1/16 of its power in
+common, and other echoes less. Over half of it, the share would be 1/5."""
+_LEAST_PINGS = 8  # pings in a stretch
+_READ_PINGS, _READ_RECEIVERS = 32, 4  # most pings and receivers of a stretch that are compared
 _MOST_COMMON = 0.3
-"""Share of the power. Passages of points and speckle have up to 0.03, halts 0.56 where noise has
-the power of the echoes."""
+"""Largest share of the power that pings of a passage have in common. Passages over points and
+speckle reach 0.03. Halts have 0.56 if noise is as strong as the echoes."""
 _MOST_EXPECTED = 0.2
-"""Share by the navigation, up to which it tells a passage from a halt. Straight tracks have up to
-0.07, a circle about the one response 1."""
+"""Largest share predicted by the navigation for which halts and passages differ. Straight tracks
+have up to 0.07, and a circle about the only response has 1."""
 
 
 def halt(passage: Passage, readout: Readout, found: Contributions) -> tuple[int, int] | None:
-    """Return the first and last ping of the longest halt that the navigation does not have.
+    """Return the first and last ping of the longest halt that the navigation does not contain.
 
     Parameters
     ----------
     passage : Passage
-        By the navigation.
+        Passage according to the navigation.
     readout : Readout
         The lines.
     found : Contributions
-        To the brightest responses along the navigation's track. Their ranges are looked at.
+        Contributions to the brightest responses along the navigated track. Pings are compared at
+        the ranges of these responses.
 
     Returns
     -------
     (first, last) or None
-        None where pings have little in common, or as much as the navigation makes expect.
+        None if pings have little in common, or as much as the navigation predicts.
     """
     halts: list[tuple[int, int]] = []
     for first, stop in _stretches(passage, found):
@@ -60,7 +61,7 @@ def halt(passage: Passage, readout: Readout, found: Contributions) -> tuple[int,
 
 
 def _stretches(passage: Passage, found: Contributions) -> list[tuple[int, int]]:
-    """Return the first pings of stretches, and those after their last ones."""
+    """Return the first ping of every stretch, and the one after its last."""
     along_m = passage.along_m
     length_m = _STRETCH * passage.fresnel_length_m(found)
     count = max(int((along_m[-1] - along_m[0]) / length_m), 1)
@@ -75,7 +76,7 @@ def _stretches(passage: Passage, found: Contributions) -> list[tuple[int, int]]:
 
 
 def _expected_share(passage: Passage, found: Contributions, first: int, stop: int) -> float:
-    """Return the share of the power that pings have in common if they move like the navigation."""
+    """Return the share of the power that pings have in common if the navigation is correct."""
     some = np.flatnonzero((passage.ping >= first) & (passage.ping < stop))
     if not len(some):
         return 1.0
@@ -89,16 +90,16 @@ def _expected_share(passage: Passage, found: Contributions, first: int, stop: in
 def _common_share(
     passage: Passage, readout: Readout, found: Contributions, first: int, stop: int
 ) -> float:
-    """Return the share of the power that is the same in all pings of a stretch.
+    """Return the share of the power that all pings of a stretch have in common.
 
-    Of independent pings the expectation is 0. Pings count alike, however loud they are.
+    Its expectation is 0 for independent pings. All pings count equally, whatever their level.
     """
     lines = passage.lines
     starts = lines.ping_starts
     counts = np.diff(np.append(starts, lines.channels))[first:stop]
-    pings = first + _spread(stop - first, _READ_PINGS)
+    pings = first + _evenly_spaced(stop - first, _READ_PINGS)
     common = total = 0.0
-    for receiver in _spread(int(counts.min()), _READ_RECEIVERS).tolist():
+    for receiver in _evenly_spaced(int(counts.min()), _READ_RECEIVERS).tolist():
         channels = starts[pings] + receiver
         values = _unit_power(readout.read(channels, _ranges_m(readout, found, channels)))
         number = len(values)
@@ -110,14 +111,15 @@ def _common_share(
     return common / total if total else 0.0
 
 
-def _spread(count: int, most: int) -> NDArray[np.int64]:
+def _evenly_spaced(count: int, most: int) -> NDArray[np.int64]:
+    """Return up to `most` of `count` numbers."""
     return np.unique(np.linspace(0, count - 1, min(count, most)).astype(np.int64))
 
 
 def _ranges_m(
     readout: Readout, found: Contributions, channels: NDArray[np.int64]
 ) -> NDArray[np.float64]:
-    """Return ranges about the responses that all of the channels have, [channels, n]."""
+    """Return the ranges of the responses that all of the channels have, [channels, n]."""
     lines = readout.lines
     least_m = max(float(found.range_m[channels].min()), float(lines.first_range_m[channels].max()))
     most_m = min(float(found.range_m[channels].max()), float(lines.last_range_m[channels].min()))
@@ -126,8 +128,8 @@ def _ranges_m(
 
 
 def _unit_power(values: NDArray[np.complex64]) -> NDArray[np.complex128]:
-    """Return the pings that received something, [pings, n], each with a power of 1 in all."""
+    """Return the pings that received anything, [pings, n], each scaled to a total power of 1."""
     wide = values.astype(np.complex128)
     power = np.sum(np.abs(wide) ** 2, axis=1)
-    heard = power > 0
-    return wide[heard] / np.sqrt(power[heard])[:, None]
+    received = power > 0
+    return wide[received] / np.sqrt(power[received])[:, None]

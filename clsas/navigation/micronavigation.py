@@ -15,7 +15,7 @@ from clsas.core.conditioning import DEAD_DB
 from clsas.core.lines import RangeLines
 from clsas.navigation.accuracy import Accuracy, check_plausible
 from clsas.navigation.checks import check_navigation, mean_wavelength_m
-from clsas.navigation.displacement import Correlator
+from clsas.navigation.correlation import Correlator
 from clsas.navigation.overlap import Array, moved
 from clsas.navigation.passes import LEAST_ECHOES, Displacements, measured
 from clsas.navigation.smoother import Step, persistence, shape_deviation_m, smooth
@@ -26,10 +26,10 @@ from clsas.sonar.track import Track
 
 UNKNOWNS = ("sway", "yaw", "surge")
 YAW_SD_RAD = math.radians(1.0)
-"""Standard deviation of a navigation's yaw, unless given."""
+"""Default standard deviation of a navigation's yaw."""
 
-_LEAST_BLOCKS = 4  # of range, whose scatter tells a variance
-_LEAST_SHARE = 0.25  # of the pairs of pings, that must be coherent
+_LEAST_BLOCKS = 4  # blocks of range that are needed to estimate a variance from their scatter
+_LEAST_SHARE = 0.25  # share of the pairs of pings that must be usable
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,30 +39,35 @@ class Micronavigation:
     Attributes
     ----------
     lines : RangeLines
-        The lines given, with corrected positions.
+        The given lines with corrected positions.
     track : Track
-        The array's mean phase centre and heading, ping by ping. `time_s` counts pings.
+        Mean phase centre and heading of the array, ping by ping. Its `time_s` counts pings.
     sway_m, yaw_rad, surge_m : float64 [pings]
-        Displacement of the array to port of its navigation, turn from forward to port, and
-        displacement forward.
+        Corrections of the navigation: displacement of the array to port, turn from forward to port,
+        and displacement forward.
     sway_sd_m, yaw_sd_rad, surge_sd_m : float64 [pings]
-        Their standard deviations. A common shift and turn of the whole track stem from the
-        navigation and have its accuracy.
+        Standard deviations of the corrections. A common shift and turn of the whole track come from
+        the navigation and have its accuracy.
     sway_steps_m, yaw_steps_rad : float64 [pings - 1]
-        Displacement from ping to ping beside the navigation's, at the middle of the overlap.
+        Displacements from ping to ping relative to the navigation, at the middle of the overlap.
     sway_steps_sd_m, yaw_steps_sd_rad : float64 [pings - 1]
-        Their standard deviations; infinite where the echoes were not coherent.
+        Standard deviations of the displacements; infinite where the echoes are not coherent.
     coherence : float64 [pings - 1, windows]
-        Mean coherence of the pairs by window of range.
+        Mean coherence of the pairs of channels, by window of range.
     range_m : float64 [windows]
-        Middles of the windows.
+        Ranges in the middle of the windows.
     overlap : int64 [pings - 1]
         Number of pairs of channels that share a phase centre.
     persistence : float
-        Variance that errors of many steps add up to, over that of independent ones: echoes stay in
-        the beam for many pings. It is measured between blocks of range, and is at least the number
-        of pings times the share of the variance that few echoes make. Standard deviations of
-        positions and of the shape contain it.
+        Variance of the sum of the errors of many steps, over that of independent errors. It exceeds
+        1 because echoes stay in the beam for many pings. It is estimated from the scatter between
+        blocks of range, and is at least the number of pings times the share of the variance that
+        is due to having few echoes. The standard deviations of positions and of the track's shape
+        include it.
+
+    See Also
+    --------
+    micronavigate : Function that returns this result.
     """
 
     lines: RangeLines
@@ -86,11 +91,11 @@ class Micronavigation:
     def shape_sd_m(self) -> NDArray[np.float64]:
         """Standard deviation of the sway without a common shift and turn, metres, [pings].
 
-        An image is as sharp as this is small: a shift and a turn of the whole track move and turn
-        the image. NaN if echoes of some pings were not coherent.
+        This part of the sway determines how sharp an image is. A shift and a turn of the whole
+        track only shift and turn the image. NaN if the echoes of some pings are not coherent.
 
-        It does not hold errors that all ranges share. Over 5000 points of speckle, 30 to 60 pings
-        and a navigation that was right, errors were 0.4 to 2.6 times this.
+        It does not include errors that all ranges have in common. With 5000 points of speckle, 30
+        to 60 pings and a correct navigation, errors were 0.4 to 2.6 times this value.
         """
         deviations = self.sway_steps_sd_m, self.yaw_steps_sd_rad
         if not all(np.isfinite(each).all() for each in deviations):
@@ -100,7 +105,7 @@ class Micronavigation:
         return shape_deviation_m(sway_m, yaw_rad, advance_m)
 
     def __repr__(self) -> str:
-        """Return the size of what was found, and how coherent the echoes are."""
+        """Return the rms corrections and the median coherence."""
         return reprs.summary(
             self,
             f"{len(self.sway_m)} pings",
@@ -126,38 +131,39 @@ def micronavigate(
     most_step_m: float = 0.1,
     progress: Callable[[int, int], None] | None = None,
 ) -> Micronavigation:
-    """Correct an array's track by echoes that consecutive pings have in common.
+    """Return the track of an array, corrected by echoes that consecutive pings have in common.
 
     Parameters
     ----------
     lines : RangeLines or Echoes
-        Of an array whose phase centres overlap from ping to ping, at least three of them. Echoes
-        are compressed first. Positions are those of the navigation.
+        Data of an array whose phase centres overlap from ping to ping, by at least three. Echoes
+        are compressed first. The positions are those of the navigation.
     range_m : (near, far), optional
-        Ranges to use, metres. All that every channel has, unless given.
+        Ranges to use, metres. By default nearly all ranges that every channel has.
     window_m : float, optional
-        Length of a window of range, metres. About 150 resolution cells unless given.
+        Length of a window of range, metres. By default about 150 range resolution cells.
     side : {"port", "starboard"}
-        Where the seabed lies, seen in the direction in which the array advances. Echoes do not
-        tell: the wrong side gives sway of the wrong sign.
+        Side on which the seabed lies, as seen in the direction in which the array advances. The
+        echoes do not show it, and the wrong side gives sway of the wrong sign.
     seabed_z_m : float, optional
-        Height of the seabed. Rays then slope down to it, and sway is horizontal; without it rays
-        are taken as horizontal.
+        Height of the seabed. Rays then slope down to it, and sway is horizontal. By default, rays
+        are horizontal.
     element_length_m : float or (transmitter, receiver), optional
-        Lengths of the elements. Give them where the beam is wide: echoes far from broadside change
-        their range less, and with separate transmitters and receivers they shift phases. Both pings
-        are then aligned for every direction of the beam.
+        Lengths of the elements, which are needed if the beam is wide: far from broadside, echoes
+        change their range less, and separate transmitters and receivers shift their phases. Both
+        pings are then aligned for every direction of the beam.
     sway_sd_m, yaw_sd_rad, surge_sd_m : float or array_like [pings]
-        Standard deviation of the navigation's sway, yaw and surge.
+        Standard deviations of the navigation's sway, yaw and surge.
     correlation_pings : float, optional
-        Number of pings over which errors of the navigation persist. Unless given the whole
-        recording, so that the navigation decides little but a common shift and turn.
+        Number of pings over which errors of the navigation persist. By default they persist over
+        the whole recording, so that the navigation determines little but a common shift and turn.
     unknowns : sequence of {"sway", "yaw", "surge"}
-        What to find; sway always. Leave out yaw and surge of an array at rest whose timing jitters.
-        Surge, the advance, is told by where the coherence along the array is largest.
+        What to measure; must include sway. Leave out yaw and surge for an array at rest whose
+        timing jitters. Surge, an error of the advance, is measured by where the coherence along the
+        array is largest.
     most_step_m : float
-        Largest displacement in range that is looked for between two pings, beside the
-        navigation's.
+        Largest displacement in range between two pings, relative to the navigation, that is
+        searched.
     progress : callable, optional
         Called as progress(steps done, steps).
 
@@ -168,41 +174,79 @@ def micronavigate(
     Raises
     ------
     TypeError, ValueError
-        If an argument is of the wrong kind or outside its limits; if there is one ping, positions
-        are missing, or pings repeat a position; if fewer than three phase centres overlap; if
-        hardly any two pings are coherent; or if yaw is looked for in the echoes of a few
-        reflectors.
+        If an argument has the wrong type or is outside its limits; if there is only one ping,
+        positions are missing, or pings repeat a position; if fewer than three phase centres
+        overlap; if hardly any two pings are coherent; or if yaw is to be measured from the echoes
+        of a few reflectors.
 
     Warns
     -----
     ClsasWarning
-        If some pairs of pings are not coherent: the navigation bridges them. If some hold so few
-        echoes that their yaw may err by more than its deviation. If channels are dead:
-        they are left out. If what is found is far beyond the accuracy of the navigation. If the
-        track turns back, so that pings may be out of order.
+        If some pairs of pings are not coherent and the navigation bridges them; if some contain so
+        few echoes that their yaw may be off by more than its standard deviation; if channels are
+        dead and left out; if the corrections are far larger than the accuracy of the navigation;
+        or if the track turns back, so that pings may be out of order.
+
+    See Also
+    --------
+    autofocus : Corrects a track from the bright responses of an image.
+    calibrate_track : Corrects timing, sound speed and lever arm from known reflectors.
 
     Notes
     -----
-    See `clsas.navigation.displacement` for the measurement. Standard deviations follow the bound
-    for K pairs of coherence g over L independent samples (Bellettini and Pinto 2002):
+    Both channels of a pair that shares a phase centre receive the same speckle. Sway and yaw follow
+    from a straight line fitted to their phase differences along the array, and surge from the
+    coherence of neighbouring channels [1]_. The standard deviations follow the bound for K pairs
+    with coherence g over L independent samples,
 
         sigma_phase = sqrt((1 - g^2)/(2 L g^2)),
         sigma_sway = wavelength/(4 pi) sigma_phase/sqrt(K),
         sigma_yaw = wavelength/(4 pi) sigma_phase sqrt(12/(K (K^2 - 1)))/spacing.
 
-    They follow from the phase of a product of two correlated complex Gaussian signals, averaged
-    over L samples, and a straight line fitted to K such phases at equal steps. Where a window holds
-    fewer echoes than speckle, phases are less certain by what filters leave of the directions of so
-    few. Deviations are scaled by the misfit of that line over all pings, or by the contradiction
-    between blocks of range, where either is more than expected; yaw's also by what neighbouring
-    pairs have in common. Those of positions and of the track's shape are scaled by
-    `Micronavigation.persistence` too.
+    It is derived from the phase of a product of two correlated complex Gaussian signals, averaged
+    over L samples, and from a straight line fitted to K such phases at equal steps.
+
+    Several effects increase these values. If a window contains fewer echoes than speckle has,
+    phases are less certain because the alignment of the few directions is not exact. All
+    deviations are scaled by the misfit of the line over all pings, or by the contradiction between
+    blocks of range, if either is larger than expected. Those of yaw are also scaled because
+    neighbouring pairs share errors. The standard deviations of positions and of the track's shape
+    are scaled by `Micronavigation.persistence` as well.
+
+    References
+    ----------
+    .. [1] Bellettini, Pinto, "Theoretical accuracy of synthetic aperture sonar micronavigation
+       using a displaced phase-center antenna", IEEE Journal of Oceanic Engineering 27, 2002.
+
+    Examples
+    --------
+    An array over speckle sways by some millimetres, and its navigation does not contain the sway:
+
+    >>> from dataclasses import replace
+    >>> import numpy as np
+    >>> import clsas
+    >>> pulse = clsas.Pulse(carrier_hz=100e3, bandwidth_hz=30e3, duration_s=1e-3)
+    >>> rx_m = [[0.015 * n, 0, 0] for n in range(16)]
+    >>> sonar = clsas.Sonar(pulse, rx_m, tx_length_m=0.03, rx_length_m=0.03)
+    >>> random = np.random.default_rng(0)
+    >>> xyz_m = random.uniform([-3, 9, 0], [3, 13, 0], (800, 3))
+    >>> speckle = clsas.PointTargets(xyz_m, random.standard_normal((800, 2)) @ [1, 1j])
+    >>> course = (0, 0, 0), (0.045, 0, 0), 5, 1.0
+    >>> true = clsas.Track.straight(*course, sway_m=[0, 2e-3, 1e-3, 3e-3, 0])
+    >>> lines = clsas.compress(clsas.simulate(sonar, true, speckle, range_m=(9.5, 12.5)))
+    >>> navigated = clsas.channels(sonar, clsas.Track.straight(*course))
+    >>> lines = replace(lines, tx_m=navigated.tx_m, rx_m=navigated.rx_m)
+    >>> found = clsas.micronavigate(lines, range_m=(10, 12), element_length_m=0.03)
+    >>> (1e3 * found.sway_steps_m).round(1).tolist()
+    [2.0, -1.0, 2.0, -3.0]
     """
     if isinstance(lines, Echoes):
         lines = compress(lines)
     validate.instance("lines", lines, RangeLines)
     validate.progress(progress)
-    names = _checked_unknowns(unknowns)
+    names = validate.named("unknowns", unknowns, UNKNOWNS)
+    if "sway" not in names:
+        raise ValueError(f"unknowns must include 'sway', got {names}")
     check_navigation(lines, 2, "micronavigation", may_stand=False)
     array = Array.of(lines)
     swath = checked_swath(lines, range_m, window_m, side, seabed_z_m, element_length_m)
@@ -211,24 +255,15 @@ def micronavigate(
     most_step_m = validate.number("most_step_m", most_step_m, "m", above=0.0, most=longest_m)
     correlator = Correlator(lines, swath)
     check_sizes(lines, array, swath, mean_wavelength_m(correlator.readout))
-    dead = int((~correlator.heard).sum())
+    dead = int((~correlator.live).sum())
     if dead:
         validate.warn(
-            f"{dead} of {lines.channels} channels hold no signal, or {-DEAD_DB:.0f} dB less than "
-            f"others of their ping (the first is channel {int(np.argmin(correlator.heard))}): they "
-            "are left out of what is correlated"
+            f"{dead} of {lines.channels} channels have no signal, or at least {-DEAD_DB:.0f} dB "
+            "less than the other channels of their ping (the first is channel "
+            f"{int(np.argmin(correlator.live))}). They are left out"
         )
-    found = measured(
-        lines, array, correlator, names, accuracy.deviations[:, :2], most_step_m, progress
-    )
+    found = measured(array, correlator, names, accuracy.deviations[:, :2], most_step_m, progress)
     return _result(lines, array, swath, found, accuracy)
-
-
-def _checked_unknowns(unknowns: Sequence[str]) -> tuple[str, ...]:
-    names = validate.named("unknowns", unknowns, UNKNOWNS)
-    if "sway" not in names:
-        raise ValueError(f"unknowns must hold 'sway', got {names}")
-    return names
 
 
 def _result(
@@ -238,11 +273,11 @@ def _result(
     found: Displacements,
     accuracy: Accuracy,
 ) -> Micronavigation:
-    """Fuse displacements with the navigation."""
+    """Return the displacements combined with the navigation."""
     _check_coherence(found)
     count = len(found.moved)
     misfit = max(float(found.misfit[found.coherent].mean()), _contradiction(found), 1.0)
-    # A reflector is in the beam of many pings, and all blocks may have the same few directions.
+    # A reflector stays in the beam for many pings, and all blocks may share a few directions.
     lasting = float(found.lasting[found.coherent].mean()) * int(found.coherent.sum())
     persist = max(persistence(found.scatter[found.coherent]), lasting)
     steps: list[Step | None] = [None] * count
@@ -280,9 +315,9 @@ def _result(
 
 
 def _contradiction(found: Displacements) -> float:
-    """Return the variance by which blocks of range contradict each other, over what is expected.
+    """Return the variance of the scatter between blocks of range over its expectation.
 
-    Yaw's, or sway's where yaw is not looked for.
+    It is that of yaw, or of sway if yaw is not measured.
     """
     scatter, covariance = found.scatter[found.coherent], found.covariance[found.coherent]
     blocks = scatter.shape[1]
@@ -294,32 +329,32 @@ def _contradiction(found: Displacements) -> float:
 
 
 def _check_coherence(found: Displacements) -> None:
-    """Refuse lines if hardly any pair of pings is usable; warn of those that are not."""
+    """Refuse lines if hardly any pair of pings is usable; warn of pairs that are not."""
     count, without = len(found.coherent), int((~found.coherent).sum())
     few = int(found.sparse.sum())
     if count - without - few < max(1, _LEAST_SHARE * count):
         if few > without:
             raise ValueError(
-                f"lines must hold echoes from all over a seabed; {few} of {count} pairs of pings "
-                f"have those of about {np.median(found.echoes):.1f} reflectors, at least "
-                f"{LEAST_ECHOES:g} are needed: they do not tell a yaw from their directions. "
-                'Take more range, leave out yaw with unknowns=("sway",), or use clsas.autofocus'
+                "lines must have echoes from all over a seabed to measure yaw, but in "
+                f"{few} of {count} pairs of pings they come from about "
+                f"{np.median(found.echoes):.1f} reflectors; at least {LEAST_ECHOES:g} are needed. "
+                'Use more range, leave out yaw with unknowns=("sway",), or use clsas.autofocus'
             )
         raise ValueError(
-            f"lines must be coherent from ping to ping; {without} of {count} pairs "
-            f"of pings are not: their coherence is at most "
-            f"{found.coherence[~found.coherent].max():.2f} in any window, and "
-            f"{found.least_coherence.min():.2f} at least is needed to tell echoes from noise. "
-            f"Check range_m, and the navigation's advance from ping to ping"
+            f"lines must be coherent from ping to ping, but {without} of {count} pairs of pings "
+            "are not: their coherence is at most "
+            f"{found.coherence[~found.coherent].max():.2f} in any window, and at least "
+            f"{found.least_coherence.min():.2f} is needed to distinguish echoes from noise. "
+            "Check range_m, and the advance from ping to ping in the navigation"
         )
     if without:
         validate.warn(
-            f"{without} of {count} pairs of pings are not coherent (the first after "
-            f"ping {int(np.argmin(found.coherent))}): the navigation's accuracy bridges them"
+            f"{without} of {count} pairs of pings are not coherent (the first one after ping "
+            f"{int(np.argmin(found.coherent))}). The navigation bridges them, with its accuracy"
         )
     if few:
         validate.warn(
-            f"{few} of {count} pairs of pings hold the echoes of fewer than {LEAST_ECHOES:g} "
-            f"reflectors (the first after ping {int(np.argmax(found.sparse))}), which may all lie "
-            f"in one direction: yaw may err by several of its standard deviations there"
+            f"{few} of {count} pairs of pings have echoes of fewer than {LEAST_ECHOES:g} "
+            f"reflectors (the first one after ping {int(np.argmax(found.sparse))}), which may all "
+            "lie in one direction. The yaw of these pairs may be off by several standard deviations"
         )

@@ -1,4 +1,4 @@
-"""Channels of consecutive pings that share phase centres."""
+"""Pairs of channels in consecutive pings that share a phase centre."""
 
 from __future__ import annotations
 
@@ -11,25 +11,25 @@ from scipy.spatial.transform import Rotation
 from clsas.core.lines import RangeLines
 
 _MOST_APART = 0.5
-"""Distance along the array within which two phase centres count as one, in spacings of the array.
-It is the largest that can occur within an overlap."""
+"""Largest distance along the array, in spacings of the array, at which two phase centres are
+paired. No channel within an overlap is farther than this from the nearest one of the other ping."""
 
 
 @dataclass(frozen=True, eq=False)
 class Array:
-    """The receivers' phase centres, ping by ping.
+    """Phase centres of the receivers, ping by ping.
 
     Attributes
     ----------
     starts : int64 [pings + 1]
-        First channel of every ping, and one past the last.
+        First channel of every ping, and the number of channels as the last entry.
     reference_m : float64 [pings, 3]
         Mean phase centre of every ping, about which the platform turns.
     forward : float64 [pings, 3]
-        Horizontal unit vector along the array, in the direction in which it advances. An array at
-        rest has the direction from its first receiver to its last.
+        Horizontal unit vectors along the array, in the direction in which it advances. For an array
+        at rest, they point from its first receiver to its last.
     port : float64 [pings, 3]
-        Horizontal unit vector to port.
+        Horizontal unit vectors to port.
     spacing_m : float
         Median distance between neighbouring phase centres.
     """
@@ -42,19 +42,19 @@ class Array:
 
     @classmethod
     def of(cls, lines: RangeLines) -> Array:
-        """Return the array of lines.
+        """Return the array that recorded some range lines.
 
         Raises
         ------
         ValueError
-            If there are fewer than two pings, or a ping of fewer than two receivers, or an array
-            without horizontal extent.
+            If there are fewer than two pings, if a ping has fewer than two receivers, or if the
+            receivers of a ping have no horizontal extent.
         """
         starts = np.append(lines.ping_starts, lines.channels)
         counts = np.diff(starts)
         if len(counts) < 2:
             raise ValueError(
-                "lines must hold at least 2 pings, got one (all channels share one transmitter "
+                "lines must have at least 2 pings, got one (all channels share one transmitter "
                 "position)"
             )
         if counts.min() < 2:
@@ -69,18 +69,18 @@ class Array:
         length_m = np.linalg.norm(forward, axis=1)
         if length_m.min() <= 0:
             raise ValueError(
-                f"the receivers of a ping must extend horizontally, got none in ping "
-                f"{length_m.argmin()}"
+                "the receivers of every ping must have different horizontal positions, got a "
+                f"horizontal extent of 0 m in ping {length_m.argmin()}"
             )
         forward /= length_m[:, None]
-        # Receivers may be numbered from either end: forward is where the array goes.
+        # Receivers may be numbered from either end, so the advance decides which way is forward.
         advance_m = np.gradient(reference_m, axis=0)
         forward[np.einsum("pi,pi->p", forward, advance_m) < 0] *= -1
         port = np.stack([-forward[:, 1], forward[:, 0], np.zeros(len(forward))], axis=1)
-        at_m = np.einsum("ci,ci->c", centres_m, np.repeat(forward, counts, axis=0))
-        neighbours = np.ones(len(at_m) - 1, bool)
-        neighbours[starts[1:-1] - 1] = False  # from a ping to the next
-        spacing_m = float(np.median(np.abs(np.diff(at_m)[neighbours])))
+        along_m = np.einsum("ci,ci->c", centres_m, np.repeat(forward, counts, axis=0))
+        same_ping = np.ones(len(along_m) - 1, bool)
+        same_ping[starts[1:-1] - 1] = False
+        spacing_m = float(np.median(np.abs(np.diff(along_m)[same_ping])))
         return cls(starts, reference_m, forward, port, spacing_m)
 
     @property
@@ -95,16 +95,16 @@ class Array:
 
 @dataclass(frozen=True, eq=False)
 class Overlap:
-    """Channels of a ping and of the next with nearly one phase centre.
+    """Pairs of channels of a ping and of the next one that nearly share a phase centre.
 
     Attributes
     ----------
     first, second : int64 [pairs]
-        Channels of the ping, and of the next.
+        Channels of the ping, and of the next one.
     along_m : float64 [pairs]
-        Where their phase centres lie along the array, from the middle of the overlap.
+        Positions of the phase centres along the array, relative to the middle of the overlap.
     pivot_m : float64 [3]
-        The middle of the overlap.
+        Middle of the overlap.
     """
 
     first: NDArray[np.int64]
@@ -117,27 +117,29 @@ class Overlap:
         """Number of pairs of channels."""
         return len(self.first)
 
+    @property
+    def spacing_m(self) -> float:
+        """Median distance between neighbouring pairs along the array; 0 for a single pair."""
+        steps_m = np.diff(np.sort(self.along_m))
+        return float(np.median(steps_m)) if len(steps_m) else 0.0
 
-def overlap(
-    lines: RangeLines, array: Array, ping: int, heard: NDArray[np.bool_] | None = None
-) -> Overlap:
-    """Return the overlap of a ping with the next, of the channels [channels] that are `heard`."""
+
+def overlap(lines: RangeLines, array: Array, ping: int, usable: NDArray[np.bool_]) -> Overlap:
+    """Return the overlap of a ping with the next one, of those channels that are `usable`."""
     centres_m, forward = lines.phase_centres_m, array.forward[ping]
-    here, there = array.channels(ping), array.channels(ping + 1)
-    if heard is not None:
-        here, there = here[heard[here]], there[heard[there]]
+    here, there = (each[usable[each]] for each in (array.channels(ping), array.channels(ping + 1)))
+    origin_m = array.reference_m[ping]
     if min(len(here), len(there)) < 2:
         none = np.zeros(0, np.int64)
-        return Overlap(none, none, np.zeros(0), array.reference_m[ping])
-    origin_m = array.reference_m[ping]
-    at, at_next = ((centres_m[each] - origin_m) @ forward for each in (here, there))
-    order = np.argsort(at_next, kind="stable")
-    sorted_at = at_next[order]
-    after = np.clip(np.searchsorted(sorted_at, at), 1, len(sorted_at) - 1)
-    nearest = after - (at - sorted_at[after - 1] < sorted_at[after] - at)
-    apart_m = np.abs(sorted_at[nearest] - at)
+        return Overlap(none, none, np.zeros(0), origin_m)
+    at_m, at_next_m = ((centres_m[each] - origin_m) @ forward for each in (here, there))
+    order = np.argsort(at_next_m, kind="stable")
+    sorted_m = at_next_m[order]
+    after = np.clip(np.searchsorted(sorted_m, at_m), 1, len(sorted_m) - 1)
+    nearest = after - (at_m - sorted_m[after - 1] < sorted_m[after] - at_m)
+    apart_m = np.abs(sorted_m[nearest] - at_m)
     paired = np.flatnonzero(apart_m <= _MOST_APART * array.spacing_m * (1 + 1e-6))
-    # Of two channels that choose the same one, the nearer keeps it.
+    # If two channels have the same nearest partner, the nearer of them keeps it.
     paired = paired[np.argsort(apart_m[paired], kind="stable")]
     _, unique = np.unique(nearest[paired], return_index=True)
     paired = np.sort(paired[unique])
@@ -154,9 +156,10 @@ def moved(
     yaw_rad: NDArray[np.float64],
     surge_m: NDArray[np.float64],
 ) -> RangeLines:
-    """Return lines whose array lies further to port and forward and is turned about z, by ping.
+    """Return lines whose array is displaced to port and forward, and turned, ping by ping.
 
-    The array turns about its mean phase centre, positive yaw from forward to port.
+    The array turns about a vertical axis through its mean phase centre. Positive yaw turns it from
+    forward to port.
     """
     ping = np.repeat(np.arange(array.pings), np.diff(array.starts))
     turn = Rotation.from_rotvec(np.outer(yaw_rad, [0.0, 0.0, 1.0]))

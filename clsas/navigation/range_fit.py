@@ -11,38 +11,40 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from clsas.navigation.range_model import Model
-from clsas.navigation.reflector_search import HALF_CELLS, found, noise_power
+from clsas.navigation.reflector_search import HALF_CELLS, coarse_state, noise_power
 from clsas.navigation.reflectors import Reader, Responses
 
 MOST_CONDITION = 1e4
-"""Condition number of the normal matrix, of columns scaled to 1, up to which unknowns are told
-apart. At this limit they are 50 times less certain together than each alone; errors of the track
-and of the points' positions grow as much."""
+"""Largest condition number of the normal matrix, with columns scaled to 1, at which unknowns count
+as distinguishable. At this limit, their standard deviations are 50 times as large together as each
+alone, and errors of the track and of the points' positions grow as much."""
 
-_MOST_TURN_RAD = 0.8  # standard deviation of a phase's prediction, up to which it is followed
-_LEAST_AGREEMENT = 0.7  # of the phases of a reflector: a residual of 0.85 rad rms
-_OUTLIER = 4.0  # standard deviations
-_ROUNDS = 4  # of measuring around the model and fitting it, and of errors beside the noise
-_SETTLED = 1e-3  # resolution cells by which a fit moves expected ranges in the end
+# Largest standard deviation of a predicted phase with which a reflector's phases are used.
+_MOST_TURN_RAD = 0.8
+# Smallest agreement of the phases of a reflector. 0.7 is a residual of 0.85 rad rms.
+_LEAST_AGREEMENT = 0.7
+_OUTLIER = 4.0  # residual above which a response is left out, standard deviations
+_ROUNDS = 4  # most alternations of measuring and fitting, and of fitting and estimating the misfit
+_SETTLED = 1e-3  # change of the expected ranges that ends the alternations, range cells
 
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """Corrections that explain the measured ranges best.
+    """Corrections that best explain the measured ranges.
 
     Attributes
     ----------
     state : float64 [5]
-        Corrections; 0 where they were held.
+        Corrections; 0 for unknowns that were held.
     free : tuple of int
         Numbers of the unknowns that were solved for.
     covariance : float64 [free, free]
     residual_m : float64 [channels, points]
-        Measured range less the model's; NaN where a reflector was not seen.
+        Measured range minus the model's; NaN where a reflector was not seen.
     phases : bool [points]
-        Whether the phases of a reflector were used, and residuals are theirs.
+        Whether the phases of a reflector were used. Its residuals are then those of the phases.
     misfit_m : float
-        Rms error of track, points or model beside the noise.
+        Rms error of track, points or model, in addition to the noise.
     """
 
     state: NDArray[np.float64]
@@ -54,8 +56,8 @@ class Fit:
 
 
 @dataclass(frozen=True)
-class Alike:
-    """Unknowns that the geometry does not tell apart, and the one that is held for that reason."""
+class Ambiguity:
+    """Unknowns that the geometry does not distinguish, and the one that is held because of that."""
 
     unknowns: tuple[int, ...]
     held: int
@@ -68,34 +70,31 @@ def fitted(
     free: tuple[int, ...],
     search_m: float,
     step: Callable[[], None],
-) -> tuple[Fit, list[Alike], Responses]:
-    """Return the fit, the unknowns that were held, and the responses; `step` is called 4 times."""
-    state = found(model, reader, free, search_m)
+) -> tuple[Fit, list[Ambiguity], Responses]:
+    """Return the fit, the unknowns that were held, and the responses; `step` is called 3 times."""
+    state = coarse_state(model, reader, free, search_m)
     step()
     noise = noise_power(model, reader, state, search_m)
-    # As if all ranges were equally certain: errors of track and points do not fall with noise.
-    seen = _measured(model, reader, state, noise).seen
+    # All ranges count equally here, because errors of track and points do not depend on noise.
+    seen = _Problem(model, reader, free, noise).measured(state).seen
     slopes = model.gradient(state)[list(free)][:, seen]
-    kept, alike = tell_apart(slopes @ slopes.T, free)
-    start = state if kept == free else found(model, reader, kept, search_m)
+    kept, ambiguities = distinguishable(slopes @ slopes.T, free)
+    start = state if kept == free else coarse_state(model, reader, kept, search_m)
     step()
-    for phases in (True, False):
-        fit, responses = _settled(model, reader, kept, start, noise, phases)
-        if fit is not None:
-            break
-    assert fit is not None  # without phases there always is one
-    return fit, alike, responses
+    fit, responses = _settled(_Problem(model, reader, kept, noise), start)
+    step()
+    return fit, ambiguities, responses
 
 
-def tell_apart(
+def distinguishable(
     normal: NDArray[np.float64], free: tuple[int, ...]
-) -> tuple[tuple[int, ...], list[Alike]]:
-    """Return the unknowns that can be solved for, and for each other one what it is like.
+) -> tuple[tuple[int, ...], list[Ambiguity]]:
+    """Return the unknowns that can be solved for, and the ambiguity of each other one.
 
-    While the normal matrix is ill-conditioned, the last of the unknowns that make up its weakest
-    direction is held.
+    As long as the normal matrix is ill-conditioned, the last one of the unknowns that make up its
+    weakest direction is held.
     """
-    kept, alike = list(range(len(free))), []
+    kept, ambiguities = list(range(len(free))), []
     while kept:
         part = normal[np.ix_(kept, kept)]
         scale = np.sqrt(np.maximum(np.diag(part), 1e-300))
@@ -105,108 +104,124 @@ def tell_apart(
             break
         involved = np.flatnonzero(np.abs(vectors[:, 0]) >= 0.5 * np.abs(vectors[:, 0]).max())
         held = kept[int(involved[-1])]
-        alike.append(Alike(tuple(free[kept[n]] for n in involved), free[held], condition))
+        unknowns = tuple(free[kept[n]] for n in involved)
+        ambiguities.append(Ambiguity(unknowns, free[held], condition))
         kept.remove(held)
-    return tuple(free[n] for n in kept), alike
+    return tuple(free[n] for n in kept), ambiguities
 
 
-def _measured(
-    model: Model, reader: Reader, state: NDArray[np.float64], noise: NDArray[np.float64]
-) -> Responses:
-    return reader.responses(model.range_m(state), noise, HALF_CELLS * reader.cell_m)
+@dataclass(frozen=True, eq=False)
+class _Problem:
+    """Model, measurements and unknowns of a fit.
+
+    Attributes
+    ----------
+    model : Model
+    reader : Reader
+    free : tuple of int
+        Numbers of the unknowns.
+    noise : float64 [points]
+        Power of the noise around each reflector.
+    """
+
+    model: Model
+    reader: Reader
+    free: tuple[int, ...]
+    noise: NDArray[np.float64]
+
+    def measured(self, state: NDArray[np.float64]) -> Responses:
+        """Return the responses near the ranges expected for a state."""
+        half_m = HALF_CELLS * self.reader.cell_m
+        return self.reader.responses(self.model.range_m(state), self.noise, half_m)
 
 
-def _settled(
-    model: Model,
-    reader: Reader,
-    free: tuple[int, ...],
-    state: NDArray[np.float64],
-    noise: NDArray[np.float64],
-    phases: bool,
-) -> tuple[Fit | None, Responses]:
-    """Return the fit around a state, or None if phases cannot be followed."""
-    followed = np.zeros(len(model.points_m), bool)
-    equations, fit = _converged(model, reader, free, state, noise, followed)
-    if not phases:
-        return fit, equations.responses
-    followed = equations.can_be_followed(fit)
+def _settled(problem: _Problem, state: NDArray[np.float64]) -> tuple[Fit, Responses]:
+    """Return the fit around a state, using the phases of those reflectors where they are certain.
+
+    A phase is certain if it is predicted to a fraction of a cycle and agrees with the others of its
+    reflector. Without such reflectors, the fit uses envelopes alone.
+    """
+    none = np.zeros(len(problem.model.points_m), bool)
+    of_envelopes, envelopes = _converged(problem, state, none)
+    followed, fit = of_envelopes.can_be_followed(envelopes), envelopes
     while followed.any():
-        equations, fit = _converged(model, reader, free, fit.state, noise, followed)
+        equations, fit = _converged(problem, fit.state, followed)
         agreed = followed & (equations.agreement(fit) >= _LEAST_AGREEMENT)
         if (agreed == followed).all():
             return fit, equations.responses
         followed = agreed
-    return None, equations.responses
+    return envelopes, of_envelopes.responses
 
 
 def _converged(
-    model: Model,
-    reader: Reader,
-    free: tuple[int, ...],
-    state: NDArray[np.float64],
-    noise: NDArray[np.float64],
-    followed: NDArray[np.bool_],
+    problem: _Problem, state: NDArray[np.float64], followed: NDArray[np.bool_]
 ) -> tuple[_Equations, Fit]:
-    """Measure around the model and fit it, until the expected ranges settle."""
+    """Alternate between measuring around the model and fitting it, until expected ranges settle.
+
+    `followed` marks the reflectors whose phases are used.
+    """
     for _ in range(_ROUNDS):
-        responses = _measured(model, reader, state, noise)
-        equations = _Equations(model, reader, responses, state, free, followed)
+        equations = _Equations(problem, problem.measured(state), state, followed)
         fit = equations.solved()
         state = fit.state
-        if np.abs(model.range_m(state) - equations.expected_m).max() <= _SETTLED * reader.cell_m:
+        change_m = np.abs(problem.model.range_m(state) - equations.expected_m).max()
+        if change_m <= _SETTLED * problem.reader.cell_m:
             break
     return equations, fit
 
 
-class _Equations:
-    """Ranges and phases measured around a state, and what they say about the unknowns.
+@dataclass(frozen=True, eq=False)
+class _Values:
+    """Values for the ranges (m) and the phases (rad) of all responses, [channels, points] each."""
 
-    The phases of a reflector have its own phase in common, which is taken from their mean.
+    ranges: NDArray[np.float64]
+    phases: NDArray[np.float64]
+
+
+class _Equations:
+    """Equations for the unknowns, from ranges and phases measured around a state.
+
+    All phases of a reflector contain the unknown phase of the reflector itself, which is estimated
+    from their mean.
     """
 
     def __init__(
         self,
-        model: Model,
-        reader: Reader,
+        problem: _Problem,
         responses: Responses,
         state: NDArray[np.float64],
-        free: tuple[int, ...],
         followed: NDArray[np.bool_],
     ) -> None:
-        self.model, self.state, self.free = model, state, free
-        self.turn = 2 * np.pi * reader.cycles_per_m
+        self.model, self.free, self.state = problem.model, problem.free, state
+        self.turn = 2 * np.pi * problem.reader.cycles_per_m
         self.responses, self.followed = responses, followed
-        self.expected_m = model.range_m(state)
+        self.expected_m = self.model.range_m(state)
         self.use = responses.seen.copy()
 
     def solved(self) -> Fit:
-        """Return the solution, with errors beside the noise as large as the residuals tell."""
+        """Return the solution, with a misfit that explains the residuals beyond the noise."""
         misfit_m, state = 0.0, self.state
         for number in range(_ROUNDS):
             state = self._least_squares(misfit_m)
-            ranges, phases = self._residuals(state)
-            misfit_m = self._misfit_m(ranges, phases)
+            residuals = self._residuals(state)
+            misfit_m = self._misfit_m(residuals)
             if number == 0:
-                self._leave_out(ranges, phases, misfit_m)
-        chi2, freedom = self._chi2(ranges, phases, misfit_m)
+                self._leave_out_outliers(residuals, misfit_m)
+        chi2, freedom = self._chi2(residuals, misfit_m)
         scale = chi2 / freedom if freedom > 0 else 1.0
-        residual_m = np.where(self.followed, phases / self.turn, ranges)
+        slopes = self._slopes(self.state, misfit_m)
+        residual_m = np.where(self.followed, residuals.phases / self.turn, residuals.ranges)
         return Fit(
             state=state,
             free=self.free,
-            covariance=np.asarray(scale * np.linalg.pinv(self.normal(misfit_m)), np.float64),
+            covariance=np.asarray(scale * np.linalg.pinv(slopes.T @ slopes), np.float64),
             residual_m=np.where(self.use, residual_m, np.nan),
             phases=self.followed,
             misfit_m=misfit_m,
         )
 
-    def normal(self, misfit_m: float) -> NDArray[np.float64]:
-        """Return the normal matrix, [free, free]."""
-        slopes = self._slopes(self.state, misfit_m)
-        return slopes.T @ slopes
-
     def can_be_followed(self, fit: Fit) -> NDArray[np.bool_]:
-        """Return for which reflectors the fit predicts phases to a fraction of a cycle."""
+        """Return for which reflectors the fit predicts phases well within a cycle, [points]."""
         slopes = self._varying(self.model.gradient(fit.state)[list(self.free)], 0.0)
         slopes *= self.turn
         variance = np.einsum("ucp,uv,vcp->cp", slopes, fit.covariance, slopes)
@@ -214,35 +229,35 @@ class _Equations:
         return (worst <= _MOST_TURN_RAD**2) & (self.use.sum(axis=0) > 1)
 
     def agreement(self, fit: Fit) -> NDArray[np.float64]:
-        """Return how far the phases of every reflector agree, 0 to 1."""
-        _, phases = self._residuals(fit.state)
+        """Return how well the phases of each reflector agree, 0 to 1, [points]."""
+        phases = self._residuals(fit.state).phases
         total = np.abs(np.sum(np.where(self.use, np.exp(1j * phases), 0), axis=0))
         return total / np.maximum(self.use.sum(axis=0), 1)
 
-    def _deviations(self, misfit_m: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return standard deviations of ranges (m) and phases (rad), [channels, points]."""
-        ranges = np.hypot(self.responses.error_sd_m, misfit_m)
-        return ranges, np.hypot(self.responses.phase_sd_rad, self.turn * misfit_m)
+    def _deviations(self, misfit_m: float) -> _Values:
+        """Return the standard deviations for a misfit."""
+        return _Values(
+            np.hypot(self.responses.error_sd_m, misfit_m),
+            np.hypot(self.responses.phase_sd_rad, self.turn * misfit_m),
+        )
 
     def _varying(self, values: NDArray, misfit_m: float) -> NDArray:
-        """Return values less their weighted mean over the channels that see a reflector."""
-        _, deviation = self._deviations(misfit_m)
-        weight = self.use / deviation**2
+        """Return values minus their weighted mean over the channels that see a reflector."""
+        weight = self.use / self._deviations(misfit_m).phases ** 2
         mean = np.sum(weight * values, axis=-2) / np.maximum(weight.sum(axis=0), 1e-300)
         return values - mean[..., None, :]
 
-    def _residuals(
-        self, state: NDArray[np.float64], misfit_m: float = 0.0
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return residuals of ranges (m) and of phases (rad, by the sign of ranges)."""
+    def _residuals(self, state: NDArray[np.float64], misfit_m: float = 0.0) -> _Values:
+        """Return the residuals. Those of phases have the sign of the range."""
         moved_m = self.model.range_m(state) - self.expected_m
         phase = self.responses.phase_rad + self.turn * moved_m
-        _, deviation = self._deviations(misfit_m)
+        deviation = self._deviations(misfit_m).phases
         own = np.angle(np.sum(self.use * np.exp(1j * phase) / deviation**2, axis=0))
         rest = np.angle(np.exp(1j * (phase - own)))
-        return self.responses.error_m - moved_m, -self._varying(rest, misfit_m)
+        return _Values(self.responses.error_m - moved_m, -self._varying(rest, misfit_m))
 
     def _least_squares(self, misfit_m: float) -> NDArray[np.float64]:
+        """Return the state that minimises the squared residuals over their variances."""
         index = list(self.free)
         if not index or not self.use.any():
             return self.state
@@ -263,50 +278,50 @@ class _Equations:
         return at(solved.x)
 
     def _slopes(self, state: NDArray[np.float64], misfit_m: float) -> NDArray[np.float64]:
-        """Return weighted derivatives of ranges and phases, [measurements, free]."""
+        """Return the weighted derivatives of ranges and phases, [measurements, free]."""
         gradient = self.model.gradient(state)[list(self.free)]
         varying = self.turn * self._varying(gradient, misfit_m)
         columns = [
-            self._weighted((one, other), misfit_m)
-            for one, other in zip(gradient, varying, strict=True)
+            self._weighted(_Values(of_range, of_phase), misfit_m)
+            for of_range, of_phase in zip(gradient, varying, strict=True)
         ]
         return np.stack(columns, axis=-1) if columns else np.zeros((0, 0))
 
-    def _weighted(
-        self, both: tuple[NDArray[np.float64], NDArray[np.float64]], misfit_m: float
-    ) -> NDArray[np.float64]:
-        """Return what is used of ranges and phases, over their standard deviations, as one row."""
-        of_range, of_phase = self._deviations(misfit_m)
+    def _weighted(self, values: _Values, misfit_m: float) -> NDArray[np.float64]:
+        """Return the values in use over their standard deviations, as one row."""
+        deviations = self._deviations(misfit_m)
         followed = self.use & self.followed
-        return np.concatenate([(both[0] / of_range)[self.use], (both[1] / of_phase)[followed]])
+        return np.concatenate(
+            [
+                (values.ranges / deviations.ranges)[self.use],
+                (values.phases / deviations.phases)[followed],
+            ]
+        )
 
-    def _chi2(
-        self, ranges: NDArray[np.float64], phases: NDArray[np.float64], misfit_m: float
-    ) -> tuple[float, int]:
+    def _chi2(self, residuals: _Values, misfit_m: float) -> tuple[float, int]:
         """Return the sum of squared residuals over their variances, and the degrees of freedom."""
-        values = self._weighted((ranges, phases), misfit_m)
+        values = self._weighted(residuals, misfit_m)
         unknowns = len(self.free) + int((self.use & self.followed).any(axis=0).sum())
         return float(values @ values), len(values) - unknowns
 
-    def _misfit_m(self, ranges: NDArray[np.float64], phases: NDArray[np.float64]) -> float:
-        """Return the rms error beside the noise that explains the residuals.
+    def _misfit_m(self, residuals: _Values) -> float:
+        """Return the rms error in addition to the noise that explains the residuals.
 
-        Every reflector has it, so that a loud one does not outweigh the others by more than its
-        ranges are right.
+        It is the same for every reflector, so that a strong one does not outweigh the others by
+        more than the accuracy of its ranges justifies.
         """
-        if self._chi2(ranges, phases, 0.0)[0] <= max(self._chi2(ranges, phases, 0.0)[1], 0):
+        chi2, freedom = self._chi2(residuals, 0.0)
+        if chi2 <= max(freedom, 0):
             return 0.0
-        low_m, high_m = 0.0, float(np.abs(ranges[self.use]).max()) + 1e-12
+        low_m, high_m = 0.0, float(np.abs(residuals.ranges[self.use]).max()) + 1e-12
         for _ in range(50):
             middle_m = (low_m + high_m) / 2
-            chi2, freedom = self._chi2(ranges, phases, middle_m)
+            chi2, freedom = self._chi2(residuals, middle_m)
             low_m, high_m = (middle_m, high_m) if chi2 > freedom else (low_m, middle_m)
         return high_m
 
-    def _leave_out(
-        self, ranges: NDArray[np.float64], phases: NDArray[np.float64], misfit_m: float
-    ) -> None:
-        """Leave out what does not belong to its reflector."""
-        of_range, of_phase = self._deviations(misfit_m)
-        self.use &= np.abs(ranges) <= _OUTLIER * of_range
-        self.use &= ~self.followed | (np.abs(phases) <= _OUTLIER * of_phase)
+    def _leave_out_outliers(self, residuals: _Values, misfit_m: float) -> None:
+        """Leave out responses that do not belong to their reflector."""
+        deviations = self._deviations(misfit_m)
+        self.use &= np.abs(residuals.ranges) <= _OUTLIER * deviations.ranges
+        self.use &= ~self.followed | (np.abs(residuals.phases) <= _OUTLIER * deviations.phases)

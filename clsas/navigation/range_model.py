@@ -1,8 +1,8 @@
-"""Ranges of known points, as functions of time offset, sound speed and lever arm.
+"""Ranges of known points as functions of time offset, sound speed and lever arm.
 
-Ranges are those that the lines' own time axis and sound speed give. A point at range rho from the
-corrected positions is expected at (c0/c) rho - c0 dt/2, for a sound speed c where the lines say c0,
-and a time dt that is missing in them.
+The lines' own time axis and sound speed define the ranges. A point at the range rho from the
+corrected positions is expected at (c0/c) rho - c0 dt/2, where c0 is the sound speed of the lines, c
+the corrected one, and dt the time that must be added to the lines.
 """
 
 from __future__ import annotations
@@ -15,10 +15,12 @@ from numpy.typing import NDArray
 from clsas.core.geometry import pairwise_range_m
 from clsas.core.lines import RangeLines
 
+UNKNOWNS = ("time_offset", "sound_speed", "forward", "port", "up")
+
 
 @dataclass(frozen=True, eq=False)
 class Model:
-    """Ranges of points as functions of the corrections, float64 [5] as in `UNKNOWNS`.
+    """Ranges of points as functions of the corrections of `UNKNOWNS`, float64 [5].
 
     Attributes
     ----------
@@ -33,7 +35,7 @@ class Model:
     axes: NDArray[np.float64]
 
     def corrected(self, state: NDArray[np.float64]) -> RangeLines:
-        """Return the lines with corrections applied."""
+        """Return the lines with the corrections applied."""
         lines = self.lines
         speed_m_s = lines.sound_speed_m_s + float(state[1])
         ratio = speed_m_s / lines.sound_speed_m_s

@@ -9,18 +9,21 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
 
+from clsas.navigation.checks import range_cell_m
 from clsas.signal.readout import Readout
 from clsas.signal.spectrum import cycles_per_m_at
 
 LEAST_SNR = 10.0
-"""Power of a response over the noise around it, from which on it is used: 10 dB. Noise alone
-exceeds that once in 20 000 samples."""
+"""Power of a response over that of the noise around it, from which it is used (10 dB). Noise alone
+exceeds it once in 20 000 samples."""
 
-_MOST_SNR = 1e7  # lines are read to -70 dB
-_READ_AT_ONCE = 1 << 21  # samples: bounds the memory
-_LEAST_AMPLITUDE = 0.1  # of a reflector's largest; side lobes of elements are weaker
-_LARGE = 0.9  # quantile of amplitudes that counts as the largest: single lines may be louder
-_STEPS = 8  # points per resolution cell at which the envelope is read
+_MOST_SNR = 1e7  # because lines are read to -70 dB
+_READ_AT_ONCE = 1 << 21  # samples read together, which bounds the memory
+# Smallest amplitude of a response, relative to the largest ones of its reflector. Side lobes of
+# elements are weaker.
+_LEAST_AMPLITUDE = 0.1
+_LARGE = 0.9  # quantile of the powers that counts as the largest, as single lines may be louder
+_STEPS = 8  # points per range cell at which the envelope is read
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,13 +33,13 @@ class Responses:
     Attributes
     ----------
     error_m : float64 [channels, points]
-        Range of the envelope's peak less the expected one.
+        Range of the peak of the envelope minus the expected range.
     phase_rad : float64 [channels, points]
-        Phase at the expected range: that of the reflector, less what the error turns it by.
+        Phase at the expected range: that of the reflector, minus the phase of the range error.
     snr : float64 [channels, points]
-        Power of the peak over the noise around it.
+        Power of the peak over that of the noise around it.
     seen : bool [channels, points]
-        Whether the response stands out.
+        Whether the response exceeds the noise.
     bandwidth_per_m : float64 [points]
         Rms bandwidth of the responses, cycles per metre of range.
     """
@@ -49,21 +52,21 @@ class Responses:
 
     @property
     def error_sd_m(self) -> NDArray[np.float64]:
-        """Standard deviation of `error_m` by noise, [channels, points].
+        """Standard deviation of `error_m` due to noise, [channels, points].
 
-        1/(2 pi b sqrt(2 snr)) for an rms bandwidth b, the Cramer-Rao bound of a delay.
+        It is 1/(2 pi b sqrt(2 snr)) for an rms bandwidth b, the Cramer-Rao bound of a delay.
         """
         return 1 / (2 * np.pi * self.bandwidth_per_m * np.sqrt(2 * self.snr))
 
     @property
     def phase_sd_rad(self) -> NDArray[np.float64]:
-        """Standard deviation of `phase_rad` by noise, 1/sqrt(2 snr), [channels, points]."""
+        """Standard deviation of `phase_rad` due to noise, 1/sqrt(2 snr), [channels, points]."""
         return 1 / np.sqrt(2 * self.snr)
 
 
 @dataclass(frozen=True, eq=False)
 class Reader:
-    """Lines that are read around expected ranges.
+    """Range lines that are read around expected ranges.
 
     Attributes
     ----------
@@ -81,16 +84,16 @@ class Reader:
     @classmethod
     def of(cls, readout: Readout) -> Reader:
         """Return the reader of some lines."""
-        lines, spectrum = readout.lines, readout.spectrum
-        cell_m = lines.range_step_m * min(max(spectrum.oversampling, 1.0), 64.0)
-        return cls(readout, cell_m, float(cycles_per_m_at(lines, spectrum.centre)))
+        cycles_per_m = float(cycles_per_m_at(readout.lines, readout.spectrum.centre))
+        return cls(readout, range_cell_m(readout), cycles_per_m)
 
     def noise(
         self, channels: NDArray[np.int64], range_m: NDArray[np.float64], half_m: float
     ) -> NDArray[np.float64]:
-        """Return the mean power of noise around expected ranges, [points].
+        """Return the mean power of the noise around expected ranges, [points].
 
-        The median over channels and ranges, which a response in a few cells hardly changes.
+        It is estimated from the median over channels and ranges, which a response in a few range
+        cells hardly changes.
         """
         power = np.abs(self._read(channels, range_m, self._offsets_m(half_m))) ** 2
         power[power == 0] = np.nan  # beyond the ends of the lines
@@ -107,10 +110,10 @@ class Reader:
         half_m: float,
         blur: int,
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return where the largest echo around expected ranges lies, and its power.
+        """Return the offset of the largest echo from each expected range, and its power.
 
         Both are [channels, points]. Powers are means over `blur` neighbouring channels: a response
-        moves little from one to the next, and noise averages out.
+        moves little between them, and noise averages out.
         """
         offsets_m = self._offsets_m(half_m)
         power = np.abs(self._read(channels, range_m, offsets_m)) ** 2
@@ -120,11 +123,10 @@ class Reader:
     def responses(
         self, range_m: NDArray[np.float64], noise: NDArray[np.float64], half_m: float
     ) -> Responses:
-        """Return the responses of all channels within `half_m` of expected ranges."""
+        """Return the responses of all channels within `half_m` of the expected ranges."""
         channels = np.arange(len(range_m))
         offsets_m = self._offsets_m(half_m)
-        error_m, peak, phase = (np.empty(range_m.shape) for _ in range(3))
-        bend = np.empty(range_m.shape)
+        error_m, peak, phase, bend = (np.empty(range_m.shape) for _ in range(4))
         at_once = max(_READ_AT_ONCE // (range_m.shape[1] * len(offsets_m)), 1)
         for first in range(0, len(range_m), at_once):
             some = slice(first, first + at_once)
@@ -134,12 +136,11 @@ class Reader:
         snr = peak / np.maximum(noise, 1e-300)
         large = np.quantile(peak, _LARGE, axis=0)
         seen = (snr >= LEAST_SNR) & (peak >= _LEAST_AMPLITUDE**2 * large) & (bend > 0)
-        # |p|^2 falls as 1 - (2 pi b)^2 r^2 from its peak.
-        mean = np.sum(np.where(seen, bend, 0), axis=0) / np.maximum(
-            np.sum(np.where(seen, peak, 0), axis=0), 1e-300
-        )
-        least = 0.01 / self.cell_m  # cycles per metre: far below a band of this resolution
-        bandwidth = np.maximum(np.sqrt(mean) / (2 * np.pi), least)
+        # At a distance r from its peak, |p|^2 is 1 - (2 pi b)^2 r^2.
+        total_peak = np.sum(np.where(seen, peak, 0), axis=0)
+        mean_bend = np.sum(np.where(seen, bend, 0), axis=0) / np.maximum(total_peak, 1e-300)
+        least = 0.01 / self.cell_m  # cycles per metre, far below any band of this resolution
+        bandwidth = np.maximum(np.sqrt(mean_bend) / (2 * np.pi), least)
         return Responses(error_m, phase, np.clip(snr, 1e-3, _MOST_SNR), seen, bandwidth)
 
     def _offsets_m(self, half_m: float) -> NDArray[np.float64]:
@@ -153,7 +154,10 @@ class Reader:
         range_m: NDArray[np.float64],
         offsets_m: NDArray[np.float64],
     ) -> NDArray[np.complex128]:
-        """Return values in phase with a point at every range, [channels, points, offsets]."""
+        """Return values around each range, with the path's phase removed.
+
+        They are [channels, points, offsets].
+        """
         at_m = (range_m[..., None] + offsets_m).reshape(len(channels), -1)
         turns = self.readout.lines.carrier_cycles_per_m * at_m
         values = self.readout.read(channels, at_m) * np.exp(2j * np.pi * (turns - np.rint(turns)))
@@ -163,9 +167,10 @@ class Reader:
 def _vertex(
     power: NDArray[np.float64], offsets_m: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Return where powers are largest, by a parabola; the power there, and its fall per m^2.
+    """Return the offset of the largest power, that power, and its decrease per m^2.
 
-    A peak at an end of the offsets has no fall: it belongs to something outside.
+    They follow from a parabola through three points. The decrease is 0 for a peak at either end of
+    the offsets, which belongs to an echo outside of them.
     """
     best = np.argmax(power, axis=-1)
     inside = np.clip(best, 1, len(offsets_m) - 2)[..., None]

@@ -1,4 +1,4 @@
-"""Bright responses of an image, and the contributions of every ping to them."""
+"""Bright responses of an image, and what each ping contributes to them."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ from clsas.sonar.directions import track_directions
 from clsas.sonar.visibility import sines
 
 READ_DB = -40.0
-"""Accuracy of what is read of the lines."""
-_READ_AT_ONCE = 1 << 17  # samples of a thread: bounds the memory
+"""Accuracy with which the lines are read."""
+_READ_AT_ONCE = 1 << 17  # samples per thread, which bounds the memory
 
 
-def directions(lines: RangeLines, unknowns: tuple[str, ...]) -> NDArray[np.float64]:
+def displacement_axes(lines: RangeLines, unknowns: tuple[str, ...]) -> NDArray[np.float64]:
     """Return the unit vectors of "sway", "heave" and "surge" at every ping, [unknowns, pings, 3].
 
-    They point to port, up and along the track.
+    They point to port, up, and along the track.
     """
     along = track_directions(lines)[lines.ping_starts]
     sway = np.cross(np.array([0.0, 0.0, 1.0]), along)
@@ -40,19 +40,19 @@ def directions(lines: RangeLines, unknowns: tuple[str, ...]) -> NDArray[np.float
 
 @dataclass(frozen=True, eq=False)
 class Passage:
-    """The sonar's passage: its pings, and the directions in which each may be moved.
+    """Passage of the sonar: its pings, and the directions in which each may be displaced.
 
     Attributes
     ----------
     lines : RangeLines
     ping : int64 [channels]
-        Number of every channel's ping.
+        Ping of every channel.
     along_m : float64 [pings]
         Distance travelled.
     axes : float64 [unknowns, pings, 3]
         Unit vectors of the displacements that are solved for.
     wavelength_m : float
-        At the centre of the lines' band.
+        Wavelength at the centre of the lines' band.
     """
 
     lines: RangeLines
@@ -66,7 +66,7 @@ class Passage:
         """Return the passage of lines; `unknowns` are some of "sway", "heave" and "surge"."""
         steps_m = np.linalg.norm(np.diff(lines.ping_centres_m, axis=0), axis=1)
         travelled_m = np.concatenate([[0.0], np.cumsum(steps_m)])
-        axes = directions(lines, unknowns)
+        axes = displacement_axes(lines, unknowns)
         return cls(lines, lines.ping_numbers, travelled_m, axes, wavelength_m)
 
     @property
@@ -75,15 +75,19 @@ class Passage:
         return len(self.along_m)
 
     def fresnel_length_m(self, found: Contributions) -> float:
-        """Return sqrt(wavelength range/2): a straight piece of track sees no curvature over it."""
+        """Return sqrt(wavelength range/2), the length over which wavefronts are nearly plane."""
         return math.sqrt(self.wavelength_m * float(np.median(found.range_m)) / 2)
 
     def by_ping(self, values: NDArray) -> NDArray:
-        """Return sums over the channels of every ping, [pings, ...], of values [channels, ...]."""
+        """Return sums of values, [channels, ...], over the channels of each ping, [pings, ...]."""
         return np.add.reduceat(values, self.lines.ping_starts, axis=0)
 
+    def mean_by_ping(self, values: NDArray) -> NDArray:
+        """Return means of values, [channels, n], over the channels of each ping, [pings, n]."""
+        return self.by_ping(values) / np.bincount(self.ping)[:, None]
+
     def vectors_m(self, moved_m: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return displacements of the channels, [channels, 3], from those of pings.
+        """Return the displacements of channels, [channels, 3], for those of pings.
 
         `moved_m` is [unknowns, pings].
         """
@@ -91,9 +95,9 @@ class Passage:
 
 
 def brightest(image: Image, count: int, apart_m: float) -> NDArray[np.float64]:
-    """Return positions of the largest local maxima of an image, [n, 3], at most `count`.
+    """Return the positions of the largest local maxima of an image, at most `count`, [n, 3].
 
-    Each is the largest within `apart_m` along rows and columns.
+    Each is the largest pixel within `apart_m` along rows and columns.
     """
     amplitude = np.abs(image.pixels)
     size = []
@@ -106,7 +110,7 @@ def brightest(image: Image, count: int, apart_m: float) -> NDArray[np.float64]:
 
 
 def _steps_m(grid: Grid) -> list[float]:
-    """Return the distances of neighbouring pixels along rows' and columns' numbers."""
+    """Return the distances between neighbouring pixels along each axis of a grid."""
     if grid.points_m is None:
         return [float(np.linalg.norm(each)) for each in grid.vectors_m[1:]]
     steps = [np.diff(grid.points_m, axis=axis) for axis in range(grid.points_m.ndim - 1)]
@@ -120,7 +124,7 @@ class Contributions:
     Attributes
     ----------
     values : complex64 [channels, points, offsets]
-        In phase with the point displaced by every offset in range.
+        Samples at the range of the point plus each offset, with the phase of the path removed.
     gradient : float64 [unknowns, channels, points]
         Change in range per metre of displacement.
     range_m : float64 [channels, points]
@@ -150,9 +154,9 @@ def contributions(
     beam: BeamWindow | None,
     offsets_m: NDArray[np.float64] | None = None,
 ) -> Contributions:
-    """Return the contributions to points and, with offsets, to others beside them in range.
+    """Return the contributions to points and, with offsets, to ranges beside them.
 
-    `readout` reads the passage's lines, and `lines` are these, moved as far as is known.
+    `readout` reads the lines of the passage, and `lines` are the same with corrected positions.
     """
     offsets_m = np.zeros(1) if offsets_m is None else offsets_m
     shape = lines.channels, len(points_m)
@@ -184,9 +188,10 @@ def contributions(
 
 
 def received_share(found: Contributions) -> float:
-    """Return the share of the channels that receive a response: the median over the responses.
+    """Return the share of the channels that receive a response, the median over the responses.
 
-    Channels with equal power count fully, others less: (sum p)^2/(n sum p^2).
+    The share is (sum p)^2/(n sum p^2) for the powers p in n channels. Channels with equal power
+    thus count fully, and weaker ones count less.
     """
     power = np.square(np.abs(found.values[..., 0]), dtype=np.float64)
     total, squares = power.sum(axis=0), np.sum(power**2, axis=0)
@@ -205,7 +210,7 @@ def _gradient(
     ends_m = (lines.tx_m,) if monostatic else (lines.tx_m, lines.rx_m)
     total = np.zeros((*axes.shape[:2], len(points_m)))
     for end_m in ends_m:
-        # Relative to one place, so that large coordinates do not cancel.
+        # Positions are relative to one of them, so that large coordinates do not cancel.
         along_m = axes @ (points_m - end_m[0]).T
         along_m -= np.sum(axes * (end_m - end_m[0]), axis=-1)[..., None]
         total -= along_m / np.maximum(cdist(end_m, points_m), 1e-9)

@@ -1,18 +1,18 @@
-"""Errors of a navigation, from displacements between pings and the navigation's own accuracy.
+"""Errors of a navigation, estimated from displacements between pings and its own accuracy.
 
-The state of a ping is (sway, yaw): how far its array lies to port of where the navigation has it,
-and how far it is turned. A displacement between two pings, measured at the middle of their overlap,
-relates both states linearly:
+The state of a ping is (sway, yaw): how far its array lies to port of its navigated position, and
+how far it is turned from its navigated heading. A displacement between two pings, measured at the
+middle of their overlap, relates their states linearly:
 
     yaw'  = yaw + b,
     sway' = sway + yaw l - yaw' l' + a,
 
-with the measured sway a and yaw b, and l, l' the distances from either array's middle forward to
-the middle of the overlap. Before any echo the navigation's own accuracy tells how large states are:
-they are a Gauss-Markov process, which has that standard deviation at every ping and persists over
-some pings. A Kalman filter forward and the smoother of Rauch, Tung and Striebel (1965) backward
-give the states that explain both, and their covariances. A covariance is never larger than that of
-the navigation.
+where a is the measured sway, b the measured yaw, and l and l' are the distances from the middle of
+either array forward to the middle of the overlap. The prior for the states is the accuracy of the
+navigation: they form a Gauss-Markov process with the given standard deviation at every ping, which
+persists over some pings. A Kalman filter forward and a Rauch-Tung-Striebel smoother (1965) backward
+estimate the states and their covariances from both. A covariance never exceeds that of the
+navigation.
 """
 
 from __future__ import annotations
@@ -23,20 +23,22 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-_ERRORS_PER_LAG = 60  # of pings and blocks: tell the variance of independent errors to 15 %
-_DRAWS = 400  # of errors: the deviation is certain to 4 %
+# Errors, pings times blocks, that are needed per lag of the autocovariance. With 60, the variance
+# of independent errors is estimated to 15 %.
+_ERRORS_PER_LAG = 60
+_DRAWS = 400  # random tracks from which the deviation of a shape is estimated, to 4 %
 
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """Relation between the states of a ping and of the next: x' = F x + u, with an uncertain u.
+    """Relation between the states x of a ping and x' of the next one: x' = F x + u.
 
     Attributes
     ----------
     transition : float64 [n, n]
         F.
     drift : float64 [n]
-        u.
+        Expectation of u.
     spread : float64 [n, n]
         Covariance of u.
     """
@@ -52,16 +54,16 @@ class Step:
         covariance: NDArray[np.float64],
         levers_m: tuple[float, float],
     ) -> Step:
-        """Return the step of sway and yaw from a displacement at the middle of an overlap.
+        """Return the step of sway and yaw for a displacement at the middle of an overlap.
 
         Parameters
         ----------
         moved : float64 [2]
             Sway in metres and yaw in radians.
         covariance : float64 [2, 2]
-            Of both.
-        levers_m : (here, there)
-            From the middles of both arrays forward to the middle of the overlap.
+            Covariance of both.
+        levers_m : (first, second)
+            Distances from the middles of both arrays forward to the middle of the overlap.
         """
         here, there = (np.array([[1.0, lever], [0.0, 1.0]]) for lever in levers_m)
         back = np.linalg.inv(there)
@@ -74,10 +76,11 @@ class Step:
 
 
 def integrated(steps: Sequence[Step], deviations: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the states of all pings, [pings, n], by steps taken as exact.
+    """Return the states of all pings, [pings, n], when the steps are exact.
 
-    The first state is the one that keeps the track nearest to its navigation: a common shift and
-    turn. `deviations` are those of the navigation, [pings, n]; a number whose are 0 begins at 0.
+    The first state, that is, a common shift and turn, is chosen so that the track stays as near as
+    possible to its navigation. `deviations`, [pings, n], are those of the navigation. Where they
+    are 0, the first state is 0.
     """
     size = len(steps[0].drift)
     states, from_first = [np.zeros(size)], [np.eye(size)]
@@ -100,24 +103,24 @@ def smooth(
     Parameters
     ----------
     steps : sequence of Step or None, [pings - 1]
-        Relations between consecutive states; None where the echoes tell none.
+        Relations between consecutive states; None where nothing was measured.
     deviations : float64 [pings, n]
         Standard deviations of the navigation.
     correlation_pings : float
-        Pings over which errors of the navigation persist: those of two pings that are k apart have
-        the correlation exp(-k/correlation_pings).
+        Number of pings over which errors of the navigation persist: the errors of two pings that
+        are k pings apart have the correlation exp(-k/correlation_pings).
     """
     pings, size = deviations.shape
     keep = np.exp(-1 / correlation_pings)
     states, covariances = np.zeros((pings, size)), np.zeros((pings, size, size))
     covariances[0] = np.diag(deviations[0] ** 2)
-    both: list[tuple[NDArray[np.float64], NDArray[np.float64]]] = []  # of a ping and the next
+    both: list[tuple[NDArray[np.float64], NDArray[np.float64]]] = []  # a ping and the next one
     for ping, step in enumerate(steps):
         change = np.diag(keep * deviations[ping + 1] / deviations[ping])
         fresh = (1 - keep**2) * deviations[ping + 1] ** 2
         mean, covariance = _extended(states[ping], covariances[ping], change, np.diag(fresh))
         if step is not None:
-            mean, covariance = _measured(mean, covariance, step)
+            mean, covariance = _updated(mean, covariance, step)
         both.append((mean, covariance))
         states[ping + 1], covariances[ping + 1] = mean[size:], covariance[size:, size:]
     for ping in range(pings - 2, -1, -1):
@@ -139,7 +142,10 @@ def _extended(
     change: NDArray[np.float64],
     fresh: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return mean and covariance of a state and the next: `change` of it, and `fresh` noise."""
+    """Return the joint mean and covariance of a state and the next one.
+
+    The next state is `change` times the state, plus noise of the covariance `fresh`.
+    """
     across = change @ covariance
     return (
         np.concatenate([state, change @ state]),
@@ -147,15 +153,15 @@ def _extended(
     )
 
 
-def _measured(
+def _updated(
     mean: NDArray[np.float64], covariance: NDArray[np.float64], step: Step
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return mean and covariance of a state and of the next, given the step between them."""
-    seen = np.hstack([-step.transition, np.eye(len(step.drift))])
-    spread = seen @ covariance @ seen.T + step.spread
-    gain = np.linalg.solve(spread, seen @ covariance).T
-    covariance = covariance - gain @ seen @ covariance
-    return mean + gain @ (step.drift - seen @ mean), (covariance + covariance.T) / 2
+    """Return the joint mean and covariance of a state and the next one, given their step."""
+    observed = np.hstack([-step.transition, np.eye(len(step.drift))])
+    spread = observed @ covariance @ observed.T + step.spread
+    gain = np.linalg.solve(spread, observed @ covariance).T
+    covariance = covariance - gain @ observed @ covariance
+    return mean + gain @ (step.drift - observed @ mean), (covariance + covariance.T) / 2
 
 
 def shape_deviation_m(
@@ -163,9 +169,9 @@ def shape_deviation_m(
 ) -> NDArray[np.float64]:
     """Return the standard deviation of a track's sway without a common shift and turn, [pings].
 
-    Errors of the displacements from ping to ping (sway and yaw, [pings - 1]) add up along a track
-    that advances by `advance_m` each. What is left of many random draws beside their straight lines
-    tells how certain the track's shape is, which is what an image needs.
+    The sharpness of an image depends on this part of the sway alone. Errors of the displacements
+    from ping to ping (sway and yaw, [pings - 1]) add up along a track that advances by `advance_m`,
+    [pings - 1]. The deviation is that of many random tracks from the straight lines fitted to them.
     """
     random = np.random.default_rng(0)
     shape = _DRAWS, len(advance_m)
@@ -173,18 +179,19 @@ def shape_deviation_m(
     before = np.concatenate([np.zeros((_DRAWS, 1)), yaw[:, :-1]], axis=1)
     steps_m = random.standard_normal(shape) * sway_sd_m + advance_m * (before + yaw) / 2
     sway_m = np.concatenate([np.zeros((_DRAWS, 1)), np.cumsum(steps_m, axis=1)], axis=1)
-    at_m = np.concatenate([[0.0], np.cumsum(advance_m)])
-    line, _ = np.linalg.qr(np.stack([np.ones_like(at_m), at_m], axis=1))
+    along_m = np.concatenate([[0.0], np.cumsum(advance_m)])
+    line, _ = np.linalg.qr(np.stack([np.ones_like(along_m), along_m], axis=1))
     return np.sqrt(np.mean((sway_m - sway_m @ line @ line.T) ** 2, axis=0))
 
 
 def persistence(scatter: NDArray[np.float64]) -> float:
-    """Return the variance of a sum of errors over that of independent ones, at least 1.
+    """Return the variance of a sum of errors over that of independent errors, at least 1.
 
-    Echoes stay in the beam for many pings, and so do the errors that they make. They differ between
-    blocks of range: `scatter`, [pings - 1, blocks], is how far every block is off the joint
-    displacement. Its covariance from ping to ping tells, weighted by a triangle (Newey and West
-    1987), over as many pings as all blocks together tell. One block or few pings do not tell: 1.
+    Echoes stay in the beam for many pings, and so do the errors that they cause. These errors
+    differ between blocks of range: `scatter`, [pings - 1, blocks], is the deviation of each block
+    from the joint displacement. The variance of the sum is estimated from the autocovariance of
+    `scatter`, weighted by a triangle (Newey and West 1987). The number of lags grows with the
+    number of errors. One block or a few pings are not enough, and the result is 1.
     """
     count, blocks = scatter.shape
     lags = min(count - 1, int(count * blocks / _ERRORS_PER_LAG))

@@ -1,4 +1,4 @@
-"""Autofocus against tracks that it is not told."""
+"""Autofocus of lines whose navigation does not contain the motion of the sonar."""
 
 import json
 import math
@@ -47,9 +47,9 @@ CASES = "points-smooth", "points-beyond-resolution", "speckle-smooth"
 def test_smooth_sway_is_found(name):
     scene = SCENES[name]
     sway_m = scene.sway_m
-    true, told = recorded(scene.targets, sway_m)
-    found = autofocus(told, GRID)
-    assert peak_db(told, true) < -3
+    true, nominal = recorded(scene.targets, sway_m)
+    found = autofocus(nominal, GRID)
+    assert peak_db(nominal, true) < -3
     assert abs(peak_db(found.lines, true)) <= 0.3
     assert smooth_residual_m(found.correction_m[:, 1] - sway_m) <= WAVELENGTH_M / 100
     assert found.focused
@@ -59,21 +59,21 @@ def test_smooth_sway_is_found(name):
 @pytest.mark.slow
 def test_smooth_sway_and_jitter():
     sway_m = smooth_m(2 * WAVELENGTH_M) + white_m(0.05 * WAVELENGTH_M)
-    true, told = recorded(points(), sway_m)
-    found = autofocus(told, GRID)
+    true, nominal = recorded(points(), sway_m)
+    found = autofocus(nominal, GRID)
     assert abs(peak_db(found.lines, true)) <= 0.5
     assert smooth_residual_m(found.correction_m[:, 1] - sway_m) <= WAVELENGTH_M / 100
 
 
 @pytest.mark.slow
 def test_jitter_alone():
-    true, told = recorded(points(), white_m(0.1 * WAVELENGTH_M))
-    assert peak_db(told, true) < -3
-    assert abs(peak_db(autofocus(told, GRID).lines, true)) <= 1.0
+    true, nominal = recorded(points(), white_m(0.1 * WAVELENGTH_M))
+    assert peak_db(nominal, true) < -3
+    assert abs(peak_db(autofocus(nominal, GRID).lines, true)) <= 1.0
 
 
 @pytest.mark.slow
-def test_an_image_in_focus_stays_so():
+def test_a_focused_image_stays_focused():
     true, _ = recorded(points(), np.zeros(PINGS))
     found = autofocus(true, GRID)
     assert abs(10 * np.log10(found.sharpness_after / found.sharpness_before)) <= 0.1
@@ -81,18 +81,18 @@ def test_an_image_in_focus_stays_so():
 
 
 @pytest.mark.slow
-def test_speckle_is_reported_not_focused():
-    _, told = recorded(speckle(0), smooth_m(0.5 * WAVELENGTH_M))
+def test_speckle_alone_is_not_focused():
+    _, nominal = recorded(speckle(0), smooth_m(0.5 * WAVELENGTH_M))
     with pytest.warns(ClsasWarning, match="no bright responses"):
-        found = autofocus(told, GRID)
+        found = autofocus(nominal, GRID)
     assert not found.focused
-    np.testing.assert_array_equal(found.lines.tx_m, told.tx_m)
+    np.testing.assert_array_equal(found.lines.tx_m, nominal.tx_m)
 
 
 def seen_from_above(motion, unknowns):
-    """What autofocus finds of a track above the scene, and the peak beside that of the true track.
+    """Return the result for a track above the scene, and its peak relative to the true track's.
 
-    Responses are seen at different angles, which tell displacements apart.
+    Responses are seen at different depression angles, which distinguishes sway from heave.
     """
     course = (0, 0, 12.0), (STEP_M, 0, 0), PINGS, 1.0
     track = clsas.Track.straight(*course, **motion)
@@ -102,12 +102,12 @@ def seen_from_above(motion, unknowns):
     true = clsas.compress(clsas.simulate(SONAR, track, scene, element_pattern=True,
         pointing=clsas.Pointing.broadside(depression_rad=0.6)))  # fmt: skip
     geometry = clsas.channels(SONAR, clsas.Track.straight(*course))
-    told = replace(true, tx_m=geometry.tx_m, rx_m=geometry.rx_m)
+    nominal = replace(true, tx_m=geometry.tx_m, rx_m=geometry.rx_m)
     grid = clsas.Grid.plane(x=(1.5, 6.5, 256), y=(8.0, 21.0, 700))
-    found = autofocus(told, grid, unknowns=unknowns)
+    found = autofocus(nominal, grid, unknowns=unknowns)
     peaks = [
         20 * np.log10(np.abs(clsas.factorize(each, grid, -40.0).pixels).max())
-        for each in (told, found.lines, true)
+        for each in (nominal, found.lines, true)
     ]
     assert peaks[0] < peaks[2] - 1
     return found, peaks[1] - peaks[2]
@@ -116,14 +116,14 @@ def seen_from_above(motion, unknowns):
 @pytest.mark.slow
 @pytest.mark.parametrize(("wavelengths", "most"), [(0.3, 1 / 100), (2.0, 1 / 20)])
 def test_sway_and_heave(wavelengths, most):
-    """Both are found together, also where they are beyond the range resolution."""
+    """Both are found together, even if they exceed the range resolution."""
     motion = {
         "sway_m": smooth_m(wavelengths * WAVELENGTH_M, 2),
         "heave_m": smooth_m(wavelengths * WAVELENGTH_M, 3),
     }
     found, peak = seen_from_above(motion, ("sway", "heave"))
-    for axis, wanted_m in zip((1, 2), motion.values(), strict=True):
-        residual_m = detrended(found.correction_m[:, axis] - wanted_m)
+    for axis, true_m in zip((1, 2), motion.values(), strict=True):
+        residual_m = detrended(found.correction_m[:, axis] - true_m)
         assert np.std(gaussian_filter1d(residual_m, 12)) <= most * WAVELENGTH_M
     assert abs(peak) <= 0.3
 
@@ -136,16 +136,16 @@ def test_sway_and_heave_of_single_pings():
     }
     found, peak = seen_from_above(motion, ("sway", "heave"))
     assert abs(peak) <= 0.5
-    wanted_m = np.stack(list(motion.values()), axis=1)
-    residual_m = found.correction_m[:, 1:] - wanted_m
+    true_m = np.stack(list(motion.values()), axis=1)
+    residual_m = found.correction_m[:, 1:] - true_m
     residual_m = np.stack([detrended(each) for each in residual_m.T], axis=1)
-    # Single axes scatter by a tenth between seeds.
-    assert np.std(residual_m) <= 0.6 * np.std(wanted_m)
+    # The results of single axes vary by a tenth between seeds.
+    assert np.std(residual_m) <= 0.6 * np.std(true_m)
 
 
 @pytest.mark.slow
 def test_surge():
-    """Displacements along the track move responses from one subaperture to the next."""
+    """Displacements along the track move responses between images of subapertures."""
     found, peak = seen_from_above({"surge_m": smooth_m(WAVELENGTH_M, 2)}, ("surge",))
     assert found.sharpness_after > 1.9 * found.sharpness_before
     assert abs(peak) <= 0.3
@@ -154,18 +154,18 @@ def test_surge():
 @pytest.mark.slow
 @pytest.mark.skipif(not RECORDED.exists(), reason=f"no recorded data at {RECORDED}")
 @pytest.mark.parametrize(("smooth", "white"), RADAR_ERRORS)
-def test_a_recorded_pass_comes_back(smooth, white):
-    """A radar's track is displaced; left alone, it is not made worse."""
+def test_displacements_of_a_recorded_pass_are_undone(smooth, white):
+    """The track of a radar is displaced. Without displacement, autofocus does not degrade it."""
     lines = radar_pass(RECORDED)
-    told, given_db = swaying(lines, smooth, white), reflector_db(lines)
-    found = autofocus(told, RADAR_GRID)
+    nominal, given_db = swaying(lines, smooth, white), reflector_db(lines)
+    found = autofocus(nominal, RADAR_GRID)
     assert found.focused
-    assert reflector_db(told) - given_db < -2 or not smooth + white
+    assert reflector_db(nominal) - given_db < -2 or not smooth + white
     assert reflector_db(found.lines) - given_db >= (-0.3 if smooth + white else 0.0)
 
 
 def with_carrier(lines):
-    """Lines whose samples hold the carrier still: finer ones, of no carrier."""
+    """Return lines whose samples still have their carrier, which need a smaller range step."""
     finer = math.ceil(4 * lines.range_step_m * lines.carrier_cycles_per_m)
     samples = resample(lines.samples, finer * lines.length, axis=1)
     step_m = lines.range_step_m / finer
@@ -175,47 +175,47 @@ def with_carrier(lines):
 
 
 @pytest.mark.slow
-def test_lines_that_hold_their_carrier_still_are_focused_alike():
+def test_lines_with_their_carrier_are_focused_alike():
     sway_m = smooth_m(2 * WAVELENGTH_M)
-    _, told = recorded(points(), sway_m)
-    usual, found = autofocus(told, GRID), autofocus(with_carrier(told), GRID)
+    _, nominal = recorded(points(), sway_m)
+    usual, found = autofocus(nominal, GRID), autofocus(with_carrier(nominal), GRID)
     assert found.focused
     assert np.abs(found.correction_m - usual.correction_m).max() <= WAVELENGTH_M / 30
     assert smooth_residual_m(found.correction_m[:, 1] - sway_m) <= WAVELENGTH_M / 100
 
 
 @pytest.mark.slow
-def test_pings_that_receive_nothing_are_left_where_they_are():
-    true, told = recorded(points(), smooth_m(2 * WAVELENGTH_M))
+def test_pings_that_receive_nothing_do_no_harm():
+    true, nominal = recorded(points(), smooth_m(2 * WAVELENGTH_M))
     silent = np.arange(PINGS) < 50
-    samples = np.where(silent[:, None], 0, told.samples)
-    found = autofocus(replace(told, samples=samples), GRID)
-    heard = replace(true, samples=samples)
+    samples = np.where(silent[:, None], 0, nominal.samples)
+    found = autofocus(replace(nominal, samples=samples), GRID)
+    received = replace(true, samples=samples)
     assert found.focused
-    assert abs(peak_db(found.lines, heard)) <= 0.3
+    assert abs(peak_db(found.lines, received)) <= 0.3
     assert np.isfinite(found.correction_m).all()
 
 
 def test_bad_arguments():
-    _, told = recorded(points(), np.zeros(PINGS))
+    _, nominal = recorded(points(), np.zeros(PINGS))
     with pytest.raises(ValueError, match="at least 10 pings"):
-        autofocus(told.select(slice(0, 9)), GRID)
+        autofocus(nominal.select(slice(0, 9)), GRID)
     with pytest.raises(ValueError, match="unknowns"):
-        autofocus(told, GRID, unknowns=("roll",))
+        autofocus(nominal, GRID, unknowns=("roll",))
     with pytest.raises(ValueError, match="unknowns"):
-        autofocus(told, GRID, unknowns=())
+        autofocus(nominal, GRID, unknowns=())
     with pytest.raises(TypeError, match="lines"):
-        autofocus(told.samples, GRID)
+        autofocus(nominal.samples, GRID)
     with pytest.raises(TypeError, match="grid"):
-        autofocus(told, None)
+        autofocus(nominal, None)
     with pytest.raises(ValueError, match=r"carrier_hz must be that of the lines, .* got 0 Hz"):
-        autofocus(replace(told, carrier_hz=0.0), GRID)
+        autofocus(replace(nominal, carrier_hz=0.0), GRID)
 
 
 @pytest.mark.slow
 def test_the_command(tmp_path):
-    true, told = recorded(points(), smooth_m(0.3 * WAVELENGTH_M))
-    clsas.save(tmp_path / "lines.h5", told)
+    true, nominal = recorded(points(), smooth_m(0.3 * WAVELENGTH_M))
+    clsas.save(tmp_path / "lines.h5", nominal)
     result = CliRunner().invoke(
         main,
         ["focus", str(tmp_path / "lines.h5"), "-o", str(tmp_path / "focused.h5"), "--json"]
@@ -230,11 +230,11 @@ def test_the_command(tmp_path):
 
 @pytest.mark.slow
 def test_a_gap_of_the_track():
-    """Pings beyond a gap are focused with the others; no subaperture lies in the gap."""
+    """Pings beyond a gap are focused with the others, and no subaperture lies in the gap."""
     kept = np.r_[0:190, 240:PINGS]
     sway_m = smooth_m(0.3 * WAVELENGTH_M)
-    true, told = recorded(points(), sway_m)
-    found = autofocus(told.select(kept), GRID)
+    true, nominal = recorded(points(), sway_m)
+    found = autofocus(nominal.select(kept), GRID)
     assert np.isfinite(found.lines.tx_m).all()
     assert abs(peak_db(found.lines, true.select(kept))) <= 1.0
 
@@ -242,49 +242,49 @@ def test_a_gap_of_the_track():
 @pytest.mark.filterwarnings("default::clsas.core.validate.ClsasWarning")
 @pytest.mark.parametrize("case", ["zeros", "beyond", "one pixel"])
 def test_nothing_to_focus_on(case):
-    _, told = recorded(points(), np.zeros(PINGS))
+    _, nominal = recorded(points(), np.zeros(PINGS))
     grid = GRID
     if case == "zeros":
-        told = replace(told, samples=np.zeros_like(told.samples))
+        nominal = replace(nominal, samples=np.zeros_like(nominal.samples))
     elif case == "beyond":
         grid = clsas.Grid.plane(x=(0, 1, 20), y=(900, 901, 20))
     else:
         grid = clsas.Grid.plane(x=(3, 3, 1), y=(19, 19, 1))
-    with pytest.warns(ClsasWarning, match=r"no bright responses to focus on: the grid shows [01] "):
-        found = autofocus(told, grid)
+    with pytest.warns(ClsasWarning, match=r"no bright responses to focus on: the grid has [01] "):
+        found = autofocus(nominal, grid)
     assert not found.focused
-    np.testing.assert_array_equal(found.lines.tx_m, told.tx_m)
+    np.testing.assert_array_equal(found.lines.tx_m, nominal.tx_m)
 
 
-def test_unknowns_that_look_alike():
-    """From one elevation angle sway and heave change ranges alike."""
+def test_unknowns_that_cannot_be_distinguished():
+    """At a single elevation angle, sway and heave change ranges alike."""
     course = (0, 0, 12.0), (STEP_M, 0, 0), PINGS, 1.0
     at = [[x, 18.0, 0.0] for x in np.linspace(2, 6, 20)]
     scene = clsas.PointTargets(at, np.ones(20))
     lines = clsas.compress(clsas.simulate(SONAR, clsas.Track.straight(*course), scene))
     grid = clsas.Grid.plane(x=(1.5, 6.5, 320), y=(17.9, 18.1, 16))
-    with pytest.raises(ValueError, match="sway, heave cannot be told apart"):
+    with pytest.raises(ValueError, match="sway, heave cannot be distinguished"):
         autofocus(lines, grid, unknowns=("sway", "heave"))
 
 
-def test_an_unknown_that_responses_do_not_see():
-    _, told = recorded(points(), np.zeros(PINGS))
+def test_an_unknown_that_changes_no_range():
+    _, nominal = recorded(points(), np.zeros(PINGS))
     with pytest.raises(ValueError, match="heave of 1 m changes it by"):
-        autofocus(told, GRID, unknowns="heave")
+        autofocus(nominal, GRID, unknowns="heave")
     with pytest.raises(TypeError, match="unknowns must be one or several"):
-        autofocus(told, GRID, unknowns=3)
+        autofocus(nominal, GRID, unknowns=3)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("scale", [1e-25, 1e10, 1e30])
 def test_the_level_of_samples_does_not_matter(scale):
-    """Recorders count in volts or in integers of 32 bits."""
+    """Recorders use units from volts to 32-bit integers."""
     scene = SCENES["points-smooth"]
-    true, told = recorded(scene.targets, scene.sway_m)
-    loud = replace(told, samples=(told.samples * scale).astype(np.complex64))
+    true, nominal = recorded(scene.targets, scene.sway_m)
+    loud = replace(nominal, samples=(nominal.samples * scale).astype(np.complex64))
     found = autofocus(loud, GRID)
     assert found.focused
-    assert abs(peak_db(replace(found.lines, samples=told.samples), true)) <= 0.3
+    assert abs(peak_db(replace(found.lines, samples=nominal.samples), true)) <= 0.3
     assert np.array_equal(found.lines.samples, loud.samples)
     assert smooth_residual_m(found.correction_m[:, 1] - scene.sway_m) <= WAVELENGTH_M / 100
 
@@ -292,12 +292,12 @@ def test_the_level_of_samples_does_not_matter(scale):
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [4, 5])
 def test_two_bright_points_are_too_few(seed):
-    """The scene is told as one without responses, or its track is found: never in between."""
+    """Either the scene is reported as having no responses, or the track is found."""
     sway_m = smooth_m(2 * WAVELENGTH_M, seed)
-    _, told = recorded(speckle(2), sway_m)
+    _, nominal = recorded(speckle(2), sway_m)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        found = autofocus(told, GRID)
+        found = autofocus(nominal, GRID)
     if found.focused:
         assert smooth_residual_m(found.correction_m[:, 1] - sway_m) <= WAVELENGTH_M / 16
     else:

@@ -1,4 +1,4 @@
-"""Micronavigation over few reflectors, and how certain it is of a navigation that is right."""
+"""Micronavigation over few reflectors, and its uncertainty if the navigation is correct."""
 
 import dataclasses
 
@@ -20,8 +20,8 @@ from clsas.navigation.micronavigation import micronavigate
 NEAR_M, FAR_M = 12.0, 16.0
 
 
-def right(scene_of, pings):
-    """Lines of a straight track, as their navigation says."""
+def correct(scene_of, pings):
+    """Return lines of a straight track, which the navigation contains."""
     sonar, advance_m = overlapping_array(56, 24)
     track = clsas.Track.straight((0, 0, 0), (advance_m, 0, 0), pings, 1.0)
     echoes = clsas.simulate(sonar, track, scene_of(track), range_m=(NEAR_M - 0.5, FAR_M + 0.5))
@@ -29,7 +29,7 @@ def right(scene_of, pings):
 
 
 def reflectors(count, seed):
-    """Points in front of the middle of a track."""
+    """Return a function that places points abeam of the middle of a track."""
     random = np.random.default_rng(seed)
 
     def scene(track):
@@ -48,46 +48,46 @@ def navigate(lines, **options):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("count", "noise"), [(1, False), (1, True), (3, False)])
-def test_few_reflectors_do_not_tell_a_yaw(count, noise):
-    """Their directions look like one."""
-    lines = right(reflectors(count, 3), 8)
+def test_few_reflectors_do_not_determine_yaw(count, noise):
+    """Their directions look like a yaw."""
+    lines = correct(reflectors(count, 3), 8)
     if noise:
         lines = with_noise(lines, 0.95, np.random.default_rng(count))
-    with pytest.raises(ValueError, match=r"those of about .* reflectors, at least 8"):
+    with pytest.raises(ValueError, match=r"from about .* reflectors; at least 8"):
         navigate(lines)
-    with pytest.raises(ValueError, match=r"reflectors, at least 8|must be coherent"):
+    with pytest.raises(ValueError, match=r"reflectors; at least 8|must be coherent"):
         navigate(lines, element_length_m=WAVELENGTH_M)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("count", [1, 3])
-def test_few_reflectors_tell_a_sway(count):
-    found = navigate(right(reflectors(count, 4), 8), unknowns=("sway",))
+def test_few_reflectors_determine_sway(count):
+    found = navigate(correct(reflectors(count, 4), 8), unknowns=("sway",))
     assert np.abs(found.sway_steps_m).max() <= 1e-6 + 3 * found.sway_steps_sd_m.max()
     assert np.std(detrended(found.sway_m)) <= 3 * found.shape_sd_m.max()
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("count", [12, 30])
-def test_deviations_over_some_reflectors_are_true(count):
-    """All lie near broadside, and an even seabed is expected."""
-    found = navigate(right(reflectors(count, 5), 12), element_length_m=WAVELENGTH_M)
-    wrong_rad = np.sqrt(np.mean(found.yaw_steps_rad**2))
-    assert wrong_rad <= 2 * np.sqrt(np.mean(found.yaw_steps_sd_rad**2))
+def test_deviations_over_some_reflectors_match_the_errors(count):
+    """All reflectors are near broadside, whereas the filters expect an even seabed."""
+    found = navigate(correct(reflectors(count, 5), 12), element_length_m=WAVELENGTH_M)
+    error_rad = np.sqrt(np.mean(found.yaw_steps_rad**2))
+    assert error_rad <= 2 * np.sqrt(np.mean(found.yaw_steps_sd_rad**2))
 
 
 @pytest.mark.slow
-def test_one_window_tells_how_errors_persist():
-    """Of a navigation that is right. One window is the default for a short swath."""
-    wrong_m, told_m = [], []
+def test_one_window_shows_how_errors_persist():
+    """One window is the default for a short swath."""
+    error_m, reported_m = [], []
     for seed in (20, 26):
-        lines = right(lambda track, seed=seed: seabed(track, NEAR_M, FAR_M, 5000, seed=seed), 40)
+        lines = correct(lambda track, seed=seed: seabed(track, NEAR_M, FAR_M, 5000, seed=seed), 40)
         found = navigate(lines, element_length_m=WAVELENGTH_M)
         assert found.coherence.shape[1] == 1
         assert found.persistence > 1
-        wrong_m.append(np.std(detrended(found.lines.ping_centres_m[:, 1])))
-        told_m.append(np.sqrt(np.mean(found.shape_sd_m**2)))
-    assert np.sqrt(np.mean(np.square(wrong_m))) <= 1.4 * np.sqrt(np.mean(np.square(told_m)))
+        error_m.append(np.std(detrended(found.lines.ping_centres_m[:, 1])))
+        reported_m.append(np.sqrt(np.mean(found.shape_sd_m**2)))
+    assert np.sqrt(np.mean(np.square(error_m))) <= 1.4 * np.sqrt(np.mean(np.square(reported_m)))
 
 
 def window(samples):
@@ -96,7 +96,7 @@ def window(samples):
 
 
 def test_echoes_are_counted():
-    """Points with slopes count one by one, speckle by its independent samples."""
+    """Points with slopes count one by one, and speckle counts by its independent samples."""
     random = np.random.default_rng(0)
     white = random.standard_normal((2, 4, 400, 2)) @ [1, 1j]
     speckle = white[0], white[1]
@@ -122,14 +122,14 @@ def test_blocks_add_up_to_the_correlation(lag):
 
 @pytest.mark.slow
 def test_a_few_pairs_of_few_echoes_are_used_and_counted():
-    """The first pings see speckle, and the last ones hardly anything but one bright corner."""
-    lines = right(lambda track: seabed(track, NEAR_M, FAR_M, 5000, seed=3), 16)
-    bright = right(reflectors(1, 3), 16)
+    """The first pings see speckle, and the last ones little more than one bright corner."""
+    lines = correct(lambda track: seabed(track, NEAR_M, FAR_M, 5000, seed=3), 16)
+    bright = correct(reflectors(1, 3), 16)
     samples = lines.samples.copy()
     last = slice(lines.ping_starts[12], None)
     samples[last] = 1e-3 * samples[last] + bright.samples[last, : lines.length]
     mixed = dataclasses.replace(lines, samples=samples)
     bridged = pytest.warns(clsas.ClsasWarning, match="1 of 15 pairs of pings are not coherent")
-    with bridged, pytest.warns(clsas.ClsasWarning, match="3 of 15 pairs .* hold the echoes of few"):
+    with bridged, pytest.warns(clsas.ClsasWarning, match="3 of 15 pairs .* have echoes of few"):
         found = navigate(mixed)
     assert np.isfinite(found.yaw_steps_sd_rad[12:]).all()

@@ -17,7 +17,7 @@ from clsas.signal.readout import Readout
 
 
 def found_halt(lines, grid):
-    """First and last ping of a halt, by the brightest responses of the image."""
+    """Return the first and last ping of a halt, from the brightest responses of the image."""
     readout = Readout.of(lines, READ_DB)
     passage = Passage.of(lines, ("sway",), mean_wavelength_m(readout))
     points_m = brightest(clsas.factorize(lines, grid, -30), 40, 0.1)
@@ -25,7 +25,7 @@ def found_halt(lines, grid):
 
 
 def standing(scene, coherence, seed, *, still=PINGS):
-    """Lines of `still` pings from one place, and others along a track; the navigation moves."""
+    """Return lines of `still` pings at one position and others along a track, all navigated."""
     course = clsas.Track.straight((0, 0, 0), (STEP_M, 0, 0), PINGS, 1.0)
     lines, _ = recorded(scene, np.zeros(PINGS))
     samples = lines.samples.copy()
@@ -39,34 +39,36 @@ def standing(scene, coherence, seed, *, still=PINGS):
 @pytest.mark.parametrize(
     ("scene", "coherence"), [(points, 0.99), (points, 0.5), (lambda seed: speckle(20, seed), 0.99)]
 )
-def test_a_platform_that_stood_still_is_named(scene, coherence, seed):
-    told = standing(scene(seed), coherence, seed)
+def test_a_platform_that_stood_still_is_reported(scene, coherence, seed):
+    nominal = standing(scene(seed), coherence, seed)
     with pytest.warns(ClsasWarning, match="pings 0 to 399 receive the same echoes"):
-        found = autofocus(told, GRID)
+        found = autofocus(nominal, GRID)
     assert not found.focused
-    np.testing.assert_array_equal(found.lines.tx_m, told.tx_m)
+    np.testing.assert_array_equal(found.lines.tx_m, nominal.tx_m)
 
 
 @pytest.mark.slow
-def test_a_halt_that_the_navigation_does_not_have():
-    """The platform stands for the first 200 pings, and moves from there on."""
-    told = standing(points(3), 0.99, 0, still=200)
+def test_a_halt_of_some_pings_is_reported():
+    """The platform stands still for the first 200 pings, and then moves."""
+    nominal = standing(points(3), 0.99, 0, still=200)
     with pytest.warns(ClsasWarning, match=r"pings 0 to (159|239) receive the same echoes"):
-        assert not autofocus(told, GRID).focused
+        assert not autofocus(nominal, GRID).focused
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("loud", [1.0, 30.0])
 def test_a_passage_is_no_halt(loud):
-    """Nor where one response abeam outshines all others."""
+    """This holds even if one response abeam is much brighter than all others."""
     scene = points(2)
     at = np.vstack([scene.positions_m, [[4.0, 19.5, 0.0]]])
-    _, told = recorded(clsas.PointTargets(at, np.append(scene.amplitudes, loud)), np.zeros(PINGS))
-    assert found_halt(told, GRID) is None
+    _, nominal = recorded(
+        clsas.PointTargets(at, np.append(scene.amplitudes, loud)), np.zeros(PINGS)
+    )
+    assert found_halt(nominal, GRID) is None
 
 
 def test_a_circle_about_the_brightest_response_is_no_halt():
-    """Its range is the same in every ping, as the navigation says."""
+    """Its range is the same in every ping, as the navigation predicts."""
     angle = np.linspace(-0.25, 0.25, 200)
     at = 20.0 * np.stack([np.sin(angle), 1 - np.cos(angle), 0 * angle], axis=1)
     random = np.random.default_rng(1)

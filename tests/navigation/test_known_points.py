@@ -1,4 +1,4 @@
-"""Calibration by known points against offsets that it is not told."""
+"""Calibration with known points against offsets of the lines."""
 
 import json
 import re
@@ -14,7 +14,6 @@ from clsas.cli import main
 from clsas.core.validate import ClsasWarning
 from clsas.navigation.known_points import UNKNOWNS, calibrate_track
 
-SPEED_M_S = 1500.0  # that lines claim
 SONAR = clsas.Sonar(
     clsas.Pulse(100e3, 30e3, 1e-3),
     [[0.0, 0.0, 0.0]],
@@ -28,7 +27,7 @@ SIZES = {"time_offset": 1e-6, "sound_speed": 0.1, "forward": 1e-3, "port": 1e-3,
 
 
 def passage(pings=160, length_m=8.0):
-    """A track with pitch, roll and a turn, so that the lever arm shows."""
+    """Return a track that turns and rolls, so that the lever arm matters."""
     at = np.arange(pings) * length_m / (pings - 1)
     yaw = np.radians(4) * np.sin(at)
     positions = np.stack([at, 0.1 * np.sin(0.7 * at), 5 + 0.05 * np.cos(at)], axis=1)
@@ -41,8 +40,8 @@ def true_lines(points=POINTS, amplitudes=(1.0, 0.5, 2.0, 1.0), track=None, sonar
     return clsas.compress(echoes)
 
 
-def claimed(lines, track, offsets, sonar_speed=1490.0):
-    """The lines with faults that a calibration must undo."""
+def with_offsets(lines, track, offsets, sonar_speed=1490.0):
+    """Return lines with offsets that a calibration must undo."""
     shift = np.array([offsets.get(name, 0.0) for name in UNKNOWNS[2:]])
     vectors = np.einsum("pij,j->pi", track.rotations.as_matrix(), shift)
     vectors = np.repeat(vectors, lines.channels // track.pings, axis=0)
@@ -60,7 +59,7 @@ def claimed(lines, track, offsets, sonar_speed=1490.0):
 
 
 def with_noise(lines, snr_db, rng):
-    """Lines with noise of their own band, so far below the strongest sample."""
+    """Return lines with noise of their own band, at a level below the strongest sample."""
     spectrum = np.sqrt(np.mean(np.abs(np.fft.fft(lines.samples, axis=1)) ** 2, axis=0))
     white = rng.standard_normal((*lines.samples.shape, 2)) @ [1, 1j]
     noise = np.fft.ifft(np.fft.fft(white, axis=1) * spectrum, axis=1)
@@ -79,7 +78,7 @@ def errors(found, true=TRUE):
 
 
 def test_all_offsets_are_found_at_once(lines):
-    given = claimed(with_noise(lines, 45, np.random.default_rng(0)), passage(), TRUE)
+    given = with_offsets(with_noise(lines, 45, np.random.default_rng(0)), passage(), TRUE)
     found = calibrate_track(given, POINTS, unknowns=UNKNOWNS, track=passage(), search_m=0.8)
     assert found.unknowns == UNKNOWNS
     assert not found.held
@@ -95,39 +94,39 @@ def test_all_offsets_are_found_at_once(lines):
 
 
 def peaks_db(lines, reference):
-    """Levels of the image at the points, relative to those of other lines' images."""
+    """Return the levels of an image at the points, relative to the image of other lines."""
     grid = clsas.Grid.points(POINTS[None])
     levels = [np.abs(clsas.backproject(each, grid).pixels) for each in (lines, reference)]
     return 20 * np.log10(levels[0] / levels[1])[0]
 
 
-def test_every_reflector_is_sharp_at_its_place(lines):
-    given = claimed(with_noise(lines, 45, np.random.default_rng(0)), passage(), TRUE)
+def test_every_reflector_is_focused_at_its_position(lines):
+    given = with_offsets(with_noise(lines, 45, np.random.default_rng(0)), passage(), TRUE)
     assert peaks_db(given, lines).max() < -10
     found = calibrate_track(given, POINTS, unknowns=UNKNOWNS, track=passage(), search_m=0.8)
     assert np.abs(peaks_db(found.lines, lines)).max() < 0.1
 
 
-def test_no_reflector_gets_sharp_at_the_others_expense(lines):
-    """A navigation that drifts by 2 mm: the loudest point alone would take all corrections."""
+def test_no_reflector_is_focused_at_the_expense_of_others(lines):
+    """The navigation drifts by 2 mm. The strongest point must not determine all corrections."""
     drift = 2e-3 * np.sin(np.arange(160) / 12)[:, None] * np.array([0, 1, 0])
     drifting = replace(lines, tx_m=lines.tx_m + drift, rx_m=lines.rx_m + drift)
     amplitudes = 1.0, 0.1, 10.0, 1.0
     loud = true_lines(amplitudes=amplitudes)
-    given = claimed(replace(loud, tx_m=drifting.tx_m, rx_m=drifting.rx_m), passage(), TRUE)
+    given = with_offsets(replace(loud, tx_m=drifting.tx_m, rx_m=drifting.rx_m), passage(), TRUE)
     found = calibrate_track(given, POINTS, unknowns=UNKNOWNS, track=passage(), search_m=0.8)
     assert 0.5e-3 < found.misfit_m < 4e-3
-    ideal = peaks_db(drifting, lines)  # what the drift takes, whatever the calibration
+    ideal = peaks_db(drifting, lines)  # the drift costs this much in any case
     assert (peaks_db(found.lines, loud) > ideal - 0.5).all()
     assert np.ptp(found.residual_rms_m) < found.residual_rms_m.mean()
 
 
 @pytest.mark.slow
-def test_deviations_are_those_of_the_scatter(lines):
+def test_deviations_match_the_scatter(lines):
     rng, runs = np.random.default_rng(3), 30
     found = [
         calibrate_track(
-            claimed(with_noise(lines, 35, rng), passage(), TRUE),
+            with_offsets(with_noise(lines, 35, rng), passage(), TRUE),
             POINTS,
             unknowns=UNKNOWNS,
             track=passage(),
@@ -136,7 +135,7 @@ def test_deviations_are_those_of_the_scatter(lines):
         for _ in range(runs)
     ]
     scaled = np.array([errors(each) / each.sd for each in found])
-    # Sums of 30 squared standard normal numbers, of 5 unknowns: 1 in 1000 lies outside.
+    # Of 5 sums of 30 squared standard normal numbers, one is outside in 1 of 1000 cases.
     low, high = chi2.ppf([1e-4, 1 - 1e-4], runs)
     assert (low < np.sum(scaled**2, axis=0)).all(), np.sum(scaled**2, axis=0)
     assert (np.sum(scaled**2, axis=0) < high).all(), np.sum(scaled**2, axis=0)
@@ -144,13 +143,13 @@ def test_deviations_are_those_of_the_scatter(lines):
 
 
 @pytest.mark.slow
-def test_envelopes_do_where_phases_cannot_be_followed(lines):
-    """A navigation that errs by a wavelength from ping to ping."""
+def test_envelopes_suffice_where_phases_cannot_be_followed(lines):
+    """The navigation is off by a wavelength from ping to ping."""
     rng = np.random.default_rng(4)
     jitter = 6e-3 * rng.standard_normal((160, 1)) * np.array([0, 1, 0])
     names = "time_offset", "sound_speed", "forward"
     others = {**TRUE, "port": 0.0, "up": 0.0}
-    given = claimed(with_noise(lines, 40, rng), passage(), others)
+    given = with_offsets(with_noise(lines, 40, rng), passage(), others)
     given = replace(given, tx_m=given.tx_m + jitter, rx_m=given.rx_m + jitter)
     found = calibrate_track(given, POINTS, unknowns=names, track=passage(), search_m=0.8)
     assert not found.phases.any()
@@ -159,40 +158,40 @@ def test_envelopes_do_where_phases_cannot_be_followed(lines):
 
 
 @pytest.mark.slow
-def test_deviations_hold_an_error_that_persists_along_the_track(lines):
-    """Residuals of a drifting navigation are not as many measurements as there are channels."""
+def test_deviations_include_an_error_that_persists_along_the_track(lines):
+    """Residuals of a drifting navigation are fewer independent measurements than channels."""
     offsets = {name: TRUE[name] for name in ("time_offset", "sound_speed")}
     scaled = []
     for run in range(10):
         drift = 2e-3 * np.sin(np.arange(160) / (20 + 3 * run) + run)[:, None] * np.array([0, 1, 0])
-        given = claimed(with_noise(lines, 40, np.random.default_rng(run)), passage(), offsets)
+        given = with_offsets(with_noise(lines, 40, np.random.default_rng(run)), passage(), offsets)
         given = replace(given, tx_m=given.tx_m + drift, rx_m=given.rx_m + drift)
         found = calibrate_track(given, POINTS, search_m=0.8)
         scaled.append(errors(found, offsets) / found.sd)
     assert np.sqrt(np.mean(np.square(scaled))) < 2
-    assert np.sqrt(np.mean(np.square(scaled))) > 0.2  # nor are they told too large
+    assert np.sqrt(np.mean(np.square(scaled))) > 0.2  # nor are they much too large
 
 
 def test_noise_is_no_reflector():
-    """A few of many channels reach any limit by chance; they may not decide."""
+    """A few of many channels exceed any threshold by chance, and must not be used."""
     place_m = np.stack([0.01 * np.arange(640), np.zeros(640), np.zeros(640)], axis=1)
     refused = []
     for seed in range(8):
         rng = np.random.default_rng(seed)
         samples = rng.standard_normal((640, 240, 2)) @ [1, 1j]
         noise = clsas.RangeLines(samples, 11.5, 0.0125, place_m, place_m, 1e5, 1500.0)
-        with pytest.raises(ValueError, match="points_m must be seen, but of none") as error:
+        with pytest.raises(ValueError, match="points_m must be seen, but no point is") as error:
             calibrate_track(noise, [[3.0, 12.5, 0.0], [4.0, 13.5, 0.0]])
         refused.append(max(map(int, re.findall(r"in (\d+) of", str(error.value)))))
-    assert max(refused) >= 3  # more than chance would let pass if only channels were counted
+    assert max(refused) >= 3  # so that a count of channels alone would accept them
 
 
-def test_time_and_speed_look_alike_from_one_range():
+def test_time_and_speed_cannot_be_distinguished_at_one_range():
     track = clsas.Track.straight((0, 0, 0), (0.02, 0, 0), 20, 1.0)
     at = np.array([[0.2, 15.0, 0.0]])
     offsets = {"time_offset": 3e-4}
-    given = claimed(true_lines(at, (1.0,), track), track, offsets)
-    with pytest.warns(ClsasWarning, match="do not tell time_offset and sound_speed apart"):
+    given = with_offsets(true_lines(at, (1.0,), track), track, offsets)
+    with pytest.warns(ClsasWarning, match="do not distinguish time_offset and sound_speed"):
         found = calibrate_track(given, at)
     assert found.unknowns == ("time_offset",)
     assert found.held == ("sound_speed",)
@@ -203,18 +202,18 @@ def test_time_and_speed_look_alike_from_one_range():
     assert other.unknowns == ("sound_speed",)
 
 
-def test_lever_arm_in_a_plane_looks_alike():
+def test_lever_arm_out_of_a_plane_is_not_determined():
     track = clsas.Track.straight((0, 0, 0), (0.05, 0, 0), 120, 1.0)
     at = np.array([[2.0, 12.0, 0.0], [4.0, 18.0, 0.0]])
-    given = claimed(true_lines(at, (1.0, 1.0), track), track, {"forward": 0.1})
-    with pytest.warns(ClsasWarning, match="tell up at all"):
+    given = with_offsets(true_lines(at, (1.0, 1.0), track), track, {"forward": 0.1})
+    with pytest.warns(ClsasWarning, match="do not determine up"):
         found = calibrate_track(given, at, unknowns=("forward", "up"))
     assert found.unknowns == ("forward",)
     assert found.lever_arm_m == pytest.approx([0.1, 0, 0], abs=1e-3)
 
 
 def test_a_point_that_some_channels_do_not_see(lines):
-    """One is out of the beam of half of the pings, another not there at all."""
+    """One point is outside the beam in half of the pings, and another one does not exist."""
     samples = lines.samples.copy()
     range_m = np.linalg.norm(POINTS[1] - lines.tx_m, axis=1)
     for channel in range(80):
@@ -222,7 +221,7 @@ def test_a_point_that_some_channels_do_not_see(lines):
         samples[channel, near - 30 : near + 30] = 0
     offsets = {"time_offset": 2e-4, "sound_speed": -10.0}
     noisy = with_noise(replace(lines, samples=samples), 40, np.random.default_rng(1))
-    given = claimed(noisy, passage(), offsets)
+    given = with_offsets(noisy, passage(), offsets)
     found = calibrate_track(given, POINTS, search_m=0.8)
     assert (np.abs(errors(found, offsets)) < [1e-6, 0.1]).all(), found
     assert found.seen[1] <= 85 < found.seen.min(initial=160, where=[True, False, True, True])
@@ -244,18 +243,18 @@ def test_receivers_of_an_array_that_move():
     track = clsas.Track.straight((0, 0, 5), (2.0, 0, 0), 20, 0.2)
     scene = clsas.PointTargets(POINTS, np.ones(4))
     echoes = clsas.simulate(sonar, track, scene, range_m=(9.0, 26.0), motion_in_flight=True)
-    given = claimed(clsas.compress(echoes), track, TRUE)
+    given = with_offsets(clsas.compress(echoes), track, TRUE)
     found = calibrate_track(given, POINTS, unknowns=UNKNOWNS, search_m=0.8)
     assert (np.abs(errors(found)) < [SIZES[name] for name in UNKNOWNS]).all(), found
 
 
 def test_reflectors_are_not_mistaken_for_each_other(lines):
-    """Two of the reflectors lie 1.2 m apart, less than 50 resolution cells."""
-    given = claimed(with_noise(lines, 40, np.random.default_rng(1)), passage(), TRUE)
+    """Two of the reflectors are 1.2 m apart in range, less than 50 resolution cells."""
+    given = with_offsets(with_noise(lines, 40, np.random.default_rng(1)), passage(), TRUE)
     found = calibrate_track(given, POINTS, unknowns=UNKNOWNS, track=passage())
     assert (np.abs(errors(found)) < 4 * found.sd).all(), found
     wrong = POINTS + [0.0, 0.03, 0.0] * np.array([[1], [-1], [1], [-1]])
-    with pytest.warns(ClsasWarning, match="lets a reflector be mistaken for another"):
+    with pytest.warns(ClsasWarning, match="reflectors are mistaken for each other"):
         calibrate_track(lines, wrong)
 
 
@@ -274,7 +273,7 @@ def test_bad_input(lines):
         calibrate_track(lines, POINTS, search_m=0.0)
     with pytest.raises(ValueError, match="point 1 is at ranges from 1"):
         calibrate_track(lines, [POINTS[0], [0.0, 100.0, 0.0]])
-    with pytest.raises(ValueError, match="points_m must be seen, but of none echoes stand out"):
+    with pytest.raises(ValueError, match=r"points_m must be seen, but no point is\. Echoes must"):
         calibrate_track(with_noise(lines, 0, np.random.default_rng(0)), [[4.0, 22.5, 0.0]])
     with pytest.raises(ValueError, match="track must have a pose for each of the 160 pings"):
         calibrate_track(lines, POINTS, track=passage(20))
@@ -289,7 +288,7 @@ def test_bad_input(lines):
 
 
 def test_command(lines, tmp_path):
-    given = claimed(lines, passage(), {"time_offset": 2e-4, "sound_speed": -10.0})
+    given = with_offsets(lines, passage(), {"time_offset": 2e-4, "sound_speed": -10.0})
     source, corrected = tmp_path / "lines.h5", tmp_path / "corrected.h5"
     clsas.save(source, given)
     points = [part for at in POINTS for part in ("--point", ",".join(map(str, at)))]

@@ -1,4 +1,4 @@
-"""Micronavigation against tracks that it is not told, and against the bound of its errors."""
+"""Micronavigation of unknown motion, and its errors compared with their bound."""
 
 import json
 from dataclasses import replace
@@ -34,10 +34,10 @@ from clsas.navigation.overlap import Array, overlap
 RECORDED = Path(__file__).parents[2] / "../shared/data/fmc_aluminium/contact_notch_aluminium.mat"
 
 
-def recorded(sonar, true, told, scene, near_m, far_m):
-    """Lines of a true track that say that they were recorded on another."""
+def recorded(sonar, true, nominal, scene, near_m, far_m):
+    """Return lines recorded on a true track, with the positions of a nominal one."""
     echoes = clsas.simulate(sonar, true, scene, range_m=(near_m - 0.5, far_m + 0.5))
-    return said_to_be_on(clsas.compress(echoes), sonar, told)
+    return said_to_be_on(clsas.compress(echoes), sonar, nominal)
 
 
 @pytest.fixture(scope="module")
@@ -47,7 +47,7 @@ def straight():
 
 @pytest.fixture(scope="module")
 def noisy():
-    """Results for many realisations of noise, by coherence."""
+    """Return results for many realisations of noise, by coherence."""
     return noisy_runs()
 
 
@@ -63,7 +63,7 @@ def test_errors_reach_the_bound(noisy, coherence):
 
 
 @pytest.mark.slow
-def test_intervals_hold_what_they_promise(noisy):
+def test_intervals_cover_the_errors(noisy):
     covers = [
         against_bound(runs, name, coherence)[2]
         for coherence, runs in noisy.items()
@@ -81,10 +81,10 @@ def moving():
         "yaw_rad": lambda t: np.radians(1) * np.sin(2 * np.pi * t / 27 + 1),
     }
     course = (0, 0, 0), (advance_m, 0, 0), pings, 1.0
-    true, told = clsas.Track.straight(*course, **motion), clsas.Track.straight(*course)
+    true, nominal = clsas.Track.straight(*course, **motion), clsas.Track.straight(*course)
     points = seabed(true, 12, 20, 10000)
     target = clsas.PointTargets([[true.positions_m[:, 0].mean(), 14.0, 0.0]], [30.0])
-    lines = recorded(sonar, true, told, (points, target), 12, 20)
+    lines = recorded(sonar, true, nominal, (points, target), 12, 20)
     right = said_to_be_on(lines, sonar, true)
     found = micronavigate(
         lines, range_m=(12, 20), element_length_m=WAVELENGTH_M, sway_sd_m=0.1, yaw_sd_rad=0.02
@@ -93,7 +93,7 @@ def moving():
 
 
 @pytest.mark.slow
-def test_motion_that_nobody_told_is_found(moving):
+def test_unknown_motion_is_found(moving):
     _, _, found, motion = moving
     assert np.std(detrended(found.sway_m - motion["sway_m"])) <= WAVELENGTH_M / 16
     assert np.std(found.yaw_rad - motion["yaw_rad"]) < 1e-3
@@ -109,17 +109,17 @@ def test_an_image_is_focused(moving, platform):
     grid = clsas.Grid.plane(x=(x - 0.6, x + 0.6, 401), y=(13.7, 14.3, 121))
     peaks = {
         name: np.abs(clsas.backproject(each, grid, device=platform, accuracy_db=-40).pixels).max()
-        for name, each in (("told", lines), ("true", right), ("found", found.lines))
+        for name, each in (("nominal", lines), ("true", right), ("found", found.lines))
     }
     assert 20 * np.log10(peaks["found"] / peaks["true"]) >= -0.5
-    assert peaks["told"] < 0.5 * peaks["true"]
+    assert peaks["nominal"] < 0.5 * peaks["true"]
 
 
 @pytest.mark.slow
-def test_a_hundred_pings_that_nobody_told():
-    """The array of Sensotek, 0.2 m of sway and 1 degree of yaw, within every synthetic aperture.
+def test_a_hundred_pings_of_unknown_motion():
+    """The array of Sensotek sways by 0.2 m and yaws by 1 degree within every synthetic aperture.
 
-    Few points of speckle and a bright one among them come from uneven directions.
+    The echoes come from uneven directions: few points of speckle, and a bright one among them.
     """
     made = voyage(range_m=(12.0, 15.0), points=5000, bright=30.0)
     found = navigated(made, window_m=1.0)
@@ -128,25 +128,25 @@ def test_a_hundred_pings_that_nobody_told():
     peak_db, width = point_against_true(made, found.lines)
     assert peak_db >= -0.5
     assert width <= 1.05
-    wrong_m = detrended((found.lines.ping_centres_m - made.true.ping_centres_m)[:, 1])
-    told_m = np.sqrt(np.mean(found.shape_sd_m**2))
-    assert np.std(wrong_m) < 3 * told_m
+    error_m = detrended((found.lines.ping_centres_m - made.true.ping_centres_m)[:, 1])
+    reported_m = np.sqrt(np.mean(found.shape_sd_m**2))
+    assert np.std(error_m) < 3 * reported_m
     array = [Array.of(each).forward for each in (made.true, made.told)]
-    heading, planned = (np.arctan2(each[:, 1], each[:, 0]) for each in array)
-    misses = found.yaw_steps_rad - np.diff(heading - planned)
+    heading, nominal = (np.arctan2(each[:, 1], each[:, 0]) for each in array)
+    misses = found.yaw_steps_rad - np.diff(heading - nominal)
     assert np.std(misses) < 1.5 * np.mean(found.yaw_steps_sd_rad) < 1.5**2 * np.std(misses)
 
 
 @pytest.mark.slow
 def test_the_other_side_and_a_seabed_below():
-    """Rays to starboard that slope down: sway is horizontal."""
+    """Rays to starboard slope down, and sway is horizontal."""
     sonar, advance_m = overlapping_array(48, 16)
     sway_m = 0.01 * np.array([0, 1, 3, 2, 0, -1])
     course = (0, 0, 6.0), (advance_m, 0, 0), 6, 1.0
-    true, told = clsas.Track.straight(*course, sway_m=sway_m), clsas.Track.straight(*course)
+    true, nominal = clsas.Track.straight(*course, sway_m=sway_m), clsas.Track.straight(*course)
     scene = seabed(true, 8, 14, 5000, side=-1)
     echoes = clsas.simulate(sonar, true, scene, range_m=(9.5, 14.5), element_pattern=False)
-    lines = said_to_be_on(clsas.compress(echoes), sonar, told)
+    lines = said_to_be_on(clsas.compress(echoes), sonar, nominal)
     found = micronavigate(lines, range_m=(10, 14), side="starboard", seabed_z_m=0.0)
     assert np.std(detrended(found.sway_m - sway_m)) <= WAVELENGTH_M / 16
 
@@ -154,15 +154,15 @@ def test_the_other_side_and_a_seabed_below():
 @pytest.mark.slow
 @pytest.mark.skipif(not RECORDED.exists(), reason=f"no recorded data at {RECORDED}")
 def test_jitter_of_a_recorded_array_is_followed():
-    """Transmissions of a recorded full matrix get 20 ns rms of jitter, which is found to 5 ns."""
-    wanted_s, found = jitter_followed(RECORDED, 20e-9)
+    """20 ns rms of jitter is added to a recorded full matrix, and is found to 5 ns."""
+    true_s, found = jitter_followed(RECORDED, 20e-9)
     followed_s = -2 / found.lines.sound_speed_m_s * found.sway_m
-    assert np.std(detrended(followed_s - wanted_s)) <= 5e-9
+    assert np.std(detrended(followed_s - true_s)) <= 5e-9
     assert found.overlap.min() == 63
 
 
 @pytest.mark.slow
-def test_what_cannot_be_navigated_is_refused(straight):
+def test_unsuitable_lines_are_refused(straight):
     def one_ping():
         return straight.select(slice(0, 48))
 
@@ -180,7 +180,7 @@ def test_what_cannot_be_navigated_is_refused(straight):
     for make, message in (
         (one_ping, "at least 2 pings"),
         (single_receivers, "at least 2 receivers"),
-        (without_overlap, "phase centres must overlap.*got 0 between pings 0 and 1"),
+        (without_overlap, "phase centres that overlap.*got 0 between pings 0 and 1"),
         (noise, "coherent from ping to ping"),
     ):
         with pytest.raises(ValueError, match=message):
@@ -205,8 +205,8 @@ def test_what_cannot_be_navigated_is_refused(straight):
         ({"most_step_m": 1e3}, "most_step_m"),
         ({"sway_sd_m": 1e-200}, "sway_sd_m must be from"),
         ({"yaw_sd_rad": 1e200}, "yaw_sd_rad must be from"),
-        ({"seabed_z_m": -1000.0}, "seabed_z_m must lie less than the nearest range"),
-        ({"unknowns": ("yaw",)}, "unknowns must hold 'sway'"),
+        ({"seabed_z_m": -1000.0}, "seabed_z_m must differ .* by less than the nearest range"),
+        ({"unknowns": ("yaw",)}, "unknowns must include 'sway'"),
     ],
 )
 def test_arguments_outside_their_limits(straight, options, message):
@@ -228,7 +228,8 @@ def test_pings_without_coherence_are_bridged(straight):
 
 @pytest.mark.slow
 def test_phase_centres_pair_up(straight):
-    pairs = overlap(straight, Array.of(straight), 0)
+    usable = np.ones(straight.channels, bool)
+    pairs = overlap(straight, Array.of(straight), 0, usable)
     assert pairs.pairs == 24
     centres_m = straight.phase_centres_m
     apart_m = np.abs(centres_m[pairs.first] - centres_m[pairs.second]).max()
@@ -238,11 +239,11 @@ def test_phase_centres_pair_up(straight):
 
 @pytest.mark.slow
 def test_an_advance_that_differs_is_found():
-    """The navigation says 2 % too little, by a part of the array's spacing and by more of it."""
+    """The navigated advance is 2 % too small, which is a fraction of the spacing of the array."""
     sonar, advance_m = overlapping_array(56, 24)
     true = clsas.Track.straight((0, 0, 0), (advance_m, 0, 0), 6, 1.0)
-    told = clsas.Track.straight((0, 0, 0), (0.98 * advance_m, 0, 0), 6, 1.0)
-    lines = recorded(sonar, true, told, seabed(true, 12, 20, 8000), 12, 20)
+    nominal = clsas.Track.straight((0, 0, 0), (0.98 * advance_m, 0, 0), 6, 1.0)
+    lines = recorded(sonar, true, nominal, seabed(true, 12, 20, 8000), 12, 20)
     found = micronavigate(lines, range_m=(12, 20), element_length_m=WAVELENGTH_M, surge_sd_m=0.05)
     advanced_m = np.diff(found.track.positions_m[:, 0])
     assert np.abs(advanced_m - advance_m).max() <= 0.05 * SPACING_M
@@ -251,7 +252,7 @@ def test_an_advance_that_differs_is_found():
 @pytest.mark.slow
 @pytest.mark.parametrize("every", [2, 5])
 def test_sparse_arrays_do_not_take_side_lobes_for_an_advance(every):
-    """Elements shorter than their spacing: neighbours share no speckle that tells the advance."""
+    """Elements are shorter than their spacing, so that neighbours share no speckle."""
     sonar, advance_m = overlapping_array(48, 16)
     pings = np.arange(16)
     course = ((0, 0, 0), (advance_m, 0, 0), 16, 1.0)
@@ -287,24 +288,24 @@ def test_the_command(straight, tmp_path):
 
 @pytest.mark.slow
 def test_the_order_of_receivers_does_not_matter(straight):
-    """An array whose receivers are numbered from the bow advances in the same direction."""
+    """Receivers may be numbered from the bow or from the stern."""
     order = np.concatenate([np.arange(48)[::-1] + start for start in straight.ping_starts])
     moved_m = 0.004 * np.sin(np.arange(21))
     rx_m = straight.rx_m - np.repeat(moved_m, 48)[:, None] * [0.0, 1.0, 0.0]
     tx_m = straight.tx_m - np.repeat(moved_m, 48)[:, None] * [0.0, 1.0, 0.0]
-    told = replace(straight, rx_m=rx_m, tx_m=tx_m)  # the navigation errs to starboard
+    nominal = replace(straight, rx_m=rx_m, tx_m=tx_m)  # the navigation is off to starboard
     options = {"range_m": (60, 66), "unknowns": ("sway",), "element_length_m": WAVELENGTH_M}
-    found, reversed_ = (micronavigate(each, **options) for each in (told, told.select(order)))
+    found, reversed_ = (micronavigate(each, **options) for each in (nominal, nominal.select(order)))
     np.testing.assert_allclose(reversed_.sway_m, found.sway_m, atol=1e-6)
     assert np.std(detrended(found.sway_m - moved_m)) <= WAVELENGTH_M / 100
 
 
 def small(pings=8, receivers=56, overlapping=24, **motion):
-    """Lines of few pings on a straight track that the navigation tells, and what it hides."""
+    """Return lines of a few pings whose navigation is straight, with a motion that it lacks."""
     sonar, advance_m = overlapping_array(receivers, overlapping)
     course = (0, 0, 0), (advance_m, 0, 0), pings, 1.0
-    true, told = clsas.Track.straight(*course, **motion), clsas.Track.straight(*course)
-    return recorded(sonar, true, told, seabed(true, 12, 15, 5000), 12, 15)
+    true, nominal = clsas.Track.straight(*course, **motion), clsas.Track.straight(*course)
+    return recorded(sonar, true, nominal, seabed(true, 12, 15, 5000), 12, 15)
 
 
 @pytest.fixture(scope="module")
@@ -327,21 +328,21 @@ def test_deviations_are_no_larger_than_those_of_the_navigation(swaying):
 
 @pytest.mark.slow
 def test_dead_receivers_are_left_out(swaying):
-    """Of 48 receivers a dead one among the overlapping ones, and another for three pings."""
+    """One of the overlapping receivers is dead, and another one for three pings."""
     options = {"range_m": (12, 15), "element_length_m": WAVELENGTH_M}
     whole = micronavigate(swaying, **options)
     samples = swaying.samples.copy()
     samples[4::48] = 0
     samples[30 : 30 + 3 * 48 : 48] *= 1e-3
-    with pytest.warns(ClsasWarning, match=r"11 of 384 channels hold no signal.*channel 4\)"):
+    with pytest.warns(ClsasWarning, match=r"11 of 384 channels have no signal.*channel 4\)"):
         found = micronavigate(replace(swaying, samples=samples), **options)
     assert found.overlap.tolist() == [22, 22, 22, 23, 23, 23, 23]
     assert np.std(detrended(found.sway_m - whole.sway_m)) < WAVELENGTH_M / 100
 
 
 @pytest.mark.slow
-def test_implausible_corrections_are_told():
-    """Conjugated samples turn the other way; so does a wrong accuracy of the navigation."""
+def test_implausible_corrections_are_reported():
+    """They far exceed the accuracy given for the navigation."""
     lines = small(yaw_rad=np.radians(3) * np.sin(np.arange(8)))
     options = {"range_m": (12, 15), "element_length_m": WAVELENGTH_M}
     with pytest.warns(ClsasWarning, match="the yaw found is .* times the accuracy.*yaw_sd_rad"):
@@ -357,7 +358,7 @@ def test_implausible_corrections_are_told():
         ({"yaw_sd_rad": 20.0}, "yaw_sd_rad must be from 1e-09 to 3.142 rad, got 20 rad"),
         ({"sway_sd_m": 1e4}, "sway_sd_m must be from 1e-09 to 1000 m, got 10000 m"),
         ({"range_m": (12.0, 12.05)}, "range_m must be at least 16 samples long"),
-        ({"range_m": (15.0, 12.0)}, "the nearer first"),
+        ({"range_m": (15.0, 12.0)}, "the nearest first"),
     ],
 )
 @pytest.mark.slow
@@ -375,7 +376,9 @@ def test_positions_in_other_units_are_refused(swaying, factor):
 
 
 @pytest.mark.slow
-def test_lines_without_variety_are_told_from_noise(swaying):
+def test_constant_lines_are_refused_with_their_coherence(swaying):
     constant = replace(swaying, samples=np.ones_like(swaying.samples))
-    with pytest.raises(ValueError, match=r"at most 1\.00 in any window, and [0-9.]+ at least"):
+    with pytest.raises(
+        ValueError, match=r"at most 1\.00 in any window, and at least [0-9.]+ is needed"
+    ):
         micronavigate(constant, range_m=(12, 15))

@@ -1,4 +1,4 @@
-"""Passes of micronavigation: coarse arrays, progress, and how certain a track's shape is."""
+"""Passes of micronavigation: coarse arrays, progress, and the deviation of a track's shape."""
 
 from dataclasses import replace
 
@@ -8,13 +8,13 @@ import pytest
 import clsas
 from clsas.navigation.smoother import persistence, shape_deviation_m
 
-SPACING_M = 0.1  # of phase centres: yaw of 30 mrad turns neighbours by half a cycle
+SPACING_M = 0.1  # of phase centres; the phases of neighbours differ by half a cycle at 30 mrad
 PINGS = 12
 
 
 @pytest.fixture(scope="module")
 def coarse():
-    """An array of few receivers with large elements, which sways unknown to its navigation."""
+    """Return lines of an array of few large receivers, and its sway, which is not navigated."""
     rx_m = [[2 * SPACING_M * (n - 2.5), 0.0, 0.0] for n in range(6)]
     pulse = clsas.Pulse(125e3, 15e3, 1e-3)
     sonar = clsas.Sonar(pulse, rx_m, tx_length_m=0.2, rx_length_m=0.2)
@@ -25,8 +25,8 @@ def coarse():
     at = np.stack([rng.uniform(-5, 8, 4000), rng.uniform(28, 40, 4000), np.zeros(4000)], axis=1)
     scene = clsas.PointTargets(at, rng.standard_normal(4000) + 1j * rng.standard_normal(4000))
     lines = clsas.compress(clsas.simulate(sonar, true, scene, range_m=(29, 39)))
-    told = clsas.channels(sonar, clsas.Track.straight(*course))
-    return replace(lines, tx_m=told.tx_m, rx_m=told.rx_m), sway_m
+    nominal = clsas.channels(sonar, clsas.Track.straight(*course))
+    return replace(lines, tx_m=nominal.tx_m, rx_m=nominal.rx_m), sway_m
 
 
 def detrended(values):
@@ -35,25 +35,25 @@ def detrended(values):
 
 
 @pytest.mark.slow
-def test_coarse_arrays_do_not_turn_into_their_grating_lobes(coarse):
+def test_coarse_arrays_do_not_lock_onto_grating_lobes(coarse):
     lines, sway_m = coarse
-    told = []
+    reported = []
     found = clsas.micronavigate(
         lines, range_m=(30, 38), element_length_m=0.2, yaw_sd_rad=0.05,
-        progress=lambda *each: told.append(each),
+        progress=lambda *each: reported.append(each),
     )  # fmt: skip
     assert np.abs(found.yaw_steps_rad).max() < 2e-3
     residual_m = detrended(found.sway_m - sway_m)
     assert np.std(residual_m) < 0.5e-3
     assert np.std(residual_m) < 3 * found.shape_sd_m.max()
-    # Every pass counts, the bar never goes back, and in the end all is done.
-    done = [each / total for each, total in told]
+    # Every pass advances the progress, which never decreases and ends at 1.
+    done = [each / total for each, total in reported]
     assert done == sorted(done)
     assert done[-1] == 1
     assert sum(each > 0.25 for each in done) > PINGS
 
 
-def test_deviation_of_shape_is_that_of_walks():
+def test_deviation_of_shape_is_that_of_random_walks():
     count, random = 60, np.random.default_rng(1)
     advance_m = np.full(count - 1, 0.3)
     walks_m = []
@@ -61,13 +61,13 @@ def test_deviation_of_shape_is_that_of_walks():
         yaw = np.concatenate([[0.0], np.cumsum(1e-3 * random.standard_normal(count - 1))])
         steps = 1e-4 * random.standard_normal(count - 1) + 0.3 * (yaw[1:] + yaw[:-1]) / 2
         walks_m.append(detrended(np.concatenate([[0.0], np.cumsum(steps)])))
-    told = shape_deviation_m(np.full(count - 1, 1e-4), np.full(count - 1, 1e-3), advance_m)
-    np.testing.assert_allclose(told, np.std(walks_m, axis=0), rtol=0.25)
+    found = shape_deviation_m(np.full(count - 1, 1e-4), np.full(count - 1, 1e-3), advance_m)
+    np.testing.assert_allclose(found, np.std(walks_m, axis=0), rtol=0.25)
     assert shape_deviation_m(np.zeros(4), np.zeros(4), np.ones(4)) == pytest.approx(np.zeros(5))
 
 
 def test_errors_that_persist_count_more():
-    """Errors that stay for several pings add up to more than independent ones do."""
+    """Errors that last for several pings add up to more than independent ones."""
     random = np.random.default_rng(2)
     white = random.standard_normal((400, 3))
     kept = np.stack([np.convolve(each, np.ones(5), "valid") for each in white.T], axis=1)
@@ -77,7 +77,7 @@ def test_errors_that_persist_count_more():
 
 
 def test_corrections_that_leave_no_overlap_are_refused():
-    """Here because the ranges are wrong: samples are 100 m apart, a swath of 80 km."""
+    """The ranges are wrong here: samples are 100 m apart, and the swath is 80 km wide."""
     pings, receivers = 12, 8
     tx_m, rx_m = np.zeros((2, pings, receivers, 3))
     tx_m[..., 0] = rx_m[..., 0] = 0.1 * np.arange(pings)[:, None]
@@ -89,5 +89,7 @@ def test_corrections_that_leave_no_overlap_are_refused():
         clsas.PointTargets(at, rng.standard_normal(500) + 1j * rng.standard_normal(500)),
         carrier_hz=100e3, bandwidth_hz=20e3, first_range_m=25.0, length=800,
     )  # fmt: skip
-    with pytest.raises(ValueError, match=r"no phase centres overlap .* Check range_step_m, 100 m"):
+    with pytest.raises(
+        ValueError, match=r"no phase centres of .* overlap .* Check range_step_m, 100 m"
+    ):
         clsas.micronavigate(replace(lines, range_step_m=100.0))

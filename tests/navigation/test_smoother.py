@@ -1,4 +1,4 @@
-"""The smoother against the posterior of all states at once, and against the navigation alone."""
+"""The smoother, compared with the joint posterior of all states and with the navigation alone."""
 
 import numpy as np
 import pytest
@@ -15,7 +15,7 @@ def deviations():
 
 
 def steps(sway_m=1e-3, yaw_rad=1e-4):
-    """Displacements at an overlap that lies ahead of one array's middle and behind the next's."""
+    """Return steps over an overlap ahead of the middle of one array and behind that of the next."""
     random = np.random.default_rng(1)
     covariance = np.diag([sway_m**2, yaw_rad**2])
     return [
@@ -25,7 +25,7 @@ def steps(sway_m=1e-3, yaw_rad=1e-4):
 
 
 def at_once(steps, deviations, correlation):
-    """Posterior of a Gaussian vector of all states, by dense linear algebra."""
+    """Return mean and covariance of all states given all steps, by dense linear algebra."""
     apart = np.abs(np.subtract.outer(np.arange(PINGS), np.arange(PINGS)))
     prior = np.einsum("pn,qn,pq,nm->pnqm", deviations, deviations,
                       np.exp(-apart / correlation), np.eye(2))  # fmt: skip
@@ -51,27 +51,27 @@ def at_once(steps, deviations, correlation):
 def test_states_are_the_posterior_of_all_pings(deviations, missing):
     given = [None if ping in missing else step for ping, step in enumerate(steps())]
     states, covariances = smooth(given, deviations, CORRELATION)
-    wanted, spreads = at_once(given, deviations, CORRELATION)
-    np.testing.assert_allclose(states, wanted, atol=1e-9)
+    expected, spreads = at_once(given, deviations, CORRELATION)
+    np.testing.assert_allclose(states, expected, atol=1e-9)
     np.testing.assert_allclose(covariances, spreads, atol=1e-9)
 
 
 @pytest.mark.parametrize("correlation", [0.5, 10.0, PINGS, 1e4])
-def test_echoes_never_make_the_navigation_less_certain(deviations, correlation):
+def test_deviations_never_exceed_those_of_the_navigation(deviations, correlation):
     for given in (steps(), steps(10.0, 1.0), [None] * (PINGS - 1)):
         _, covariances = smooth(given, deviations, correlation)
-        told = np.sqrt(np.einsum("pnn->pn", covariances))
-        assert np.all(told <= deviations * (1 + 1e-6))
-    np.testing.assert_allclose(told, deviations)  # of the last: nothing was measured
+        reported = np.sqrt(np.einsum("pnn->pn", covariances))
+        assert np.all(reported <= deviations * (1 + 1e-6))
+    np.testing.assert_allclose(reported, deviations)  # in the last case, nothing is measured
 
 
 def test_a_long_track_keeps_its_shape():
-    """Steps are a thousand times as certain as the navigation, over 2000 pings."""
+    """Steps are a million times as accurate as the navigation, over 2000 pings."""
     count, random = 2000, np.random.default_rng(3)
     true = np.cumsum(1e-3 * random.standard_normal(count))
     measured = np.diff(true) + 1e-7 * random.standard_normal(count - 1)
     given = [Step.along(each, 1e-7) for each in measured]
     states, covariances = smooth(given, np.full((count, 1), 0.1), count)
-    away = states[:, 0] - true
-    assert np.std(away) < 1e-5
+    error = states[:, 0] - true
+    assert np.std(error) < 1e-5
     assert np.all((covariances[:, 0, 0] > 0.05**2) & (covariances[:, 0, 0] <= 0.1**2))
