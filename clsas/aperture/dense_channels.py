@@ -49,15 +49,15 @@ def strip_channels(
         widths.append(virtual.coordinate.shape[1])
         bounds.append(int(stop))
         before += widths[-1]
-    place, base, between = (np.concatenate(each, axis=1) for each in zip(*found, strict=True))
+    coordinates, base, between = (np.concatenate(each, axis=1) for each in zip(*found, strict=True))
     order = np.concatenate(orders, axis=1)
     in_order = bool((order == np.arange(order.shape[1])).all())
     every = np.ones((roots, 1), np.int64)
     none = 0 * every * np.array(firsts)
     bands = Bands(every * bounds, every * firsts, every * widths, none, None)
-    positions_m = track.positions_m(place)
+    positions_m = track.positions_m(coordinates)
     return VirtualChannels(
-        place, positions_m, None if in_order else order, base, between, aperture, bands
+        coordinates, positions_m, None if in_order else order, base, between, aperture, bands
     )
 
 

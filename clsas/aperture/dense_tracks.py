@@ -204,9 +204,9 @@ def smooth_over_sheet(
 def _same_way(track: MeanTrack, along: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return signs that turn directions [channels, 3] into the same way along or across a sheet."""
     assert track.across is not None
-    places = track.coordinate, track.across
+    coordinates = track.coordinate, track.across
     toward = []
-    for axes_m in (track.tangents_m(*places), track.sideways_m(*places)):
+    for axes_m in (track.tangents_m(*coordinates), track.sideways_m(*coordinates)):
         length_m = np.maximum(np.linalg.norm(axes_m, axis=1), 1e-30)
         toward.append(np.einsum("ci,ci->c", along, axes_m) / length_m)
     clearest = max(toward, key=lambda each: float(np.abs(each).mean()))

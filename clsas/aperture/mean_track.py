@@ -224,15 +224,6 @@ class MeanTrack:
         points_m: NDArray[np.float64],
         phase_centres_m: NDArray[np.float64],
         own_drift: NDArray[np.float64] | None = None,
-    ) -> NDArray[np.float64]:
-        """Return the first of `apparent_places`: aperture coordinates along the track."""
-        return self.apparent_places(points_m, phase_centres_m, own_drift)[0]
-
-    def apparent_places(
-        self,
-        points_m: NDArray[np.float64],
-        phase_centres_m: NDArray[np.float64],
-        own_drift: NDArray[np.float64] | None = None,
     ) -> tuple[NDArray[np.float64], NDArray[np.float64] | None]:
         """Return the aperture coordinates at which phase centres appear from some points.
 

@@ -7,13 +7,13 @@ from collections.abc import Sequence
 from typing import Annotated, ClassVar, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from clsas.aperture.dense_tracks import Shape
 from clsas.aperture.predicted_channels import StageChannels, VisiblePhases
-from clsas.aperture.virtual_channels import VirtualChannels, nearest_nodes
+from clsas.aperture.virtual_channels import VirtualChannels, summed_neighbours
 from clsas.core.fields import CONFIG, Whole
 from clsas.signal.interpolation import Gain, Interpolator
 
@@ -62,13 +62,13 @@ class NearestBeams:
 
     def used_channels(
         self,
-        place: NDArray[np.float64],
+        coordinate: NDArray[np.float64],
         start: NDArray[np.float64],
         stop: NDArray[np.float64],
         slack: float,
     ) -> slice:
         """Return all channels: which of them are neighbours does not depend on the sector."""
-        return slice(0, len(place))
+        return slice(0, len(coordinate))
 
     def beams(
         self, coordinate: NDArray[np.float64], channels_m: NDArray[np.float64]
@@ -84,7 +84,7 @@ class NearestBeams:
         """
         found, position_m = [], np.broadcast_to(channels_m, (*coordinate.shape, 3))
         for factor in self.factors:
-            found.append(nearest_nodes(coordinate, position_m, factor))
+            found.append(summed_neighbours(coordinate, position_m, factor))
             coordinate, position_m = found[-1].coordinate, found[-1].position_m
         return found
 
@@ -97,31 +97,6 @@ class NearestBeams:
             used, channels = channels, math.ceil(channels / factor)
             found.append(StageChannels(used, channels, factor, channels, channels))
         return found
-
-
-def range_error_m(
-    range_m: ArrayLike, half_length_m: ArrayLike, angle_rad: ArrayLike, away_rad: ArrayLike
-) -> NDArray[np.float64]:
-    """Return the error of one beam standing for a sector, at one place [40].
-
-    Parameters
-    ----------
-    range_m : array_like
-        Distance r of the point from the middle of the subaperture.
-    half_length_m : array_like
-        Half the subaperture's length, t.
-    angle_rad : array_like
-        Angle a between the subaperture and the beam's direction.
-    away_rad : array_like
-        Angle b from the beam's direction to the point.
-
-    Notes
-    -----
-    sqrt(r^2 + t^2 - 2 r t cos(a + b)) - sqrt(r^2 + t^2 - 2 r t cos(a)).
-    """
-    r, t, a, b = map(np.asarray, (range_m, half_length_m, angle_rad, away_rad))
-    square = r * r + t * t
-    return np.sqrt(square - 2 * r * t * np.cos(a + b)) - np.sqrt(square - 2 * r * t * np.cos(a))
 
 
 def stage_errors_m(

@@ -219,26 +219,26 @@ def _smoothed_rates(
     return np.exp(inside, out=inside)[:, nearest]
 
 
-def nearest_nodes(
-    place: NDArray[np.float64], position_m: NDArray[np.float64], factor: int
+def summed_neighbours(
+    coordinate: NDArray[np.float64], position_m: NDArray[np.float64], factor: int
 ) -> VirtualChannels:
     """Return nodes as THESIS [43] has them: means of `factor` neighbours, which are summed.
 
     Parameters
     ----------
-    place : float64 [roots, channels]
+    coordinate : float64 [roots, channels]
     position_m : float64 [roots, channels, 3]
     """
-    roots, channels = place.shape
-    order = np.argsort(place, axis=1, kind="stable")
+    roots, channels = coordinate.shape
+    order = np.argsort(coordinate, axis=1, kind="stable")
     starts = np.arange(0, channels, factor)
     counts = np.diff(np.append(starts, channels))
-    sorted_place = np.take_along_axis(place, order, axis=1)
-    sorted_m = np.take_along_axis(position_m, order[..., None], axis=1)
+    in_order = np.take_along_axis(coordinate, order, axis=1)
+    in_order_m = np.take_along_axis(position_m, order[..., None], axis=1)
     base = np.broadcast_to(np.arange(channels) // factor, (roots, channels))
     return VirtualChannels(
-        np.add.reduceat(sorted_place, starts, axis=1) / counts,
-        np.add.reduceat(sorted_m, starts, axis=1) / counts[:, None],
+        np.add.reduceat(in_order, starts, axis=1) / counts,
+        np.add.reduceat(in_order_m, starts, axis=1) / counts[:, None],
         order,
         base,
         np.zeros((roots, channels)),

@@ -46,8 +46,8 @@ def leaf_groups(geometry: Geometry, width: int) -> LeafGroups:
     corners = division.corners(last, roots)
     middles_m = division.centres_m(last, corners).reshape(-1, 3)
     leaves = _cells(geometry, corners, width)
-    leaf, place = (each.ravel()[surface.cell] for each in leaves)
-    groups, of_leaf = groups_within(surface.grid, leaf, place, middles_m, width)
+    leaf, cell = (each.ravel()[surface.cell] for each in leaves)
+    groups, of_leaf = groups_within(surface.grid, leaf, cell, middles_m, width)
     held = np.bincount(leaf // corners.shape[1], minlength=len(roots))
     return LeafGroups(
         groups,

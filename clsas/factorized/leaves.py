@@ -112,8 +112,8 @@ class Leaves:
         position_m = sector.positions_m(-1)
         rows = [float_pairs(position_m.reshape(-1, 3))]
         if self.geometry.directions is not None:
-            nodes = sector.nodes[-1]
-            along = self.geometry.directions.at(nodes.coordinate, nodes.across)
+            virtual = sector.virtual[-1]
+            along = self.geometry.directions.at(virtual.coordinate, virtual.across)
             rows.append((along * self.beam.per_sine).astype(np.float32).reshape(-1, 3))
         values = {"geometry": np.concatenate(rows, axis=1).T} | self._parts(sector)
         if self.normalise:
@@ -155,11 +155,11 @@ class Leaves:
     ) -> NDArray[np.int32]:
         """Return virtual channels of tiles or groups, and the first line, [..., 3]."""
         need = sector.needs[-1]
-        node = root * sector.nodes[-1].coordinate.shape[1]
+        first_of_root = root * sector.virtual[-1].coordinate.shape[1]
         in_batch = root % self.factorization.roots_at_once * need.first.shape[1] + leaf
         ranges = [
-            node + need.first[root, leaf],
-            node + need.last[root, leaf],
+            first_of_root + need.first[root, leaf],
+            first_of_root + need.last[root, leaf],
             in_batch * sector.stride(-1),
         ]
         return np.stack(np.broadcast_arrays(*ranges), axis=-1).astype(np.int32)
@@ -178,40 +178,44 @@ def represented(sector: Sector, track: MeanTrack) -> NDArray[np.float32]:
     Cubics interpolate the beam's weights, which are smooth along the track and across a sheet. The
     stages' filters err as little on average, but with the same sign on a function so smooth.
     """
-    nodes = sector.nodes[-1]
-    shares = np.empty(nodes.coordinate.shape)
+    virtual = sector.virtual[-1]
+    shares = np.empty(virtual.coordinate.shape)
     strip = track.strip_of(sector.coordinate[0])
-    for root, (at, place) in enumerate(zip(nodes.coordinate, sector.coordinate, strict=True)):
-        if nodes.rows is not None and sector.across is not None:
-            columns = at[: len(at) // len(nodes.rows[root])]
-            column, along = _cubics(columns, place)
-            row, across = _cubics(nodes.rows[root], sector.across[root])
+    for root, (at, coordinate) in enumerate(
+        zip(virtual.coordinate, sector.coordinate, strict=True)
+    ):
+        if virtual.rows is not None and sector.across is not None:
+            columns = at[: len(at) // len(virtual.rows[root])]
+            column, along = _cubics(columns, coordinate)
+            row, across = _cubics(virtual.rows[root], sector.across[root])
             index = len(columns) * row[:, :, None] + column[:, None]
             weights = across[:, :, None] * along[:, None]
-        elif nodes.bands is not None:
-            first = nodes.bands.first[root][strip]
-            index, weights = _cubics(at, place, first, first + nodes.bands.width[root][strip])
+        elif virtual.bands is not None:
+            first = virtual.bands.first[root][strip]
+            index, weights = _cubics(
+                at, coordinate, first, first + virtual.bands.width[root][strip]
+            )
         else:
-            index, weights = _cubics(at, place)
+            index, weights = _cubics(at, coordinate)
         shares[root] = np.bincount(index.ravel(), weights.ravel(), len(at))
     return shares.astype(np.float32)
 
 
 def _cubics(
     at: NDArray[np.float64],
-    place: NDArray[np.float64],
+    coordinate: NDArray[np.float64],
     first: NDArray[np.int64] | int = 0,
     stop: NDArray[np.int64] | int | None = None,
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Return which four of ascending coordinates interpolate places, and their weights, [n, 4].
 
-    Those of each place are from `first` on, and before `stop`.
+    Those of each coordinate are from `first` on, and before `stop`.
     """
     stop = len(at) if stop is None else stop
-    begin = np.clip(np.searchsorted(at, place) - 2, first, np.asarray(stop) - 4)
+    begin = np.clip(np.searchsorted(at, coordinate) - 2, first, np.asarray(stop) - 4)
     index = begin[:, None] + np.arange(4)
     near = at[index]
     weights = np.ones(near.shape)
     for one, other in permutations(range(4), 2):
-        weights[:, one] *= (place - near[:, other]) / (near[:, one] - near[:, other])
+        weights[:, one] *= (coordinate - near[:, other]) / (near[:, one] - near[:, other])
     return index, weights

@@ -98,7 +98,7 @@ class PlaneLeaves(Leaves):
             (pitch // self.width, tiles),
             **expanded,
             geometry=tables["geometry"],
-            geometry_pitch=sector.nodes[-1].coordinate.size + VECTOR_ROOM,
+            geometry_pitch=sector.virtual[-1].coordinate.size + VECTOR_ROOM,
             centres=self.centres,
             column_step=column_m,
             row_step=row_m,
@@ -208,12 +208,12 @@ class PlaneLeaves(Leaves):
         leaves_m = sector.relative_m[-1][batch][:, self.leaf_of]
         for root, position_m in enumerate(sector.positions_m(-1)[batch]):
             index = np.minimum(first[root][:, None] + np.arange(pitch), len(position_m) - 1)
-            node_m, leaf_m = position_m[index], leaves_m[root]
-            range_m = bistatic_range_m(self.tile_m[:, None], node_m, node_m)
-            range_m -= bistatic_range_m(leaf_m[:, None], node_m, node_m)
+            channel_m, leaf_m = position_m[index], leaves_m[root]
+            range_m = bistatic_range_m(self.tile_m[:, None], channel_m, channel_m)
+            range_m -= bistatic_range_m(leaf_m[:, None], channel_m, channel_m)
             range_m -= (self.tile_m - leaf_m) @ self.geometry.drift[:, None]
-            place = range_m * self.geometry.samples_per_m
-            sample[root] += np.rint(place).astype(np.int32)
-            fraction[root] = place - np.rint(place)
+            position = range_m * self.geometry.samples_per_m
+            sample[root] += np.rint(position).astype(np.int32)
+            fraction[root] = position - np.rint(position)
             phase[root] = np.remainder(self.geometry.cycles_per_m * range_m + 0.5, 1) - 0.5
         return {"sample": sample, "fraction": fraction, "phase": phase}

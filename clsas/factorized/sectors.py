@@ -45,9 +45,9 @@ class Sector:
         Raw channels, in the order of the track, that see any of them.
     relative_m : list of float64 [roots, subimages, 3]
         Centres of subimages relative to those of their roots, stage by stage.
-    nodes : list of VirtualChannels
+    virtual : list of VirtualChannels
         Virtual channels, stage by stage.
-    needs : list of Ranges
+    needs : list of ChannelRanges
         Virtual channels of each subimage, and the channels that it combines, stage by stage.
     coordinate : float64 [roots, channels]
         Aperture coordinates of the raw channels.
@@ -59,7 +59,7 @@ class Sector:
     root_m: NDArray[np.float64]
     channels: slice
     relative_m: list[NDArray[np.float64]]
-    nodes: list[VirtualChannels]
+    virtual: list[VirtualChannels]
     needs: list[ChannelRanges]
     coordinate: NDArray[np.float64]
     across: NDArray[np.float64] | None = None
@@ -67,7 +67,7 @@ class Sector:
     @property
     def nbytes(self) -> int:
         """Approximate memory of all arrays."""
-        parts = [self, *self.nodes, *self.needs]
+        parts = [self, *self.virtual, *self.needs]
         arrays = [value for part in parts for value in vars(part).values()] + self.relative_m
         return sum(array.nbytes for array in arrays if isinstance(array, np.ndarray))
 
@@ -78,7 +78,7 @@ class Sector:
 
     def positions_m(self, level: int) -> NDArray[np.float64]:
         """Return virtual channels of a stage relative to the centres of their roots."""
-        return self.nodes[level].position_m - self.root_m[:, None]
+        return self.virtual[level].position_m - self.root_m[:, None]
 
 
 def sector_of(geometry: Geometry, roots: NDArray[np.int64]) -> Sector:
@@ -108,13 +108,13 @@ def sector_of(geometry: Geometry, roots: NDArray[np.int64]) -> Sector:
         )
     centres_m, some = geometry.phase_centres_m[channels], track.some(channels)
     own = None if geometry.own_drift is None else geometry.own_drift[channels]
-    place, across = _apparent(geometry, some, root_m, centres_m, own)
-    nodes = _virtual_channels(geometry, roots, root_m, place, across, centres_m)
+    coordinate, across = _apparent(geometry, some, root_m, centres_m, own)
+    virtual = _virtual_channels(geometry, roots, root_m, coordinate, across, centres_m)
     if track.is_dense:
-        needs = all_channels(nodes, place.shape[1], _holding(geometry, inside))
+        needs = all_channels(virtual, coordinate.shape[1], _holding(geometry, inside))
     else:
-        needs = channel_ranges(division, nodes, place, (begin, end), inside)
-    return Sector(roots, root_m, channels, relative_m, nodes, needs, place, across)
+        needs = channel_ranges(division, virtual, coordinate, (begin, end), inside)
+    return Sector(roots, root_m, channels, relative_m, virtual, needs, coordinate, across)
 
 
 def _apparent(
@@ -124,9 +124,9 @@ def _apparent(
     centres_m: NDArray[np.float64],
     own: NDArray[np.float64] | None,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64] | None]:
-    """Return coordinates at which channels appear: see `MeanTrack.apparent_places`."""
+    """Return coordinates at which channels appear: see `MeanTrack.apparent_coordinates`."""
     if some.across is None or own is not None or not geometry.on_sheet:
-        return some.apparent_places(root_m, centres_m, own)
+        return some.apparent_coordinates(root_m, centres_m, own)
     shape = (len(root_m), len(centres_m))
     return np.broadcast_to(some.coordinate, shape), np.broadcast_to(some.across, shape)
 
@@ -205,37 +205,37 @@ def _boxes(
 
 
 def references(geometry: Geometry, sector: Sector) -> dict[str, NDArray]:
-    """Return how roots align the raw channels, in the order of their nodes, [roots, channels].
+    """Return how roots align the raw channels, by the names of the kernel's tables.
 
-    By name: the line, its first sample, the position between samples, the phase in cycles and
-    its change per sample.
+    Each is [roots, channels], in the order of the virtual channels: the line, its first sample, the
+    position between samples, the phase in cycles and its change per sample.
     """
     lines, resampling, half = (
         geometry.lines,
         geometry.factorization.resampling,
         geometry.factorization.half_lengths[0],
     )
-    nodes = sector.nodes[0]
+    virtual = sector.virtual[0]
     channels = geometry.channels[sector.channels]
     range_m = pairwise_range_m(sector.root_m, *antennas_of(geometry.lines, channels))
-    place = (range_m - lines.first_range_m[channels]) / lines.range_step_m
-    place += resampling.lead
+    position = (range_m - lines.first_range_m[channels]) / lines.range_step_m
+    position += resampling.lead
     cycles = lines.carrier_cycles_per_m * range_m
-    cycles += place * resampling.centre_cycles_per_sample
+    cycles += position * resampling.centre_cycles_per_sample
     cycles -= np.rint(cycles)
-    place *= resampling.ratio
-    place += MARGIN - resampling.first - half
-    lower = np.floor(place)
+    position *= resampling.ratio
+    position += MARGIN - resampling.first - half
+    lower = np.floor(position)
     start = np.clip(lower + 1 - geometry.factorization.align.taps // 2, -_FAR, _FAR)
-    channel = np.broadcast_to(channels, place.shape)
+    channel = np.broadcast_to(channels, position.shape)
     references = {
-        "order": nodes.ordered(channel).astype(np.int32),
-        "start": nodes.ordered(start).astype(np.int32),
-        "nu": nodes.ordered(place - lower - 0.5).astype(np.float32),
-        "cycles": nodes.ordered(cycles).astype(np.float32),
+        "order": virtual.ordered(channel).astype(np.int32),
+        "start": virtual.ordered(start).astype(np.int32),
+        "nu": virtual.ordered(position - lower - 0.5).astype(np.float32),
+        "cycles": virtual.ordered(cycles).astype(np.float32),
     }
     if geometry.ramps:
-        references["ramp"] = nodes.ordered(_ramp(geometry, sector)).astype(np.float32)
+        references["ramp"] = virtual.ordered(_ramp(geometry, sector)).astype(np.float32)
     return references
 
 

@@ -191,7 +191,7 @@ class Run:
         slot.wait()
         strides = [sector.stride(level) for level in levels]
         for level in levels:
-            roots, channels = sector.nodes[level].base.shape
+            roots, channels = sector.virtual[level].base.shape
             subimages = self.division.per_root(level)
             values = self._stage_values(sector, level)
             ramps = self.geometry.ramps
@@ -206,14 +206,14 @@ class Run:
             ).items():
                 slot.fill(name, buffer.holding(values[name]))
         self.leaves.fill(slot, sector)
-        pitches = [row_pitch(nodes.base.shape[1]) for nodes in sector.nodes]
-        bands = [1 if each.bands is None else each.bands.first.shape[1] for each in sector.nodes]
+        pitches = [row_pitch(virtual.base.shape[1]) for virtual in sector.virtual]
+        bands = [1 if each.bands is None else each.bands.first.shape[1] for each in sector.virtual]
         return _Tables(slot, pitches, strides, bands)
 
     def _stage_values(self, sector: Sector, level: int) -> dict[str, NDArray]:
         """Return what the tables of a stage hold, see `cl/stage.cl`."""
-        nodes, need = sector.nodes[level], sector.needs[level]
-        values = {f"base{level}": nodes.base, f"between{level}": nodes.between}
+        virtual, need = sector.virtual[level], sector.needs[level]
+        values = {f"base{level}": virtual.base, f"between{level}": virtual.between}
         first_of_parent = np.zeros_like(need.first)
         if level:
             parents = self.division.parents(level)
@@ -224,9 +224,9 @@ class Run:
             values[f"positions{level}"] = sector.positions_m(level - 1).swapaxes(1, 2)
         else:
             values |= references(self.geometry, sector)
-        values[f"bands{level}"] = band_table(nodes.bands, need, first_of_parent)
-        if nodes.bands is not None and nodes.bands.between is not None:
-            values[f"rows{level}"] = nodes.bands.between
+        values[f"bands{level}"] = band_table(virtual.bands, need, first_of_parent)
+        if virtual.bands is not None and virtual.bands.between is not None:
+            values[f"rows{level}"] = virtual.bands.between
         return values
 
     def _stage(self, tables: _Tables, level: int, batch: slice) -> None:

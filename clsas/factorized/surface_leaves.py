@@ -66,7 +66,7 @@ class SurfaceLeaves(Leaves):
                 centre_sample=self.level.centre,
                 drift=self.geometry.drift,
                 geometry=tables["geometry"],
-                geometry_pitch=sector.nodes[-1].coordinate.size + VECTOR_ROOM,
+                geometry_pitch=sector.virtual[-1].coordinate.size + VECTOR_ROOM,
                 centres=tables["centres"],
                 offsets=tables["offsets"],
                 points=size * (self._groups(self._numbers(sector)).stop - first),

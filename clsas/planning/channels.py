@@ -115,8 +115,8 @@ class SampledChannels:
         """Return where the channels appear on the track, from some points: [points, n, 3]."""
         drifts = own_drift(self.model)
         own = drifts if drifts is None else drifts[self.index]
-        places = self.part.apparent_places(centres_m, self.phase_centres_m, own)
-        return self.model.track.positions_m(*places)
+        coordinates = self.part.apparent_coordinates(centres_m, self.phase_centres_m, own)
+        return self.model.track.positions_m(*coordinates)
 
 
 @cached

@@ -3,6 +3,7 @@ import dataclasses
 import numpy as np
 import pytest
 from dense import TRACKS, WAVELENGTH, scene, to_and_fro, turning
+from factorizing import BEAMS, arc, made
 
 from clsas.aperture.beam_directions import BeamDirections, beam_rate
 from clsas.aperture.dense_tracks import mean_track_of
@@ -58,3 +59,12 @@ def test_rates_hold_all_over_a_box():
     at_corners = beam_rate(beam, track, along, corners_m, 0 * sides_m)[:, inside].max(axis=0)
     np.testing.assert_allclose(box, np.maximum(at_corners, middle), rtol=1e-9)
     assert middle.max() < 0.2 * box.max()
+
+
+def test_directions_between_channels_are_of_length_one():
+    lines, _ = made(arc)
+    track = mean_track(lines, WAVELENGTH)
+    along = BeamDirections.of(BEAMS[0], BEAMS[0].directions(lines), track).at(
+        np.linspace(-1, 2, 50)
+    )
+    np.testing.assert_allclose(np.linalg.norm(along, axis=1), 1)

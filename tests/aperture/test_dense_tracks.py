@@ -98,16 +98,17 @@ def test_only_channels_far_from_any_curve_begin_with_another_shape(monkeypatch):
     assert simplest_track(lines_at(20 * TRACKS["planar"]()), WAVELENGTH)[0] == "track"
 
 
-def test_places_on_a_sheet_lie_in_the_direction_of_channels():
-    """A channel off the sheet is replaced by the place where the line of sight meets the sheet."""
+def test_points_on_a_sheet_lie_in_the_direction_of_channels():
+    """A channel off the sheet is replaced by the point where the line of sight meets the sheet."""
     tx_m = TRACKS["planar"]()
     tx_m[:, 2] += np.random.default_rng(1).normal(0, 0.05, len(tx_m))
     lines = lines_at(tx_m)
     found, point_m = sheet(lines, WAVELENGTH), np.array([[0.4, -0.7, 0.0]])
-    along, across = found.apparent_places(point_m, tx_m)
-    place_m = found.positions_m(along[0], across[0])
+    along, across = found.apparent_coordinates(point_m, tx_m)
+    virtual_m = found.positions_m(along[0], across[0])
     seen, given = (
-        each / np.linalg.norm(each, axis=1)[:, None] for each in (place_m - point_m, tx_m - point_m)
+        each / np.linalg.norm(each, axis=1)[:, None]
+        for each in (virtual_m - point_m, tx_m - point_m)
     )
     straight_m = found.positions_m(found.coordinate, found.across) - point_m
     without = straight_m / np.linalg.norm(straight_m, axis=1)[:, None]
@@ -122,15 +123,15 @@ def test_weights_interpolate_smooth_functions_on_a_sheet(name):
     samples = [line.samples.size for line in (track.line_along(0.5), track.line_across(0.5))]
     rates = [SheetRates(*(np.full((1, n), cycles) for n in samples)) for cycles in (12.0, 6.0)]
     order = np.argsort(track.coordinate)
-    places = track.coordinate[order][None], track.across[order][None]
-    first, grid = first_on_sheet(track, rates[0], *places, aperture)
+    coordinates = track.coordinate[order][None], track.across[order][None]
+    first, grid = first_on_sheet(track, rates[0], *coordinates, aperture)
     later, last = later_on_sheet(track, rates[1], grid, aperture)
 
     def function(along, across):
         return np.exp(2j * np.pi * (2.0 * along - 1.7 * across))
 
     for virtual, given, found in (
-        (first, places, grid),
+        (first, coordinates, grid),
         (later, (grid.coordinate, np.repeat(grid.rows, grid.columns.shape[1], axis=1)), last),
     ):
         width = found.columns.shape[1]

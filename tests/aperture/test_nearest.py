@@ -1,13 +1,23 @@
 import numpy as np
 import pytest
 
-from clsas.aperture.nearest import operations, range_error_m, stage_errors_m
+from clsas.aperture.nearest import operations, stage_errors_m
 
 SPACING_M, SIDE_M, NEAREST_M = 8.25e-3, 5.0, 40.0  # THESIS chapter 5
 
 
+def range_error_m(r, t, a, b):
+    """Error of a beam that stands for a sector, at a point [40].
+
+    The point is at r from the middle of a subaperture of half length t, and at an angle b from the
+    beam, whose angle with the subaperture is a.
+    """
+    square = r * r + t * t
+    return np.sqrt(square - 2 * r * t * np.cos(a + b)) - np.sqrt(square - 2 * r * t * np.cos(a))
+
+
 def largest_by_angle(half_length_m, range_m, away_rad):
-    """The largest [40] over directions of the beam and places up to some angle from it."""
+    """The largest [40] over directions of the beam and of points up to some angle from it."""
     angle = np.linspace(0, np.pi, 721)[:, None]
     away = np.linspace(-away_rad, away_rad, 41)
     return np.abs(range_error_m(range_m, half_length_m, angle, away)).max()
@@ -49,14 +59,14 @@ def test_stage_errors_near_the_aperture():
     ]
 
 
-def test_range_error_against_the_places_themselves():
+def test_range_error_against_the_points_themselves():
     # The end of the subaperture at (t, 0); the beam's point and the other at r under a and a + b.
     random = np.random.default_rng(1)
     r, t = random.uniform(1, 50, 200), random.uniform(0, 50, 200)
     a, b = random.uniform(0, np.pi, 200), random.uniform(-1, 1, 200)
     end = np.stack([t, 0 * t])
-    places = [r * np.stack([np.cos(angle), np.sin(angle)]) for angle in (a, a + b)]
-    at_beam, away = (np.linalg.norm(place - end, axis=0) for place in places)
+    points = [r * np.stack([np.cos(angle), np.sin(angle)]) for angle in (a, a + b)]
+    at_beam, away = (np.linalg.norm(point - end, axis=0) for point in points)
     np.testing.assert_allclose(range_error_m(r, t, a, b), away - at_beam, atol=1e-12)
 
 
@@ -92,9 +102,9 @@ def test_the_formula_does_not_bound_oblique_squares(squint_deg):
     (bound_m,) = stage_errors_m([(1, 1)], 0.05, 0.1, NEAREST_M)
     squint = np.radians(squint_deg)
     centre = NEAREST_M * np.array([np.sin(squint), np.cos(squint)])
-    place = centre + np.array([0.05, -0.05])
-    angle, beam = np.arctan2(*place[::-1]), np.arctan2(*centre[::-1])
-    error_m = abs(range_error_m(np.linalg.norm(place), 0.025, beam, angle - beam))
+    point = centre + np.array([0.05, -0.05])
+    angle, beam = np.arctan2(*point[::-1]), np.arctan2(*centre[::-1])
+    error_m = abs(range_error_m(np.linalg.norm(point), 0.025, beam, angle - beam))
     ratio = np.cos(squint) * (np.cos(squint) + np.sin(squint))
     assert error_m / bound_m == pytest.approx(ratio, rel=0.005)
     assert ratio <= (1 + np.sqrt(2)) / 2 + 1e-12

@@ -120,20 +120,20 @@ def test_beyond_its_ends_a_track_is_straight():
 
 
 def test_the_tangent_is_the_derivative():
-    track, place = mean_track(lines_of(TRACKS["arc"]), WAVELENGTH), np.linspace(0.01, 0.99, 50)
-    slope = (track.positions_m(place + 1e-6) - track.positions_m(place - 1e-6)) / 2e-6
-    np.testing.assert_allclose(track.tangents_m(place), slope, rtol=1e-5, atol=1e-4)
+    track, coordinate = mean_track(lines_of(TRACKS["arc"]), WAVELENGTH), np.linspace(0.01, 0.99, 50)
+    slope = (track.positions_m(coordinate + 1e-6) - track.positions_m(coordinate - 1e-6)) / 2e-6
+    np.testing.assert_allclose(track.tangents_m(coordinate), slope, rtol=1e-5, atol=1e-4)
 
 
 def test_a_channel_off_the_track_is_seen_in_its_direction():
     centres_m = along_x(200, 0.03) + np.random.default_rng(4).normal(0, 0.05, (200, 3)) * [0, 1, 1]
     track = mean_track(lines_of(centres_m), WAVELENGTH)
     points_m = np.array([[0.5, 40, -5], [30, 30, -5], [-20, 25, 3]])
-    places = track.apparent_coordinates(points_m, centres_m)
-    for point_m, place in zip(points_m, places, strict=True):
-        ways = [position - point_m for position in (track.positions_m(place), centres_m)]
+    coordinates, _ = track.apparent_coordinates(points_m, centres_m)
+    for point_m, coordinate in zip(points_m, coordinates, strict=True):
+        ways = [position - point_m for position in (track.positions_m(coordinate), centres_m)]
         virtual, real = (way / np.linalg.norm(way, axis=1, keepdims=True) for way in ways)
-        tangent = track.tangents_m(place)
+        tangent = track.tangents_m(coordinate)
         tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
         # Along the track the directions agree, far better than the angle that channels are off.
         off = np.abs(np.einsum("ci,ci->c", virtual - real, tangent))
@@ -142,8 +142,10 @@ def test_a_channel_off_the_track_is_seen_in_its_direction():
 
 def test_on_a_straight_track_channels_are_seen_where_they_are():
     track = mean_track(lines_of(TRACKS["straight"]), WAVELENGTH)
-    places = track.apparent_coordinates(np.array([[0.0, 10, 0], [5, 3, 1]]), TRACKS["straight"])
-    np.testing.assert_allclose(places, np.tile(track.coordinate, (2, 1)), atol=1e-9)
+    coordinates, _ = track.apparent_coordinates(
+        np.array([[0.0, 10, 0], [5, 3, 1]]), TRACKS["straight"]
+    )
+    np.testing.assert_allclose(coordinates, np.tile(track.coordinate, (2, 1)), atol=1e-9)
 
 
 def test_drift_is_the_mean_speed_of_receivers():
@@ -163,8 +165,8 @@ def test_ranges_grow_as_those_of_places_do_once_stretched(speed):
     lines = lines_of(tx, rx, velocity=velocity)
     track = mean_track(lines, WAVELENGTH)
     point_m = np.array([[3.0, 40.0, -8.0]])
-    place = track.apparent_coordinates(point_m, lines.phase_centres_m, own_drift(lines))
-    virtual_m = track.positions_m(place)
+    coordinate, _ = track.apparent_coordinates(point_m, lines.phase_centres_m, own_drift(lines))
+    virtual_m = track.positions_m(coordinate)
     plane = Grid.plane((0, 1, 2), (0, 1, 2))
     antennas = tx, rx, velocity, 1500.0
     found = stretches(*antennas, drift(lines), plane, point_m, virtual_m)[0]
@@ -205,7 +207,7 @@ def test_no_phase_turns_faster_than_its_bound(seed):
     ]
     bound = inside[0] * bound[0] + inside[1] * bound[1]
     # A subimage of 16 x 8 pixels anywhere inside, and a pixel anywhere in that.
-    places = track.samples
+    coordinates = track.samples
     room = (np.array(side) - inside) / 2
     for _ in range(20):
         middle_m = centre_m + rng.uniform(-room, room) @ steps
@@ -218,8 +220,8 @@ def test_no_phase_turns_faster_than_its_bound(seed):
                 - np.linalg.norm(middle_m - position, axis=1)
             )
 
-        rate = np.abs(phase(places + 1e-5) - phase(places - 1e-5)) / 2e-5
-        within = np.abs(places - 0.5) <= 0.5
+        rate = np.abs(phase(coordinates + 1e-5) - phase(coordinates - 1e-5)) / 2e-5
+        within = np.abs(coordinates - 0.5) <= 0.5
         assert (rate <= 1.1 * bound + 1e-3 * bound.max())[within].all()
 
 
@@ -237,11 +239,11 @@ def test_rates_about_many_places_are_those_about_each():
 
 def test_turns_are_the_integral_of_rates():
     track = mean_track(lines_of(TRACKS["straight"]), WAVELENGTH)
-    place = track.samples
-    cycles = cumulative_cycles(track, np.full((1, len(place)), 7.0))[0]
-    np.testing.assert_allclose(np.diff(cycles), 7 * np.diff(place), rtol=1e-9)
-    rate = 3 * np.clip(place, 0, 1)[None]
-    inside = np.searchsorted(place, [0, 1])
+    coordinate = track.samples
+    cycles = cumulative_cycles(track, np.full((1, len(coordinate)), 7.0))[0]
+    np.testing.assert_allclose(np.diff(cycles), 7 * np.diff(coordinate), rtol=1e-9)
+    rate = 3 * np.clip(coordinate, 0, 1)[None]
+    inside = np.searchsorted(coordinate, [0, 1])
     rising = cumulative_cycles(track, rate)[0, inside]
     assert rising[1] - rising[0] == pytest.approx(1.5, rel=1e-4)
 

@@ -74,9 +74,9 @@ def test_both_ends_of_the_track_are_alike(wide):
 def test_nothing_is_formed_that_no_channel_reaches(wide):
     sector = sector_of(wide, wide.division.roots)
     counts = np.full(len(sector.roots), sector.coordinate.shape[1])
-    for nodes, need in zip(sector.nodes, sector.needs, strict=True):
+    for virtual, need in zip(sector.virtual, sector.needs, strict=True):
         assert (need.end <= counts[:, None]).all()
-        counts = nodes.base[np.arange(len(counts)), counts - 1] + nodes.taps
+        counts = virtual.base[np.arange(len(counts)), counts - 1] + virtual.taps
         assert (need.last <= counts[:, None]).all()
 
 
@@ -103,14 +103,14 @@ def test_roots_do_not_depend_on_those_prepared_beside_them(case):
     together = sector_of(geometry, roots)
     for index in range(len(roots)):
         alone = sector_of(geometry, roots[index : index + 1])
-        for level, nodes in enumerate(alone.nodes):
+        for level, virtual in enumerate(alone.virtual):
             count = int(alone.needs[level].last.max())
             for name in ("first", "last", "begin", "end"):
                 mine = getattr(alone.needs[level], name)[0]
                 np.testing.assert_array_equal(mine, getattr(together.needs[level], name)[index])
             np.testing.assert_allclose(
-                nodes.position_m[0, :count],
-                together.nodes[level].position_m[index, :count],
+                virtual.position_m[0, :count],
+                together.virtual[level].position_m[index, :count],
                 atol=1e-9,
             )
 
@@ -131,14 +131,14 @@ def test_leaves_are_seen_from_wherever_they_are_seen_alone():
         geometry.division.centres_m(last, leaves),
         half_m,
     )
-    need, place = sector.needs[-1], sector.nodes[-1].coordinate
+    need, coordinate = sector.needs[-1], sector.virtual[-1].coordinate
     counts = np.full(len(sector.roots), sector.coordinate.shape[1])
-    for nodes in sector.nodes:  # as far as channels reach
-        counts = nodes.base[np.arange(len(counts)), counts - 1] + nodes.taps
+    for virtual in sector.virtual:  # as far as channels reach
+        counts = virtual.base[np.arange(len(counts)), counts - 1] + virtual.taps
     inside = np.all(leaves < grid.shape, axis=-1)
     for root, leaf in np.argwhere(inside & (stop > start)):
         mine = np.flatnonzero(
-            (place[root] >= start[root, leaf]) & (place[root] <= stop[root, leaf])
+            (coordinate[root] >= start[root, leaf]) & (coordinate[root] <= stop[root, leaf])
         )
         mine = mine[mine < counts[root]]
         assert need.first[root, leaf] <= mine.min()
