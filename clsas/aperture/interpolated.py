@@ -6,9 +6,8 @@ interpolated from those of fewer, virtual channels; their lines are weighted sum
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
-from typing import Annotated, ClassVar, Literal, NamedTuple
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,52 +24,20 @@ from clsas.aperture.dense_channels import (
 from clsas.aperture.dense_tracks import Shape
 from clsas.aperture.filters import edges_gain
 from clsas.aperture.mean_track import MeanTrack
-from clsas.aperture.predicted_channels import StageChannels, VisiblePhases
+from clsas.aperture.predicted_channels import (
+    SampledStage,
+    StageChannels,
+    VisiblePhases,
+    channels_on_curves,
+    channels_on_sheet,
+)
 from clsas.aperture.virtual_channels import VirtualChannels, interpolated_channels
 from clsas.core import reprs
 from clsas.core.fields import CONFIG
 from clsas.signal.fields import RangeFilter
 from clsas.signal.interpolation import Gain, Interpolator
 
-BEAM_MARGIN = 1 / 16
-"""Width of the beam by which a rectangle of leaves may widen what is visible from one of them."""
-
 _Cycles = Annotated[float, Field(ge=-0.5, le=0.5)]
-
-
-class _Overhang(NamedTuple):
-    """Virtual channels past the aperture's ends, where filters extend beyond the last channel.
-
-    Each stage interpolates the virtual channels that the one before has there, and has more past
-    these. So they become more from stage to stage, as if filters had more taps.
-
-    Attributes
-    ----------
-    columns, rows : float
-        Virtual channels along the aperture, and across a sheet, without those past the ends.
-    taps_along, taps_across : float
-        Taps of filters that would extend as far.
-    """
-
-    columns: float
-    rows: float
-    taps_along: float
-    taps_across: float
-
-    @classmethod
-    def after(cls, before: _Overhang | None, columns: float, rows: float, taps: int) -> _Overhang:
-        """Return that of the next stage; `before` is None for the first."""
-        if before is None:
-            return cls(columns, rows, taps, taps)
-        # Those of the stage before count as fewer: virtual channels lie farther apart now.
-        along, across = (
-            taps + of_taps * min(now / max(then, 1e-9), 1.0)
-            for of_taps, now, then in (
-                (before.taps_along, columns, before.columns),
-                (before.taps_across, rows, before.rows),
-            )
-        )
-        return cls(columns, rows, along, across)
 
 
 @dataclass(frozen=True, eq=False, config=CONFIG)
@@ -132,7 +99,7 @@ class InterpolatedAperture:
 
     def used_channels(
         self,
-        place: NDArray[np.float64],
+        coordinate: NDArray[np.float64],
         start: NDArray[np.float64],
         stop: NDArray[np.float64],
         slack: float,
@@ -141,7 +108,7 @@ class InterpolatedAperture:
 
         Parameters
         ----------
-        place : float64 [channels]
+        coordinate : float64 [channels]
             Aperture coordinates, ascending.
         start, stop : float64 [leaves]
             Where each leaf is visible from.
@@ -151,9 +118,9 @@ class InterpolatedAperture:
         seen = stop > start
         if not seen.any():
             return slice(0, 1)
-        first = np.searchsorted(place, start[seen].min() - slack, "left")
-        last = np.searchsorted(place, stop[seen].max() + slack, "right")
-        return slice(int(min(first, len(place) - 1)), int(max(last, first + 1)))
+        first = np.searchsorted(coordinate, start[seen].min() - slack, "left")
+        last = np.searchsorted(coordinate, stop[seen].max() + slack, "right")
+        return slice(int(min(first, len(coordinate) - 1)), int(max(last, first + 1)))
 
     def on_curves(
         self,
@@ -217,45 +184,10 @@ class InterpolatedAperture:
         self, phases: VisiblePhases, sides: tuple[tuple[int, int], ...]
     ) -> list[StageChannels]:
         """Predict the virtual channels of subimages, stage by stage."""
-        model, strips = phases.model, phases.model.track.strips
-        taps, density = self.filter.taps, 2 * self.filter.upsampling
-        found: list[StageChannels] = []
-        everywhere_seen, bands = np.ones_like(model.visible(sides[0])), strips
-        used = model.lines.channels * model.visible_share(sides[0])
-        before: _Overhang | None = None
-        for level, (oversampling, side) in enumerate(zip(self.oversampling, sides, strict=True)):
-            seen = model.visible(side)
-            beam_cycles = self.beam_cycles if level == len(sides) - 1 else 0.0
-            dense = density * oversampling, density * beam_cycles
-            turns = oversampling * phases.subimage_phase_cycles(side, seen)
-            turns += beam_cycles * phases.beam_phase_cycles(seen)
-            past = _Overhang.after(before, density * turns, phases.rows(side, 0, *dense), taps)
-            if before is not None:
-                parent, above = sides[level - 1], self.oversampling[level - 1]
-                seen_turns = above * phases.subimage_phase_cycles(parent, seen)
-                columns = phases.virtual_channels(before.taps_along, density, seen_turns)
-                rows = phases.rows(parent, before.taps_across, density * above)
-                used = min(found[-1].count, columns * rows)
-            rows, most_rows = (
-                phases.rows(side, past.taps_across, *dense, most=most) for most in (False, True)
-            )
-            everywhere, most = (
-                most_rows
-                * (
-                    dense[0] * phases.subimage_phase_cycles(side, where, most=True)
-                    + dense[1] * phases.beam_phase_cycles(where, most=True)
-                    + strips * (past.taps_along + 2)
-                )
-                for where in (everywhere_seen, seen)
-            )
-            if model.beam is not None:
-                most *= 1 + BEAM_MARGIN
-            count = rows * phases.virtual_channels(past.taps_along, density, turns)
-            summed = taps**self.dimensions * used / count
-            if self.dimensions == 2 and level == 0:
-                bands = math.ceil(most_rows) + 2
-            before = past
-            found.append(StageChannels(used, count, summed, everywhere, most, bands))
-            if self.dimensions == 2:
-                bands = math.ceil(most_rows) + 3  # the rows, for the next stage
-        return found
+        density, last = 2 * self.filter.upsampling, len(sides) - 1
+        stages = [
+            SampledStage(phases, side, density, oversampling, self.beam_cycles * (level == last))
+            for level, (side, oversampling) in enumerate(zip(sides, self.oversampling, strict=True))
+        ]
+        predict = channels_on_sheet if self.shape == "sheet" else channels_on_curves
+        return predict(stages, self.filter.taps)

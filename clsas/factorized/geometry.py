@@ -11,9 +11,9 @@ from scipy.spatial.distance import cdist
 
 from clsas.aperture.beam_directions import BeamDirections
 from clsas.aperture.dense_tracks import mean_track_of
-from clsas.aperture.interpolated import BEAM_MARGIN
 from clsas.aperture.mean_track import MeanTrack
 from clsas.aperture.phase_rates import drift, own_drift
+from clsas.aperture.predicted_channels import BEAM_MARGIN
 from clsas.core.lines import RangeLines, some_channels
 from clsas.factorized.surface import Surface
 from clsas.factorized.tree import Division
