@@ -12,8 +12,8 @@ from clsas.core.grid import Grid
 from clsas.core.image import Image, holds_any
 from clsas.core.lines import RangeLines
 from clsas.exact.checks import check_numbers
+from clsas.factorized.run import Run
 from clsas.factorized.sectors import Roots
-from clsas.factorized.stages import Run
 from clsas.factorized.surface import Surface
 from clsas.opencl.device import Device, aligned
 from clsas.plans.plan import Plan

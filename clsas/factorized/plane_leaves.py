@@ -12,42 +12,59 @@ from numpy.typing import NDArray
 from clsas.core.geometry import bistatic_range_m
 from clsas.exact.tiles import STACK, Tiles
 from clsas.factorized.buffers import tile_buffers
-from clsas.factorized.leaves import Finish, Leaves
+from clsas.factorized.leaves import Finish, LeafStage
 from clsas.factorized.sectors import Sector
 from clsas.factorized.tree import Division
 from clsas.opencl.buffers import VECTOR_ROOM, Slot, channel_pitch, expansion_kernel, float_pairs
+from clsas.opencl.kernels import Kernel
 from clsas.sonar.beam import normalising
 
 _EVERYTHING = slice(None), slice(None)
 
 
-class PlaneLeaves(Leaves):
-    """Leaves on a plane, in tiles."""
+class PlaneLeaves:
+    """Leaves on a plane, in tiles; the methods are those of `leaves.Leaves`.
 
-    def _prepare(self) -> None:
-        device, image = self.device, self.image
-        chosen, plane = self.factorization, self.surface.plane
+    Parameters
+    ----------
+    stage : LeafStage
+    image : complex64 array
+        The image, whose pixels are set.
+    """
+
+    def __init__(self, stage: LeafStage, image: NDArray[np.complex64]) -> None:
+        self.stage, self.image = stage, image
+        self.geometry, self.device, self.slot = stage.geometry, stage.device, stage.slot
+        self.factorization, self.surface = self.geometry.factorization, self.geometry.surface
         # A CPU sets the pixels where they belong.
-        on_cpu = device.info.kind == "cpu" and not self.normalise
-        self.shared = device.share(image) if on_cpu else None
-        layout = Tiles(plane, chosen.tile[0], self.width)
-        beam, along = self.geometry.beam, self.geometry.along
-        if beam is not None and along is not None:
-            layout = replace(layout, cosines=layout.cosines_in_beam(beam, along))
-        options = self._options(layout)
-        tile = {"TILE_ROWS": chosen.tile[0], "TILE_COLUMNS": chosen.tile[1]}
-        self.expand = expansion_kernel(device, self.geometry.beam)
-        self.backproject = device.kernel("backproject_tiles", **options, **tile)
+        on_cpu = self.device.info.kind == "cpu" and not stage.normalise
+        self.shared = self.device.share(image) if on_cpu else None
+        self.expand = expansion_kernel(self.device, self.geometry.beam)
+        self.backproject = self._kernel()
+        chosen = self.factorization
         self.tiles = Division(self.surface, (chosen.sides[0], chosen.sides[-1], chosen.tile))
         self.per_root, self.leaf_of = self.tiles.per_root(2), self.tiles.parents(2)
         first = np.zeros((1, 2), np.int64)
         centres_m = self.tiles.centres_m(2, self.tiles.corners(2, first))[0]
         self.tile_m = centres_m - self.tiles.centres_m(0, first)
-        self.centres = device.upload(np.tile(float_pairs(self.tile_m), (chosen.roots_at_once, 1)))
+        centres = np.tile(float_pairs(self.tile_m), (chosen.roots_at_once, 1))
+        self.centres = self.device.upload(centres)
 
-    def _parts(self, sector: Sector) -> dict[str, NDArray]:
+    def _kernel(self) -> Kernel:
+        """Build the backprojection of tiles."""
+        rows, columns = self.factorization.tile
+        layout = Tiles(self.surface.plane, rows, self.device.info.width)
+        beam, along = self.geometry.beam, self.geometry.along
+        if beam is not None and along is not None:
+            layout = replace(layout, cosines=layout.cosines_in_beam(beam, along))
+        options = self.stage.options(layout) | {"TILE_ROWS": rows, "TILE_COLUMNS": columns}
+        return self.device.kernel("backproject_tiles", **options)
+
+    def fill(self, slot: Slot, sector: Sector) -> None:
+        """Start copying the tables of a sector's leaves to the device."""
         root = np.arange(len(sector.roots))[:, None]
-        return {"ranges": self._ranges(sector, root, self.leaf_of).reshape(-1, 3)}
+        ranges = self.stage.ranges(sector, root, self.leaf_of).reshape(-1, 3)
+        self.stage.fill(slot, sector, {"ranges": ranges})
 
     def form(self, tables: Slot, sector: Sector, batch: slice, samples: cl.Buffer) -> Finish:
         """Start forming the pixels of some roots; see `Leaves.form`."""
@@ -58,10 +75,10 @@ class PlaneLeaves(Leaves):
         count = len(parts) * self.per_root
         event = self.device.run(
             self.backproject,
-            (tile[0] * tile[1] // (self.width * STACK), count),
+            (tile[0] * tile[1] // (self.device.info.width * STACK), count),
             lines=samples,
             **tiles,
-            **self.arguments,
+            **self.stage.arguments,
             **pixels,
             tiles_down=sides[0] // tile[0],
             tiles_across=sides[1] // tile[1],
@@ -75,8 +92,8 @@ class PlaneLeaves(Leaves):
         tiles = (batch.stop - batch.start) * self.per_root
         stride = sector.stride(-1)
         pitch, most = channel_pitch(stride), max(stride, self.factorization.most_channels[-1])
-        beam, aligned = self.geometry.beam, self.aligned
-        references: dict[str, Any] = {"centre_sample": self.level.centre}
+        beam, aligned = self.geometry.beam, self.stage.aligned
+        references: dict[str, Any] = {"centre_sample": self.stage.level.centre}
         if not aligned:  # the host fills references that the batch before may still read
             self.slot.wait()
         buffers = self.slot.make(tile_buffers(tiles, most, beam, aligned=aligned))
@@ -95,7 +112,7 @@ class PlaneLeaves(Leaves):
         samples_per_m = self.geometry.samples_per_m
         self.device.run(
             self.expand,
-            (pitch // self.width, tiles),
+            (pitch // self.device.info.width, tiles),
             **expanded,
             geometry=tables["geometry"],
             geometry_pitch=sector.virtual[-1].coordinate.size + VECTOR_ROOM,
@@ -104,7 +121,7 @@ class PlaneLeaves(Leaves):
             row_step=row_m,
             samples_per_m=samples_per_m,
             drift=[self.geometry.drift @ step * samples_per_m for step in (column_m, row_m)],
-            **self.beam.origin,
+            **self.stage.beam.origin,
             wait_for=tables.filled,
         )
         return expanded | references
@@ -121,7 +138,7 @@ class PlaneLeaves(Leaves):
             pixels: dict[str, Any] = {"pixels": self.shared}
         else:
             corners, columns = np.arange(len(roots))[:, None] * np.array([height, 0]), width
-            pixels = self._pixels(tables, len(roots) * height * width)
+            pixels = self.stage.pixels(tables, len(roots) * height * width)
         uploaded = self.device.upload(corners.astype(np.int32))
         return {"corners": uploaded, "columns": columns, **pixels}
 
@@ -146,7 +163,7 @@ class PlaneLeaves(Leaves):
         def finish() -> int:
             cl.wait_for_events(ready)
             for part, each in zip(parts, weights, strict=bool(weights)):
-                self.image[part] *= normalising(each.real, self.lines.channels)
+                self.image[part] *= normalising(each.real, self.stage.lines.channels)
             return sum(self.image[part].size for part in parts)
 
         return finish
@@ -201,7 +218,7 @@ class PlaneLeaves(Leaves):
 
     def _references(self, sector: Sector, batch: slice, pitch: int) -> dict[str, NDArray]:
         """Return samples of tiles' centres in the lines of their leaves, [roots, tiles, pitch]."""
-        shape, centre = (batch.stop - batch.start, self.per_root, pitch), self.level.centre
+        shape, centre = (batch.stop - batch.start, self.per_root, pitch), self.stage.level.centre
         sample = np.full(shape, centre, np.int32)
         fraction, phase = np.zeros((2, *shape), np.float32)
         first = sector.needs[-1].first[batch][:, self.leaf_of]

@@ -1,11 +1,7 @@
-"""One factorized image at work on a device, stage by stage."""
+"""The stages of a factorized image on a device: from lines to those of the leaves."""
 
 from __future__ import annotations
 
-import itertools
-import math
-from collections import deque
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,285 +10,250 @@ import pyopencl as cl
 from numpy.typing import NDArray
 
 from clsas.aperture.dense_channels import band_table
-from clsas.core import validate
-from clsas.core.lines import RangeLines
+from clsas.aperture.virtual_channels import VirtualChannels
 from clsas.factorized.buffers import CHUNK, Level, row_pitch, stage_lines, stage_tables
-from clsas.factorized.geometry import imaged_rms
-from clsas.factorized.leaves import Finish
-from clsas.factorized.plane_leaves import PlaneLeaves
-from clsas.factorized.sectors import Roots, Sector, references
-from clsas.factorized.surface_leaves import SurfaceLeaves
+from clsas.factorized.device_lines import DeviceLines
+from clsas.factorized.geometry import Geometry
+from clsas.factorized.sectors import Sector, references
 from clsas.opencl import phases
-from clsas.opencl.buffers import (
-    GUARD,
-    MARGIN,
-    Slot,
-    filter_table,
-    lines_buffer,
-    padded_length,
-    phase_polynomials,
-    upsampled_lines,
-)
+from clsas.opencl.buffers import GUARD, Slot, filter_table, phase_polynomials
 from clsas.opencl.device import Device
-from clsas.opencl.upsampling import upsample
-from clsas.plans.plan import Plan
+from clsas.opencl.kernels import Kernel
 
 _GROUP = 64  # work-items that share a subimage where each has one lane
-_AHEAD_S = 0.1  # of enqueued work: hides the preparation of roots; an interruption waits for it
-_PREPARED_FIRST = 4  # batches in the first sector, few, so that the device starts early
-_LARGEST_HALF, _LEAST_HALF = 65504.0, 2.0**-13  # below twice the latter, half precision coarsens
-_FILTERS_SUM = 8.0  # bounds the sum of absolute values of upsampling and aligning filters
-_MOST_EXPONENT = 100  # of a gain: float32 holds filters multiplied and divided by it
 _GROUPS_PER_UNIT = 3  # work-groups per compute unit, at least, so that all end together
 
 
+@dataclass(frozen=True)
+class StageShape:
+    """Sizes of a stage's tables and lines, for one sector.
+
+    Attributes
+    ----------
+    pitch : int
+        Entries in a row of the tables, one for each channel and some more.
+    stride : int
+        Lines of a subimage.
+    bands : int
+        Bands of channels; see `clsas.aperture.virtual_channels.Bands`.
+    """
+
+    pitch: int
+    stride: int
+    bands: int
+
+
 @dataclass(frozen=True, eq=False)
-class _Tables:
+class SectorTables:
     """Tables of a sector on the device.
 
     Attributes
     ----------
     slot : Slot
-        Buffers, see `clsas.factorized.buffers`.
-    pitches : list of int
-        Channels of a row, stage by stage.
-    strides : list of int
-        Lines of a subimage, stage by stage.
-    bands : list of int
-        Bands of channels, stage by stage: see `clsas.aperture.virtual_channels.Bands`.
+        The buffers, whose names are those of `clsas.factorized.buffers`.
+    shapes : tuple of StageShape
+        Sizes, stage by stage.
     """
 
     slot: Slot
-    pitches: list[int]
-    strides: list[int]
-    bands: list[int]
+    shapes: tuple[StageShape, ...]
+
+    @property
+    def has_lines(self) -> bool:
+        """True if each stage has a subimage with a virtual channel."""
+        return all(shape.stride for shape in self.shapes)
 
 
-class Run:
-    """An image of some lines at work on a device: its kernels, tables and buffers."""
+@dataclass(frozen=True, eq=False)
+class _Kernels:
+    """The stage kernel in both variants, and the tables that it takes for every sector.
 
-    def __init__(
-        self,
-        lines: RangeLines,
-        plan: Plan,
-        roots: Roots,
-        device: Device,
-        pixels: NDArray[np.complex64],
-        largest: float,
-    ) -> None:
-        image = plan.factorization
-        self.lines, self.plan, self.factorization, self.device = lines, plan, image, device
-        self.width, self.pitch = device.info.width, padded_length(image.resampling)
-        self.half_precision = image.half_precision
-        self.gain = _gain(largest, lines.channels) if self.half_precision and largest > 0 else 1.0
-        self.samples = self._upload_lines()  # early: a device upsamples them beside what follows
-        self.roots, self.geometry = roots, roots.geometry
-        self.division = self.geometry.division
-        if self.half_precision and not _holds(self.gain * imaged_rms(self.geometry, lines)):
-            device.finish()  # the buffer given up may still be written
-            self.half_precision, self.gain = False, 1.0
-            self.samples = self._upload_lines()
-            validate.warn(
-                "lines are held in single precision, not in half as planned, which takes up to "
-                "twice the memory: what can be seen of the grid is too faint beside the "
-                f"largest sample, {largest:.3g}, or that is too far from 1"
-            )
-        self.levels = [Level.of(half, self.width) for half in image.half_lengths]
-        self.filters = {
-            "range_filter": filter_table(device, image.align.coefficients),
-            "aperture_filter": filter_table(device, image.aperture.filter.coefficients),
+    Attributes
+    ----------
+    first, later : Kernel
+        For the stage that takes the raw lines, and for those that take virtual channels.
+    filters : dict of str to Buffer
+        Coefficients of filters and polynomials, by the names of the kernel's parameters.
+    parents : list of Buffer or None
+        Parent of each subimage of a root, stage by stage; the first stage has none.
+    """
+
+    first: Kernel
+    later: Kernel
+    filters: dict[str, cl.Buffer]
+    parents: list[cl.Buffer | None]
+
+    @classmethod
+    def built(cls, geometry: Geometry, device: Device, *, half_precision: bool) -> _Kernels:
+        """Build the kernels, and upload their tables."""
+        align = geometry.factorization.align
+        aperture = geometry.factorization.aperture.filter
+        filters = {
+            "range_filter": filter_table(device, align.coefficients),
+            "aperture_filter": filter_table(device, aperture.coefficients),
             "phase_polynomials": phase_polynomials(device, phases.PRECISE_TERMS),
         }
-        options = {"WIDTH": self.width, "TAPS": image.align.taps}
-        options |= {"APERTURE_TAPS": image.aperture.filter.taps, "HALF": int(self.half_precision)}
-        options |= {"CHUNK": CHUNK, "PHASE_TERMS": phases.PRECISE_TERMS}
-        ramp = int(self.geometry.ramps)
-        rows = int(self.geometry.track.is_sheet)
-        self.first_stage = device.kernel("stage", SHIFTS_GIVEN=1, RAMP=ramp, ROWS=rows, **options)
-        self.later_stage = device.kernel("stage", SHIFTS_GIVEN=0, RAMP=0, ROWS=2 * rows, **options)
-        kind = PlaneLeaves if self.geometry.surface.is_plane else SurfaceLeaves
-        self.leaves = kind(
-            lines, roots, plan, self.levels[-1], device, pixels, self.half_precision, self.gain
-        )
-        later = range(1, len(self.levels))
-        self.parents = {
-            level: device.upload(self.division.parents(level).astype(np.int32)) for level in later
+        options = {
+            "WIDTH": device.info.width,
+            "TAPS": align.taps,
+            "APERTURE_TAPS": aperture.taps,
+            "HALF": int(half_precision),
+            "CHUNK": CHUNK,
+            "PHASE_TERMS": phases.PRECISE_TERMS,
         }
-        # One set of tables is filled while the device works with the other.
-        self.table_slots = itertools.cycle([Slot(device), Slot(device)])
-        self.slot = Slot(device)
-
-    def _upload_lines(self) -> cl.Buffer:
-        """Return all lines on the device, upsampled."""
-        device, image, count = self.device, self.factorization, self.lines.channels
-        resampling = image.resampling
-        needed = lines_buffer(count, self.pitch, self.half_precision).nbytes
-        if needed > device.info.max_buffer_bytes:
-            raise ValueError(
-                f"{count} lines of {self.lines.length} samples need "
-                f"{needed / 2**20:.0f} MiB when upsampled, more than a buffer of "
-                f"{device.info.label}, {device.info.max_buffer_bytes / 2**20:.0f} MiB: image "
-                f"a part of them, or backproject exactly"
-            )
-        if image.upsampler is not None:
-            return upsample(
-                self.lines.samples,
-                resampling,
-                image.upsampler,
-                self.pitch,
-                device,
-                half_precision=self.half_precision,
-                gain=self.gain,
-            )
-        gain = image.aperture.lines_gain(image.align, image.final, resampling.ratio)
-        return device.share(
-            upsampled_lines(self.lines.samples, resampling, self.width, MARGIN, self.pitch, gain)
+        ramp, rows = int(geometry.ramps), int(geometry.track.is_sheet)
+        division = geometry.division
+        return cls(
+            first=device.kernel("stage", SHIFTS_GIVEN=1, RAMP=ramp, ROWS=rows, **options),
+            later=device.kernel("stage", SHIFTS_GIVEN=0, RAMP=0, ROWS=2 * rows, **options),
+            filters=filters,
+            parents=[
+                device.upload(division.parents(level).astype(np.int32)) if level else None
+                for level in range(len(division.sides))
+            ],
         )
 
-    def parts(self) -> Iterator[int]:
-        """Form all pixels; yield how many each time that some are finished.
+    def of(self, level: int) -> Kernel:
+        """Return the kernel of a stage."""
+        return self.later if level else self.first
 
-        The geometry of a sector is prepared while the device works on the one before.
-        """
-        under_way: deque[Finish] = deque()
-        batches = -(-len(self.division.roots) // self.factorization.roots_at_once)
-        most = max(math.ceil(_AHEAD_S * batches / max(self.plan.predicted_seconds, 1e-9)), 2)
-        for sector, tables in self._sectors():
-            for first in range(0, len(sector.roots), self.factorization.roots_at_once):
-                under_way.append(self._start(sector, tables, first))
-                if len(under_way) > most:
-                    yield under_way.popleft()()
-            tables.slot.busy = cl.enqueue_marker(self.device.queue)
-        while under_way:
-            yield under_way.popleft()()
-        self.leaves.complete()
 
-    def _sectors(self) -> Iterator[tuple[Sector, _Tables]]:
-        """Prepare sectors of roots; the first is small, for the device to begin with."""
-        first = _PREPARED_FIRST * self.factorization.roots_at_once
-        for sector in self.roots.sectors(first, self.factorization.roots_prepared):
-            yield sector, self._upload_tables(sector)
+class Stages:
+    """The stages of an image on a device.
 
-    def _start(self, sector: Sector, tables: _Tables, first: int) -> Finish:
-        """Start forming the pixels of some roots of a sector."""
-        batch = slice(first, min(first + self.factorization.roots_at_once, len(sector.roots)))
-        if not all(tables.strides):
-            return self.leaves.blank(sector, batch)
-        for level in range(len(self.levels)):
-            self._stage(tables, level, batch)
-        lines = self.slot[f"lines{len(self.levels) - 1}"]
-        finish = self.leaves.form(tables.slot, sector, batch, lines)
-        self.slot.busy = cl.enqueue_marker(self.device.queue)
-        return finish
+    Parameters
+    ----------
+    lines : DeviceLines
+        The raw lines.
+    geometry : Geometry
+    device : Device
+    """
 
-    def _upload_tables(self, sector: Sector) -> _Tables:
+    def __init__(self, lines: DeviceLines, geometry: Geometry, device: Device) -> None:
+        self.lines, self.geometry, self.device = lines, geometry, device
+        self.division, self.width = geometry.division, device.info.width
+        halves = geometry.factorization.half_lengths
+        self.levels = [Level.of(half, self.width) for half in halves]
+        self._kernels = _Kernels.built(geometry, device, half_precision=lines.half_precision)
+        self._slot = Slot(device)
+
+    def fill(self, slot: Slot, sector: Sector) -> SectorTables:
         """Start copying the tables of a sector to the device."""
-        slot, levels = next(self.table_slots), range(len(self.levels))
-        slot.wait()
-        strides = [sector.stride(level) for level in levels]
-        for level in levels:
-            roots, channels = sector.virtual[level].base.shape
-            subimages = self.division.per_root(level)
-            values = self._stage_values(sector, level)
-            ramps = self.geometry.ramps
-            for name, buffer in stage_tables(
+        for level, virtual in enumerate(sector.virtual):
+            values = _table_values(self.geometry, sector, level)
+            roots, channels = virtual.base.shape
+            tables = stage_tables(
                 level,
                 roots,
-                subimages,
+                self.division.per_root(level),
                 channels,
-                ramps=ramps,
-                bands=values[f"bands{level}"].shape[2],
+                ramps=self.geometry.ramps,
+                bands=_bands(virtual),
                 rows=self.geometry.track.is_sheet,
-            ).items():
+            )
+            for name, buffer in tables.items():
                 slot.fill(name, buffer.holding(values[name]))
-        self.leaves.fill(slot, sector)
-        pitches = [row_pitch(virtual.base.shape[1]) for virtual in sector.virtual]
-        bands = [1 if each.bands is None else each.bands.first.shape[1] for each in sector.virtual]
-        return _Tables(slot, pitches, strides, bands)
+        shapes = (
+            StageShape(row_pitch(virtual.base.shape[1]), sector.stride(level), _bands(virtual))
+            for level, virtual in enumerate(sector.virtual)
+        )
+        return SectorTables(slot, tuple(shapes))
 
-    def _stage_values(self, sector: Sector, level: int) -> dict[str, NDArray]:
-        """Return what the tables of a stage hold, see `cl/stage.cl`."""
-        virtual, need = sector.virtual[level], sector.needs[level]
-        values = {f"base{level}": virtual.base, f"between{level}": virtual.between}
-        first_of_parent = np.zeros_like(need.first)
-        if level:
-            parents = self.division.parents(level)
-            first_of_parent = sector.needs[level - 1].first[:, parents]
-            parent_m = sector.relative_m[level - 1][:, parents]
-            offsets_m = [parent_m, sector.relative_m[level] - parent_m]
-            values[f"offsets{level}"] = np.concatenate(offsets_m, axis=-1)
-            values[f"positions{level}"] = sector.positions_m(level - 1).swapaxes(1, 2)
-        else:
-            values |= references(self.geometry, sector)
-        values[f"bands{level}"] = band_table(virtual.bands, need, first_of_parent)
-        if virtual.bands is not None and virtual.bands.between is not None:
-            values[f"rows{level}"] = virtual.bands.between
-        return values
+    def form(self, tables: SectorTables, batch: slice) -> cl.Buffer:
+        """Start forming the lines of the leaves of some roots, and return their buffer.
 
-    def _stage(self, tables: _Tables, level: int, batch: slice) -> None:
+        The buffer is in use until the event that is passed to `busy_until`.
+        """
+        for level in range(len(self.levels)):
+            self._form(level, tables, batch)
+        return self._slot[f"lines{len(self.levels) - 1}"]
+
+    def busy_until(self, event: cl.Event) -> None:
+        """Set the event after which lines may be overwritten."""
+        self._slot.busy = event
+
+    def _form(self, level: int, tables: SectorTables, batch: slice) -> None:
         """Form the lines of a stage from those of the one before, or from the raw ones."""
-        device, table = self.device, tables.slot
-        shape, stride = self.levels[level], tables.strides[level]
-        # Room for most subimages from the start: a buffer that grows waits for all commands.
-        lines_each = max(stride, self.factorization.most_channels[level])
+        lines, shape, slot = self.levels[level], tables.shapes[level], tables.slot
         per_root = self.division.per_root(level)
         children = (batch.stop - batch.start) * per_root
-        ((name, buffer),) = stage_lines(
-            level, children, lines_each, shape.pitch, half_precision=self.half_precision
-        ).items()
-        child_lines = self.slot.zeros(name, buffer.nbytes)
+        child_lines = self._child_lines(level, children, shape.stride)
+        part_length = self._part_length(lines.length, children)
         items = _GROUP if self.width == 1 else 1
-        # Few children are divided, so that there is work for all.
-        step = _GROUP if self.width == 1 else 8 * self.width
-        if self.geometry.track.is_dense and self.width > 1:
-            # All channels of a dense aperture go into few children: they need every core.
-            few = children < _GROUPS_PER_UNIT * device.info.compute_units
-            step = 2 * self.width if few else step
-        parts = -(-_GROUPS_PER_UNIT * device.info.compute_units // children)
-        part_length = step * -(-shape.length // (step * parts))
-        device.run(
-            self.later_stage if level else self.first_stage,
-            (children * items, -(-shape.length // part_length)),
-            bands=table[f"bands{level}"],
-            band_count=tables.bands[level],
+        rows = {"row_position": slot[f"rows{level}"]} if self.geometry.track.is_sheet else {}
+        self.device.run(
+            self._kernels.of(level),
+            (children * items, -(-lines.length // part_length)),
+            bands=slot[f"bands{level}"],
+            band_count=shape.bands,
             first_child=batch.start * per_root,
             children_per_root=per_root,
-            first_virtual=table[f"base{level}"],
-            tap_position=table[f"between{level}"],
-            **({"row_position": table[f"rows{level}"]} if self.geometry.track.is_sheet else {}),
-            channel_pitch=tables.pitches[level],
-            **self._shifts(tables, level),
-            half_length=shape.half,
-            **self.filters,
+            first_virtual=slot[f"base{level}"],
+            tap_position=slot[f"between{level}"],
+            **rows,
+            channel_pitch=shape.pitch,
+            **(self._later_parents(tables, level) if level else self._raw_parents(tables)),
+            half_length=lines.half,
+            **self._kernels.filters,
             child_lines=child_lines,
-            lines_per_child=stride,
-            child_pitch=shape.pitch,
-            length=shape.length,
+            lines_per_child=shape.stride,
+            child_pitch=lines.pitch,
+            length=lines.length,
             part_length=part_length,
             guard=GUARD,
-            wait_for=table.filled,
+            wait_for=slot.filled,
             local=(items, 1),
         )
 
-    def _shifts(self, tables: _Tables, level: int) -> dict[str, Any]:
-        """Return the kernel's arguments about a stage's parents, and how their lines are shifted.
+    def _child_lines(self, level: int, children: int, stride: int) -> cl.Buffer:
+        """Return a buffer for the lines that a stage forms of some subimages."""
+        # Most subimages fit from the start: a buffer that grows waits for all commands.
+        lines_each = max(stride, self.geometry.factorization.most_channels[level])
+        pitch, half = self.levels[level].pitch, self.lines.half_precision
+        ((name, buffer),) = stage_lines(
+            level, children, lines_each, pitch, half_precision=half
+        ).items()
+        return self._slot.zeros(name, buffer.nbytes)
 
-        Shifts of raw lines are found on the host in float64. Later ones follow from positions.
+    def _part_length(self, length: int, children: int) -> int:
+        """Return the samples of a line that a work-group forms.
+
+        With few subimages lines are divided into parts, so that all compute units have work.
         """
-        table, geometry = tables.slot, self.geometry
-        if level == 0:
-            names = ("order", "start", "nu", "cycles", *(["ramp"] if geometry.ramps else []))
-            shifts = {name: table[name] for name in names}
-            return {"parent_lines": self.samples, "parent_pitch": self.pitch, **shifts}
-        before = self.levels[level - 1]
+        step = _GROUP if self.width == 1 else 8 * self.width
+        wanted = _GROUPS_PER_UNIT * self.device.info.compute_units
+        if self.geometry.track.is_dense and self.width > 1 and children < wanted:
+            # Few subimages combine all channels of a dense aperture: they need every core.
+            step = 2 * self.width
+        parts = -(-wanted // children)
+        return step * -(-length // (step * parts))
+
+    def _raw_parents(self, tables: SectorTables) -> dict[str, Any]:
+        """Return the kernel's arguments about the raw lines, and how to align them.
+
+        The host has computed their shifts and phases in float64.
+        """
+        names = ("order", "start", "nu", "cycles", *(["ramp"] if self.geometry.ramps else []))
         return {
-            "parent_lines": self.slot[f"lines{level - 1}"],
+            "parent_lines": self.lines.samples,
+            "parent_pitch": self.lines.pitch,
+            **{name: tables.slot[name] for name in names},
+        }
+
+    def _later_parents(self, tables: SectorTables, level: int) -> dict[str, Any]:
+        """Return the kernel's arguments about the lines of the stage before.
+
+        The kernel finds their shifts and phases from the positions of virtual channels.
+        """
+        geometry, before = self.geometry, self.levels[level - 1]
+        return {
+            "parent_lines": self._slot[f"lines{level - 1}"],
             "parent_pitch": before.pitch,
-            "parents": self.parents[level],
+            "parents": self._kernels.parents[level],
             "parents_per_root": self.division.per_root(level - 1),
-            "lines_per_parent": tables.strides[level - 1],
-            "positions": table[f"positions{level}"],
-            "offsets": table[f"offsets{level}"],
+            "lines_per_parent": tables.shapes[level - 1].stride,
+            "positions": tables.slot[f"positions{level}"],
+            "offsets": tables.slot[f"offsets{level}"],
             "drift": geometry.drift,
             "samples_per_m": geometry.samples_per_m,
             "cycles_per_m": geometry.cycles_per_m,
@@ -300,12 +261,25 @@ class Run:
         }
 
 
-def _gain(largest: float, channels: int) -> float:
-    """Return a power of 2 with which lines, and the sum of all, stay within half precision."""
-    exponent = math.floor(math.log2(_LARGEST_HALF / (_FILTERS_SUM * channels * largest)))
-    return 2.0 ** min(max(exponent, -_MOST_EXPONENT), _MOST_EXPONENT)
+def _bands(virtual: VirtualChannels) -> int:
+    """Return the number of bands of a stage's channels."""
+    return 1 if virtual.bands is None else virtual.bands.first.shape[1]
 
 
-def _holds(rms: float) -> bool:
-    """Return whether half precision resolves lines of an rms value; zeros it does."""
-    return rms == 0 or _LEAST_HALF <= rms <= _LARGEST_HALF
+def _table_values(geometry: Geometry, sector: Sector, level: int) -> dict[str, NDArray]:
+    """Return the values of a stage's tables, by name; see `cl/stage.cl`."""
+    virtual, need = sector.virtual[level], sector.needs[level]
+    values = {f"base{level}": virtual.base, f"between{level}": virtual.between}
+    if virtual.bands is not None and virtual.bands.between is not None:
+        values[f"rows{level}"] = virtual.bands.between
+    if level == 0:
+        first_of_parent = np.zeros_like(need.first)
+        values |= references(geometry, sector)
+    else:
+        parents = geometry.division.parents(level)
+        first_of_parent = sector.needs[level - 1].first[:, parents]
+        parent_m = sector.relative_m[level - 1][:, parents]
+        offsets_m = [parent_m, sector.relative_m[level] - parent_m]
+        values[f"offsets{level}"] = np.concatenate(offsets_m, axis=-1)
+        values[f"positions{level}"] = sector.positions_m(level - 1).swapaxes(1, 2)
+    return values | {f"bands{level}": band_table(virtual.bands, need, first_of_parent)}

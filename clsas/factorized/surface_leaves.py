@@ -6,7 +6,8 @@ import numpy as np
 import pyopencl as cl
 from numpy.typing import NDArray
 
-from clsas.factorized.leaves import Finish, Leaves
+from clsas.factorized.leaf_groups import LeafGroups
+from clsas.factorized.leaves import Finish, LeafStage
 from clsas.factorized.sectors import Sector
 from clsas.opencl.buffers import VECTOR_ROOM, Slot, float_pairs
 from clsas.sonar.beam import normalising
@@ -14,15 +15,23 @@ from clsas.sonar.beam import normalising
 _ALL = slice(None)
 
 
-class SurfaceLeaves(Leaves):
-    """Leaves off a plane, in groups of points about their centres."""
+class SurfaceLeaves:
+    """Leaves off a plane, in groups of points; the methods are those of `leaves.Leaves`.
 
-    def _prepare(self) -> None:
-        found = self.roots.groups(self.width)
-        self.groups, self.leaf, self.ends = found.groups, found.leaf, found.ends
-        self.pixels_before = found.pixels_before
+    Parameters
+    ----------
+    stage : LeafStage
+    leaves : LeafGroups
+        The groups of points in all leaves.
+    image : complex64 array
+        The image, whose pixels are set.
+    """
+
+    def __init__(self, stage: LeafStage, leaves: LeafGroups, image: NDArray[np.complex64]) -> None:
+        self.stage, self.leaves, self.image = stage, leaves, image
+        self.geometry, self.device = stage.geometry, stage.device
         self.number = {tuple(root): n for n, root in enumerate(self.geometry.roots)}
-        options = self._options(self.groups)
+        options = stage.options(leaves.groups)
         self.backproject = self.device.kernel("backproject_points", **options)
 
     def _numbers(self, sector: Sector, batch: slice = _ALL) -> slice:
@@ -33,29 +42,31 @@ class SurfaceLeaves(Leaves):
 
     def _groups(self, roots: slice) -> slice:
         """Return the groups of some roots."""
-        return slice(int(self.ends[roots.start]), int(self.ends[roots.stop]))
+        return slice(int(self.leaves.ends[roots.start]), int(self.leaves.ends[roots.stop]))
 
-    def _parts(self, sector: Sector) -> dict[str, NDArray]:
+    def fill(self, slot: Slot, sector: Sector) -> None:
+        """Start copying the tables of a sector's leaves to the device."""
         roots = self._numbers(sector)
         groups = self._groups(roots)
-        root, leaf = np.divmod(self.leaf[groups], sector.relative_m[-1].shape[1])
+        root, leaf = np.divmod(self.leaves.leaf[groups], sector.relative_m[-1].shape[1])
         root -= roots.start
-        return {
-            "ranges": self._ranges(sector, root, leaf),
+        parts = {
+            "ranges": self.stage.ranges(sector, root, leaf),
             "centres": float_pairs(sector.relative_m[-1][root, leaf]),
-            "offsets": self.groups.offset_m[groups].reshape(-1, 3).T,
+            "offsets": self.leaves.groups.offset_m[groups].reshape(-1, 3).T,
         }
+        self.stage.fill(slot, sector, parts)
 
     def form(self, tables: Slot, sector: Sector, batch: slice, samples: cl.Buffer) -> Finish:
         """Start forming the pixels of some roots; see `Leaves.form`."""
         first = self._groups(self._numbers(sector)).start
         roots = self._numbers(sector, batch)
         groups = self._groups(roots)
-        count, size = self.groups.index[groups].shape
-        formed = [np.empty((count, size), np.complex64) for _ in range(1 + self.normalise)]
+        count, size = self.leaves.groups.index[groups].shape
+        formed = [np.empty((count, size), np.complex64) for _ in range(1 + self.stage.normalise)]
         ready = []
         if count:
-            pixels = self._pixels(tables, count * size)
+            pixels = self.stage.pixels(tables, count * size)
             self.device.run(
                 self.backproject,
                 (self.device.in_whole_groups(count),),
@@ -63,7 +74,7 @@ class SurfaceLeaves(Leaves):
                 groups=count,
                 ranges=tables["ranges"],
                 first_range=groups.start - first,
-                centre_sample=self.level.centre,
+                centre_sample=self.stage.level.centre,
                 drift=self.geometry.drift,
                 geometry=tables["geometry"],
                 geometry_pitch=sector.virtual[-1].coordinate.size + VECTOR_ROOM,
@@ -71,7 +82,7 @@ class SurfaceLeaves(Leaves):
                 offsets=tables["offsets"],
                 points=size * (self._groups(self._numbers(sector)).stop - first),
                 samples_per_m=self.geometry.samples_per_m,
-                **self.arguments,
+                **self.stage.arguments,
                 **pixels,
                 first_group=0,
                 wait_for=tables.filled,
@@ -81,14 +92,14 @@ class SurfaceLeaves(Leaves):
                 cl.enqueue_copy(self.device.queue, each, buffer, is_blocking=False)
                 for each, buffer in zip(formed, buffers, strict=True)
             ]
-            self.slot.busy = ready[-1]
+            self.stage.slot.busy = ready[-1]
             self.device.queue.flush()
 
         def finish() -> int:
             for event in ready:
                 event.wait()
             for sums in formed[1:]:
-                formed[0] *= normalising(sums.real, self.lines.channels)
+                formed[0] *= normalising(sums.real, self.stage.lines.channels)
             return self._put(roots, formed[0])
 
         return finish
@@ -97,7 +108,10 @@ class SurfaceLeaves(Leaves):
         """Return a function that sets pixels to 0; see `Leaves.blank`."""
         return lambda: self._put(self._numbers(sector, batch), np.complex64(0))
 
+    def complete(self) -> None:
+        """Do nothing: each batch hands its own pixels to the host."""
+
     def _put(self, roots: slice, pixels: NDArray[np.complex64] | np.complex64) -> int:
         """Set the pixels of some roots; return their number."""
-        self.image.reshape(-1)[self.groups.index[self._groups(roots)]] = pixels
-        return int(self.pixels_before[roots.stop] - self.pixels_before[roots.start])
+        self.image.reshape(-1)[self.leaves.groups.index[self._groups(roots)]] = pixels
+        return int(self.leaves.pixels_before[roots.stop] - self.leaves.pixels_before[roots.start])
