@@ -1,1 +1,1 @@
-"""The aperture: which few virtual channels stand for many channels."""
+"""The aperture: mean tracks, and the few virtual channels that stand for many channels."""

@@ -1,4 +1,4 @@
-"""Directions of the beam along a mean track, or over a sheet; and how fast its weights change."""
+"""Directions of the beam anywhere on a mean track, and the rates at which its weights change."""
 
 from __future__ import annotations
 
@@ -12,55 +12,78 @@ from clsas.aperture.dense_tracks import smooth_over_sheet
 from clsas.aperture.mean_track import MeanTrack
 from clsas.sonar.beam import BeamWindow
 
-_END = 0.03  # of a curve: over so much, turning at an end is measured
+_END = 0.03  # share of a curve over which the turning at an end is measured
 
 
 @dataclass(frozen=True, eq=False)
-class BeamDirections:
-    """Unit directions of the beam at any place of a mean track.
+class DirectionsOnCurves:
+    """Unit directions of the beam anywhere on one curve or on strips.
 
-    Past its ends, where positions go on straight ahead, directions keep turning as at the ends. So
-    weights of a beam that stays on a target change there as little as before.
+    Past the ends of a curve, where positions continue straight, directions keep turning as they do
+    at the ends. The weights of a beam that stays on a target thus change no faster there.
 
     Attributes
     ----------
     coordinate : float64 [samples]
-        Aperture coordinates of a curve's samples; none of a sheet.
+        Aperture coordinates of samples, ascending.
     along : float64 [samples, 3]
-        Directions there, between which others are interpolated.
-    sheet : MeanTrack or None
-        Of a sheet: the smooth directions nearest to those of the channels, as its positions.
+        Directions at the samples, between which others are interpolated.
     """
 
     coordinate: NDArray[np.float64]
     along: NDArray[np.float64]
-    sheet: MeanTrack | None = None
-
-    @classmethod
-    def of(
-        cls, beam: BeamWindow, channels_along: NDArray[np.float64], track: MeanTrack
-    ) -> BeamDirections:
-        """Return the directions over a mean track whose channels have directions [channels, 3]."""
-        if track.is_sheet:
-            smooth = smooth_over_sheet(track, channels_along, either_sign=beam.squint_deg == 0)
-            return cls(np.zeros(0), np.zeros((0, 3)), smooth)
-        order = np.argsort(track.coordinate, kind="stable")
-        sampled = interpolated_directions(
-            track.coordinate[order], channels_along[order], track.samples
-        )
-        return cls(track.samples, _turning_on(track, sampled))
 
     def at(
         self, coordinate: NDArray[np.float64], across: NDArray[np.float64] | None = None
     ) -> NDArray[np.float64]:
-        """Return unit directions at aperture coordinates, [..., 3]; in the middle of a sheet."""
-        if self.sheet is None:
-            return interpolated_directions(self.coordinate, self.along, coordinate)
-        return _unit(self.sheet.positions_m(coordinate, across))
+        """Return directions at aperture coordinates, [..., 3]; `across` has no effect."""
+        return interpolated_directions(self.coordinate, self.along, coordinate)
+
+
+@dataclass(frozen=True, eq=False)
+class DirectionsOnSheet:
+    """Unit directions of the beam anywhere on a sheet.
+
+    Attributes
+    ----------
+    smooth : MeanTrack
+        Its positions are smooth directions, the nearest to those of the channels.
+    """
+
+    smooth: MeanTrack
+
+    def at(
+        self, coordinate: NDArray[np.float64], across: NDArray[np.float64] | None = None
+    ) -> NDArray[np.float64]:
+        """Return directions at coordinates along and across, [..., 3]; by default in the middle."""
+        return _unit(self.smooth.positions_m(coordinate, across))
+
+
+BeamDirections = DirectionsOnCurves | DirectionsOnSheet
+
+
+def directions_of(
+    beam: BeamWindow, channels_along: NDArray[np.float64], track: MeanTrack
+) -> BeamDirections:
+    """Return the directions of a beam over a mean track.
+
+    Parameters
+    ----------
+    beam : BeamWindow
+    channels_along : float64 [channels, 3]
+        Directions of the track's channels.
+    track : MeanTrack
+    """
+    if track.is_sheet:
+        either_sign = beam.squint_deg == 0
+        return DirectionsOnSheet(smooth_over_sheet(track, channels_along, either_sign=either_sign))
+    order = np.argsort(track.coordinate, kind="stable")
+    sampled = interpolated_directions(track.coordinate[order], channels_along[order], track.samples)
+    return DirectionsOnCurves(track.samples, _turning_on(track, sampled))
 
 
 def _turning_on(track: MeanTrack, sampled: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return directions at `track.samples` that turn past the curves' ends as before them."""
+    """Return directions at `track.samples` that keep turning past the ends of curves."""
     strip, result = track.strip_of(track.samples), sampled.copy()
     steps = max(round(_END * track.sampled), 1)
     for number in range(track.strips):
@@ -94,9 +117,10 @@ def beam_rate(
     centres_m: NDArray[np.float64],
     sides_m: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """Largest phase rate at which a beam's weights change along a line, [boxes, samples].
+    """Return the largest rates at which a beam's weights change along a line, [boxes, samples].
 
-    Virtual channels must sample the weights, too. An edge of the beam counts as one cycle.
+    Virtual channels must sample these weights, too. The rates are those of a phase that turns by
+    one cycle over an edge of the beam, per unit of the aperture coordinate.
 
     Parameters
     ----------
@@ -105,7 +129,7 @@ def beam_rate(
     along : float64 [samples, 3]
         Directions of the beam at `line.samples`.
     centres_m : float64 [boxes, 3]
-        Middles of boxes. The rates hold at these and at the corners.
+        Middles of boxes. The rates are the largest of those at the middle and at the corners.
     sides_m : float64 [axes, 3]
         Sides of the boxes.
     """

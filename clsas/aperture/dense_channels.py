@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from clsas.aperture.beam_directions import BeamDirections, beam_rate
 from clsas.aperture.mean_track import ACROSS_AT, ALONG_AT, MeanTrack
-from clsas.aperture.phase_rates import SampledLines, cycles_per_extent
+from clsas.aperture.phase_rates import PhaseBoxes, largest_rates
 from clsas.aperture.virtual_channels import (
     Bands,
     ChannelRanges,
@@ -111,31 +111,16 @@ class SheetRates:
         )
 
 
-def sheet_rates(
-    track: MeanTrack,
-    steps_m: NDArray[np.float64],
-    centres_m: NDArray[np.float64],
-    extents: NDArray[np.float64],
-    cycles_per_m: float,
-    nearest_m: float,
-    every: int = 1,
-) -> SheetRates:
-    """Return the largest phase rates of subimages within boxes, on lines along and across a sheet.
+def sheet_rates(track: MeanTrack, boxes: PhaseBoxes, every: int = 1) -> SheetRates:
+    """Return the largest phase rates of subimages within boxes, along and across a sheet.
 
-    Rates are [axes, n, samples] as those of `cycles_per_extent`, which has the parameters. They are
-    the largest of some lines each.
+    Each is [axes, boxes, samples], as `cycles_per_extent` returns them, which has the parameters.
+    They are the largest of those on several lines.
     """
     lines = track.lines_along + track.lines_across
     sampled = [[each[::every] for each in line.sampled_m] for line in lines]
     positions_m, tangents_m = (np.concatenate(each) for each in zip(*sampled, strict=True))
-    rates = cycles_per_extent(
-        SampledLines((positions_m, tangents_m)),
-        steps_m,
-        centres_m,
-        extents,
-        cycles_per_m,
-        nearest_m,
-    )
+    rates = largest_rates(positions_m, tangents_m, boxes)
     first = len(track.lines_along) * len(sampled[0][0])
     shape = rates.shape[:-1]
     along, across = rates[..., :first], rates[..., first:]
@@ -262,7 +247,7 @@ def _of_sheet(
     aperture: Interpolator,
     bands: Bands,
 ) -> VirtualChannels:
-    position_m = track.positions_on_grid_m(found.columns, found.rows)
+    position_m = track.sheet.positions_on_grid_m(found.columns, found.rows)
     position_m = position_m.reshape(len(position_m), -1, 3)
     return VirtualChannels(
         found.coordinate, position_m, order, base, between, aperture, bands, found.rows

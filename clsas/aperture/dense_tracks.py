@@ -206,7 +206,7 @@ def _same_way(track: MeanTrack, along: NDArray[np.float64]) -> NDArray[np.float6
     assert track.across is not None
     coordinates = track.coordinate, track.across
     toward = []
-    for axes_m in (track.tangents_m(*coordinates), track.sideways_m(*coordinates)):
+    for axes_m in (track.tangents_m(*coordinates), track.sheet.sideways_m(*coordinates)):
         length_m = np.maximum(np.linalg.norm(axes_m, axis=1), 1e-30)
         toward.append(np.einsum("ci,ci->c", along, axes_m) / length_m)
     clearest = max(toward, key=lambda each: float(np.abs(each).mean()))

@@ -1,13 +1,12 @@
-"""The mean track of an aperture: smooth curves along its channels.
+"""The mean track of an aperture: smooth curves along its channels, or a sheet.
 
-An aperture coordinate is a curve's parameter: 0 at its first and 1 at its last channel. A dense
-aperture has several curves, its strips, or is a sheet: a curve that moves sideways.
+The aperture coordinate is the parameter of a curve: 0 at its first channel and 1 at its last. A
+dense aperture has several curves, called strips, or a sheet, which is a curve that moves sideways.
 """
 
 from __future__ import annotations
 
 import functools
-import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
@@ -16,47 +15,52 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import BSpline, make_lsq_spline
 
+from clsas.aperture.sheets import Sheet
 from clsas.core.lines import RangeLines
 
-# What half and twice change, by `scripts/bench sensitivity`, where they change anything:
-_SAMPLES = 257  # of the track, at which rates are evaluated; half: errors 0.1 dB larger
-# Past either end, each twice as far as the one before; half: images up to 16 % slower.
+# The effects of half and twice these values were measured by `scripts/bench sensitivity`.
+# Samples of a single curve at which rates are evaluated. With half, errors are 0.1 dB larger.
+_SAMPLES = 257
+# Samples past either end, each twice as far as the one before. With half, images take up to 16 %
+# more time.
 _SAMPLES_BEYOND = 12
 ALONG_AT = (0.0, 0.5, 1.0)
 """Coordinates across a sheet of the lines along it at which rates are evaluated."""
 ACROSS_AT = tuple(np.linspace(0, 1, 9))
 """Aperture coordinates of the lines across a sheet at which rates are evaluated."""
 STRIP_SAMPLES = 40
-"""Samples of each of several strips, and of lines across a sheet."""
+"""Samples at which rates are evaluated on each strip, and on lines across a sheet."""
 APART = 16.0
-"""Aperture coordinates from one strip to the next, more than samples go past the ends."""
-_SAME_PLACE_M = 1e-9  # within which channels lie on the mean track
+"""Difference of aperture coordinates between strips; samples past their ends must not overlap."""
+_SAME_PLACE_M = 1e-9  # channels that are closer to the mean track lie on it
 _CHANNELS_PER_KNOT = 16
 _MOST_INTERVALS = 64
 CLOSE_ENOUGH = 0.01
-"""Distance of phase centres from the mean track that needs no better one, wavelengths rms."""
+"""Rms distance of phase centres from a mean track that is close enough, wavelengths."""
 
 
 @dataclass(frozen=True, eq=False)
 class MeanTrack:
-    """Smooth curves along the phase centres, (tx + rx)/2, continued straight past their ends.
+    """Smooth curves or a sheet through the phase centres, (tx + rx)/2.
+
+    Past their ends they are continued straight.
 
     Attributes
     ----------
     spline : BSpline
-        Position in metres [3] over the aperture coordinate, 0 to 1. Of a sheet, coefficients of
-        the powers of the coordinate across it, [powers, 3].
+        Position over the aperture coordinate from 0 to 1, metres [3]. For a sheet, the
+        coefficients of the powers of the coordinate across, [powers, 3].
     coordinate : float64 [channels]
-        Aperture coordinate of the point of the curve nearest to each phase centre. The coordinates
-        of strip n run from 16 n to 16 n + 1.
+        Aperture coordinate of the point of the track that is nearest to each phase centre. The
+        coordinates of strip n run from 16 n to 16 n + 1.
     others : tuple of BSpline
         The curves of further strips.
     across : float64 [channels] or None
         Coordinate of each phase centre across a sheet, 0 to 1; None without a sheet.
     sampled : int
-        Samples of each strip at which rates are evaluated.
+        Number of samples of each curve at which rates are evaluated.
     is_closed : bool
-        True for a sheet whose first and last column coincide: a whole ring.
+        True for a sheet that is a whole ring: its first and last columns coincide.
     """
 
     spline: BSpline
@@ -68,7 +72,7 @@ class MeanTrack:
 
     @property
     def strips(self) -> int:
-        """Number of curves."""
+        """Number of curves; 1 for a sheet."""
         return 1 + len(self.others)
 
     @property
@@ -78,17 +82,17 @@ class MeanTrack:
 
     @property
     def is_sheet(self) -> bool:
-        """True if the curve moves sideways."""
+        """True for a sheet."""
         return self.across is not None
 
     def some(self, channels: Any) -> MeanTrack:
-        """Return this track with some of the channels, in any order."""
+        """Return this track with only some of the channels, in any order."""
         across = None if self.across is None else self.across[channels]
         return replace(self, coordinate=self.coordinate[channels], across=across)
 
     @functools.cached_property
     def alone(self) -> tuple[MeanTrack, ...]:
-        """The curve of each strip as a track of its own, without channels."""
+        """A track for each curve, without channels."""
         curves = (self.spline, *self.others)
         return tuple(MeanTrack(each, np.zeros(0), sampled=self.sampled) for each in curves)
 
@@ -100,108 +104,59 @@ class MeanTrack:
         """Return the strip that each aperture coordinate belongs to."""
         return np.clip(np.rint((coordinate - 0.5) / APART), 0, self.strips - 1).astype(np.int64)
 
+    @functools.cached_property
+    def sheet(self) -> Sheet:
+        """Positions on the sheet; only for a track that is one."""
+        return Sheet(self.spline)
+
     def positions_m(
         self, coordinate: NDArray[np.float64], across: NDArray[np.float64] | None = None
     ) -> NDArray[np.float64]:
-        """Return positions at aperture coordinates, [..., 3]; in the middle across a sheet."""
-        return self._in_strips(self._position_m, coordinate, across)
+        """Return positions at aperture coordinates, [..., 3]; by default in a sheet's middle."""
+        if self.is_sheet:
+            return self.sheet.positions_m(coordinate, _across_or_middle(coordinate, across))
+        return self._on_strips(_positions_on_curve_m, coordinate)
 
     def tangents_m(
         self, coordinate: NDArray[np.float64], across: NDArray[np.float64] | None = None
     ) -> NDArray[np.float64]:
-        """Return the derivative of the position by the aperture coordinate, [..., 3]."""
-        return self._in_strips(self._tangent_m, coordinate, across)
+        """Return the derivatives of positions by the aperture coordinate, [..., 3]."""
+        if self.is_sheet:
+            return self.sheet.tangents_m(coordinate, _across_or_middle(coordinate, across))
+        return self._on_strips(_tangents_of_curve_m, coordinate)
 
-    def _in_strips(
+    def _on_strips(
         self,
-        evaluate: Callable[..., NDArray[np.float64]],
+        evaluate: Callable[[BSpline, NDArray[np.float64]], NDArray[np.float64]],
         coordinate: NDArray[np.float64],
-        across: NDArray[np.float64] | None,
     ) -> NDArray[np.float64]:
         """Evaluate each coordinate on the curve of its strip."""
         if not self.others:
-            return evaluate(self.spline, coordinate, across)
+            return evaluate(self.spline, coordinate)
         strip, result = self.strip_of(coordinate), np.empty((*coordinate.shape, 3))
         for number, spline in enumerate((self.spline, *self.others)):
             its = strip == number
-            result[its] = evaluate(spline, coordinate[its] - APART * number, None)
+            result[its] = evaluate(spline, coordinate[its] - APART * number)
         return result
-
-    def _position_m(
-        self,
-        spline: BSpline,
-        coordinate: NDArray[np.float64],
-        across: NDArray[np.float64] | None,
-    ) -> NDArray[np.float64]:
-        inside = np.clip(coordinate, 0, 1)
-        position_m = self._swept(spline(inside), across)
-        beyond = inside != coordinate
-        past = (coordinate - inside)[beyond]
-        if past.size:
-            sideways = None if across is None else across[beyond]
-            position_m[beyond] += past[:, None] * self._swept(spline(inside[beyond], 1), sideways)
-        return position_m
-
-    def _tangent_m(
-        self,
-        spline: BSpline,
-        coordinate: NDArray[np.float64],
-        across: NDArray[np.float64] | None,
-    ) -> NDArray[np.float64]:
-        return self._swept(spline(np.clip(coordinate, 0, 1), 1), across)
-
-    def _swept(
-        self, values: NDArray[np.float64], across: NDArray[np.float64] | None
-    ) -> NDArray[np.float64]:
-        """Return the polynomial across a sheet of coefficients [..., powers, 3], [..., 3]."""
-        if not self.is_sheet:
-            return values
-        return _polynomial(values, np.full(values.shape[:-2], 0.5) if across is None else across)
-
-    def positions_on_grid_m(
-        self, coordinate: NDArray[np.float64], across: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
-        """Return positions of a sheet at columns [n, columns] and rows [n, rows].
-
-        float64 [n, rows, columns, 3].
-        """
-        inside = np.clip(coordinate, 0, 1)
-        coefficients = self.spline(inside)
-        coefficients += (coordinate - inside)[..., None, None] * self.spline(inside, 1)
-        shape = (*across.shape, coordinate.shape[1])
-        return _polynomial(coefficients[:, None], np.broadcast_to(across[..., None], shape))
 
     def line_along(self, across: float) -> MeanTrack:
         """Return the curve along a sheet at a coordinate across it."""
-        powers = across ** np.arange(self.spline.c.shape[1])
-        coefficients = np.einsum("nki,k->ni", self.spline.c, powers)
-        return MeanTrack(BSpline(self.spline.t, coefficients, self.spline.k), np.zeros(0))
+        return MeanTrack(self.sheet.curve_along(across), np.zeros(0))
 
     def line_across(self, coordinate: float) -> MeanTrack:
         """Return the curve across a sheet at an aperture coordinate."""
-        powers = self.spline(coordinate)
-        degree = len(powers) - 1
-        # Bernstein's coefficients of a polynomial.
-        bernstein = np.array(
-            [
-                [math.comb(i, k) / math.comb(degree, k) for k in range(degree + 1)]
-                for i in range(degree + 1)
-            ]
-        )
-        knots = np.repeat([0.0, 1.0], degree + 1)
-        spline = BSpline(knots, bernstein @ powers, degree)
-        return MeanTrack(spline, np.zeros(0), sampled=STRIP_SAMPLES)
+        return MeanTrack(self.sheet.curve_across(coordinate), np.zeros(0), sampled=STRIP_SAMPLES)
 
     @functools.cached_property
     def samples(self) -> NDArray[np.float64]:
-        """Aperture coordinates at which rates are evaluated, past the curves' ends too, [n]."""
+        """Aperture coordinates at which rates are evaluated, also past the ends of curves, [n]."""
         beyond = 2.0 ** np.arange(1 - _SAMPLES_BEYOND, 1) * 4
         one = np.concatenate([-beyond[::-1], np.linspace(0, 1, self.sampled), 1 + beyond])
         return (APART * np.arange(self.strips)[:, None] + one).ravel()
 
     @functools.cached_property
     def on_track(self) -> NDArray[np.bool_]:
-        """False for samples past the curves' ends, [n]."""
+        """False for samples past the ends of curves, [n]."""
         return np.abs(self.samples - APART * self.strip_of(self.samples) - 0.5) <= 0.5
 
     @functools.cached_property
@@ -225,54 +180,87 @@ class MeanTrack:
         phase_centres_m: NDArray[np.float64],
         own_drift: NDArray[np.float64] | None = None,
     ) -> tuple[NDArray[np.float64], NDArray[np.float64] | None]:
-        """Return the aperture coordinates at which phase centres appear from some points.
+        """Return the coordinates at which phase centres appear from some points.
 
-        A channel off the track is replaced by the point of the track in the same direction. The
-        remaining difference, of distance, matters least. A receiver's motion during flight moves
-        the phase centre by half as much.
+        A channel off the track is replaced by the point of the track that is seen in the same
+        direction. Only its distance is then different, which matters least. The motion of a
+        receiver during flight moves the phase centre by half as much.
 
         Parameters
         ----------
         points_m : float64 [points, 3]
         phase_centres_m : float64 [channels, 3]
-            Those of the channels of `coordinate`.
+            Phase centres of the channels of `coordinate`.
         own_drift : float64 [channels, 3], optional
-            See `own_drift`.
+            See `clsas.aperture.phase_rates.own_drift`.
 
         Returns
         -------
         float64 [points, channels]
-            Along the track.
+            Aperture coordinates.
         float64 [points, channels] or None
-            Across a sheet.
+            Coordinates across a sheet.
         """
-        shape = (len(points_m), len(self.coordinate))
-        across = None if self.across is None else np.broadcast_to(self.across, shape)
         off_m = self.offsets_m(phase_centres_m)[None]
         if own_drift is None and not np.abs(off_m).max() > _SAME_PLACE_M:
-            return np.broadcast_to(self.coordinate, shape), across
-        tangent = self.tangents_m(self.coordinate, self.across)
+            return self.coordinates_everywhere(len(points_m))
         sight = points_m[:, None] - phase_centres_m
-        square = np.einsum("pci,pci->pc", sight, sight)
-        square = np.maximum(square, 1e-30)
+        square = np.maximum(np.einsum("pci,pci->pc", sight, sight), 1e-30)
         if own_drift is not None:
             off_m = off_m + np.sqrt(square)[..., None] * own_drift
-        if across is not None:
-            return self._apparent_on_sheet(sight / np.sqrt(square)[..., None], off_m, tangent)
+        if self.is_sheet:
+            return self._apparent_on_sheet(sight / np.sqrt(square)[..., None], off_m)
+        return self._apparent_on_curves(sight, square, off_m), None
+
+    def coordinates_everywhere(
+        self, points: int
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64] | None]:
+        """Return the coordinates of the channels, repeated for a number of points.
+
+        If all channels lie on the track, `apparent_coordinates` are these.
+        """
+        shape = (points, len(self.coordinate))
+        across = None if self.across is None else np.broadcast_to(self.across, shape)
+        return np.broadcast_to(self.coordinate, shape), across
+
+    def _apparent_on_curves(
+        self, sight: NDArray[np.float64], square: NDArray[np.float64], off_m: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Return apparent coordinates along curves, [points, channels].
+
+        Parameters
+        ----------
+        sight : float64 [points, channels, 3]
+            From channels to points, metres.
+        square : float64 [points, channels]
+            Squares of their lengths.
+        off_m : float64 [1 or points, channels, 3]
+            From the track to channels.
+        """
+        tangent = self.tangents_m(self.coordinate)
         along = np.einsum("pci,ci->pc", sight, tangent)
         toward = np.sum(sight * off_m, axis=-1)
         both = np.sum(tangent * off_m, axis=-1) - along * toward / square
         length = np.einsum("ci,ci->c", tangent, tangent)
         # Where the curve leads towards the point, the direction changes little along it.
         sideways = np.maximum(length - along**2 / square, 0.01 * length)
-        return self.coordinate + both / sideways, None
+        return self.coordinate + both / sideways
 
     def _apparent_on_sheet(
-        self, sight: NDArray[np.float64], off_m: NDArray[np.float64], tangent: NDArray[np.float64]
+        self, sight: NDArray[np.float64], off_m: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return coordinates along and across a sheet; `sight` are unit vectors to the points."""
+        """Return apparent coordinates along and across a sheet, [points, channels] each.
+
+        Parameters
+        ----------
+        sight : float64 [points, channels, 3]
+            Unit vectors from channels to points.
+        off_m : float64 [1 or points, channels, 3]
+            From the sheet to channels.
+        """
         assert self.across is not None
-        sideways = self.sideways_m(self.coordinate, self.across)
+        tangent = self.sheet.tangents_m(self.coordinate, self.across)
+        sideways = self.sheet.sideways_m(self.coordinate, self.across)
         axes = np.stack([tangent, sideways])
         length = np.einsum("aci,aci->ac", axes, axes)
         toward = np.einsum("pci,aci->apc", sight, axes)
@@ -287,41 +275,41 @@ class MeanTrack:
             self.across + (second * square[0] - first * mixed) / determinant,
         )
 
-    def sideways_m(
-        self, coordinate: NDArray[np.float64], across: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
-        """Return the derivative of a sheet's position by the coordinate across it, [..., 3]."""
-        coefficients = self.spline(np.clip(coordinate, 0, 1))
-        powers = np.arange(1, coefficients.shape[-2])
-        inside = np.clip(across, 0, 1)[..., None]
-        return np.einsum(
-            "...ki,...k->...i", coefficients[..., 1:, :], powers * inside ** (powers - 1)
-        )
-
     def offsets_m(self, phase_centres_m: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the offsets of the channels' phase centres from the track, [channels, 3]."""
         return phase_centres_m - self.positions_m(self.coordinate, self.across)
 
 
-def _polynomial(coefficients: NDArray[np.float64], at: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return polynomials of coefficients [..., powers, 3], straight beyond 0 to 1, [..., 3]."""
-    powers = coefficients.shape[-2]
-    if powers == 2:
-        return coefficients[..., 0, :] + at[..., None] * coefficients[..., 1, :]
-    inside = np.clip(at, 0, 1)[..., None]
-    value, slope = np.zeros((2, *at.shape, 3))
-    for power in reversed(range(powers)):
-        slope = slope * inside + value
-        value = value * inside + coefficients[..., power, :]
-    return value + (at[..., None] - inside) * slope
+def _across_or_middle(
+    coordinate: NDArray[np.float64], across: NDArray[np.float64] | None
+) -> NDArray[np.float64]:
+    """Return coordinates across a sheet; by default its middle, for each aperture coordinate."""
+    return np.full(np.shape(coordinate), 0.5) if across is None else across
+
+
+def _positions_on_curve_m(spline: BSpline, coordinate: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return positions on a curve, which is continued straight past its ends, [..., 3]."""
+    inside = np.clip(coordinate, 0, 1)
+    position_m: NDArray[np.float64] = spline(inside)
+    beyond = inside != coordinate
+    past = (coordinate - inside)[beyond]
+    if past.size:
+        position_m[beyond] += past[:, None] * spline(inside[beyond], 1)
+    return position_m
+
+
+def _tangents_of_curve_m(spline: BSpline, coordinate: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the derivatives of positions on a curve by the aperture coordinate, [..., 3]."""
+    tangent_m: NDArray[np.float64] = spline(np.clip(coordinate, 0, 1), 1)
+    return tangent_m
 
 
 def mean_track(lines: RangeLines, wavelength_m: float) -> MeanTrack | None:
     """Return a curve along the phase centres of lines, or None if they all coincide.
 
-    Channels may be in any order. Three orders are tried: as given, along the principal axis, and
-    around the middle. The one with the shortest path through the phase centres is taken. The
-    curve has as many intervals as it needs to follow them.
+    Channels may be in any order. Three orders are tried: the given one, along the principal axis,
+    and by the angle around the middle. The one with the shortest path through the phase centres
+    wins. The number of the curve's intervals is doubled until the curve follows them.
     """
     centres_m = lines.phase_centres_m
     order, along = _order(centres_m)
@@ -341,7 +329,7 @@ def mean_track(lines: RangeLines, wavelength_m: float) -> MeanTrack | None:
     coordinate = np.empty(len(along))
     coordinate[order] = along
     track = MeanTrack(best, coordinate)
-    # Newton's steps towards the nearest point of the curve.
+    # Newton steps towards the nearest points of the curve.
     for _ in range(3):
         tangent = track.tangents_m(coordinate)
         off_m = centres_m - track.positions_m(coordinate)
@@ -353,7 +341,7 @@ def mean_track(lines: RangeLines, wavelength_m: float) -> MeanTrack | None:
 
 
 def _order(centres_m: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return the order of phase centres along the track, and each one's distance along it, m."""
+    """Return the order of phase centres along the track, and their path lengths along it, m."""
     if len(centres_m) == 1:
         return np.zeros(1, np.int64), np.zeros(1)
     offset_m = centres_m - centres_m.mean(axis=0)

@@ -1,4 +1,4 @@
-"""Factorized backprojection with nearest beams: the method and the formulas of THESIS chapter 4."""
+"""Factorized backprojection with nearest beams: method and formulas of chapter 4 of THESIS."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ from clsas.core.fields import CONFIG, Whole
 from clsas.signal.interpolation import Gain, Interpolator
 
 Stages = Sequence[tuple[int, int]]
-"""(QR, QI) of every stage: how many lines are summed, and the division of either image side."""
+"""(QR, QI) of each stage: the number of lines summed, and the divisor of both image sides."""
 
 
 @dataclass(frozen=True, config=CONFIG)
 class NearestBeams:
-    """Virtual channels that are sums of neighbours as they are, at their mean position [43].
+    """Virtual channels that are plain sums of neighbours, at their mean positions [43].
 
-    The alternative is `clsas.aperture.interpolated.InterpolatedAperture`.
+    `clsas.aperture.interpolated.InterpolatedAperture` is the alternative.
 
     Attributes
     ----------
     factors : tuple of int
-        Neighbours that are summed into one beam, QR, stage by stage.
+        Number of neighbours that are summed into one virtual channel, QR, stage by stage.
     """
 
     factors: Annotated[tuple[Whole, ...], Field(min_length=1)]
@@ -39,14 +39,14 @@ class NearestBeams:
     filter: ClassVar[Interpolator] = Interpolator(1, 1.0, np.zeros((0, 2, 0)), -math.inf, -math.inf)
     """A single tap of weight 1."""
     band: ClassVar[None] = None
-    """Linear interpolation takes any band."""
+    """Linear interpolation serves any band."""
     dimensions: ClassVar[int] = 1
     shape: ClassVar[Shape] = "track"
     """Virtual channels are means of neighbours on one curve."""
 
     aligns_phases: ClassVar[bool] = False
     splits_leaves: ClassVar[bool] = True
-    """Leaves as large as the stages ask for are backprojected in tiles."""
+    """Leaves have the size that the stages define, and are backprojected in smaller tiles."""
 
     @property
     def stages(self) -> int:
@@ -58,7 +58,7 @@ class NearestBeams:
         return f"sums of {', '.join(map(str, self.factors))} neighbours"
 
     def lines_gain(self, align: Interpolator, final: Interpolator, ratio: float) -> Gain | None:
-        """Return None: the thesis leaves lines as they are."""
+        """Return None: the thesis does not compensate for range filters."""
 
     def used_channels(
         self,
@@ -67,13 +67,13 @@ class NearestBeams:
         stop: NDArray[np.float64],
         slack: float,
     ) -> slice:
-        """Return all channels: which of them are neighbours does not depend on the sector."""
+        """Return all channels: the choice of neighbours does not depend on the sector."""
         return slice(0, len(coordinate))
 
-    def beams(
+    def virtual_channels(
         self, coordinate: NDArray[np.float64], channels_m: NDArray[np.float64]
     ) -> list[VirtualChannels]:
-        """Return the beams of some roots, stage by stage.
+        """Return the virtual channels of some roots, stage by stage.
 
         Parameters
         ----------
@@ -91,7 +91,7 @@ class NearestBeams:
     def predicted_channels(
         self, phases: VisiblePhases, sides: tuple[tuple[int, int], ...]
     ) -> list[StageChannels]:
-        """Return the beams of a subimage, stage by stage."""
+        """Return the virtual channels of a subimage, stage by stage."""
         found, channels = [], phases.model.lines.channels
         for factor in self.factors:
             used, channels = channels, math.ceil(channels / factor)
@@ -102,7 +102,7 @@ class NearestBeams:
 def stage_errors_m(
     stages: Stages, aperture_m: float, image_m: float, nearest_m: float
 ) -> list[float]:
-    """Return the largest range error of every stage [45]; those of a plan add up.
+    """Return the largest range error of each stage [45]; those of all stages add up.
 
     Parameters
     ----------
@@ -112,19 +112,25 @@ def stage_errors_m(
     image_m : float
         Longer side of the image.
     nearest_m : float
-        Least range, Rmin.
+        Smallest range, Rmin.
 
     Notes
     -----
-    L_A L_I/(4 Rmin) for L_A <= Rmin, else L_I/2, with the subaperture's length L_A and the
-    subimage's side L_I after the stage. This bounds [40] with t = L_A/2 over the sector L_I/(2 r)
-    to either side, as |d rho/d angle| <= min(r, t). Channels lie less far out, at most
-    (QR - 1)/QR of t; corners of square subimages that are seen obliquely, at 22.5 degrees most,
-    err by up to (1 + sqrt 2)/2 more.
+    The error is L_A L_I/(4 Rmin) for L_A <= Rmin, else L_I/2, where L_A is the length of the
+    subaperture and L_I the side of the subimage after the stage. It bounds the range error of one
+    beam that stands for a sector [40],
+
+        sqrt(r^2 + t^2 - 2 r t cos(a + b)) - sqrt(r^2 + t^2 - 2 r t cos(a)),
+
+    for a point at range r, half the subaperture's length t = L_A/2, an angle a between subaperture
+    and beam, and angles b from the beam to the point of up to L_I/(2 r), because
+    |d rho/d angle| <= min(r, t). Channels are closer to the middle, at (QR - 1)/QR of t at most.
+    Corners of square subimages have errors up to (1 + sqrt 2)/2 larger where they are seen
+    obliquely, the most at 22.5 degrees.
     """
     errors, length_m, side_m = [], aperture_m, image_m
-    for beams, divisions in stages:
-        length_m *= beams
+    for summed, divisions in stages:
+        length_m *= summed
         side_m /= divisions
         near = length_m > nearest_m
         errors.append(side_m / 2 if near else length_m * side_m / (4 * nearest_m))
@@ -134,29 +140,29 @@ def stage_errors_m(
 def operations(
     stages: Stages, channels: int, samples: Sequence[int], pixels: int, gamma: float = 0.0
 ) -> list[float]:
-    """Return the operations of every stage and, last, of the backprojection [44].
+    """Return the operations of each stage and, last, of the backprojection [44].
 
     Parameters
     ----------
     stages : sequence of (QR, QI)
     channels : int
-        Raw lines, N.
+        Number of raw lines, N.
     samples : sequence of int
         Range samples per line, Nr, stage by stage.
     pixels : int
-        Of the whole image, X Y.
+        Pixels of the whole image, X Y.
     gamma : float
-        What a line costs in a stage besides its samples.
+        Cost of a line in a stage in addition to its samples, operations.
 
     Notes
     -----
-    As the thesis's worked example has it, N lines take part in the first stage, for each of its
-    QI^2 subimages; N/QR in the second, for each of its QI^4; and so on.
+    As in the worked example of the thesis, N lines take part in the first stage for each of its
+    QI^2 subimages, N/QR in the second for each of its QI^4, and so on.
     """
     counts, subimages = [], 1
-    for (beams, divisions), length in zip(stages, samples, strict=True):
+    for (summed, divisions), length in zip(stages, samples, strict=True):
         subimages *= divisions**2
         counts.append(float(channels * (subimages * length + gamma)))
-        channels = math.ceil(channels / beams)
+        channels = math.ceil(channels / summed)
     counts.append(float(channels * pixels))
     return counts

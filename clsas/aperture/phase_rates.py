@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import product
-from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -94,71 +93,99 @@ def own_drift(lines: RangeLines) -> NDArray[np.float64] | None:
 
 
 @dataclass(frozen=True, eq=False)
-class SampledLines:
-    """Positions and tangents of samples of some lines of a sheet, [n, 3] each."""
+class PhaseBoxes:
+    """Boxes in which the phases of subimages are bounded.
 
-    is_dense: ClassVar[bool] = True
-
-    sampled_m: tuple[NDArray[np.float64], NDArray[np.float64]]
-
-
-def cycles_per_extent(
-    track: MeanTrack | SampledLines,
-    steps_m: NDArray[np.float64],
-    centres_m: NDArray[np.float64],
-    extents: NDArray[np.float64],
-    cycles_per_m: float,
-    nearest_m: float,
-    limits: tuple[float, float] | None = None,
-    along: NDArray[np.float64] | None = None,
-    every: int = 1,
-) -> NDArray[np.float64]:
-    """Largest phase rates along the track, per extent of subimages within boxes.
-
-    A channel's range to a pixel at d from a subimage's centre c exceeds that to c by e.d, with e
-    the unit vector from the channel to c. Along the track, of tangent t, that changes by
-    -(t - e (e.t)).d / R. The phase of a subimage therefore changes by at most its extents times the
-    results. (Yegulalp 1999 and Ulander, Hellsten and Stenström 2003 bound the same phase
-    to find the sampling of subapertures.)
-
-    Parameters
+    Attributes
     ----------
-    track : MeanTrack or SampledLines
     steps_m : float64 [axes, 3]
-        Steps of an extent of 1 along each axis, see `Surface`.
-    centres_m : float64 [n, 3]
-        Middles of boxes. The rates hold everywhere within these.
+        Steps of an extent of 1 along each axis; see `Surface`.
+    centres_m : float64 [boxes, 3]
+        Middles of the boxes.
     extents : float64 [axes]
         Extents of the boxes; see `Surface`.
     cycles_per_m : float
         Phase per metre of range.
     nearest_m : float
         Lower bound assumed for distances from the track.
+    """
+
+    steps_m: NDArray[np.float64]
+    centres_m: NDArray[np.float64]
+    extents: NDArray[np.float64]
+    cycles_per_m: float
+    nearest_m: float
+
+
+def cycles_per_extent(
+    track: MeanTrack,
+    boxes: PhaseBoxes,
+    limits: tuple[float, float] | None = None,
+    along: NDArray[np.float64] | None = None,
+    every: int = 1,
+) -> NDArray[np.float64]:
+    """Return the largest phase rates along curves, per extent of subimages within boxes.
+
+    Parameters
+    ----------
+    track : MeanTrack
+        One curve, or strips.
+    boxes : PhaseBoxes
+        The rates hold everywhere within them.
     limits : (low, high), optional
-        Sines of the aspect angle at which the beam begins and ends; rates beyond are 0. Dense
-        apertures ignore them: all their virtual channels are formed and used, wherever beams point.
+        Sines of the aspect angle at which the beam begins and ends; rates beyond are 0. Strips
+        ignore them: all their virtual channels are formed and used, wherever beams point.
     along : float64 [samples, 3]
         With limits, the track's unit direction at `track.samples`.
     every : int
-        Evaluate only one in so many samples of the track.
+        Use only one in `every` samples of the track.
 
     Returns
     -------
-    float64 [axes, n, samples]
+    float64 [axes, boxes, samples]
         Cycles per unit of the aperture coordinate, per row, per column and per metre of relief, at
         `track.samples`.
+
+    Notes
+    -----
+    The range of a channel to a pixel at d from a subimage's centre c exceeds that to c by e.d,
+    where e is the unit vector from the channel to c. Along a track with tangent t, this difference
+    changes by -(t - e (e.t)).d / R per unit of the aperture coordinate. The phase of a subimage
+    therefore changes at most by its extents times the results. Yegulalp (1999) and Ulander,
+    Hellsten and Stenström (2003) bound the same phase to find the sampling of subapertures.
     """
-    limits = None if track.is_dense else limits
-    position, tangent = (each[::every] for each in track.sampled_m)
+    position_m, tangent_m = (each[::every] for each in track.sampled_m)
+    if limits is None or along is None or track.is_dense:
+        return largest_rates(position_m, tangent_m, boxes)
+    return largest_rates(position_m, tangent_m, boxes, (limits, along[::every]))
+
+
+def largest_rates(
+    position_m: NDArray[np.float64],
+    tangent_m: NDArray[np.float64],
+    boxes: PhaseBoxes,
+    beam: tuple[tuple[float, float], NDArray[np.float64]] | None = None,
+) -> NDArray[np.float64]:
+    """Return the largest phase rates at some positions: see `cycles_per_extent`.
+
+    Parameters
+    ----------
+    position_m, tangent_m : float64 [samples, 3]
+        Positions on a track, and their derivatives by the aperture coordinate.
+    boxes : PhaseBoxes
+    beam : (limits, along), optional
+        Limits of the beam and directions at the positions, as in `cycles_per_extent`.
+    """
+    steps_m, extents, nearest_m = boxes.steps_m, boxes.extents, boxes.nearest_m
     sides_m = extents[:, None] * steps_m
-    rates = np.zeros((len(steps_m), len(centres_m), len(position)))
+    rates = np.zeros((len(steps_m), len(boxes.centres_m), len(position_m)))
     # Products of the line of sight to a point of a box follow from those to its middle.
-    sight = centres_m[:, None] - position
+    sight = boxes.centres_m[:, None] - position_m
     square = np.einsum("psi,psi->ps", sight, sight)
-    ahead = np.einsum("psi,si->ps", sight, tangent)
+    ahead = np.einsum("psi,si->ps", sight, tangent_m)
     leaning = np.stack([sight @ step for step in steps_m])
-    if limits is not None and along is not None:
-        (low, high), along = limits, along[::every]
+    if beam is not None:
+        (low, high), along = beam
         sideways = np.einsum("psi,si->ps", sight, along)
     points, between_m = _points_of_box(sides_m, float(np.sqrt(square.min()) + nearest_m))
     together = max(_RATES_AT_ONCE // square.size, 1)
@@ -170,20 +197,20 @@ def cycles_per_extent(
         inverse += np.einsum("oi,oi->o", offset_m, offset_m)[:, None, None]
         np.maximum(inverse, nearest_m**2, out=inverse)
         np.divide(1, np.sqrt(inverse, out=inverse), out=inverse)
-        turn = ahead + (offset_m @ tangent.T)[:, None]
+        turn = ahead + (offset_m @ tangent_m.T)[:, None]
         turn *= inverse
         turn *= inverse
-        if limits is not None and along is not None:
-            sine, reach = sideways + (offset_m @ along.T)[:, None], between_m * inverse
+        if beam is not None:
+            sine, margin = sideways + (offset_m @ along.T)[:, None], between_m * inverse
             sine *= inverse
-            inverse[(sine + reach < low) | (sine - reach > high)] = 0  # as if infinitely far
+            inverse[(sine + margin < low) | (sine - margin > high)] = 0  # as if infinitely far
         for rate, step, lean in zip(rates, steps_m, leaning, strict=True):
             here = lean + (offset_m @ step)[:, None, None]
             here *= turn
-            np.subtract(tangent @ step, here, out=here)
+            np.subtract(tangent_m @ step, here, out=here)
             here *= inverse
             np.maximum(rate, np.abs(here, out=here).max(axis=0), out=rate)
-    return cycles_per_m / 2 * rates
+    return boxes.cycles_per_m / 2 * rates
 
 
 def _points_of_box(

@@ -1,4 +1,4 @@
-"""Virtual channels: where they lie along the mean track, and which channels they stand for."""
+"""Virtual channels: their positions on the mean track, and the channels that they stand for."""
 
 from __future__ import annotations
 
@@ -12,29 +12,31 @@ from clsas.aperture.mean_track import MeanTrack
 from clsas.aperture.phase_rates import cumulative_cycles
 from clsas.signal.interpolation import Interpolator
 
-_SMOOTHED_CHANNELS = 2.5  # rms width, virtual channels, over which their spacing is smoothed
-_LEAST_RATE = 0.3  # of the mean phase rate over the track
-_LEAST_CHANNELS = 2.0  # virtual channels between the track's ends
+_SMOOTHED_CHANNELS = 2.5  # rms width over which the spacing is smoothed, virtual channels
+_LEAST_RATE = 0.3  # lower bound of phase rates, relative to their mean over the track
+_LEAST_CHANNELS = 2.0  # lower bound of the virtual channels between the ends of the track
 
 
 @dataclass(frozen=True, eq=False)
 class Bands:
-    """Channels that contribute to the same rows of virtual channels, in the order of these.
+    """Groups of channels that contribute to the same rows of virtual channels.
 
-    The virtual channels of a row follow each other; so do rows. Strips are rows of their own.
+    Virtual channels are ordered row by row. Bands are in the order of their rows. Each strip is a
+    row of its own.
 
     Attributes
     ----------
     bounds : int64 [roots, bands + 1]
-        First channel of each band, in the order in which channels are added, and the end.
+        First channel of each band, in the order in which channels are added, and the total.
     first : int64 [roots, bands]
-        First virtual channel of the first row that a band contributes to.
+        First virtual channel of the first row to which a band contributes.
     width : int64 [roots, bands]
-        Virtual channels of these rows.
+        Number of virtual channels in each of these rows.
     old : int64 [roots, bands]
-        Of the rows, the number that earlier bands contribute to.
+        Number of leading rows to which earlier bands have already contributed.
     between : float64 [roots, channels] or None
-        Position of each channel from the middle of its rows, -0.5 to 0.5; None with single rows.
+        Position of each channel relative to the middle of its rows, from -0.5 to 0.5; None if each
+        band contributes to a single row.
     """
 
     bounds: NDArray[np.int64]
@@ -46,26 +48,28 @@ class Bands:
 
 @dataclass(frozen=True, eq=False)
 class VirtualChannels:
-    """Virtual channels of one stage, shared by all its subimages within a root, for some roots.
+    """Virtual channels of one stage for some roots, shared by all subimages within a root.
 
     Attributes
     ----------
     coordinate : float64 [roots, virtual channels]
-        Aperture coordinate on the mean track; of a sheet, of its columns.
+        Aperture coordinates on the mean track. On a sheet, those of the columns.
     position_m : float64 [roots, virtual channels, 3]
+        Positions, metres.
     order : int64 [roots, channels] or None
-        Order in which the channels of the stage before are added; None if it is theirs.
+        Order in which the channels of the stage before are added; None if it is their own order.
     base : int64 [roots, channels]
-        First virtual channel to which each of these contributes, never decreasing.
+        First virtual channel to which each channel contributes, in that order. It never decreases
+        within a band.
     between : float64 [roots, channels]
-        Position of each from the middle of the virtual channels to which it contributes, -0.5 to
-        0.5 of their spacing.
+        Position of each channel relative to the middle of the virtual channels to which it
+        contributes, from -0.5 to 0.5 of their spacing.
     aperture : Interpolator or None
-        Filter that weights the contributions; None if each channel is added to a single one.
+        Filter that weights the contributions; None if each channel is added to one virtual channel.
     bands : Bands or None
-        The channels of strips, or of rows of a sheet; None for a single curve.
+        Bands of strips or of a sheet; None for a single curve.
     rows : float64 [roots, rows] or None
-        Coordinates across a sheet of the rows of virtual channels; None without one.
+        Coordinates of the rows across a sheet; None without a sheet.
     """
 
     coordinate: NDArray[np.float64]
@@ -79,7 +83,7 @@ class VirtualChannels:
 
     @property
     def across(self) -> NDArray[np.float64] | None:
-        """Coordinates across a sheet, [roots, virtual channels]; None without one."""
+        """Coordinates across a sheet, [roots, virtual channels]; None without a sheet."""
         if self.rows is None:
             return None
         return np.repeat(self.rows, self.coordinate.shape[1] // self.rows.shape[1], axis=1)
@@ -91,16 +95,16 @@ class VirtualChannels:
 
     @property
     def weights(self) -> NDArray[np.float64]:
-        """Weights of channels in virtual channels, from `base` on, [roots, channels, taps]."""
+        """Weights of channels in the virtual channels from `base` on, [roots, channels, taps]."""
         if self.aperture is None:
             return np.ones((*self.base.shape, 1))
         return self.aperture.weights(self.between)
 
     @property
     def contributed(self) -> NDArray[np.int64]:
-        """Virtual channels to which channels contribute, counted on from root to root.
+        """Virtual channels to which channels contribute, numbered through all roots.
 
-        int64 [roots, channels, taps]; `weights` has their weights.
+        int64 [roots, channels, taps], as `weights`.
         """
         first = self.coordinate.shape[1] * np.arange(len(self.base))
         return (first[:, None] + self.base)[..., None] + np.arange(self.taps)
@@ -116,21 +120,25 @@ def interpolated_channels(
     coordinate: NDArray[np.float64],
     aperture: Interpolator,
 ) -> VirtualChannels:
-    """Return virtual channels between which steering functions are interpolated.
+    """Return virtual channels on a curve, between which steering functions are interpolated.
 
-    They lie at equal steps of the phase. Over the phase every steering function is band-limited to
-    one cycle per unit, whatever the track. (A separable low-rank expansion serves the same end in
-    butterfly algorithms: Demanet et al. 2012.)
+    They lie at equal steps of the phase, the integral of the largest phase rate. As a function of
+    this phase, every steering function is band-limited to one cycle per unit, whatever the track.
 
     Parameters
     ----------
     track : MeanTrack
     rate : float64 [roots, samples]
-        Largest phase rate at `track.samples`, cycles per unit of the aperture coordinate.
+        Largest phase rates at `track.samples`, cycles per unit of the aperture coordinate.
     coordinate : float64 [roots, channels]
-        Apparent aperture coordinate of the channels.
+        Apparent aperture coordinates of the channels.
     aperture : Interpolator
-        Its `upsampling` is the oversampling of virtual channels.
+        Filter along the aperture. Its `upsampling` is the oversampling of virtual channels.
+
+    Notes
+    -----
+    In butterfly algorithms, a separable low-rank expansion serves the same purpose (Demanet et al.
+    2012).
     """
     spacing = Spacing.of(track, rate, aperture)
     position, origin, taps = *spacing.positions(coordinate), aperture.taps
@@ -153,9 +161,9 @@ class Spacing:
     ----------
     track : MeanTrack
     phase : float64 [roots, samples]
-        The number of virtual channels up to `track.samples`.
+        Number of virtual channels up to each of `track.samples`.
     taps : int
-        Of the filter between them.
+        Taps of the aperture filter.
     """
 
     track: MeanTrack
@@ -164,7 +172,7 @@ class Spacing:
 
     @classmethod
     def of(cls, track: MeanTrack, rate: NDArray[np.float64], aperture: Interpolator) -> Spacing:
-        """Return the spacing that phase rates ask for: see `interpolated_channels`."""
+        """Return the spacing that phase rates require: see `interpolated_channels`."""
         per_cycle = 2 * aperture.upsampling
         rates = _smoothed_rates(track, rate, per_cycle)
         return cls(track, per_cycle * cumulative_cycles(track, rates), aperture.taps)
@@ -172,7 +180,11 @@ class Spacing:
     def positions(
         self, coordinate: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return positions among virtual channels, [roots, channels], and what number 0 is at."""
+        """Return positions among virtual channels, [roots, channels], and that of the first one.
+
+        Positions are counted from the first virtual channel; that of the first, from the first
+        sample of the curve.
+        """
         position = np.stack(
             [
                 np.interp(c, self.track.samples, p)
@@ -184,7 +196,7 @@ class Spacing:
         return position, origin
 
     def coordinates(self, position: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the aperture coordinates of positions from the curve's first sample."""
+        """Return aperture coordinates of positions counted from the first sample of the curve."""
         return np.stack(
             [np.interp(v, p, self.track.samples) for v, p in zip(position, self.phase, strict=True)]
         )
@@ -193,12 +205,12 @@ class Spacing:
 def _smoothed_rates(
     track: MeanTrack, rate: NDArray[np.float64], per_cycle: float
 ) -> NDArray[np.float64]:
-    """Phase rates whose change over the taps of a filter is small, [roots, samples].
+    """Return phase rates that change little over the taps of a filter, [roots, samples].
 
-    Between virtual channels steering functions are band-limited only if the spacing is nearly
-    constant. The logarithms of the rates are therefore smoothed over some virtual channels. Where
-    the root is invisible (a rate of 0), beyond the track's ends and where phases nearly stand
-    still, the spacing nearby is continued.
+    Filters interpolate band-limited functions well only if the spacing is nearly constant. The
+    logarithms of the rates are therefore smoothed over a few virtual channels. The spacing nearby
+    is continued where the root is invisible (the rate is 0), past the ends of the track, and where
+    phases hardly turn.
     """
     on_track = np.flatnonzero(track.on_track)
     inside = rate[:, on_track]
@@ -222,12 +234,17 @@ def _smoothed_rates(
 def summed_neighbours(
     coordinate: NDArray[np.float64], position_m: NDArray[np.float64], factor: int
 ) -> VirtualChannels:
-    """Return nodes as THESIS [43] has them: means of `factor` neighbours, which are summed.
+    """Return virtual channels that are sums of `factor` neighbours, at their mean positions.
+
+    These are the nodes of THESIS, equation 43.
 
     Parameters
     ----------
     coordinate : float64 [roots, channels]
+        Aperture coordinates of the channels.
     position_m : float64 [roots, channels, 3]
+        Their positions.
+    factor : int
     """
     roots, channels = coordinate.shape
     order = np.argsort(coordinate, axis=1, kind="stable")
@@ -248,16 +265,16 @@ def summed_neighbours(
 
 @dataclass(frozen=True, eq=False)
 class ChannelRanges:
-    """The channels that each subimage of a stage needs, all int64 [roots, subimages].
+    """Ranges of the channels that each subimage of a stage needs, all int64 [roots, subimages].
 
-    Ranges are empty where no channel receives from the subimage.
+    Ranges are empty for subimages that are visible from no channel.
 
     Attributes
     ----------
     first, last
-        The subimage's virtual channels: the first, and the one after the last.
+        First virtual channel of the subimage, and the one after its last.
     begin, end
-        Channels of the stage before that it uses: the first, and the one after the last.
+        First channel of the stage before that the subimage uses, and the one after the last.
     """
 
     first: NDArray[np.int64]

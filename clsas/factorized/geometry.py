@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
-from clsas.aperture.beam_directions import BeamDirections
+from clsas.aperture.beam_directions import BeamDirections, directions_of
 from clsas.aperture.dense_tracks import mean_track_of
 from clsas.aperture.mean_track import MeanTrack
 from clsas.aperture.phase_rates import drift, own_drift
@@ -135,7 +135,7 @@ def geometry_of(
     directions = along = nearest_m = None
     division = Division(surface, factorization.sides)
     if beam is not None:
-        directions = BeamDirections.of(beam, beam.directions(lines), track)
+        directions = directions_of(beam, beam.directions(lines), track)
         along = directions.at(track.samples)
         root_m = division.centres_m(0, division.roots)
         nearest_m = float(cdist(root_m, lines.phase_centres_m).min())

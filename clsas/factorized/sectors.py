@@ -13,7 +13,7 @@ from clsas.aperture.beam_directions import beam_rate
 from clsas.aperture.dense_channels import SheetRates, all_channels, sheet_beam_rates, sheet_rates
 from clsas.aperture.mean_track import MeanTrack
 from clsas.aperture.nearest import NearestBeams
-from clsas.aperture.phase_rates import cycles_per_extent, stretches
+from clsas.aperture.phase_rates import PhaseBoxes, cycles_per_extent, stretches
 from clsas.aperture.virtual_channels import ChannelRanges, VirtualChannels
 from clsas.core.geometry import pairwise_range_m
 from clsas.core.grid import Grid
@@ -125,10 +125,9 @@ def _apparent(
     own: NDArray[np.float64] | None,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64] | None]:
     """Return coordinates at which channels appear: see `MeanTrack.apparent_coordinates`."""
-    if some.across is None or own is not None or not geometry.on_sheet:
+    if not some.is_sheet or own is not None or not geometry.on_sheet:
         return some.apparent_coordinates(root_m, centres_m, own)
-    shape = (len(root_m), len(centres_m))
-    return np.broadcast_to(some.coordinate, shape), np.broadcast_to(some.across, shape)
+    return some.coordinates_everywhere(len(root_m))
 
 
 def _holding(geometry: Geometry, inside: NDArray[np.bool_]) -> list[NDArray[np.bool_]]:
@@ -155,13 +154,13 @@ def _virtual_channels(
         geometry.track,
     )
     if isinstance(aperture, NearestBeams):
-        return aperture.beams(coordinate, centres_m)
+        return aperture.virtual_channels(coordinate, centres_m)
     extents = [geometry.surface.extents_in(side, sides[0], roots) for side in sides]
     boxes = _boxes(geometry, roots, root_m)
     if across is not None:
-        rates, beam_rates = sheet_rates(track, *boxes), _sheet_beam_rates(geometry, roots, root_m)
+        rates, beam_rates = sheet_rates(track, boxes), _sheet_beam_rates(geometry, roots, root_m)
         return aperture.on_sheet(track, rates, beam_rates, extents, (coordinate, across))
-    rates_along = cycles_per_extent(track, *boxes, geometry.factorization.limits, geometry.along)
+    rates_along = cycles_per_extent(track, boxes, geometry.factorization.limits, geometry.along)
     beam = _beam_rate(geometry, roots, root_m)
     return aperture.on_curves(track, rates_along, beam, extents, coordinate)
 
@@ -194,14 +193,12 @@ def _sides_m(geometry: Geometry, roots: NDArray[np.int64]) -> NDArray[np.float64
     return extents[:, None] * geometry.surface.steps_m
 
 
-def _boxes(
-    geometry: Geometry, roots: NDArray[np.int64], root_m: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], float, float]:
-    """Return roots as boxes of `cycles_per_extent`: its steps to its nearest range."""
+def _boxes(geometry: Geometry, roots: NDArray[np.int64], root_m: NDArray[np.float64]) -> PhaseBoxes:
+    """Return the boxes of some roots."""
     image, surface = geometry.factorization, geometry.surface
     extents = surface.extents_in(image.sides[0], image.sides[0], roots).max(axis=0)
     nearest_m = min(surface.radius_m(image.sides[-1]), image.closest_m)
-    return surface.steps_m, root_m, extents, image.highest_cycles_per_m, nearest_m
+    return PhaseBoxes(surface.steps_m, root_m, extents, image.highest_cycles_per_m, nearest_m)
 
 
 def references(geometry: Geometry, sector: Sector) -> dict[str, NDArray]:

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from clsas.aperture.beam_directions import beam_rate
 from clsas.aperture.dense_channels import SheetRates, sheet_beam_rates, sheet_rates
-from clsas.aperture.phase_rates import cycles_per_extent
+from clsas.aperture.phase_rates import PhaseBoxes, cycles_per_extent
 from clsas.planning.caching import cached
 from clsas.planning.sample_points import INNER_POINTS, trapezoidal_weights
 from clsas.planning.subimages import Side
@@ -99,17 +99,8 @@ def _along(
 ) -> NDArray[np.float64]:
     if model.track.is_sheet:
         return _of_sheet(model, extents, centres_m, every).along
-    return cycles_per_extent(
-        model.track,
-        model.surface.steps_m,
-        centres_m,
-        extents,
-        model.highest_cycles_per_m,
-        model.nearest_m,
-        model.limits,
-        model.along,
-        every,
-    )
+    boxes = _boxes(model, extents, centres_m)
+    return cycles_per_extent(model.track, boxes, model.limits, model.along, every)
 
 
 def _of_sheet(
@@ -119,19 +110,18 @@ def _of_sheet(
     every: int = 1,
 ) -> SheetRates:
     def find() -> SheetRates:
-        return sheet_rates(
-            model.track,
-            model.surface.steps_m,
-            centres_m,
-            extents,
-            model.highest_cycles_per_m,
-            model.nearest_m,
-            every,
-        )
+        return sheet_rates(model.track, _boxes(model, extents, centres_m), every)
 
     key = "sheet rates", tuple(extents), centres_m.tobytes(), every
     found: SheetRates = model.from_cache(key, find)
     return found
+
+
+def _boxes(
+    model: VisibilityModel, extents: NDArray[np.float64], centres_m: NDArray[np.float64]
+) -> PhaseBoxes:
+    cycles_per_m, nearest_m = model.highest_cycles_per_m, model.nearest_m
+    return PhaseBoxes(model.surface.steps_m, centres_m, extents, cycles_per_m, nearest_m)
 
 
 @cached

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from clsas.aperture.beam_directions import BeamDirections
+from clsas.aperture.beam_directions import BeamDirections, directions_of
 from clsas.aperture.dense_tracks import Shape, mean_track_of, simplest_track
 from clsas.aperture.mean_track import MeanTrack
 from clsas.core.grid import Grid
@@ -213,7 +213,7 @@ class VisibilityModel:
         """Unit directions of the beam anywhere on the track; None without a beam."""
         if self.beam is None:
             return None
-        return BeamDirections.of(self.beam, self.channels_along, self.track)
+        return directions_of(self.beam, self.channels_along, self.track)
 
     @property
     @shared

@@ -5,7 +5,7 @@ import pytest
 from dense import TRACKS, WAVELENGTH, scene, to_and_fro, turning
 from factorizing import BEAMS, arc, made
 
-from clsas.aperture.beam_directions import BeamDirections, beam_rate
+from clsas.aperture.beam_directions import beam_rate, directions_of
 from clsas.aperture.dense_tracks import mean_track_of
 from clsas.aperture.mean_track import mean_track
 from clsas.sonar.beam import BeamWindow
@@ -29,7 +29,7 @@ def test_a_beam_on_a_target_stays_there_past_the_ends(turns):
         if turns == "helix"
         else mean_track(lines, WAVELENGTH)
     )
-    found = BeamDirections.of(BeamWindow(20, "hann"), turning(tx_m), track)
+    found = directions_of(BeamWindow(20, "hann"), turning(tx_m), track)
     sight = -track.positions_m(PAST_THE_ENDS) * [1, 1, 0]
     sine = np.einsum("pi,pi->p", sight, found.at(PAST_THE_ENDS))
     assert np.abs(sine / np.linalg.norm(sight, axis=1)).max() < 0.1
@@ -39,7 +39,7 @@ def test_a_beam_on_a_target_stays_there_past_the_ends(turns):
 def test_a_scan_to_and_fro_has_one_heading_without_a_squint(squint_deg):
     track = mean_track_of(lines_at(TRACKS["raster"]()), "sheet", WAVELENGTH)
     beam = BeamWindow(20, "hann", squint_deg=squint_deg)
-    along = BeamDirections.of(beam, to_and_fro(), track).at(track.coordinate, track.across)
+    along = directions_of(beam, to_and_fro(), track).at(track.coordinate, track.across)
     assert (np.ptp(along @ [1.0, 0.0, 0.0]) < 1e-6) == (squint_deg == 0)
 
 
@@ -48,7 +48,7 @@ def test_rates_hold_all_over_a_box():
     tx_m = TRACKS["helix"]()[:180] * [1, 1, 0]
     track = mean_track(lines_at(tx_m), WAVELENGTH)
     beam = BeamWindow(20, "hann")
-    along = BeamDirections.of(beam, turning(tx_m), track).along
+    along = directions_of(beam, turning(tx_m), track).along
     sides_m = np.diag([0.2, 0.2, 0.0])[:2]
     inside = track.on_track
     middle, box = (
@@ -64,7 +64,5 @@ def test_rates_hold_all_over_a_box():
 def test_directions_between_channels_are_of_length_one():
     lines, _ = made(arc)
     track = mean_track(lines, WAVELENGTH)
-    along = BeamDirections.of(BEAMS[0], BEAMS[0].directions(lines), track).at(
-        np.linspace(-1, 2, 50)
-    )
+    along = directions_of(BEAMS[0], BEAMS[0].directions(lines), track).at(np.linspace(-1, 2, 50))
     np.testing.assert_allclose(np.linalg.norm(along, axis=1), 1)

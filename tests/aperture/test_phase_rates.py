@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from cases import along_x, beside
@@ -6,6 +8,7 @@ from hypothesis import strategies as st
 
 from clsas.aperture.mean_track import mean_track
 from clsas.aperture.phase_rates import (
+    PhaseBoxes,
     cumulative_cycles,
     cycles_per_extent,
     drift,
@@ -202,9 +205,8 @@ def test_no_phase_turns_faster_than_its_bound(seed):
     cycles_per_m = 2 / WAVELENGTH
     surface = surface_of(grid)
     extents = surface.extents(side)
-    bound = cycles_per_extent(track, surface.steps_m, centre_m[None], extents, cycles_per_m, 0.1)[
-        :, 0
-    ]
+    boxes = PhaseBoxes(surface.steps_m, centre_m[None], extents, cycles_per_m, 0.1)
+    bound = cycles_per_extent(track, boxes)[:, 0]
     bound = inside[0] * bound[0] + inside[1] * bound[1]
     # A subimage of 16 x 8 pixels anywhere inside, and a pixel anywhere in that.
     coordinates = track.samples
@@ -229,10 +231,10 @@ def test_rates_about_many_places_are_those_about_each():
     track = mean_track(lines_of(along_x(300, 0.02)), WAVELENGTH)
     surface = surface_of(Grid.plane((-1, 1, 40), (3, 5, 40)))
     centres_m = np.random.default_rng(2).uniform((-3, 2, -1), (3, 9, 1), (300, 3))
-    others = surface.steps_m, np.array([16.0, 8.0]), 160.0, 0.1
-    together = cycles_per_extent(track, others[0], centres_m, *others[1:])
+    boxes = PhaseBoxes(surface.steps_m, centres_m, np.array([16.0, 8.0]), 160.0, 0.1)
+    together = cycles_per_extent(track, boxes)
     for index in (0, 150, 299):
-        alone = cycles_per_extent(track, others[0], centres_m[[index]], *others[1:])
+        alone = cycles_per_extent(track, replace(boxes, centres_m=centres_m[[index]]))
         # Boxes are sampled more finely the nearer the nearest of them is.
         np.testing.assert_allclose(together[:, index], alone[:, 0], rtol=0.05)
 

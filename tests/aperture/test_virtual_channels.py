@@ -3,7 +3,7 @@ import pytest
 from factorizing import CARRIER, SPEED, arc, made, near, straight, swaying
 
 from clsas.aperture.mean_track import mean_track
-from clsas.aperture.phase_rates import cycles_per_extent
+from clsas.aperture.phase_rates import PhaseBoxes, cycles_per_extent
 from clsas.aperture.virtual_channels import interpolated_channels, summed_neighbours
 from clsas.factorized.surface import surface_of
 from clsas.factorized.tree import Division
@@ -27,9 +27,8 @@ def interpolation_error_db(case, side, aperture, root=(128, 128)):
         middle_m = division.centres_m(0, corner[None])
         coordinate, _ = track.apparent_coordinates(middle_m, centres_m)
         extents, nearest_m = surface.extents(root), surface.radius_m(side)
-        rates = cycles_per_extent(
-            track, surface.steps_m, middle_m, extents, cycles_per_m, nearest_m
-        )
+        boxes = PhaseBoxes(surface.steps_m, middle_m, extents, cycles_per_m, nearest_m)
+        rates = cycles_per_extent(track, boxes)
         rate = side[0] * rates[0] + side[1] * rates[1]
         virtual = interpolated_channels(track, rate, coordinate, aperture)
         between = virtual.base[0][:, None] + np.arange(virtual.taps)
@@ -72,7 +71,8 @@ def some_virtual_channels(shuffled=False):
     surface, side = surface_of(grid), (64, 64)
     middle_m = surface.middles_m(side, np.array([[0, 0], [64, 64]]))
     extents, cycles_per_m = surface.extents(side), lines.carrier_cycles_per_m
-    rates = cycles_per_extent(track, surface.steps_m, middle_m, extents, cycles_per_m, 0.1)
+    boxes = PhaseBoxes(surface.steps_m, middle_m, extents, cycles_per_m, 0.1)
+    rates = cycles_per_extent(track, boxes)
     coordinate, _ = track.apparent_coordinates(middle_m, lines.phase_centres_m)
     aperture = interpolation.design(6, 2.0, FLAT)
     return coordinate, interpolated_channels(track, 64 * rates.sum(axis=0), coordinate, aperture)

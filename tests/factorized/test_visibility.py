@@ -3,7 +3,7 @@ import pytest
 from cases import thesis_lines
 from factorizing import BEAMS, CARRIER, SPEED, made, near
 
-from clsas.aperture.beam_directions import BeamDirections
+from clsas.aperture.beam_directions import directions_of
 from clsas.aperture.mean_track import mean_track
 from clsas.core.grid import Grid
 from clsas.factorized import visibility
@@ -18,7 +18,7 @@ WAVELENGTH = SPEED / CARRIER
 def test_a_visible_stretch_holds_every_channel_of_some_weight():
     lines, grid = made(near)
     beam, track = BEAMS[0], mean_track(lines, WAVELENGTH)
-    along = BeamDirections.of(beam, beam.directions(lines), track).along
+    along = directions_of(beam, beam.directions(lines), track).along
     division = Division(surface_of(grid), ((16, 16),))
     corners = division.roots[:, None]
     half_m = 8 * np.stack([grid.row_step_m, grid.column_step_m])
@@ -27,7 +27,7 @@ def test_a_visible_stretch_holds_every_channel_of_some_weight():
     )
     coordinate = np.linspace(0, 1, 2001)
     position_m = track.positions_m(coordinate)
-    direction = BeamDirections.of(beam, beam.directions(lines), track).at(coordinate)
+    direction = directions_of(beam, beam.directions(lines), track).at(coordinate)
     for (corner,), (first,), (last,) in zip(corners, begin, end, strict=True):
         for pixel in corner + np.array([[0, 0], [0, 15], [15, 0], [15, 15], [7, 8]]):
             pixel_m = grid.origin_m + pixel @ np.stack([grid.row_step_m, grid.column_step_m])
@@ -45,7 +45,7 @@ def test_visible_stretches_are_hardly_longer_than_they_must_be(beam, range_m):
     track_m = np.stack([80 * coordinate - 40, 0.3 * np.sin(9 * coordinate), 0 * coordinate], axis=1)
     lines = thesis_lines(Grid.plane((-1, 1, 4), (29, 30, 4)), track_m)
     track = mean_track(lines, WAVELENGTH)
-    along = BeamDirections.of(beam, beam.directions(lines), track).along
+    along = directions_of(beam, beam.directions(lines), track).along
     random = np.random.default_rng(1)
     centres_m = random.uniform((-70, 0.7 * range_m, -1), (70, 1.3 * range_m, 1), (300, 3))
     half_m = range_m * np.array([[0.02, 0, 0], [0, 0.01, 0]])
@@ -54,7 +54,7 @@ def test_visible_stretches_are_hardly_longer_than_they_must_be(beam, range_m):
         np.linspace(0, 1, 4001),
         2 / 256,
     )  # of the samples at which visibility is evaluated
-    direction = BeamDirections.of(beam, beam.directions(lines), track).at(coordinate)
+    direction = directions_of(beam, beam.directions(lines), track).at(coordinate)
     boxes = Visibility.of(centres_m, half_m, track.positions_m(coordinate), direction)
     visible = boxes.overlap(beam.limits, np.ones(2)) > 0
     ever = visible.any(axis=1)
