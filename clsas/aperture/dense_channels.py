@@ -1,4 +1,4 @@
-"""Virtual channels of dense apertures: in strips, or in the rows and columns of a sheet."""
+"""Virtual channels of dense apertures: on strips, or in rows and columns on a sheet."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def strip_channels(
 ) -> VirtualChannels:
     """Return the virtual channels of all strips, one strip after another.
 
-    Parameters are those of `interpolated_channels`; coordinates ascend from strip to strip.
+    The parameters are those of `interpolated_channels`. Channels are in the order of strips.
     """
     roots, before = len(coordinate), 0
     samples, channels = (track.strip_of(each) for each in (track.samples, coordinate[0]))
@@ -63,14 +63,14 @@ def strip_channels(
 
 @dataclass(frozen=True, eq=False)
 class SheetChannels:
-    """Virtual channels of a sheet: rows, in each of which all columns follow each other.
+    """Coordinates of the virtual channels of a sheet, which follow each other row by row.
 
     Attributes
     ----------
     columns : float64 [roots, columns]
-        Aperture coordinates.
+        Aperture coordinates of the columns.
     rows : float64 [roots, rows]
-        Coordinates across the sheet.
+        Coordinates of the rows across the sheet.
     """
 
     columns: NDArray[np.float64]
@@ -87,25 +87,25 @@ class SheetChannels:
 
 @dataclass(frozen=True, eq=False)
 class SheetRates:
-    """Largest phase rates of subimages, cycles per unit of the coordinate.
+    """Largest phase rates of subimages on a sheet, cycles per unit of a coordinate.
 
     Attributes
     ----------
     along : float64 [..., samples]
-        At the samples of a line along the sheet.
+        Rates at the samples of lines along the sheet.
     across : float64 [..., samples]
-        At the samples of a line across it.
+        Rates at the samples of lines across the sheet.
     """
 
     along: NDArray[np.float64]
     across: NDArray[np.float64]
 
     def plus(self, factor: float, others: SheetRates) -> SheetRates:
-        """Return these rates and some times others."""
+        """Return the sum of these rates and others times a factor."""
         return SheetRates(self.along + factor * others.along, self.across + factor * others.across)
 
     def times(self, extents: NDArray[np.float64]) -> SheetRates:
-        """Return the rates [roots, samples] of subimages of some extents, [roots, axes]."""
+        """Return the rates [roots, samples] of subimages with given extents, [roots, axes]."""
         return SheetRates(
             *(np.einsum("ra,ars->rs", extents, each) for each in (self.along, self.across))
         )
@@ -114,8 +114,8 @@ class SheetRates:
 def sheet_rates(track: MeanTrack, boxes: PhaseBoxes, every: int = 1) -> SheetRates:
     """Return the largest phase rates of subimages within boxes, along and across a sheet.
 
-    Each is [axes, boxes, samples], as `cycles_per_extent` returns them, which has the parameters.
-    They are the largest of those on several lines.
+    They are [axes, boxes, samples] each, the largest of the rates on several lines. The parameters
+    are those of `cycles_per_extent`.
     """
     lines = track.lines_along + track.lines_across
     sampled = [[each[::every] for each in line.sampled_m] for line in lines]
@@ -137,7 +137,7 @@ def sheet_beam_rates(
     centres_m: NDArray[np.float64],
     sides_m: NDArray[np.float64],
 ) -> SheetRates:
-    """Return the largest phase rates of a beam's weights, [boxes, samples]: see `beam_rate`."""
+    """Return the largest rates of a beam's weights, [boxes, samples] each: see `beam_rate`."""
 
     def largest(lines: tuple[MeanTrack, ...], *, places: Sequence[tuple[Any, Any]]) -> NDArray:
         rates = [
@@ -160,12 +160,24 @@ def first_on_sheet(
     across: NDArray[np.float64],
     aperture: Interpolator,
 ) -> tuple[VirtualChannels, SheetChannels]:
-    """Return virtual channels of a sheet for raw channels, at coordinates [roots, channels]."""
+    """Return the virtual channels of the first stage on a sheet, and their coordinates.
+
+    Parameters
+    ----------
+    track : MeanTrack
+        The sheet.
+    rates : SheetRates
+        Largest phase rates of the subimages, [roots, samples] each.
+    along, across : float64 [roots, channels]
+        Apparent coordinates of the raw channels.
+    aperture : Interpolator
+        Filter between virtual channels, in both dimensions.
+    """
     taps = aperture.taps
     column, row, found = _grid(track, rates, along, across, aperture)
     above = np.floor(row)
     first_row = above.astype(np.int64) - (taps // 2 - 1)
-    # Few distinct numbers are sorted fast; channels come sorted along the sheet.
+    # NumPy sorts 16-bit integers in linear time. Channels are already sorted along the sheet.
     order = np.argsort(first_row.astype(np.int16), axis=1, kind="stable")
     column = np.take_along_axis(column, order, axis=1)
     first_row = np.take_along_axis(first_row, order, axis=1)
@@ -177,7 +189,7 @@ def first_on_sheet(
     lower = np.floor(column)
     base = lower.astype(np.int64) - (taps // 2 - 1)
     rows, width = found.rows.shape[1], found.columns.shape[1]
-    # A band for every row that may be the first, also where there is no channel.
+    # There is a band for each row that may be the first of a channel's rows, even an empty band.
     numbers = np.arange(rows - taps + 1)
     bounds = np.stack([np.searchsorted(each, np.arange(len(numbers) + 1)) for each in first_row])
     shape = len(bounds), len(numbers)
@@ -195,7 +207,11 @@ def first_on_sheet(
 def later_on_sheet(
     track: MeanTrack, rates: SheetRates, parent: SheetChannels, aperture: Interpolator
 ) -> tuple[VirtualChannels, SheetChannels]:
-    """Return virtual channels of a sheet for those of the stage before; every row is a band."""
+    """Return the virtual channels of a later stage on a sheet, and their coordinates.
+
+    Each row of the stage before is a band. `parent` has the coordinates of that stage; the other
+    parameters are those of `first_on_sheet`.
+    """
     taps = aperture.taps
     column, row, found = _grid(track, rates, parent.columns, parent.rows, aperture)
     lower, above = np.floor(column), np.floor(row)
@@ -224,7 +240,7 @@ def _grid(
     across: NDArray[np.float64],
     aperture: Interpolator,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], SheetChannels]:
-    """Return positions among columns and rows, and the coordinates of columns and rows."""
+    """Return positions among columns and rows, and the coordinates of these."""
     found = []
     for line, rate, given in (
         (track.line_along(0.5), rates.along, along),
@@ -257,14 +273,16 @@ def _of_sheet(
 def all_channels(
     virtual: list[VirtualChannels], channels: int, inside: list[NDArray[np.bool_]]
 ) -> list[ChannelRanges]:
-    """Return that subimages of each stage that hold a pixel need all channels.
+    """Return ranges of all channels for each subimage that contains a pixel, stage by stage.
 
     Parameters
     ----------
     virtual : list of VirtualChannels
+        Virtual channels, stage by stage.
     channels : int
         Number of raw channels.
     inside : list of bool [roots, subimages]
+        True for subimages that contain a pixel, stage by stage.
     """
     result = []
     for each, needed in zip(virtual, inside, strict=True):
@@ -278,9 +296,15 @@ def all_channels(
 def band_table(
     bands: Bands | None, need: ChannelRanges, first_of_parent: NDArray[np.int64]
 ) -> NDArray[np.int64]:
-    """Return what the stage kernel is told of every subimage's bands, [roots, subimages, bands, 7].
+    """Return the stage kernel's table of bands, [roots, subimages, bands, 7]: see `cl/stage.cl`.
 
-    See `cl/stage.cl`. `first_of_parent` is the channel of each parent's first line.
+    Parameters
+    ----------
+    bands : Bands or None
+    need : ChannelRanges
+        Channels that each subimage needs.
+    first_of_parent : int64 [roots, subimages]
+        Channel of the first line of each subimage's parent.
     """
     if bands is None:
         none = np.zeros_like(need.first)

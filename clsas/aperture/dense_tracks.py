@@ -1,8 +1,7 @@
-"""Mean tracks of dense apertures: a strip for each pass, or a sheet with all channels.
+"""Mean tracks of dense apertures: a strip for each pass, or one sheet.
 
-One curve does not follow many passes, a raster scan, a helix or a planar array. Passes apart from
-each other get a curve each. Channels close to a smooth sheet are interpolated in both of its
-dimensions.
+A single curve cannot follow many passes, a raster scan, a helix or a planar array. Separate passes
+get a curve each. Channels close to a smooth sheet are interpolated in both of its dimensions.
 """
 
 from __future__ import annotations
@@ -23,54 +22,54 @@ from clsas.aperture.mean_track import APART, STRIP_SAMPLES, MeanTrack, mean_trac
 from clsas.core.lines import RangeLines, some_channels
 
 Shape = Literal["track", "strips", "sheet"]
-"""Mean tracks of one curve, of several, or of a curve that moves sideways."""
+"""Shape of a mean track: one curve, several curves, or a curve that moves sideways."""
 
 DENSE_SHAPES: tuple[Shape, ...] = ("strips", "sheet")
 """Shapes of the mean tracks of dense apertures."""
 
-_JUMP = 8.0  # median steps from channel to channel, from which on another pass begins
-_LEAST_OF_STRIP = 32  # channels
+_JUMP = 8.0  # median steps between channels; a longer step begins another pass
+_LEAST_OF_STRIP = 32  # fewest channels of a strip
 _MOST_STRIPS = 128
-_MOST_PAIRS = 64.0  # neighbours of a channel within a jump, on average
-_FITTED = 768  # channels to which a sheet is fitted
+_MOST_PAIRS = 64.0  # most neighbours of a channel within a jump, on average
+_FITTED = 768  # most channels to which a sheet is fitted
 _TRIED = (8, 2)  # intervals of a sheet's splines, and coefficients across it
-_REFINED = ((64, 2), (8, 3), (64, 3))  # the same, until all channels lie on the sheet
-_SHEET_CLOSE = 3e-5  # wavelengths rms: then nothing is to be aligned
-_ALONG_CLOSE = 1e-4  # rms of directions: less than any beam resolves
-_OPEN = np.pi / 6  # of a ring's gap: then its ends are apart
-_OVERLAP = 0.08  # of a closed ring's ends
-_FLAT = 1e-6  # of the length: extents that are none
-# Without the outermost tenth on either side, channels must still spread over this share of the
-# width of a sheet. Otherwise a single channel off a ring makes the width, and neighbours are far
-# apart across the sheet. Regular apertures spread over 0.4 to 1.
+_REFINED = ((64, 2), (8, 3), (64, 3))  # the same, tried in turn until channels lie on the sheet
+_SHEET_CLOSE = 3e-5  # rms distance at which channels lie on a sheet, wavelengths
+_ALONG_CLOSE = 1e-4  # rms error of fitted directions that no beam resolves
+_OPEN = np.pi / 6  # widest gap of a closed ring, radians
+_OVERLAP = 0.08  # by which the ends of a closed ring overlap, in aperture coordinate
+_FLAT = 1e-6  # extents that count as zero, relative to the length
+# Without the outermost tenth on either side, channels must still cover this share of the width of
+# a sheet. Otherwise a single channel off a ring may define the width, and neighbours are far apart
+# across the sheet. Regular apertures cover 0.4 to 1.
 _SPREAD, _OUTERMOST = 0.2, 0.1
-_SCREENED = 512  # channels that tell whether one curve may serve
-_FAR_OFF = 2.0  # wavelengths rms, per axis: channels so far from a curve need several
-_CHANNELS_PER_TERM = 4
-_RIDGE = 1e-10  # of the normal equations, where no channel determines a coefficient
+_SCREENED = 512  # channels by which a single curve is accepted or rejected
+_FAR_OFF = 2.0  # rms distance per axis at which one curve is rejected, wavelengths
+_CHANNELS_PER_TERM = 4  # fewest channels for each coefficient of a sheet
+_RIDGE = 1e-10  # added to normal equations, relative, for coefficients without any channel
 
 
 def mean_track_of(lines: RangeLines, shape: Shape, wavelength_m: float) -> MeanTrack | None:
-    """Return the mean track of some shape, None if channels have none such.
+    """Return the mean track of a given shape, or None if the channels have no such track.
 
     Equal geometry and an equal wavelength (see `clsas.signal.spectrum.band_wavelength_m`) give
-    equal tracks: a plan holds the shape only.
+    equal tracks. A plan therefore contains the shape only.
     """
     of_shape = {"track": mean_track, "strips": strips, "sheet": sheet}
     return of_shape[shape](lines, wavelength_m)
 
 
 def shapes_after(shape: Shape) -> tuple[Shape, ...]:
-    """Return the shapes that channels may have besides one: see `simplest_track`.
+    """Return the shapes to try after one that `simplest_track` returned.
 
-    It has tried those before, so that these are none.
+    It has already rejected the shapes before that one.
     """
     order = ("track", *DENSE_SHAPES)
     return order[order.index(shape) + 1 :]
 
 
 def simplest_track(lines: RangeLines, wavelength_m: float) -> tuple[Shape, MeanTrack | None]:
-    """Return a mean track and its shape: one curve, unless channels are far from any."""
+    """Return the simplest mean track and its shape: one curve, unless channels are far from it."""
     if not _follows_one_curve(lines, wavelength_m):
         for shape in DENSE_SHAPES:
             track = mean_track_of(lines, shape, wavelength_m)
@@ -80,9 +79,9 @@ def simplest_track(lines: RangeLines, wavelength_m: float) -> tuple[Shape, MeanT
 
 
 def strips(lines: RangeLines, wavelength_m: float) -> MeanTrack | None:
-    """Return a track with a curve for each pass, whatever the order of the channels.
+    """Return a track with a curve for each pass, for channels in any order.
 
-    None for a single pass, and where passes are short.
+    The result is None for a single pass, or if any pass is short.
     """
     bare, centres_m = lines.without_samples(), lines.phase_centres_m
     passes = _following_each_other(centres_m) or _near_each_other(centres_m)
@@ -100,7 +99,7 @@ def strips(lines: RangeLines, wavelength_m: float) -> MeanTrack | None:
 
 
 def _following_each_other(centres_m: NDArray[np.float64]) -> list[NDArray[np.int64]] | None:
-    """Return the channels of passes that follow each other with jumps, None without any."""
+    """Return the channels of each pass if passes are separated by jumps, else None."""
     steps_m = np.linalg.norm(np.diff(centres_m, axis=0), axis=1)
     if not steps_m.size:
         return None
@@ -109,17 +108,17 @@ def _following_each_other(centres_m: NDArray[np.float64]) -> list[NDArray[np.int
 
 
 def _near_each_other(centres_m: NDArray[np.float64]) -> list[NDArray[np.int64]] | None:
-    """Return the channels of passes that lie apart, in any order of the channels.
+    """Return the channels of each pass if passes lie apart, for channels in any order; else None.
 
-    Channels are of one pass if a chain of near neighbours joins them.
+    Channels belong to one pass if a chain of near neighbours connects them.
     """
-    # Such a tree takes half the time of a balanced one to make, and more to search, but for few.
+    # This tree takes half as long to build as a balanced one. Searches take longer, but are few.
     count, tree = len(centres_m), KDTree(centres_m, balanced_tree=False, compact_nodes=False)
     some = centres_m[some_channels(count, _SCREENED)]
-    # A helix or a planar array is no passes: its channels have many neighbours within a jump.
+    # Channels of a helix or a planar array, which have no passes, have many neighbours in a jump.
     step_m = float(np.median(tree.query(some, k=2)[0][:, -1]))
     neighbours = tree.query_ball_point(some, _JUMP * step_m, return_length=True)
-    # The mean bounds the memory of pairs: channels of a platform at rest are all neighbours.
+    # The mean bounds the memory for pairs: all channels of a platform at rest are neighbours.
     if step_m == 0 or np.median(neighbours) > 2 * _JUMP + 1 or np.mean(neighbours) > _MOST_PAIRS:
         return None
     pairs = tree.query_pairs(_JUMP * step_m, output_type="ndarray")
@@ -131,16 +130,16 @@ def _near_each_other(centres_m: NDArray[np.float64]) -> list[NDArray[np.int64]] 
 
 
 def _passes(found: list[NDArray[np.int64]]) -> list[NDArray[np.int64]] | None:
-    """Return the channels of several passes unless these are too many or too short."""
+    """Return the channels of passes, or None if passes are too few, too many or too short."""
     short = min(len(each) for each in found) < _LEAST_OF_STRIP
     return found if 1 < len(found) <= _MOST_STRIPS and not short else None
 
 
 def sheet(lines: RangeLines, wavelength_m: float) -> MeanTrack | None:
-    """Return the smooth sheet nearest to the phase centres, None if they lie on a line.
+    """Return the smooth sheet nearest to the phase centres, or None if they lie on a line.
 
-    A plane, or a ring around the middle, is bent until it follows the channels. Every channel is
-    given the coordinates of the plane or the ring.
+    A plane, or a ring around the middle, is bent until it follows the channels. The coordinates of
+    channels are those on the plane or the ring.
     """
     centres_m = lines.phase_centres_m
     some = some_channels(lines.channels, _FITTED)
@@ -182,7 +181,7 @@ def smooth_over_sheet(
     along : float64 [channels, 3]
         Directions of the channels.
     either_sign : bool
-        True if a direction and its opposite mean the same: a scan may go to and fro.
+        True if opposite directions are equivalent, as on a scan to and fro.
     """
     assert track.across is not None
     some = some_channels(len(along), _FITTED)
@@ -202,7 +201,7 @@ def smooth_over_sheet(
 
 
 def _same_way(track: MeanTrack, along: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return signs that turn directions [channels, 3] into the same way along or across a sheet."""
+    """Return signs that make directions [channels, 3] agree along or across a sheet."""
     assert track.across is not None
     coordinates = track.coordinate, track.across
     toward = []
@@ -219,9 +218,9 @@ def _smoothest(
     closed: bool,
     close: float,
 ) -> tuple[BSpline, float] | None:
-    """Return the simplest sheet of values [n, 3] that is close to them, and its rms distance.
+    """Return the simplest sheet that is close to values [n, 3], and its rms distance from them.
 
-    None with too few values.
+    If no sheet is close, return the closest one; with too few values, return None.
     """
     best: BSpline | None = None
     best_rms = np.inf
@@ -237,9 +236,10 @@ def _smoothest(
 
 
 def _follows_one_curve(lines: RangeLines, wavelength_m: float) -> bool:
-    """Return whether one smooth curve may serve: False if channels are far from any.
+    """Return whether channels may be close to one smooth curve.
 
-    A sample of the channels decides, so that no curve is fitted to a hundred thousand in vain.
+    A sample of the channels decides, so that curves are not fitted to a hundred thousand channels
+    in vain.
     """
     some = some_channels(lines.channels, _SCREENED)
     if len(some) == lines.channels:
@@ -258,13 +258,14 @@ class _Surface:
     Attributes
     ----------
     axes : float64 [3, 3]
-        Of a plane, the first along it and the second across; of a ring, the last is its axis.
+        Unit vectors. The first is along a plane and the second across it; the third is the axis of
+        a ring.
     centre : (float, float) or None
-        Of the ring, along the first two axes; None for a plane.
+        Centre of the ring on the first two axes; None for a plane.
     start : float
-        Angle at which the ring is cut.
+        Angle at which the ring is cut, radians.
     closed : bool
-        True for a whole ring: its ends meet.
+        True for a whole ring, whose ends meet.
     """
 
     axes: NDArray[np.float64]
@@ -324,7 +325,7 @@ def _fitted(
     Positions are cubic splines along it, and polynomials across.
     """
     (along, across), low, high = coordinates, 0.0, 1.0
-    if closed:  # on either side of the cut, channels of the other side guide the splines
+    if closed:  # near the cut, channels from beyond it guide the splines
         low, high = -_OVERLAP, 1 + _OVERLAP
         turned = np.concatenate([along - 1, along, along + 1])
         near = np.flatnonzero((turned > low) & (turned < high))
@@ -349,8 +350,8 @@ def _fitted(
 def _least_squares(terms: csr_array, values: NDArray[np.float64], band: int) -> NDArray[np.float64]:
     """Return the coefficients of terms [n, m] that fit values [n, 3] best, [m, 3].
 
-    Terms as far apart as `band` have nothing in common, so that the normal equations are banded: a
-    general solver takes ten times as long, and more where its threads meet other work.
+    Terms that are `band` or more apart never coincide, so that the normal equations are banded. A
+    general solver takes ten times as long, and longer still when its threads compete for cores.
     """
     normal = (terms.T @ terms).toarray()
     m = len(normal)

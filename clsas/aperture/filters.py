@@ -1,4 +1,4 @@
-"""Filters between the stages of a factorized image: the sample rates that an error requires."""
+"""Filters of a factorized image, and the sample rates that they need for a given error."""
 
 from __future__ import annotations
 
@@ -17,42 +17,43 @@ from clsas.signal.spectrum import Spectrum
 ALIGN_TAPS = APERTURE_TAPS = (4, 6, 8)
 _FINAL_TAPS = (2, 4, 6, 8)
 UPSAMPLING_SHARE = 0.03
-"""Share of an image's error power that filters for upsampling may add."""
+"""Share of an image's error power that upsampling filters may add."""
 LONGEST_UPSAMPLING_SHARE = 0.2
-"""The same for the longest filter, where no other is accurate enough. Past it FFTs upsample lines:
-that takes more time than tighter filters elsewhere, and rules out half precision."""
+"""The same for the longest filter, if no shorter one is accurate enough. Beyond it, FFTs upsample
+the lines, which takes more time than tighter filters elsewhere and rules out half precision."""
 _MOST_GAIN = 3.0  # limits the gain at band edges, where lines have little power
-# Weight of pixels near the corners of a subimage: those with `_CORNERS_FROM` of the highest phase
-# rate or more. Half: 1.5 % faster and 1 dB less error on average, but corners err more. Twice:
-# tight tolerances find no filters.
+# Weight of pixels near the corners of a subimage, which have at least `_CORNERS_FROM` of the
+# highest phase rate. With half the weight, images are 1.5 % faster and their errors 1 dB smaller
+# on average, but larger at corners. With twice, there are no filters for tight tolerances.
 _CORNERS_SHARE = 0.5
 _CORNERS_FROM = 0.7
-# Of the iteration to the least oversampling; once only: 1 % slower.
-_STEPS = 3
-_SLOPE_DB = 12.0  # per tap and factor e of oversampling; a quarter more: 0.15 dB
-_CLOSE_DB = 0.1  # of the aim
-_WORST_DB = -22.0  # aperture filters; with worse ones only pixels at the corners err
-_COHERENT = 0.08  # of their error power; half: helices err by 0.5 dB more than predicted
+_STEPS = 3  # iterations towards the least oversampling; with one, images take 1 % more time
+_SLOPE_DB = 12.0  # bounds the fall of errors per tap and e-fold rate; 15 makes 0.15 dB difference
+_CLOSE_DB = 0.1  # distance from the allowed error at which the iteration aims
+_WORST_DB = -22.0  # of aperture filters; with worse ones, errors concentrate at corners
+# Share of the error power of aperture filters that is of the same sign along and across a sheet.
+# With half, errors of helices exceed the prediction by 0.5 dB.
+_COHERENT = 0.08
 _RATES = tuple(np.geomspace(1, 12, 16))  # at which errors of filters are evaluated
-_BINS = 64  # of the steering functions' spectrum
+_BINS = 64  # frequencies of the spectrum of steering functions
 
 
 def steering_spectrum(of_highest: ArrayLike = 1.0, power: ArrayLike = 1.0) -> Spectrum:
     """Return the power spectrum of steering functions along the aperture.
 
-    The spacing of virtual channels follows from the highest phase rate: that of the highest
-    frequency, at a corner of a subimage. Most pixels have lower rates. Corners get more weight than
-    their share, since the only target of a scene may lie in one.
+    The spacing of virtual channels follows from the highest phase rate, which is that of the
+    highest frequency at a corner of a subimage. Most pixels have lower rates. Corners get more
+    weight than their share of the pixels, since the only target of a scene may be in a corner.
 
     Parameters
     ----------
     of_highest : float [n]
         Frequencies of the lines, relative to the highest.
     power : float [n]
-        Share of the lines' power at each.
+        Share of the lines' power at each frequency.
     """
     edges = np.linspace(0, 1, _BINS + 1) / np.asarray(of_highest).reshape(-1, 1)
-    # Power below each edge, of a spectrum like 1 - x^2 up to the highest rate, and of a flat one.
+    # Power below each edge: of a spectrum 1 - x^2 up to the highest rate, and of a flat spectrum.
     inside = np.minimum(edges, 1) * (3 - np.minimum(edges, 1) ** 2) / 2
     corners = np.clip((edges - _CORNERS_FROM) / (1 - _CORNERS_FROM), 0, 1)
     both = (1 - _CORNERS_SHARE) * inside + _CORNERS_SHARE * corners
@@ -70,11 +71,11 @@ class Filters:
     Attributes
     ----------
     align : Interpolator
-        In range, between stages.
+        Filter in range, of the stages.
     aperture : Interpolator
-        Along the aperture.
+        Filter along the aperture.
     final : Interpolator
-        In range, for the pixels.
+        Filter in range, of the last backprojection.
     """
 
     align: Interpolator
@@ -83,9 +84,9 @@ class Filters:
 
 
 def edges_gain(align: Interpolator, final: Interpolator, stages: int, ratio: float) -> Gain:
-    """Return the gain that compensates range interpolation, for lines upsampled by a ratio.
+    """Return the gain that compensates for range interpolation of lines upsampled by a ratio.
 
-    Interpolation attenuates the band's edges a little in every stage.
+    Interpolation attenuates the edges of the band a little in every stage.
     """
 
     def gain(frequency: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -97,7 +98,7 @@ def edges_gain(align: Interpolator, final: Interpolator, stages: int, ratio: flo
 
 @dataclass(frozen=True)
 class FilterRates:
-    """Taps of filters, and the sample rates that they need; the filters are not designed yet.
+    """Taps of filters that are not designed yet, and the sample rates that they need.
 
     Attributes
     ----------
@@ -106,10 +107,10 @@ class FilterRates:
         Factor by which range lines are upsampled.
     aperture_taps : int
     oversampling : float
-        Virtual channels per half a cycle of the highest phase rate.
+        Virtual channels per half cycle of the highest phase rate.
     final_taps : int
     dimensions : int
-        Of the aperture, in which virtual channels are interpolated.
+        Dimensions of the aperture in which virtual channels are interpolated.
     """
 
     align_taps: int
@@ -127,17 +128,18 @@ class FilterRates:
     def design(
         self, spectrum: Spectrum, steering: Spectrum, stages: int, most_db: float
     ) -> Filters:
-        """Return filters with a joint error of `most_db` or little less.
+        """Return filters with a joint error of `most_db`, or a little less.
 
-        The upsampling is rounded to whole phases of the filters' tables. The error that range
-        filters leave is for the aperture filter.
+        The upsampling is rounded so that samples lie at whole phases of the filters' tables. The
+        aperture filter may have the error that range filters leave.
 
         Parameters
         ----------
         spectrum, steering : Spectrum
-            Of the range lines, and of the steering functions along the aperture.
+            Spectra of the range lines, and of the steering functions along the aperture.
         stages : int
         most_db : float
+            Relative rms error, dB.
         """
         upsampling = PHASES / max(int(PHASES / self.upsampling), 1)
         align = interpolation.design(self.align_taps, upsampling, spectrum)
@@ -158,10 +160,10 @@ class FilterRates:
 
 
 def interpolations(stages: int, dimensions: int) -> float:
-    """Return how many times the error power of an aperture's filter counts.
+    """Return the factor by which the error power of the aperture filter counts in an image.
 
-    Interpolations along and across a sheet err with the same sign at low phase rates, so that some
-    of their errors add, not their powers.
+    Errors of interpolation along and across a sheet have the same sign at low phase rates, so that
+    in part they add up themselves, rather than their powers.
     """
     if dimensions == 1:
         return stages
@@ -177,10 +179,10 @@ def choose(
     most_db: float,
     dimensions: int = 1,
 ) -> FilterRates | None:
-    """Return the least rates at which the joint error of all interpolations is at most `most_db`.
+    """Return the lowest rates at which the joint error of all interpolations is at most `most_db`.
 
-    These are two in each stage, three for a sheet, and the last one. The result is None if no rate
-    suffices.
+    There are two interpolations in each stage, three on a sheet, and one at the end. The result is
+    None if no rate suffices.
     """
     each_db = most_db - 10 * math.log10(stages + interpolations(stages, dimensions) + 1)
     upsampling = _least_rate(align_taps, each_db, spectrum, "scatter_db")
@@ -196,14 +198,14 @@ def choose(
 
 
 def _least_rate(taps: int, most_db: float, spectrum: Spectrum, error: str) -> float | None:
-    """Return the least rate at which a filter's error is at most `most_db`, or None."""
+    """Return the lowest rate at which a filter's error is at most `most_db`, or None."""
     key = spectrum.frequency.tobytes(), spectrum.power.tobytes()
     errors = _errors_db(taps, error, *key)
     if errors[-1] > most_db:
         return None
     if errors[0] <= most_db:
         return _RATES[0]
-    # Errors fall with the rate. Rounding is allowed half a per cent of rate and a tenth of a dB.
+    # Errors fall with the rate. The margins for rounding are half a per cent and a tenth of a dB.
     return 1.005 * float(np.exp(np.interp(0.1 - most_db, -errors, np.log(_RATES))))
 
 

@@ -1,7 +1,8 @@
 """The interpolated aperture: virtual channels as dense as band-limited steering functions need.
 
-Aligned on a subimage's centre, a pixel's steering function varies slowly along the aperture. It is
-interpolated from those of fewer, virtual channels; their lines are weighted sums of aligned lines.
+Relative to the centre of a subimage, the steering function of a pixel varies slowly along the
+aperture. It is interpolated from its values at fewer, virtual channels, whose lines are weighted
+sums of aligned lines.
 """
 
 from __future__ import annotations
@@ -47,17 +48,17 @@ class InterpolatedAperture:
     Attributes
     ----------
     filter : Interpolator
-        Filter along the aperture. Its `upsampling` is the density of virtual channels over the
-        band limit.
+        Filter along the aperture. Its `upsampling` is the density of virtual channels relative to
+        the band limit.
     oversampling : tuple of float
-        Stage by stage, how much denser than the filter needs virtual channels are. It makes up for
-        their uneven spacing along the track.
+        Density of virtual channels relative to what the filter needs, stage by stage. It
+        compensates for their uneven spacing along the track.
     beam_cycles : float
-        Cycles per edge of the beam for which the last stage's virtual channels are dense enough.
+        Cycles per edge of the beam that the virtual channels of the last stage can sample.
     shape : str
-        Where they lie: on a curve ("track"), on several ("strips"), or on a "sheet".
+        Shape of the mean track: one curve ("track"), several ("strips"), or a "sheet".
     band : (centre, half width)
-        Frequencies that all filters are made for, cycles per sample.
+        Frequencies for which all filters were designed, cycles per sample.
     """
 
     filter: RangeFilter
@@ -68,16 +69,16 @@ class InterpolatedAperture:
     method: Literal["interpolated"] = "interpolated"
 
     aligns_phases: ClassVar[bool] = True
-    """The first stage turns the phase of channels off the mean track along their lines."""
+    """The first stage turns the phases of channels off the mean track along their lines."""
 
     splits_leaves: ClassVar[bool] = False
-    """Leaves are small enough for the expansion of ranges about their centres."""
+    """Leaves are small enough for expansions of ranges about their centres."""
 
     __repr__ = reprs.of_fields
 
     @property
     def dimensions(self) -> int:
-        """Dimensions of the aperture in which its filter interpolates."""
+        """Dimensions of the aperture in which the filter interpolates."""
         return 2 if self.shape == "sheet" else 1
 
     @property
@@ -94,7 +95,7 @@ class InterpolatedAperture:
         )
 
     def lines_gain(self, align: Interpolator, final: Interpolator, ratio: float) -> Gain | None:
-        """Return the gain of upsampled lines that makes up for what range filters attenuate."""
+        """Return the gain of upsampled lines that compensates for the loss in range filters."""
         return edges_gain(align, final, self.stages, ratio)
 
     def used_channels(
@@ -104,22 +105,22 @@ class InterpolatedAperture:
         stop: NDArray[np.float64],
         slack: float,
     ) -> slice:
-        """Return the channels that a sector needs; one at least.
+        """Return the channels that a sector needs, at least one.
 
         Parameters
         ----------
         coordinate : float64 [channels]
-            Aperture coordinates, ascending.
+            Aperture coordinates of channels, ascending.
         start, stop : float64 [leaves]
-            Where each leaf is visible from.
+            Aperture coordinates between which each leaf is visible.
         slack : float
-            By how much coordinates may differ when seen from elsewhere.
+            Largest difference between apparent coordinates and these.
         """
-        seen = stop > start
-        if not seen.any():
+        visible = stop > start
+        if not visible.any():
             return slice(0, 1)
-        first = np.searchsorted(coordinate, start[seen].min() - slack, "left")
-        last = np.searchsorted(coordinate, stop[seen].max() + slack, "right")
+        first = np.searchsorted(coordinate, start[visible].min() - slack, "left")
+        last = np.searchsorted(coordinate, stop[visible].max() + slack, "right")
         return slice(int(min(first, len(coordinate) - 1)), int(max(last, first + 1)))
 
     def on_curves(
@@ -136,9 +137,9 @@ class InterpolatedAperture:
         ----------
         track : MeanTrack
         rates : float64 [axes, roots, samples]
-            Largest phase rates of their subimages: see `cycles_per_extent`.
+            Largest phase rates of subimages in the roots: see `cycles_per_extent`.
         beam_rate : float64 [roots, samples] or None
-            Phase rates of the beam's weights, which count in the last stage.
+            Rates at which the beam's weights change, which count in the last stage only.
         extents : sequence of float64 [roots, axes]
             Extents of the subimages, stage by stage.
         coordinate : float64 [roots, channels]
@@ -164,7 +165,7 @@ class InterpolatedAperture:
     ) -> list[VirtualChannels]:
         """Return the virtual channels of some roots, stage by stage, on a sheet.
 
-        Parameters are those of `on_curves`, with rates along and across the sheet, and the
+        The parameters are those of `on_curves`, with rates along and across the sheet, and the
         coordinates of the raw channels along and across it.
         """
         found: list[VirtualChannels] = []

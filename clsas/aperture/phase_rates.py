@@ -13,9 +13,8 @@ from clsas.core.geometry import pairwise_range_m
 from clsas.core.grid import Grid
 from clsas.core.lines import RangeLines
 
-# What half and twice change, by `scripts/bench sensitivity`, where they change anything:
-_MOST_POINTS = 9  # along a side of a box, at which rates are evaluated
-_RATES_AT_ONCE = 1 << 15  # stay in a core's cache
+_MOST_POINTS = 9  # most points along a side of a box at which rates are evaluated
+_RATES_AT_ONCE = 1 << 15  # rates evaluated together, which fit into the cache of a core
 
 
 def stretches(
@@ -28,29 +27,32 @@ def stretches(
     points_m: NDArray[np.float64],
     virtual_m: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """Return the stretch of range lines against those from the mean track, [points, channels].
-
-    The range of a channel grows along its gradient; that of a position on the track grows along the
-    unit vector from there, less the drift. The component of their difference along g, the unit
-    vector projected into the plane, stretches the range line about the point, and can be
-    compensated. `apparent_coordinates` leaves little across it.
-
-    For a moving receiver its position counts at the time when the echo arrives. With unit vectors
-    u from both antennas,
-
-        gradient = (u_tx + u_rx) / 2 / (1 + u_rx . velocity / c).
+    """Return the stretch of range lines relative to those from the mean track, [points, channels].
 
     Parameters
     ----------
     tx_m, rx_m, rx_velocity_m_s, sound_speed_m_s
-        Of the channels, as in RangeLines.
+        Positions, velocities and sound speed of the channels, as in RangeLines.
     drift : float64 [3]
         See `drift`.
     plane : Grid
         The plane of the pixels.
     points_m : float64 [points, 3]
     virtual_m : float64 [points, channels, 3]
-        Position on the track of every channel, as it appears from each point.
+        Position on the track at which each channel appears from each point.
+
+    Notes
+    -----
+    The range of a channel grows along its gradient, and that of a position on the track along the
+    unit vector from there, minus the drift. Let g be that unit vector, projected onto the plane.
+    The component along g of the difference between both gradients stretches the range line about
+    the point, which can be compensated. The component across g is small, because channels are
+    replaced by positions at their `apparent_coordinates`.
+
+    For a moving receiver, the position at the time when the echo arrives counts. With unit vectors
+    u from both antennas,
+
+        gradient = (u_tx + u_rx) / 2 / (1 + u_rx . velocity / c).
     """
     normal = np.cross(*plane.vectors_m[1:])
     normal = normal / max(float(np.linalg.norm(normal)), 1e-300)
@@ -70,12 +72,12 @@ def stretches(
         more = (sight(tx_m) + from_rx) / 2 / later[..., None] - along + drift
     along = along - (along @ normal)[..., None] * normal
     square = np.einsum("pci,pci->pc", along, along)
-    # Directly below the track, ranges do not grow at all.
+    # Directly below the track, ranges hardly grow in the plane; the bound avoids a division by 0.
     return np.einsum("pci,pci->pc", more, along) / np.maximum(square, 1e-3)
 
 
 def drift(lines: RangeLines) -> NDArray[np.float64]:
-    """Return the mean velocity of the receivers over the sound speed, [3].
+    """Return the mean velocity of the receivers divided by the sound speed, [3].
 
     To first order, motion during flight shortens the range to a point x by drift.(x - channel).
     """
@@ -85,7 +87,7 @@ def drift(lines: RangeLines) -> NDArray[np.float64]:
 
 
 def own_drift(lines: RangeLines) -> NDArray[np.float64] | None:
-    """Return every channel's drift less the mean, [channels, 3]; None if all are equal."""
+    """Return the drift of each channel minus the mean, [channels, 3]; None if all are equal."""
     if lines.rx_velocity_m_s is None:
         return None
     own = lines.rx_velocity_m_s / lines.sound_speed_m_s - drift(lines)
@@ -216,9 +218,9 @@ def largest_rates(
 def _points_of_box(
     sides_m: NDArray[np.float64], closest_m: float
 ) -> tuple[NDArray[np.float64], float]:
-    """Return points of a box, in parts of its sides [n, axes], and half the distance between them.
+    """Return points of a box as fractions of its sides, [n, axes], and half their distance.
 
-    A box that is large against its distance gets more points.
+    Boxes that are large compared with their distance get more points.
     """
     lengths_m = np.linalg.norm(sides_m, axis=1)
     counts = 3 + 2 * np.clip(lengths_m / closest_m, 0, _MOST_POINTS // 2 - 1).astype(int)
@@ -229,6 +231,6 @@ def _points_of_box(
 
 
 def cumulative_cycles(track: MeanTrack, rate: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the phase at `track.samples`, cycles: the integral of rates [..., samples]."""
+    """Return the phase at `track.samples`, the integral of rates [..., samples], in cycles."""
     steps = np.diff(track.samples) * (rate[..., 1:] + rate[..., :-1]) / 2
     return np.concatenate([np.zeros((*rate.shape[:-1], 1)), np.cumsum(steps, axis=-1)], axis=-1)

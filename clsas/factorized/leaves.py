@@ -69,7 +69,7 @@ class Leaves(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class LeafStage:
-    """What leaves of either kind share: lines, geometry, and arguments of the kernels.
+    """The last stage: lines, geometry and kernel arguments that both kinds of leaves share.
 
     Attributes
     ----------
