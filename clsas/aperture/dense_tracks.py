@@ -172,12 +172,12 @@ def sheet(lines: RangeLines, wavelength_m: float) -> MeanTrack | None:
 def smooth_over_sheet(
     track: MeanTrack, along: NDArray[np.float64], *, either_sign: bool
 ) -> MeanTrack:
-    """Return the smooth directions nearest to those of a sheet's channels, as its positions.
+    """Return a track whose positions are smooth directions, the nearest to those of channels.
 
     Parameters
     ----------
     track : MeanTrack
-        The sheet.
+        A sheet, whose coordinates the result shares.
     along : float64 [channels, 3]
         Directions of the channels.
     either_sign : bool

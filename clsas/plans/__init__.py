@@ -1,1 +1,1 @@
-"""Plans: what has been decided about an image, and what is predicted of it, as frozen data."""
+"""Plans as frozen data: how an image will be formed, and the predictions for it."""

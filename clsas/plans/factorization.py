@@ -1,4 +1,4 @@
-"""How an image is formed: by a factorization, or exactly. Either is a small frozen type."""
+"""The two ways to form an image, by a factorization or exactly, as small frozen types."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from clsas.signal.fields import RangeFilter, StoredResampling, StoredUpsampler
 from clsas.signal.interpolation import PHASES
 
 UNREACHED = "no line reaches the grid"
-"""Reason of an exact image of zeros, of which `clsas.plan` has warned."""
+"""Reason for an exact image that is all zeros; `clsas.plan` has then warned."""
 
 
 @dataclass(frozen=True, config=CONFIG)
@@ -28,9 +28,9 @@ class ExactImage:
     Attributes
     ----------
     accuracy_db : float
-        Relative rms error of its interpolation.
+        Relative rms error of interpolation, dB.
     reason : str
-        Why the image cannot be factorized, in words; "" if it can, but not faster.
+        Reason why the image cannot be factorized, in words; "" if it can, but not faster.
     """
 
     accuracy_db: Number
@@ -44,45 +44,46 @@ class ExactImage:
 
 @dataclass(frozen=True, eq=False, config=CONFIG)
 class Factorization:
-    """A division of the image into subimages within subimages, with the filters in between.
+    """A division of the image into subimages within subimages, and the filters between stages.
 
-    A root subimage is formed from the lines themselves. Each stage divides the subimages of the
-    one before and combines their channels into fewer, virtual ones. The last stage's, the leaves,
-    are backprojected.
+    The roots are formed from the lines themselves. Each stage divides the subimages of the stage
+    before, and combines their channels into fewer virtual channels. The subimages of the last
+    stage, the leaves, are backprojected.
 
     Attributes
     ----------
     sides : tuple of (rows, columns)
-        Pixels of a subimage, stage by stage.
+        Size of subimages in pixels, stage by stage.
     tile : (rows, columns)
-        Pixels that are backprojected together: leaves, or parts of them.
+        Size of the blocks of pixels that are backprojected together: leaves, or parts of them.
     aperture : InterpolatedAperture or NearestBeams
-        How channels are combined into virtual ones.
+        Method that combines channels into virtual channels.
     align, final : Interpolator
-        Filters in range: of the stages, and of the last backprojection.
+        Filters in range, of the stages and of the last backprojection.
     resampling : Resampling
-        Positions of samples after lines are upsampled.
+        Positions of samples after upsampling.
     upsampler : Upsampler or None
-        Filters that upsample lines; None by FFT.
+        Filters that upsample lines; None for upsampling by FFT.
     half_precision : bool
-        True if stages hand on lines in half precision: half of the memory.
+        True if the lines between stages are in half precision, which halves their memory.
     half_lengths : tuple of int
-        Samples to either side of a subimage's centre that its lines hold, stage by stage.
+        Number of samples on either side of a subimage's centre in its lines, stage by stage.
     most_channels : tuple of int
-        Virtual channels of a subimage, stage by stage, that buffers have room for from the start.
+        Number of virtual channels of a subimage, stage by stage, for which buffers have room from
+        the start.
     highest_cycles_per_m : float
-        Phase per metre of range at the upper end of the lines' band.
+        Phase per metre of range at the upper end of the lines' band, cycles.
     closest_m : float
-        Distance from the track that no pixel is closer than.
+        Lower bound on the distance of pixels from the track.
     limits : (low, high) or None
-        With a beam: sines of the aspect angle between which its weights matter.
+        With a beam, the sines of the aspect angle between which its weights matter.
     roots_at_once, roots_prepared : int
-        Roots that are formed together, and whose geometry is prepared together.
+        Number of roots that are formed together, and whose geometry is prepared together.
     phase_terms : int
-        Terms of the polynomials for sine and cosine of pixels' phases.
+        Number of terms in the polynomials for sine and cosine of the phases of pixels.
     stretch : float
-        By how much faster ranges grow along the line of sight than those from the mean track,
-        relative to these; the mean over all channels.
+        Relative excess of the growth of ranges along the line of sight over that of ranges from
+        the mean track, averaged over all channels.
     """
 
     sides: Annotated[tuple[Size, ...], Field(min_length=1)]
@@ -108,11 +109,11 @@ class Factorization:
 
     @property
     def band(self) -> tuple[float, float] | None:
-        """Centre and half width of the band that filters are made for; None for any."""
+        """Centre and half width of the band for which filters were designed; None for any band."""
         return self.aperture.band
 
     def __post_init__(self) -> None:
-        """Check that the fields fit each other."""
+        """Raise ValueError if the fields contradict each other."""
 
         def check(fits: bool, name: str, allowed: str) -> None:
             if not fits:
@@ -124,11 +125,15 @@ class Factorization:
             for large, small in pairwise((*self.sides, self.tile))
             for a, b in zip(large, small, strict=True)
         )
-        check(nested, "sides", f"pairs of rows and columns that divide each other, to {self.tile}")
+        check(
+            nested,
+            "sides",
+            f"rows and columns, each divisible by the next and at last by {self.tile}",
+        )
         whole_items = self.tile[0] % 16 == 0 and self.tile[1] % 4 == 0
         check(whole_items, "tile", "a multiple of 16 rows and 4 columns")
         whole_leaves = self.aperture.splits_leaves or self.tile == self.sides[-1]
-        check(whole_leaves, "tile", "the last of sides")
+        check(whole_leaves, "tile", "the last pair of sides")
         levels = len(self.sides)
         check(self.aperture.stages == levels, "aperture", f"made for {levels} stages")
         for name in ("half_lengths", "most_channels"):

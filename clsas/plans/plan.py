@@ -1,4 +1,4 @@
-"""How an image will be formed, with its predicted error, time and memory."""
+"""Plans: how an image will be formed, with its predicted error, time and memory."""
 
 from __future__ import annotations
 
@@ -24,29 +24,36 @@ from clsas.sonar.beam import BeamWindow
 from clsas.sonar.simplify import EFFECTS
 
 VERSION = 5
-"""Version of a plan's JSON. Version 1, of clsas before 0.1.0, had no number; version 2 had a single
-mean track; version 3 lacked the origin of costs; in version 4 `method` was `image`."""
+"""Version of a plan's JSON. Version 1, from before clsas 0.1.0, had no number; version 2 had a
+single mean track; version 3 lacked the origin of costs; version 4 called `method` `image`."""
 
 
 @dataclass(frozen=True, eq=False, config=CONFIG)
 class Plan:
-    """An image, decided before the device starts; made by `plan`, used by `factorize`.
+    """How an image will be formed, decided in advance, with predicted error, time and memory.
+
+    `clsas.plan` makes plans. `clsas.factorize` and `clsas.Imager` form images by them.
 
     Attributes
     ----------
     tolerance_db : float or None
-        Relative rms error asked for; None where stages were given.
+        Requested relative rms error, dB; None if stages were given instead.
     method : Factorization or ExactImage
-        How the image is formed: exactly, if nothing is faster within the tolerance.
+        The factorization, or exact backprojection if no factorization within the tolerance is
+        faster.
     prediction : Prediction
         Predicted error, time and memory.
     beam : BeamWindow or None
         Weights of the channels.
     lines_digest, grid_digest : str
-        Of the geometry that this plan was made for.
+        Digests of the geometry for which this plan was made.
     left_out : tuple of str
-        Effects that the image does without, since their error lies far below the tolerance: see
-        `clsas.sonar.simplify`.
+        Effects that the image neglects, because their error is far below the tolerance.
+
+    See Also
+    --------
+    clsas.plan : Make a plan.
+    clsas.factorize : Form an image by a plan.
     """
 
     tolerance_db: Number | None
@@ -58,12 +65,12 @@ class Plan:
     left_out: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        """Check that the fields fit each other."""
+        """Raise ValueError if the fields contradict each other."""
         if not set(self.left_out) <= set(EFFECTS):
             got = validate.shown(self.left_out)
             raise ValueError(f"left_out must be some of {', '.join(EFFECTS)}, got {got}")
         if not self.is_exact and (self.factorization.limits is None) != (self.beam is None):
-            raise ValueError("limits must be given with a beam, and left out without one")
+            raise ValueError("limits must be given with a beam, and must be None without one")
 
     @property
     def is_exact(self) -> bool:
@@ -72,49 +79,49 @@ class Plan:
 
     @property
     def factorization(self) -> Factorization:
-        """How the image is divided; raises TypeError for an exact one."""
+        """Division of the image and its filters. Raises TypeError for an exact image."""
         if isinstance(self.method, ExactImage):
-            raise TypeError("the plan must divide the image, got one of an exact image")
+            raise TypeError("the plan must divide the image, got a plan for an exact image")
         return self.method
 
     @property
     def sides(self) -> tuple[tuple[int, int], ...]:
-        """Rows and columns of subimages, stage by stage. Empty for an exact image."""
+        """Rows and columns of subimages, stage by stage; empty for an exact image."""
         return self.method.sides
 
     @property
     def half_precision(self) -> bool:
-        """True if lines are handed on from stage to stage in half precision."""
+        """True if the lines between stages are in half precision."""
         return self.method.half_precision
 
     @property
     def stages(self) -> tuple[Stage, ...]:
-        """Predictions for every stage, and the backprojection at the end."""
+        """Predictions for each stage and, last, for the backprojection."""
         return self.prediction.stages
 
     @property
     def predicted_error_db(self) -> float:
-        """Relative rms error against the exact image, as a bound, dB."""
+        """Predicted bound on the relative rms error with respect to the exact image, dB."""
         return self.prediction.error_db
 
     @property
     def predicted_seconds(self) -> float:
-        """Predicted time on the device that the plan was made for."""
+        """Predicted time on the device for which the plan was made, seconds."""
         return self.prediction.seconds
 
     @property
     def exact_seconds(self) -> float:
-        """Predicted time of `clsas.backproject`."""
+        """Predicted time of `clsas.backproject` on the same device, seconds."""
         return self.prediction.exact_seconds
 
     @property
     def memory_bytes(self) -> int:
-        """Largest amount of device memory needed."""
+        """Predicted peak of device memory, bytes."""
         return self.prediction.memory_bytes
 
     @property
     def work(self) -> Work:
-        """Counted operations, which make the predicted time."""
+        """Counted operations, from which the predicted time follows."""
         return self.prediction.work
 
     @property
@@ -123,30 +130,34 @@ class Plan:
         return self.prediction.errors
 
     def __repr__(self) -> str:
-        """Return the request, the prediction and the sides of the subimages."""
+        """Return the request, the sizes of the subimages and the prediction."""
         return reprs.summary(self, *report.summary(self.tolerance_db, self.method, self.prediction))
 
     def _repr_html_(self) -> str:
         return self._report().html()
 
     def describe(self) -> str:
-        """Return a table of what is predicted, stage by stage."""
+        """Return the predictions as text: in total, stage by stage, and by cause of error."""
         return self._report().text()
 
     def _report(self) -> Report:
         return report.report(self.tolerance_db, self.method, self.prediction, self.left_out)
 
     def to_json(self, *, filters: bool = True) -> str:
-        """Return this plan as text that `from_json` reads.
+        """Return this plan as JSON, which `from_json` reads.
 
         Parameters
         ----------
         filters : bool
-            False leaves out the hundreds of coefficients of the filters. The text is then short,
-            for people and logs, but no plan that `from_json` reads.
+            If False, omit the hundreds of coefficients of the filters. The text is then short
+            enough for people and logs, but `from_json` cannot read it.
+
+        Returns
+        -------
+        str
         """
         validate.flag("filters", filters)
-        # Lists and numbers as JSON has them.
+        # The digest is of lists and numbers as they are after a round trip through JSON.
         values = {"version": VERSION} | json.loads(json.dumps(_stored().dump_python(self)))
         if filters:
             values["digest"] = _json_digest(values)
@@ -156,13 +167,21 @@ class Plan:
 
     @classmethod
     def from_json(cls, text: str) -> Plan:
-        """Return the plan that `to_json` wrote.
+        """Return the plan in a text that `to_json` wrote.
+
+        Parameters
+        ----------
+        text : str
+
+        Returns
+        -------
+        Plan
 
         Raises
         ------
         ValueError
-            If the text is not such a plan, was written by another version, or its digest is not
-            that of what it says.
+            If the text is not such a plan, was written by an unsupported version, or does not match
+            its digest.
         """
         try:
             values = parse_json(text)
@@ -180,7 +199,18 @@ class Plan:
             raise ValueError(f"text must be a plan as of Plan.to_json: {error}") from error
 
     def check(self, lines: RangeLines, grid: Grid) -> None:
-        """Raise TypeError or ValueError unless this plan was made for these lines and this grid."""
+        """Check that this plan was made for the geometry of these lines and this grid.
+
+        Parameters
+        ----------
+        lines : RangeLines
+        grid : Grid
+
+        Raises
+        ------
+        TypeError, ValueError
+            If it was made for others, or an argument is not of these types.
+        """
         validate.instance("lines", lines, RangeLines)
         validate.instance("grid", grid, Grid)
         for name, mine, theirs in (
@@ -189,26 +219,26 @@ class Plan:
         ):
             if mine != theirs:
                 raise ValueError(
-                    f"the plan was made for another {name.removesuffix('s')} geometry than that "
-                    f"of {name}; plan anew with clsas.plan"
+                    f"{name} must have the geometry for which the plan was made; make a new plan "
+                    "with clsas.plan"
                 )
         if not self.is_exact:
-            # Sampled lines hold no frequency beyond: more would only cost memory.
+            # Sampled lines contain no higher frequencies; a higher bound would only need memory.
             most = abs(lines.carrier_cycles_per_m) + 1 / lines.range_step_m
             given = self.factorization.highest_cycles_per_m
             validate.number("highest_cycles_per_m", given, "cycles/m", most=most)
 
 
 def _check_version(values: dict[str, Any]) -> None:
-    """Raise ValueError unless a text is of a version that this clsas reads."""
+    """Raise ValueError unless this clsas reads the version of a text."""
     version = values.get("version", 1 if "roots_at_once" in values else None)
     if version is None:
         raise ValueError("it lacks 'version'")
     if version not in (4, VERSION):
-        by = "clsas before 0.1.0" if version == 1 else "another clsas"
+        by = "clsas before 0.1.0" if version == 1 else "another version of clsas"
         raise ValueError(
-            f"it has version {validate.shown(version)}, made by {by}; this clsas reads versions 4 "
-            f"and {VERSION}: make it anew with clsas.plan"
+            f"it has version {validate.shown(version)}, written by {by}; this clsas reads versions "
+            f"4 and {VERSION}: make the plan again with clsas.plan"
         )
 
 
@@ -226,22 +256,22 @@ def _renamed(values: dict[str, Any]) -> dict[str, Any]:
 
 
 def _check_digest(values: dict[str, Any]) -> None:
-    """Raise ValueError unless a text holds the digest of what it says."""
+    """Raise ValueError unless a text matches the digest in it."""
     if "digest" not in values:
-        raise ValueError("it lacks 'digest', as a text that `to_json` wrote without filters does")
+        raise ValueError("it lacks 'digest', like texts that `to_json` wrote without filters")
     said = {name: value for name, value in values.items() if name != "digest"}
     if values["digest"] != _json_digest(said):
-        raise ValueError("its digest differs: it was changed or damaged")
+        raise ValueError("its digest differs: the text was changed or damaged")
 
 
 @functools.cache
 def _stored() -> TypeAdapter[Plan]:
-    """Return pydantic's reader and writer of plans."""
+    """Return the pydantic adapter that reads and writes plans."""
     return TypeAdapter(Plan)
 
 
 def _drop(values: dict[str, Any], name: str) -> None:
-    """Remove a key from nested tables."""
+    """Remove a key from nested objects."""
     values.pop(name, None)
     for value in values.values():
         if isinstance(value, dict):

@@ -17,34 +17,34 @@ from clsas.core.fields import CONFIG, Number, StoredAs
 from clsas.core.fields import Amount as StoredAmount
 
 Amount: TypeAlias = float | NDArray[np.float64]
-"""A number, or one for each of some sizes of subimages."""
+"""A number, or an array with one number for each of several sizes of subimages."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Work:
     """Counted operations of a device and its host.
 
-    `clsas.planning.costs.Costs` has the same fields, in nanoseconds each: `Costs.seconds`
-    multiplies the two. Amounts are numbers, or arrays over sizes of subimages.
+    `clsas.planning.costs.Costs` has the same fields in nanoseconds, and `Costs.seconds` multiplies
+    the two. Amounts are numbers, or arrays over sizes of subimages.
 
     Attributes
     ----------
     call
-        Images, however they are formed: decisions, buffers, launches.
+        Number of images, for the decisions, buffers and launches of any method.
     upsampled_sample, filtered_sample
-        Samples of the upsampled lines, by FFT on the host and by filters on the device.
+        Samples of upsampled lines, by FFT on the host and by filters on the device.
     reference
-        Root subimages times channels, on the host.
+        Roots times channels, on the host.
     batch
-        Stages of batches of roots: launches, tables, transfers; and of further strips.
+        Batches of roots times stages, for launches, tables and transfers; also further strips.
     subimage
-        Subimages, stage by stage.
+        Subimages of all stages.
     line
-        Lines aligned and combined in stages: their shifts, phases and weights.
+        Lines aligned and combined in stages, for their shifts, phases and weights.
     sample, sample_tap
         Samples aligned and combined in stages; the same times the taps of both filters.
     single_sample
-        Those of lines in single precision.
+        Samples of lines in single precision among these.
     given_sample
         Samples aligned in the first stage, whose lines come from main memory.
     leaf_channel
@@ -52,15 +52,15 @@ class Work:
     leaf, leaf_point
         Pixels times virtual channels of leaves, with 4 taps, on a plane and off it.
     leaf_gathered
-        Those of leaves so thick that samples are not looked up in registers.
+        The same of leaves so thick that samples are not looked up in registers.
     group
-        Pixels off a plane that the host puts into groups.
+        Pixels off a plane, which the host puts into groups.
     part
-        Tiles, or groups, times channels of an exact image: references, on the host.
+        Tiles or groups times channels of an exact image, for references on the host.
     pixel, point
         Pixels times channels of an exact image, with 4 taps, in tiles and in groups.
     beam
-        Pixels times channels that a beam weighs, in exact images and leaves.
+        Pixels times channels with beam weights, in exact images and in leaves.
     """
 
     call: Amount = 0.0
@@ -85,40 +85,40 @@ class Work:
     beam: Amount = 0.0
 
     def __add__(self, other: Work) -> Work:
-        """Return the work of both."""
+        """Return the sum of two amounts of work."""
         return Work(*(getattr(self, f.name) + getattr(other, f.name) for f in fields(self)))
 
 
 @dataclasses.dataclass(frozen=True)
 class ErrorBudget:
-    """Relative error powers that add up to the prediction, by cause.
+    """Relative error powers by cause, which add up to the predicted error.
 
     Attributes
     ----------
     exact
         The interpolation and arithmetic of exact backprojection.
     range_filters, aperture_filters
-        Interpolation in range, and along the aperture, in all stages together.
+        Interpolation in range and along the aperture, in all stages together.
     upsampling
-        The filters that upsample the lines.
+        Filters that upsample the lines.
     roots
-        Channels that are put on the mean track, and rounding in the roots.
+        Projection of channels onto the mean track, and rounding in the roots.
     spacing
-        Virtual channels whose spacing, or the beam's weights between them, changes.
+        Uneven spacing of virtual channels, and changes of the beam's weights between them.
     leaves
         Expansion of ranges and weights in the leaves.
     beam_edges
-        Edges of the beam that are left out because hardly anything is seen there.
+        Edges of the beam, which are neglected because their weights are small.
     phases
         Polynomials for sine and cosine.
     half_precision
-        Rounding of the lines that stages hand on.
+        Rounding of the lines between stages.
     nearest_beams
-        THESIS: neighbours summed as they are.
+        Plain sums of neighbours, as in THESIS.
     line_ends, aliasing
-        What the lines themselves leave open: see `clsas.signal.ambiguity`.
+        Ambiguities of the lines themselves: see `clsas.signal.ambiguity`.
     left_out
-        Effects that the image does without: see `clsas.sonar.simplify`.
+        Neglected effects: see `clsas.sonar.simplify`.
     """
 
     exact: float = 0.0
@@ -138,20 +138,20 @@ class ErrorBudget:
 
     @property
     def total(self) -> float:
-        """All of them: causes are independent, so that powers add."""
+        """Sum of all contributions. Causes are independent, so that their powers add up."""
         return sum(asdict(self).values())
 
     @property
     def total_db(self) -> float:
-        """Relative rms error of all of them, dB."""
+        """Relative rms error of all contributions together, dB."""
         return in_db(self.total)
 
     def times(self, factor: float) -> ErrorBudget:
-        """Return every contribution times a factor."""
+        """Return all contributions times a factor."""
         return ErrorBudget(*(factor * each for each in asdict(self).values()))
 
     def describe(self) -> list[str]:
-        """Return one line per contribution, the largest first, without those far below the rest."""
+        """Return a line of text per contribution, the largest first, without negligible ones."""
         found = sorted(asdict(self).items(), key=lambda item: -item[1])
         return [
             f"{name.replace('_', ' '):<16}  {in_db(error):6.1f} dB"
@@ -160,34 +160,34 @@ class ErrorBudget:
         ]
 
 
-_NEGLIGIBLE = 1e-3  # of the total
+_NEGLIGIBLE = 1e-3  # share of the total below which contributions are not shown
 
 
 CostSource: TypeAlias = Literal["given", "calibrated", "scaled", "default"]
-"""Origin of the costs that make a prediction: see `clsas.planning.costs.KnownCosts`."""
+"""Origin of the costs of a prediction: see `clsas.planning.costs.KnownCosts`."""
 
 
 @dataclass(frozen=True, config=CONFIG)
 class Stage:
-    """Predicted work of one stage.
+    """Predicted work, error and time of one stage, or of the backprojection at the end.
 
     Attributes
     ----------
     rows, columns : int
-        Pixels of its subimages.
+        Size of the subimages in pixels.
     subimages : int
-        Their number in the grid.
+        Number of subimages in the grid.
     channels : int
-        Virtual channels of each, on average.
+        Virtual channels of a subimage, on average.
     samples : int
-        Range samples of each line.
+        Range samples of a line.
     operations : float
-        Samples times channels that are aligned and combined; for the last row of a plan pixels
-        times channels that are backprojected.
+        Samples times channels that are aligned and combined. For the backprojection, pixels times
+        channels.
     error_db : float
-        Relative rms error that its interpolations add.
+        Relative rms error of the interpolations, dB.
     seconds : float
-        Expected time.
+        Time.
     """
 
     rows: int
@@ -202,29 +202,29 @@ class Stage:
 
 @dataclass(frozen=True, eq=False, config=CONFIG)
 class Prediction:
-    """Error, time and memory that an image is predicted to take.
+    """Predicted error, time and memory of an image.
 
     Attributes
     ----------
     error_db : float
-        Relative rms error against the exact image, as a bound.
+        Bound on the relative rms error with respect to the exact image, dB.
     seconds, exact_seconds : float
         Time of the image, and of `clsas.backproject`.
     memory_bytes : int
-        Largest amount of device memory needed.
+        Peak of device memory.
     device : str
-        Device whose times these are.
+        Device to which the times apply.
     cost_source : str
-        Origin of the costs that make the times: "given", "calibrated" on the device, "scaled" to it
-        by a short measurement, or "default".
+        Origin of the costs from which times follow: "given", "calibrated" on the device, "scaled"
+        to it by a short measurement, or "default".
     costs_measured : str
         Time of that measurement, UTC, in ISO 8601; "" without one.
     stages : tuple of Stage
-        Every stage, and the backprojection at the end. Empty for an exact image.
+        All stages and, last, the backprojection; empty for an exact image.
     work : Work
-        Counted operations, which make the time.
+        Counted operations, from which the time follows.
     errors : ErrorBudget
-        Contributions, which make the error.
+        Contributions to the error.
     """
 
     error_db: Number

@@ -1,4 +1,4 @@
-"""Plans in words: one line, and tables of what is predicted."""
+"""Plans as text: a summary in one line, and a report with tables."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ _COSTS = {
     "given": "costs that were given.",
     "calibrated": "costs that `clsas measure-costs` measured on this device{when}.",
     "scaled": (
-        "default costs, scaled to this device by a short measurement{when}: `clsas measure-costs` "
-        "measures each."
+        "default costs, scaled to this device by a short measurement{when}; `clsas measure-costs` "
+        "measures each of them."
     ),
     "default": (
-        "default costs, not from any measured on this device: `clsas measure-costs` measures them."
+        "default costs, which were not measured on this device; `clsas measure-costs` does that."
     ),
 }
 
@@ -26,7 +26,7 @@ _COSTS = {
 def summary(
     tolerance_db: float | None, method: Factorization | ExactImage, prediction: Prediction
 ) -> tuple[str, ...]:
-    """Return the request, the prediction and the sides of the subimages, for one line."""
+    """Return the parts of a summary: request, sizes of subimages, and prediction."""
     asked = "stages as given"
     if tolerance_db is not None:
         asked = f"tolerance {reprs.quantity(tolerance_db, 'dB')}"
@@ -46,7 +46,7 @@ def report(
     prediction: Prediction,
     left_out: tuple[str, ...],
 ) -> Report:
-    """Return what a plan predicts: in total, stage by stage, and the causes of its error."""
+    """Return the predictions of a plan: in total, stage by stage, and by cause of error."""
     parts: list[str | Table] = [_headline(tolerance_db, method, prediction)]
     if left_out:
         parts.append(f"Left out, far below the tolerance: {', '.join(left_out)}")
@@ -63,7 +63,7 @@ def report(
 
 
 def costs_in_words(source: str, measured: str) -> str:
-    """Return the origin of costs, and the day they were measured, as the end of a sentence."""
+    """Return the origin of costs and the day of their measurement, as the end of a sentence."""
     return _COSTS[source].format(when=f" on {measured[:10]}" if measured else "")
 
 

@@ -223,7 +223,7 @@ def test_a_plan_of_another_version_is_refused(chosen, version):
     values = changeable(chosen) | {"version": version}
     if version == 1:  # its fields were flat, and had no number
         values = values["method"] | {"tolerance_db": -50.0}
-    with pytest.raises(ValueError, match=r"made by .*: make it anew with clsas\.plan"):
+    with pytest.raises(ValueError, match=r"written by .*: make the plan again with clsas\.plan"):
         Plan.from_json(json.dumps(values))
 
 
@@ -412,9 +412,9 @@ def test_a_plan_knows_its_lines_and_grid(chosen):
     lines, grid = made(swaying)
     chosen.check(lines, grid)
     other_lines, _ = over(around(0, 40))
-    with pytest.raises(ValueError, match="another line geometry"):
+    with pytest.raises(ValueError, match="^lines must have the geometry"):
         chosen.check(other_lines, grid)
-    with pytest.raises(ValueError, match="another grid geometry"):
+    with pytest.raises(ValueError, match="^grid must have the geometry"):
         chosen.check(lines, around(0, 41))
 
 
@@ -430,7 +430,9 @@ def test_it_says_whether_times_are_of_this_device(chosen, monkeypatch, tmp_path)
     monkeypatch.setenv("CLSAS_CACHE", str(tmp_path))
     usual = plan(lines, grid, stages=[])
     assert usual.prediction.cost_source == "default"
-    words = "Times follow from default costs, not from any measured on this device: `clsas measure"
+    words = (
+        "Times follow from default costs, which were not measured on this device; `clsas measure"
+    )
     assert words in usual.describe()
     device = open_device()
     costs.save(device, costs.defaults(device), "scaled")
@@ -463,5 +465,5 @@ def test_json_may_leave_out_filters(chosen):
     values = json.loads(whole)
     del values["digest"]  # which is of whole plans
     assert json.loads(short) == without(values)
-    with pytest.raises(ValueError, match=r"lacks 'digest', as .* without filters"):
+    with pytest.raises(ValueError, match=r"lacks 'digest', like .* without filters"):
         Plan.from_json(short)
