@@ -10,10 +10,11 @@ import json
 import os
 import tempfile
 import zlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from clsas.core import validate
 from clsas.core.atomic import make_folders, replacing
 from clsas.core.grid import Grid
 from clsas.core.reading import parse_json, read_bytes
@@ -138,7 +139,7 @@ def read_document(path: Path) -> dict[str, Any]:
         )
     if not is_intact(attributes):
         raise ValueError(f"{path} is damaged: its attributes do not match their checksum")
-    if not is_complete(attributes):
+    if not _is_complete(attributes):
         raise ValueError(f"{path} is damaged: its attributes are not those of a mosaic")
     return attributes
 
@@ -151,14 +152,41 @@ def plane_of(attributes: Mapping[str, Any]) -> Grid | None:
     return Grid.oriented(**stored, shape=tuple(attributes["inputs"]["pixels"]))
 
 
-def is_complete(attributes: dict[str, Any]) -> bool:
+def check_inputs(inputs: Any, shape: Sequence[int] | None) -> None:
+    """Check the inputs of a mosaic.
+
+    Parameters
+    ----------
+    inputs : dict
+        The inputs, as `clsas.mosaics.provenance.inputs_of` returns them.
+    shape : (rows, columns) or None
+        Shape of the grid, which the number of pixels must equal; None for any shape.
+
+    Raises
+    ------
+    TypeError
+        If `inputs` are not a dict.
+    ValueError
+        If the list of parts or the number of pixels is missing or wrong.
+    """
+    validate.instance("inputs", inputs, dict)
+    parts, pixels = inputs.get("parts"), inputs.get("pixels")
+    if not isinstance(parts, list):
+        raise ValueError(f"inputs must have a list 'parts', got {validate.shown(parts)}")
+    if not _is_shape(pixels) or (shape is not None and pixels != list(shape)):
+        expected = "of two numbers" if shape is None else f"{list(shape)}, the shape of the grid"
+        raise ValueError(f"inputs must have 'pixels' {expected}, got {validate.shown(pixels)}")
+
+
+def _is_complete(attributes: dict[str, Any]) -> bool:
     """Return whether attributes are those of a mosaic, and of the right types."""
-    inputs, grid = attributes.get("inputs"), attributes.get("grid", ())
+    grid = attributes.get("grid", ())
+    try:
+        check_inputs(attributes.get("inputs"), None)
+    except (TypeError, ValueError):
+        return False
     if not (
-        isinstance(inputs, dict)
-        and isinstance(inputs.get("parts"), list)
-        and _is_shape(inputs.get("pixels"))
-        and _is_shape(attributes.get("patch_shape"))
+        _is_shape(attributes.get("patch_shape"))
         and isinstance(attributes.get(DIGESTS, {}), dict)
         and (grid is None or (isinstance(grid, dict) and grid.keys() == set(VECTORS)))
     ):

@@ -31,9 +31,9 @@ from clsas.core.reading import check_ordinary
 from clsas.mosaics.documents import (
     DIGESTS,
     DamageError,
+    check_inputs,
     check_own,
     check_place,
-    is_complete,
     is_there,
     read_document,
     with_checksum,
@@ -162,6 +162,8 @@ class Store:
 
         Raises
         ------
+        TypeError, ValueError
+            If `inputs` are not those of a mosaic on the grid.
         OtherInputsError
             If the path holds a mosaic with other inputs; the message names the differences.
         ValueError
@@ -170,10 +172,8 @@ class Store:
             If the store cannot be written.
         """
         arrays = _arrays()
-        validate.instance("inputs", inputs, dict)
         validate.instance("grid", grid, Grid)
-        if "parts" not in inputs:
-            raise ValueError(f"inputs must have 'parts', got {validate.shown(sorted(inputs))}")
+        check_inputs(inputs, grid.shape)
         patch_shape = validate.sides("patch_shape", patch_shape)
         check_place(self.path)
         if not is_there(self.path):
@@ -196,16 +196,12 @@ class Store:
         Raises
         ------
         TypeError, ValueError
-            If `inputs` are not a dict, or not those of a mosaic.
+            If `inputs` are not those of a mosaic on the store's grid.
         """
-        validate.instance("inputs", inputs, dict)
         attributes = read_document(self.path)
+        check_inputs(inputs, attributes["inputs"]["pixels"])
         if attributes["inputs"] != inputs:
-            changed = attributes | {"inputs": inputs}
-            if not is_complete(changed):
-                given = validate.shown(sorted(inputs))
-                raise ValueError(f"inputs must have the parts and pixels of a mosaic, got {given}")
-            write_attributes(self.path, with_checksum(changed))
+            write_attributes(self.path, with_checksum(attributes | {"inputs": inputs}))
 
     def records(self) -> dict[PatchIndex, Record]:
         """Return the records of all finished patches, by row and column.

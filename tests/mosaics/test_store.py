@@ -13,7 +13,7 @@ from click.testing import CliRunner
 import clsas
 from clsas.cli import main
 from clsas.core.grid import Grid
-from clsas.mosaics.documents import is_intact, read_attributes
+from clsas.mosaics.documents import is_intact, read_attributes, read_document
 from clsas.mosaics.store import Store
 
 GRID = Grid.plane((-4, 4, 40), (30, 40, 30))
@@ -209,10 +209,28 @@ def test_a_refused_write_leaves_the_patch(path, kept):
     test_all_is_well_of_a_whole_store(path, kept)
 
 
-def test_a_store_does_not_grow_into_what_is_no_mosaic(path, kept):
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"parts": None}, "inputs must have a list 'parts', got None"),
+        ({"parts": "abc"}, "inputs must have a list 'parts', got 'abc'"),
+        (
+            {"pixels": None},
+            r"inputs must have 'pixels' \[30, 40\], the shape of the grid, got None",
+        ),
+        ({"pixels": [40, 30]}, r"inputs must have 'pixels' \[30, 40\], .* got \[40, 30\]"),
+        ({"pixels": [30.0, 40]}, r"inputs must have 'pixels' \[30, 40\], .* got \[30.0, 40\]"),
+    ],
+)
+def test_inputs_that_are_not_those_of_a_mosaic_are_refused(path, kept, tmp_path, changed, message):
     store = Store.opened(path)
-    with pytest.raises(ValueError, match="inputs must have the parts and pixels of a mosaic"):
-        store.grow({"a": 1})
+    inputs = read_document(path)["inputs"] | changed
+    given = {name: value for name, value in inputs.items() if value is not None}
+    new = Store.at(tmp_path / "new.zarr")
+    for accept in (lambda: new.begin(given, GRID, (15, 14)), lambda: store.grow(given)):
+        with pytest.raises(ValueError, match=message):
+            accept()
+    assert not new.path.exists()
     test_all_is_well_of_a_whole_store(path, kept)
 
 
