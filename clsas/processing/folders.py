@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
 from clsas.core import validate
@@ -66,21 +66,27 @@ def checked_records(
 
 @contextmanager
 def made(folder: Path) -> Iterator[None]:
-    """Lock a folder, which is made if it is not there, and removed if nothing came into it.
+    """Lock a folder, and create it if it does not exist; then it is removed again if still empty.
 
     Raises
     ------
     BlockingIOError
-        If another process has locked it.
+        If another process has locked the folder.
+    OSError
+        If the folder cannot be created.
     """
-    if folder.is_dir():
-        with locked(folder):
-            yield
-        return
-    folder.mkdir(exist_ok=True)
+    is_new = False
     try:
-        with locked(folder):
+        with ExitStack() as held:
+            while True:
+                is_new = is_new or not folder.is_dir()
+                folder.mkdir(exist_ok=True)
+                # Another process may remove the folder, which it created, before this one locks it.
+                with suppress(FileNotFoundError):
+                    held.enter_context(locked(folder))
+                    break
             yield
     finally:
-        with suppress(OSError):  # it is not empty
-            folder.rmdir()
+        if is_new:
+            with suppress(OSError):  # the folder is not empty
+                folder.rmdir()

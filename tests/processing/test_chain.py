@@ -10,8 +10,10 @@ from click.testing import CliRunner
 
 import clsas
 from clsas.cli import main
+from clsas.core.atomic import locked
 from clsas.core.validate import ClsasWarning
 from clsas.files.process_tables import STEPS
+from clsas.processing import folders
 from clsas.processing import steps as steps_module
 
 pytest.importorskip("matplotlib")
@@ -487,6 +489,26 @@ def test_two_runs_in_one_folder_are_refused(plain, tmp_path, monkeypatch):
     assert ".clsas.lock" not in contents(folder)
     assert clsas.process(plain).repeated == ()
     assert clsas.process(plain, lines=other).repeated == ("image",)
+
+
+@pytest.mark.parametrize("is_there", [True, False])
+def test_a_folder_that_another_first_run_removes_is_made_again(tmp_path, monkeypatch, is_there):
+    """The other run created the folder, failed, and removed it before this one locked it."""
+    folder, locks = tmp_path / "output", []
+    if is_there:
+        folder.mkdir()
+
+    def locked_late(path):
+        if not locks:
+            path.rmdir()
+        locks.append(path)
+        return locked(path)
+
+    monkeypatch.setattr(folders, "locked", locked_late)
+    with folders.made(folder):
+        assert (folder / ".clsas.lock").exists()
+    assert locks == [folder, folder]
+    assert not folder.exists()
 
 
 def test_a_recording_that_changes_while_it_is_processed_is_refused(plain, tmp_path, monkeypatch):
