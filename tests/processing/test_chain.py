@@ -1,4 +1,4 @@
-"""The chain from a recording to a focused image: what runs, what is kept, what is written."""
+"""The chain from a recording to a focused image: which steps run, and which files are kept."""
 
 import json
 import pickle
@@ -42,7 +42,7 @@ unknowns = ["sway"]
 
 
 def recording(sway_m=0.0, time_s=0.0):
-    """Points seen by a sonar on a swaying track, as its navigation has them."""
+    """Return lines of points from a swaying track, with the positions of a straight one."""
     sonar = clsas.Sonar(
         clsas.Pulse(100e3, 30e3, 1e-3), [[0.0, 0.0, 0.0]], tx_length_m=0.06, rx_length_m=0.06
     )
@@ -68,7 +68,7 @@ def folder(tmp_path_factory):
 
 @pytest.fixture
 def scene(folder, tmp_path):
-    """A scene beside the recording, with all steps on lines."""
+    """A scene file beside the recording, with every step that works on lines."""
     (tmp_path / "lines.h5").symlink_to(folder / "lines.h5")
     path = tmp_path / "scene.toml"
     path.write_text(SCENE + CALIBRATE + FOCUS)
@@ -79,7 +79,7 @@ STEPS_HERE = ("calibrate", "focus", "image")
 
 
 def choose(scene, *steps):
-    """Let a scene have these steps."""
+    """Write the steps of a scene into its file."""
     text = scene.read_text().replace(
         'lines = "lines.h5"', f'lines = "lines.h5"\nsteps = {[*steps]}'
     )
@@ -88,7 +88,7 @@ def choose(scene, *steps):
 
 @pytest.fixture
 def plain(scene):
-    """A scene whose only step is an image of the recording as it came."""
+    """A scene whose only step images the uncorrected recording."""
     choose(scene, "image")
     return scene
 
@@ -205,7 +205,7 @@ def test_scene_and_folder_may_move_together(plain, tmp_path, monkeypatch):
 
 
 def test_a_killed_step_leaves_nothing_in_the_way(plain, monkeypatch):
-    """Files of a step appear together, once it is done."""
+    """The files of a step appear together when it is done."""
     folder, image = plain.with_suffix(""), steps_module.RUN["image"]
 
     def killed(job):
@@ -241,13 +241,13 @@ def test_what_was_finished_before_an_error_is_kept(scene):
 
 
 def test_a_single_step_begins_with_the_lines_that_the_scene_corrects(scene):
-    """Whether or not the corrections ran before, and whatever else is in the folder."""
+    """Whether or not the corrections ran before, and whatever else the folder contains."""
     choose(scene, "inspect", "calibrate", "image")
     found = clsas.process(scene, steps=("image",))
     assert found.repeated == ("calibrate", "image")
     assert found["image"].corrections == ("calibrate",)
     assert found["image"].lines == found["calibrate"].digest
-    with pytest.warns(ClsasWarning):  # of inspections
+    with pytest.warns(ClsasWarning):  # the findings of the inspection
         assert clsas.process(scene).repeated == ("inspect",)
     assert clsas.process(scene, steps=("image",)).repeated == ()
     assert clsas.process(scene, steps=("inspect",)).repeated == ()
@@ -267,7 +267,7 @@ def test_results_that_no_longer_belong_to_the_lines_are_named(scene):
     with pytest.warns(ClsasWarning, match="out of date, the scene leaves it out: calibrate.h5"):
         found = clsas.process(scene)
     assert found["image"].corrections == ()
-    # What compared the image before and after the corrections is gone with them.
+    # The comparison of the image before and after the corrections is removed with them.
     assert set(contents(folder)) == {"process.json", "calibrate.h5", "image.h5", "image.png"}
 
 
@@ -289,7 +289,7 @@ def test_usual_steps_and_warnings_of_inspection(scene):
     assert (found.folder / "inspect.png").exists()
     findings = found["inspect"].numbers["findings"]
     assert len(found["inspect"].warnings) == len(findings) > 0
-    assert clsas.process(scene).repeated == ()  # and warns no more
+    assert clsas.process(scene).repeated == ()  # without a warning
 
 
 def test_lines_and_echoes_in_memory(scene, tmp_path):
@@ -333,7 +333,7 @@ def test_mosaic_continues(scene):
 
 @pytest.fixture
 def joining(scene):
-    """A scene whose mosaic has been formed, from its recording as it came."""
+    """A scene whose mosaic has been formed from the uncorrected recording."""
     pytest.importorskip("zarr")
     choose(scene, "mosaic")
     scene.write_text(scene.read_text() + "[mosaic]\npatches = [1, 2]\n")
@@ -343,12 +343,12 @@ def joining(scene):
 
 def change_recording(scene):
     lines = clsas.load(scene.parent / "lines.h5")
-    (scene.parent / "lines.h5").unlink()  # a link to that of all tests
+    (scene.parent / "lines.h5").unlink()  # a hard link to the file that all tests share
     clsas.save(scene.parent / "lines.h5", replace(lines, samples=2 * lines.samples[::-1]))
 
 
 def test_a_mosaic_of_another_recording_is_formed_anew(joining):
-    """As every other step is run again."""
+    """Like any other step whose inputs changed."""
     before = clsas.Store.opened(joining.with_suffix("") / "mosaic.zarr").read()
     change_recording(joining)
     found = clsas.process(joining)
@@ -369,7 +369,7 @@ def test_a_mosaic_of_other_options_is_formed_anew(joining):
 
 
 def test_a_mosaic_is_the_steps_own_from_any_working_directory(joining, monkeypatch):
-    """Its path was recorded from another one."""
+    """The path of the store was recorded from another working directory."""
     text = joining.read_text()
     monkeypatch.chdir(joining.parent)
     joining.write_text(text.replace("tolerance_db = -40", "tolerance_db = -30"))
@@ -377,7 +377,7 @@ def test_a_mosaic_is_the_steps_own_from_any_working_directory(joining, monkeypat
 
 
 def test_a_mosaic_that_the_step_did_not_make_is_not_replaced(joining, tmp_path):
-    """Neither one that was there before, nor one that came in its place."""
+    """Neither a store that existed before, nor one that took the place of the step's."""
     store = tmp_path / "elsewhere.zarr"
     lines = clsas.load(joining.parent / "lines.h5")
     other = replace(lines, samples=3 * lines.samples[::-1])
@@ -401,7 +401,7 @@ def test_a_mosaic_that_the_step_did_not_make_is_not_replaced(joining, tmp_path):
 
 
 def test_a_refused_mosaic_leaves_the_old_one(joining):
-    """What is wrong with the request is found before anything is removed."""
+    """A wrong request is refused before anything is removed."""
     before = clsas.Store.opened(joining.with_suffix("") / "mosaic.zarr").read()
     change_recording(joining)
     text = joining.read_text()
@@ -470,7 +470,7 @@ def test_bad_arguments(scene, tmp_path):
 
 
 def test_two_runs_in_one_folder_are_refused(plain, tmp_path, monkeypatch):
-    """The second would continue from the lines of the first, and record them as its own."""
+    """Otherwise the second would continue from the lines of the first and record them as its own."""
     other = clsas.load(plain.parent / "lines.h5").weighted(np.full(260, 2.0))
     image = steps_module.RUN["image"]
     messages = []
