@@ -127,10 +127,10 @@ def test_the_folder_of_what_scenes_share_can_be_given(still, tmp_path):
     ("name", "value", "said"),
     [
         ("na/position", np.zeros((1, 7)), "/ch1/ts of shape .pings, time., 7 by 1900"),
-        ("na/position", np.full((1, 201), np.nan), "finite numbers as /na/position"),
-        ("na/temperature", np.zeros((2, 7)), "/na/temperature of 201 pings"),
+        ("na/position", np.full((1, 201), np.nan), "finite numbers in /na/position"),
+        ("na/temperature", np.zeros((2, 7)), "/na/temperature for 201 pings"),
         ("na/temperature", np.full((2, 201), 900.0), "degrees Celsius, got 900 to 900"),
-        ("na/temperature", None, "numbers as /na/temperature"),
+        ("na/temperature", None, "numbers in /na/temperature"),
         ("ch2/ts", np.zeros((201, 5)), "/ch2/ts of shape"),
         ("ch2/ts", b"text", "ts as numbers"),
         ("ch2/ts", h5py.ExternalLink("/etc/hostname", "/x"), "got a link to another place"),
@@ -155,7 +155,7 @@ def swapped(rail):
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        (np.zeros_like, "all 201 pings have one position"),
+        (np.zeros_like, "all 201 pings have the same position"),
         (swapped, r"turns back \d times \(first after ping 9\d\)"),
     ],
 )
@@ -177,7 +177,7 @@ def test_other_hdf5_files_are_refused_by_name(tmp_path):
     with h5py.File(tmp_path / "other.h5", "w") as file:
         file["na/position"] = [1.0]
     for name, got in (("lines.h5", "first_range_m"), ("other.h5", "na")):
-        said = rf"{name} is an HDF5 file, but no scene of AirSAS: .* got \['{got}'"
+        said = rf"{name} is an HDF5 file, but not an AirSAS scene: .* got \['{got}'"
         with pytest.raises(FileFormatError, match=said):
             read_airsas(tmp_path / name)
 

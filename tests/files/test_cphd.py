@@ -248,14 +248,14 @@ clsas.load({str(tmp_path / "pass.cphd")!r})
     [
         (b"<NumSamples>200<", b"<NumSamples>201<", "exceed its SIGNAL block"),
         (b"<NumVectors>48<", b"<NumVectors>49<", "exceed its"),
-        (b"<NumVectors>48<", b"<NumVectors>-8<", "must hold lines|is damaged"),
+        (b"<NumVectors>48<", b"<NumVectors>-8<", "must contain vectors|is damaged"),
         (b"<SignalArrayFormat>CF8<", b"<SignalArrayFormat>CF4<", "unknown format 'CF4'"),
         (b"<DomainType>FX<", b"<DomainType>XX<", "its domain must be one of"),
         (b"<SGN>-1<", b"<SGN>-7<", "sign"),
         (b"PVP_BLOCK_SIZE := ", b"PVP_BLOCK_SIZE := 99999", "is damaged: its PVP block ends"),
         (b"XML_BLOCK_BYTE_OFFSET", b"XML_BLOCK_BYTE_OFFSER", "lacks XML_BLOCK_BYTE_OFFSET"),
         (b"<uIAX>", b"<uIAQ>", "is damaged"),
-        (b"<X>0.0</X>", b"<X>2.0</X>", "orthogonal axes|is damaged"),
+        (b"<X>0.0</X>", b"<X>2.0</X>", "orthogonal image area axes|is damaged"),
     ],
 )
 def test_files_that_claim_something_else_are_refused(tmp_path, old, new, said):
@@ -287,10 +287,10 @@ def at_one_place(vectors):
 @pytest.mark.parametrize(
     ("change", "said", "channels"),
     [
-        (lost, r"3 of 48 vectors lack finite positions .* vector 20\): they are left out", 44),
+        (lost, r"3 of 48 vectors lack finite positions .* vector 20\) and are left out", 44),
         (repeated, r"TxTime does not ascend after 1 of 47 vectors \(first after vector 29\)", 47),
-        (at_one_place, "all 47 pings have one position", 47),
-        (everywhere, "must hold vectors with a signal and complete positions, got none", None),
+        (at_one_place, "all 47 pings have the same position", 47),
+        (everywhere, "must contain vectors with a signal and complete positions, got none", None),
     ],
 )
 @pytest.mark.parametrize("domain", ["FX", "TOA"])

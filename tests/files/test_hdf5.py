@@ -234,14 +234,14 @@ def change(file, name):
 @pytest.mark.parametrize(
     ("name", "words"),
     [
-        ("foreign", "is an HDF5 file, but not one of clsas"),
-        ("of another format", "is an HDF5 file, but not one of clsas"),
-        ("newer", "is of format version 2, newer than this clsas, which reads up to 1"),
+        ("foreign", "is an HDF5 file, but was not written by clsas"),
+        ("of another format", "is an HDF5 file, but was not written by clsas"),
+        ("newer", "is of format version 2, but this clsas reads versions up to 1"),
         ("of version 0", "is of format version 0, but the first one is 1"),
-        ("of a version in words", "is damaged: attribute version is 'zzz', not a number"),
+        ("of a version in words", "is damaged: its attribute version must be a number, got 'zzz'"),
         ("without version", "is damaged: .*version"),
-        ("of unknown kind", "holds an object of unknown kind 'hologram'"),
-        ("without kind", "holds an object of unknown kind None"),
+        ("of unknown kind", "contains an object of unknown kind 'hologram'"),
+        ("without kind", "contains an object of unknown kind None"),
         ("without samples", "lacks samples of the range_lines"),
         ("without step", "lacks range_step_m of the range_lines"),
         ("of one channel too many", r"is damaged: tx_m must have shape \(4, 3\)"),
@@ -300,12 +300,12 @@ def test_only_the_file_itself_is_read(way, name, tmp_path):
         save(each, OBJECTS["lines"])
     with h5py.File(path, "r+") as file:
         elsewhere(file, name, folder)
-    with pytest.raises(FileFormatError, match=rf"file\.h5 must hold {name} itself, got a "):
+    with pytest.raises(FileFormatError, match=rf"file\.h5 must contain {name} itself, got a "):
         load(path)
-    with pytest.raises(FileFormatError, match=rf"file\.h5 must hold {name} itself, got a "):
+    with pytest.raises(FileFormatError, match=rf"file\.h5 must contain {name} itself, got a "):
         read_geometry(path)
     if name == "samples":
-        with pytest.raises(FileFormatError, match=r"file\.h5 must hold samples itself"):
+        with pytest.raises(FileFormatError, match=r"file\.h5 must contain samples itself"):
             read_samples(path, slice(1), slice(1))
 
 
@@ -315,7 +315,7 @@ def test_an_object_is_no_part_of_itself(tmp_path):
     with h5py.File(path, "r+") as file:
         del file["pulse"]
         file["pulse"] = file["/"]
-    with pytest.raises(FileFormatError, match="holds another object as pulse of the echoes"):
+    with pytest.raises(FileFormatError, match="contains another object as pulse of the echoes"):
         load(path)
 
 
@@ -356,7 +356,7 @@ def test_other_than_numbers_are_refused(values, tmp_path):
     with h5py.File(path, "r+") as file:
         del file["first_range_m"]
         file["first_range_m"] = values
-    with pytest.raises(FileFormatError, match="must hold first_range_m as numbers, got"):
+    with pytest.raises(FileFormatError, match="must contain first_range_m as numbers, got"):
         load(path)
 
 
@@ -373,7 +373,7 @@ def test_a_pulse_alone_is_no_file(tmp_path):
     with h5py.File(path, "r+") as file:
         for name, value in file["pulse"].attrs.items():
             file.attrs[name] = value
-    with pytest.raises(FileFormatError, match="holds only a Pulse"):
+    with pytest.raises(FileFormatError, match="contains only a Pulse"):
         load(path)
 
 

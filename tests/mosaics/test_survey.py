@@ -152,7 +152,7 @@ def test_errors(folder, tmp_path):
     with pytest.raises(ValueError, match="rx_velocity_m_s must be in all files"):
         open_survey(folder)
     save(folder / "3.h5", GRID)
-    with pytest.raises(FileFormatError, match="must hold range lines, got 'grid'"):
+    with pytest.raises(FileFormatError, match="must contain range lines, got 'grid'"):
         open_survey(folder)
     empty = tmp_path / "empty"
     empty.mkdir()

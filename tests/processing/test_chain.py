@@ -470,7 +470,7 @@ def test_bad_arguments(scene, tmp_path):
 
 
 def test_two_runs_in_one_folder_are_refused(plain, tmp_path, monkeypatch):
-    """Otherwise the second would continue from the lines of the first and record them as its own."""
+    """Otherwise the second would continue from the first one's lines, recorded as its own."""
     other = clsas.load(plain.parent / "lines.h5").weighted(np.full(260, 2.0))
     image = steps_module.RUN["image"]
     messages = []
