@@ -155,10 +155,10 @@ def test_a_record_that_cannot_be_read_is_no_licence_to_replace(plain):
     path, before = folder / "process.json", contents(folder)
     record = json.loads(path.read_text())
     for text, message in (
-        ("{", "process.json that is no record of clsas: choose another output, or remove it"),
-        ("[]", "no record of clsas"),
+        ("{", "process.json that clsas did not write: choose another output, or remove the file"),
+        ("[]", "that clsas did not write"),
         (json.dumps(record | {"version": 1}), "of another version of clsas"),
-        (json.dumps(record | {"steps": [{"name": 1}]}), "holds image.h5, which image would"),
+        (json.dumps(record | {"steps": [{"name": 1}]}), "contains image.h5, which image would"),
     ):
         path.write_text(text)
         with pytest.raises(ValueError, match=message):
@@ -175,7 +175,7 @@ def test_files_of_others_are_never_replaced(plain, tmp_path, name):
     folder = tmp_path / "mine"
     folder.mkdir()
     (folder / name).write_text("mine")
-    message = f"output '.*mine' holds {name}, which image would replace .* choose another output"
+    message = f"output '.*mine' contains {name}, which image would replace .* choose another output"
     with pytest.raises(ValueError, match=message):
         clsas.process(plain, output=folder)
     assert contents(folder) == {name: b"mine"}
@@ -189,7 +189,7 @@ def test_two_scenes_do_not_share_a_folder(plain, tmp_path):
     other.write_text(plain.read_text().replace("tolerance_db = -40", "tolerance_db = -30"))
     folder = clsas.process(plain, output=tmp_path / "both").folder
     before = contents(folder)
-    with pytest.raises(ValueError, match=r"another scene, '../scene.toml' .* not '../other.toml'"):
+    with pytest.raises(ValueError, match=r"another scene: '../scene.toml' .* not '../other.toml'"):
         clsas.process(other, output=folder)
     assert contents(folder) == before
 
@@ -260,11 +260,15 @@ def test_results_that_no_longer_belong_to_the_lines_are_named(scene):
     choose(scene, "calibrate", "image")
     folder = clsas.process(scene).folder
     scene.write_text(scene.read_text().replace("search_m = 0.4", "search_m = 0.3"))
-    message = "results of image in .* are out of date, its lines .* since: image.h5, image.png"
+    message = (
+        "results of image in .* are out of date, since its lines .* changed: image.h5, image.png"
+    )
     with pytest.warns(ClsasWarning, match=message):
         assert clsas.process(scene, steps=("calibrate",)).repeated == ("calibrate",)
     scene.write_text(scene.read_text().replace("'calibrate', ", ""))
-    with pytest.warns(ClsasWarning, match="out of date, the scene leaves it out: calibrate.h5"):
+    with pytest.warns(
+        ClsasWarning, match="out of date, since the scene leaves it out: calibrate.h5"
+    ):
         found = clsas.process(scene)
     assert found["image"].corrections == ()
     # The comparison of the image before and after the corrections is removed with them.
@@ -416,9 +420,12 @@ def test_a_refused_mosaic_leaves_the_old_one(joining):
     ("text", "message"),
     [
         ('[process]\nsteps = ["images"]', "must be one of"),
-        ("[process]\nsteps = []", "steps must name one or several"),
-        ('[process]\nsteps = ["calibrate"]', "calibrate needs"),
-        (SCENE.replace("lines.h5", "nowhere.h5"), r"\[process\] lines must be a file, there is no"),
+        ("[process]\nsteps = []", "steps must name at least one"),
+        ('[process]\nsteps = ["calibrate"]', "may include calibrate only with points_m"),
+        (
+            SCENE.replace("lines.h5", "nowhere.h5"),
+            r"\[process\] lines must be a file, but .* does not exist",
+        ),
         ('[process]\noutput = ""', "output must be a path"),
         ("[process]\nstep = 1", "unknown key 'step' in \\[process\\]"),
         ("[process.calibrate]\npoints_m = [[1.0, 2.0]]", "points_m"),
@@ -460,10 +467,10 @@ def test_bad_arguments(scene, tmp_path):
     described = clsas.Grid.plane((0, 1, 2), (0, 1, 2))
     clsas.save(tmp_path / "grid.h5", described)
     output = tmp_path / "output"
-    with pytest.raises(ValueError, match="must hold RangeLines or Echoes, got Grid"):
+    with pytest.raises(ValueError, match="must contain RangeLines or Echoes, got Grid"):
         clsas.process(scene, lines=tmp_path / "grid.h5", output=output)
     assert not output.exists()
-    with pytest.raises(ValueError, match=r"cannot be made: there is no folder '.*no/such'"):
+    with pytest.raises(ValueError, match=r"cannot be created: there is no folder '.*no/such'"):
         clsas.process(scene, output=tmp_path / "no/such/folder")
     with pytest.raises(ValueError, match=r"output must be a folder, got the file '.*grid.h5'"):
         clsas.process(scene, output=tmp_path / "grid.h5")
@@ -523,7 +530,7 @@ def test_a_recording_that_changes_while_it_is_processed_is_refused(plain, tmp_pa
         return open_device(device)
 
     monkeypatch.setattr(chain, "open_device", open_late)
-    with pytest.raises(ValueError, match=r"changing\.h5 changed since its digest was recorded"):
+    with pytest.raises(ValueError, match=r"changing\.h5 has changed since its digest was recorded"):
         clsas.process(plain, lines=changing)
     assert not plain.with_suffix("").exists()
 
@@ -534,9 +541,11 @@ def test_results_that_changed_since_are_not_returned(scene):
     lines, image = found.lines, found.image
     clsas.save(found.folder / "calibrate.h5", lines.weighted(np.full(260, 2.0)))
     clsas.save(found.folder / "image.h5", replace(image, pixels=2 * image.pixels))
-    with pytest.raises(ValueError, match=r"calibrate\.h5 changed since its digest was recorded"):
+    with pytest.raises(
+        ValueError, match=r"calibrate\.h5 has changed since its digest was recorded"
+    ):
         _ = found.lines
-    with pytest.raises(ValueError, match=r"image\.h5 changed since its digest was recorded"):
+    with pytest.raises(ValueError, match=r"image\.h5 has changed since its digest was recorded"):
         _ = found.image
 
 
