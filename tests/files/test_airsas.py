@@ -1,4 +1,4 @@
-"""AirSAS scenes: synthetic files of the public schema."""
+"""AirSAS scenes, from synthetic files with the schema of the public data set."""
 
 import shutil
 
@@ -27,7 +27,7 @@ PARAMETERS = [
 
 
 def samples_of(microphone_m, speed_m_s, length=1900):
-    """Real echoes of the points, with the recorder's delay, a constant and the transmission."""
+    """Return real-valued echoes with the recorder's delay, an offset and the transmission."""
     pulse = clsas.Pulse(
         (START_HZ + STOP_HZ) / 2, abs(STOP_HZ - START_HZ), DURATION_S, "down", TAPER
     )
@@ -50,7 +50,7 @@ def samples_of(microphone_m, speed_m_s, length=1900):
 
 
 def scene(folder, drift_c=0.0, header=True):
-    """A scene whose temperature drifts while the array moves along the rail."""
+    """Write a scene whose temperature drifts while the array moves along the rail."""
     shared = folder / "characterization data"
     shared.mkdir()
     (folder / "scenes").mkdir()
@@ -93,7 +93,7 @@ def test_points_focus_where_they_are(still, point_m):
     image = image_of(lines, point_m)
     row, column = np.unravel_index(np.abs(image.pixels).argmax(), image.grid.shape)
     assert (row, column) == (20, 20)
-    # All echoes of amplitude 1 add up in phase.
+    # Echoes of amplitude 1 from all channels add up in phase.
     peak = image.pixels[20, 20] / lines.channels
     assert peak == pytest.approx(1.0, abs=0.06)
 
@@ -207,7 +207,7 @@ def test_tables_that_disagree_are_refused(still, tmp_path, file, old, new, said)
 
 
 def test_microphones_must_fit_into_memory_together_before_any_is_read(still, tmp_path, monkeypatch):
-    """A byte of a file takes 4 in memory, and 3.2 more as lines."""
+    """Every byte of the file takes 4 bytes in memory, and 3.2 more as lines."""
     shutil.copytree(still.parent.parent, tmp_path / "copy")
     path = tmp_path / "copy" / "scenes" / still.name
     with h5py.File(path, "r+") as file:
@@ -217,7 +217,7 @@ def test_microphones_must_fit_into_memory_together_before_any_is_read(still, tmp
             file.create_dataset(name, data=silent, compression="gzip")
 
     def compressed(*_, **__):
-        raise ValueError("as far as this")  # compression has a budget of its own
+        raise ValueError("as far as this")  # stop before compression, which has another budget
 
     monkeypatch.setattr(airsas, "compress", compressed)
     monkeypatch.setattr(validate, "_memory_bytes", lambda: 16 << 20)

@@ -1,4 +1,4 @@
-"""Files of every kind, told apart by their contents."""
+"""Files of all kinds, which are recognised by their contents."""
 
 import os
 

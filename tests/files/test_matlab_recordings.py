@@ -20,7 +20,7 @@ POINT_M = np.array([3.0, -4.0, 0.0])
 
 
 def phase_history(pulses=90, count=128, kind=np.float32, offset_m=0.0):
-    """A radar's pass over one point, as the public radar files have it: in single precision."""
+    """Write a radar pass over one point in single precision, as the public radar files do."""
     angle = np.linspace(-0.03, 0.03, pulses)
     antenna_m = 7000 * np.stack([np.cos(angle), np.sin(angle), 1 + 0 * angle], axis=1)
     antenna_m = antenna_m.astype(kind).astype(float)
@@ -73,7 +73,7 @@ NOTCH_M = np.array([2e-3, 15e-3, 0.0])
 
 
 def capture(every=False):
-    """A full matrix capture of one point; without `every`, of the pairs tx <= rx."""
+    """Write a full matrix capture of one point; without `every`, only pairs with tx <= rx."""
     tx, rx = np.indices((32, 32)).reshape(2, -1)
     if not every:
         tx, rx = tx[tx <= rx], rx[tx <= rx]
@@ -129,7 +129,9 @@ def test_the_sound_speed_may_be_given_and_must_be_known(tmp_path):
     assert read_full_matrix(path, sound_speed_m_s=6320).sound_speed_m_s == 6320
     del given["ph_velocity"]
     path = save(path, given)
-    with pytest.raises(ValueError, match=r"sound_speed_m_s must be given, since .* has no ph_velocity"):
+    with pytest.raises(
+        ValueError, match=r"sound_speed_m_s must be given, since .* has no ph_velocity"
+    ):
         read_full_matrix(path)
 
 
@@ -213,7 +215,7 @@ def test_files_without_a_recording_and_with_several_are_refused(tmp_path):
 
 
 def variable(kind, shape, parts=b""):
-    """A matrix of some kind in MATLAB's format 5."""
+    """Return a matrix of a given kind in MATLAB's format 5."""
     body = struct.pack("<IIII", 6, 8, kind, 0)
     body += struct.pack("<II", 5, 4 * len(shape)) + struct.pack(f"<{len(shape)}i", *shape)
     body += b"\0" * (-4 * len(shape) % 8) + struct.pack("<HHI", 1, 1, ord("a")) + parts
@@ -256,7 +258,7 @@ def test_a_variable_that_unpacks_beyond_memory_is_refused_unread(tmp_path, monke
 
 
 def test_variables_must_fit_into_memory_together(tmp_path, monkeypatch):
-    """Every one of them does: 5 MB as stored and 8 times as much as the doubles that they are."""
+    """Each array alone would fit: 5 MB in the file, and 8 times as much as doubles."""
     one = packed(variable(6, (5000, 1000), struct.pack("<II", 1, 5_000_000) + bytes(5_000_000)))
     path = file_of(tmp_path / "sum.mat", one + one + one)
     assert path.stat().st_size < 20_000

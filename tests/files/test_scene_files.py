@@ -84,7 +84,7 @@ def test_dial_and_beam():
 
 
 def documented_keys():
-    """Key and default of every row of every table of docs/scene-files.md, by TOML table."""
+    """Return key and default of every row of every table in docs/scene-files.md, by TOML table."""
     tables = {}
     for section in DOCS.read_text().split("\n## ")[2:]:
         heading, _, body = section.partition("\n")
@@ -132,7 +132,7 @@ def test_presets_and_built_in_scenes():
     np.testing.assert_allclose(np.diff(centres), 5.28 / 640)
     assert grid.shape == (1024, 1024)
     assert grid.axes_m[1][[0, -1]] == pytest.approx([40, 45])
-    # Its phase centres are too far apart for its elements, and nothing else is amiss.
+    # Its phase centres are too far apart for its elements; nothing else is wrong.
     assert [finding.name for finding in check_sampling(sonar, track, grid)] == [
         "along_track_spacing"
     ]
@@ -147,7 +147,7 @@ def test_the_wreck_comes_with_clsas():
     assert (sonar.receivers, track.pings) == (6, 200)
     assert 200 * np.diff(track.positions_m[:, 0]) == pytest.approx(80)
     assert np.ptp(track.positions_m[:, 1]) == pytest.approx(0.4, abs=0.01)
-    # It heads where it goes: the beams look square to the course made good, as windows assume.
+    # The heading follows the course, so that beams are broadside to it, as windows assume.
     course = np.gradient(track.positions_m[:, 1], track.positions_m[:, 0])
     np.testing.assert_allclose(track.yaw_rad[1:-1], course[1:-1], atol=1e-4)
     assert isinstance(seabed, Seabed)
@@ -156,7 +156,7 @@ def test_the_wreck_comes_with_clsas():
     assert grid.axes_m[0][[0, -1]] == pytest.approx(seabed.x_m)
     assert grid.axes_m[1][[0, -1]] == pytest.approx(seabed.y_m)
     assert scene.image["tolerance_db"] == -40
-    # The window is wider than where the two-way pattern is at -6 dB, and within its main lobe.
+    # The window is wider than the two-way pattern at -6 dB, and narrower than its main lobe.
     window = BeamWindow.of_element(sonar.rx_length_m, sonar.wavelength_m)
     nulls_deg = 2 * np.degrees(np.arcsin(sonar.wavelength_m / sonar.rx_length_m))
     assert window.width_deg < scene.image["beam"].width_deg < nulls_deg
@@ -495,7 +495,7 @@ def test_a_damaged_track_is_one_short_message(tmp_path):
 
 
 def test_the_recording_to_process_may_be_elsewhere(tmp_path):
-    """Only `clsas process` reads it; every other command takes the rest of the scene."""
+    """Only `clsas process` reads it; other commands use the rest of the scene."""
     path = tmp_path / "scene.toml"
     path.write_text(f'{GRID}\n[process]\nlines = "nowhere.h5"\n')
     scene = config.read_scene(path)
