@@ -39,9 +39,9 @@ def test_where_there_is_no_chroot_to_be_had_it_says_why(checkout):
     ("arguments", "message"),
     [
         (["--fast"], "unknown option --fast"),
-        (["--turns", "0", "bench"], "--turns is a number from 1 on"),
+        (["--turns", "0", "bench"], "--turns must be a whole number of at least 1"),
         (["speed"], "unknown part speed"),
-        (["--driver", "cuda"], "--driver is one of: pypi pocl rusticl rusticl-gpu"),
+        (["--driver", "cuda"], "--driver must be pypi, pocl, rusticl or rusticl-gpu"),
     ],
 )
 def test_a_wrong_argument_is_named(checkout, arguments, message):
