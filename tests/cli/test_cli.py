@@ -461,7 +461,11 @@ FIXED = ["--taps", "4", "--upsampling", "2"]
             1,
             "image.h5 must hold Echoes (clsas simulate makes them), got Image",
         ),
-        (["quality", "image.h5", "--reference", "scene.toml"], 1, "scene.toml is neither an HDF5 file, nor"),
+        (
+            ["quality", "image.h5", "--reference", "scene.toml"],
+            1,
+            "scene.toml is neither an HDF5 file, nor",
+        ),
         (["quality", "scene.toml"], 2, "IMAGE.H5 is missing, scene.toml is a scene: clsas quality"),
         (
             ["image", "scene.toml"],

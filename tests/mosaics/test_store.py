@@ -73,9 +73,7 @@ def test_all_is_well_of_a_whole_store(path, kept):
         lambda path: flip(path, 8 * path.stat().st_size - 40),  # in the last pixel
         lambda path: flip(path, 8 * path.stat().st_size - 1),  # in the checksum
         zero,
-        lambda path: path.write_bytes(
-            (path.parent / "1").read_bytes()
-        ),  # of another patch
+        lambda path: path.write_bytes((path.parent / "1").read_bytes()),  # of another patch
         lambda path: path.unlink(),
     ],
     ids=["first bit", "last bit", "checksum", "zeroed", "exchanged", "gone"],
