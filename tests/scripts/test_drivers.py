@@ -1,4 +1,4 @@
-"""scripts/drivers, as far as it goes without a chroot, and the table it prints."""
+"""The parts of scripts/drivers that need no chroot, and the table that it prints."""
 
 import json
 import shutil
@@ -13,7 +13,7 @@ SCRIPTS = Path(__file__).parents[2] / "scripts"
 
 @pytest.fixture
 def checkout(tmp_path):
-    """A folder with the script in it, and nothing to make a chroot with."""
+    """A folder with the script, on a machine that cannot make a chroot."""
     (tmp_path / "scripts").mkdir()
     for name in ("drivers", "environment"):
         shutil.copy(SCRIPTS / name, tmp_path / "scripts")

@@ -1,4 +1,4 @@
-"""The report of scripts/gpu, on whatever device there is."""
+"""The report of scripts/gpu, on any device."""
 
 import os
 import subprocess
