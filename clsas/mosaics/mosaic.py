@@ -10,9 +10,8 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import chain
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -22,21 +21,19 @@ from clsas.core import reprs, validate
 from clsas.core.grid import Grid
 from clsas.core.image import Image
 from clsas.core.lines import RangeLines
-from clsas.exact.backprojection import BEST_ACCURACY_DB
+from clsas.mosaics.arguments import beam_of_growing, check_client, checked_growth, checked_request
 from clsas.mosaics.devices import open_devices
 from clsas.mosaics.forming import Job
 from clsas.mosaics.patches import Layout, choose_patch_shape, patch_shape_of
-from clsas.mosaics.provenance import REQUESTS, inputs_of
+from clsas.mosaics.provenance import inputs_of
 from clsas.mosaics.record import PatchIndex, Record, describe_damage
-from clsas.mosaics.scheduling import Growth, Run, form_patches, wait_for_first_file
+from clsas.mosaics.scheduling import Run, form_patches, wait_for_first_file
 from clsas.mosaics.store import Store
 from clsas.mosaics.survey import open_survey
 from clsas.mosaics.visibility import SurveyVisibility
 from clsas.opencl.device import Device
-from clsas.planning.planner import TOLERANCE_DB, checked_pairs, tolerance_in_db
 from clsas.sonar.beam import BeamWindow
 from clsas.sonar.coverage import warn_unreached
-from clsas.sonar.directions import MOST_TRACK_PINGS
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -334,7 +331,7 @@ def mosaic(
     validate.instance("grid", grid, Grid)
     if len(grid.shape) != 2:
         raise ValueError(f"grid must have two axes for a mosaic, got shape {grid.shape}")
-    request = _checked_request(tolerance_db, tolerance_wavelengths, stages, accuracy_db)
+    request = checked_request(tolerance_db, tolerance_wavelengths, stages, accuracy_db)
     if beam is not None:
         validate.instance("beam", beam, BeamWindow)
     patch_shape = None if patches is None else patch_shape_of(patches, grid)
@@ -344,10 +341,10 @@ def mosaic(
     if not isinstance(source, RangeLines):
         source = validate.path("source", source)
     if client is not None:
-        _check_client(client, source, store, device)
-    growth = _checked_growth(source, follow_s)
+        check_client(client, source, store, device)
+    growth = checked_growth(source, follow_s)
     if beam is not None and not isinstance(source, RangeLines) and source.is_dir():
-        beam = _beam_of_growing(beam)
+        beam = beam_of_growing(beam)
     devices = () if client is not None else open_devices(device)
     if growth is not None:
         wait_for_first_file(growth)
@@ -375,66 +372,6 @@ def mosaic(
         finished = _still_finished(opened, visibility, layout)
     run = Run(layout, job, inputs, visibility, devices, client, growth)
     return Mosaic(grid, patch_shape, finished, run)
-
-
-def _checked_request(
-    tolerance_db: float | None,
-    tolerance_wavelengths: float | None,
-    stages: Sequence[tuple[int, int]] | None,
-    accuracy_db: float | None,
-) -> dict[str, Any]:
-    """Return the given one of `REQUESTS` after checking it, or the default tolerance."""
-    given = (tolerance_db, tolerance_wavelengths, stages, accuracy_db)
-    request: dict[str, Any] = {
-        name: value for name, value in zip(REQUESTS, given, strict=True) if value is not None
-    }
-    if len(request) > 1:
-        raise ValueError(f"at most one of {', '.join(REQUESTS)} must be given, got {request}")
-    tolerance_in_db(tolerance_db, tolerance_wavelengths)
-    if accuracy_db is not None:
-        validate.number("accuracy_db", accuracy_db, "dB", least=BEST_ACCURACY_DB, below=0.0)
-    # Convert to plain numbers, since the inputs are stored as JSON.
-    for name, value in request.items():
-        if name == "stages":
-            request[name] = checked_pairs(value)
-        elif not isinstance(value, (int, float)):
-            request[name] = float(value)
-    return request or {"tolerance_db": TOLERANCE_DB}
-
-
-def _checked_growth(source: RangeLines | Path, follow_s: float | None) -> Growth | None:
-    """Return the folder to follow, or None without `follow_s`; other sources raise ValueError."""
-    if follow_s is None:
-        return None
-    idle_s = validate.positive("follow_s", follow_s, "s")
-    if isinstance(source, RangeLines) or not source.is_dir():
-        got = "lines in memory" if isinstance(source, RangeLines) else repr(str(source))
-        raise ValueError(f"source must be a folder if follow_s is given, got {got}")
-    return Growth(source.resolve(), idle_s)
-
-
-def _beam_of_growing(beam: BeamWindow) -> BeamWindow:
-    """Return a beam whose weights later pings do not change; raise ValueError if there is none."""
-    if beam.normalise:
-        raise ValueError(
-            "beam must not normalise for a folder, which may grow: the scale depends on the number "
-            "of all channels"
-        )
-    if beam.along is None and beam.track_pings is None:
-        return replace(beam, track_pings=MOST_TRACK_PINGS)
-    return beam
-
-
-def _check_client(client: object, source: object, store: object, device: object) -> None:
-    """Raise TypeError or ValueError unless the other arguments can be used with a client."""
-    if not hasattr(client, "get_executor"):
-        raise TypeError(f"client must be a distributed.Client, got {client!r}")
-    if store is None:
-        raise ValueError("store must be given with a client, whose workers write to it")
-    if isinstance(source, RangeLines):
-        raise ValueError("source must be a path with a client, whose workers read from it")
-    if device is not None:
-        raise ValueError("device must be left out with a client: every worker takes one itself")
 
 
 def _still_finished(

@@ -199,7 +199,7 @@ def form_patches(run: Run, finished: dict[PatchIndex, Record]) -> Generator[Form
     finally:
         with uninterrupted():
             begun = {future for future in running if not future.cancel()}
-        # Wait for this process's threads to finish what they began. A cluster may be gone by now.
+        # Wait for patches that this process's threads have begun. A cluster may be gone by now.
         left = begun if run.client is None else set()
         while left:
             left = left - wait(left)
