@@ -95,8 +95,8 @@ def read_cphd(
     Notes
     -----
     Positions are those that the file contains for every vector at the times of transmission and
-    reception, as in the model of the standard [1]_. The standard assumes the speed of light. A file of
-    sonar lines that clsas wrote contains the true speed, to which the frequencies are converted
+    reception, as in the model of the standard [1]_. The standard assumes the speed of light. A file
+    of sonar lines that clsas wrote contains the true speed, to which the frequencies are converted
     back.
 
     References
