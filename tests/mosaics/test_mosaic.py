@@ -298,7 +298,7 @@ def test_missing_channels_weigh_nothing(file, wish, monkeypatch):
 @pytest.mark.parametrize(
     ("samples", "says"),
     [
-        (np.ones((160, 9), np.float32), r"samples that are complex numbers.* got float32"),
+        (np.ones((160, 9), np.float32), r"samples as complex numbers.* got float32"),
         (np.ones((160, 9), np.int16), "got int16"),
         (np.complex64(1), r"got complex64 of shape \(\)"),
         ("group", "lacks samples"),
