@@ -463,7 +463,11 @@ FIXED = ["--taps", "4", "--upsampling", "2"]
             1,
             "image.h5 must hold Echoes (clsas simulate makes them), got Image",
         ),
-        (["quality", "image.h5", "--reference", "scene.toml"], 1, "scene.toml is not an HDF5 file"),
+        (
+            ["quality", "image.h5", "--reference", "scene.toml"],
+            1,
+            "scene.toml is neither an HDF5 file, nor",
+        ),
         (["quality", "scene.toml"], 2, "IMAGE.H5 is missing, scene.toml is a scene: clsas quality"),
         (
             ["image", "scene.toml"],
@@ -475,7 +479,7 @@ FIXED = ["--taps", "4", "--upsampling", "2"]
             1,
             "x must be one position for 1 pixel, got 0.0 m to 1.0 m",
         ),
-        (["simulate", "lines.h5", "-o", "new.h5"], 1, "lines.h5: is an HDF5 file, not a scene"),
+        (["simulate", "lines.h5", "-o", "new.h5"], 1, "lines.h5: an HDF5 file, not a scene file"),
         (["simulate", "typo.toml", "-o", "new.h5"], 1, "in [grid]: did you mean 'z_m'?"),
         (["simulate", "grid.toml", "-o", "new.h5"], 1, "grid.toml: missing table [sonar]"),
         (["compress", "echoes.h5", "-o", "new.h5", "--window", "bay"], 2, "bay"),

@@ -1,4 +1,4 @@
-"""Valid calls of imagers, plans, measures of images and navigation."""
+"""Valid calls of imagers, plans, image measures and navigation."""
 
 from __future__ import annotations
 
@@ -259,7 +259,7 @@ def imaging(folder: Path) -> dict[str, Call]:
 
 
 def _anew(store: Path) -> Callable[..., clsas.Mosaic]:
-    """Return `clsas.mosaic`, which first removes the store that the last call left."""
+    """Return `clsas.mosaic`, preceded by the removal of the store that the last call left."""
 
     def mosaic(**given: Any) -> clsas.Mosaic:
         shutil.rmtree(store, ignore_errors=True)
