@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import fft
 
-from clsas.core import decibels, validate
+from clsas.core import decibels, pings, validate
 
 if TYPE_CHECKING:
     from clsas.core.lines import RangeLines
@@ -81,20 +81,20 @@ def without_background(lines: RangeLines, statistic: str, receivers: int | None)
     """Subtract what all pings have in common; see `RangeLines.without_background`."""
     statistic = validate.one_of("statistic", statistic, STATISTICS)
     count = _receivers(lines) if receivers is None else validate.count("receivers", receivers)
-    pings, rest = divmod(lines.channels, count)
-    if rest or pings < 2:
+    number, rest = divmod(lines.channels, count)
+    if rest or number < 2:
         raise ValueError(
             "receivers must divide the channels into at least 2 pings, "
             f"got {count} receivers and {lines.channels} channels"
         )
-    first_m = lines.first_range_m.reshape(pings, count)
+    first_m = lines.first_range_m.reshape(number, count)
     spread_m = float(np.ptp(first_m, axis=0).max())
     if spread_m > _EQUAL_RANGE * lines.range_step_m:
         raise ValueError(
             "first_range_m of a receiver must be the same in all pings, since a background lies "
             f"at one delay; they differ by up to {spread_m:g} m"
         )
-    samples = np.array(lines.samples).reshape(pings, count, lines.length)
+    samples = np.array(lines.samples).reshape(number, count, lines.length)
     for receiver in range(count):
         own = samples[:, receiver]
         if statistic == "mean":
@@ -121,7 +121,7 @@ def weighted(lines: RangeLines, weights: ArrayLike) -> RangeLines:
 
 def _receivers(lines: RangeLines) -> int:
     """Return the channels per ping, which must be the same for all pings."""
-    counts = np.diff(np.append(lines.ping_starts, lines.channels))
+    counts = pings.channels_per_ping(lines.ping_starts, lines.channels)
     if np.ptp(counts):
         raise ValueError(
             "receivers must be given, since pings seem to have from "

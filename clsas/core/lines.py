@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -137,17 +136,17 @@ class RangeLines:
 
     @property
     def ping_starts(self) -> NDArray[np.int64]:
-        """First channel of every ping; consecutive channels with one tx position are a ping.
+        """First channel of every ping, int64 [pings].
 
-        Pings at one place count as one; `clsas.core.pings.Transmissions` tells them apart.
+        Consecutive channels with one transmitter position are a ping. Several transmissions from
+        one position therefore count as one; `clsas.core.pings.Transmissions` separates them.
         """
-        return np.flatnonzero(np.append(True, (np.diff(self.tx_m, axis=0) != 0).any(axis=1)))
+        return pings.ping_starts(self.tx_m)
 
     @property
     def ping_numbers(self) -> NDArray[np.int64]:
         """Number of every channel's ping, shape [channels]."""
-        starts = self.ping_starts
-        return np.repeat(np.arange(len(starts)), np.diff(np.append(starts, self.channels)))
+        return pings.ping_numbers(self.ping_starts, self.channels)
 
     @property
     def ping_centres_m(self) -> NDArray[np.float64]:
@@ -359,14 +358,6 @@ def some_channels(count: int, most: int = SAMPLED_CHANNELS) -> NDArray[np.int64]
         return np.arange(count)
     number = np.arange(most)
     return ((number + number * GOLDEN % 1) * count / most).astype(np.int64)
-
-
-def wavelength_m(lines: RangeLines) -> float:
-    """Return the wavelength of the carrier, for elements' patterns; infinite without a carrier.
-
-    Lengths are compared with `clsas.signal.spectrum.band_wavelength_m`, which every line has.
-    """
-    return lines.sound_speed_m_s / lines.carrier_hz if lines.carrier_hz else math.inf
 
 
 def antennas_of(

@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 from clsas.core import validate
 from clsas.core.grid import Grid
 from clsas.core.image import Image
-from clsas.core.lines import RangeLines, fastest, wavelength_m
+from clsas.core.lines import RangeLines, fastest
+from clsas.core.wavelengths import wavelength_m
 from clsas.exact.groups import Groups
 from clsas.exact.tiles import Tiles
 from clsas.sonar.beam import BeamWindow

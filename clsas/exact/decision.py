@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsas.core.grid import Grid
-from clsas.core.lines import RangeLines, fastest, some_channels, wavelength_m
+from clsas.core.lines import RangeLines, fastest, some_channels
+from clsas.core.wavelengths import cycles_per_m_at, wavelength_m
 from clsas.exact.checks import check_distances
 from clsas.exact.groups import Groups, GroupsEstimate
 from clsas.exact.layout import GEOMETRY_ERROR, Conditions, allowed, estimate_layout, lay_out
@@ -20,7 +21,7 @@ from clsas.opencl.device import Device
 from clsas.signal import interpolation
 from clsas.signal.ambiguity import Ambiguity
 from clsas.signal.interpolation import Interpolator, Resampling
-from clsas.signal.spectrum import Spectrum, cycles_per_m_at
+from clsas.signal.spectrum import Spectrum
 from clsas.sonar.beam import BeamWindow
 from clsas.sonar.visibility import sines
 

@@ -13,7 +13,8 @@ from clsas.core import validate
 from clsas.core.geometry import pairwise_range_m
 from clsas.core.image import Image
 from clsas.core.image_error import relative_error_db
-from clsas.core.lines import RangeLines, wavelength_m
+from clsas.core.lines import RangeLines
+from clsas.core.wavelengths import wavelength_m
 from clsas.exact.preparation import Preparation
 from clsas.signal.readout import interpolated
 from clsas.signal.spectrum import measure_spectrum

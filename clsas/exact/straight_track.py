@@ -12,7 +12,8 @@ from clsas.core import validate
 from clsas.core.fourier import smooth_edge
 from clsas.core.geometry import bistatic_range_m
 from clsas.core.grid import Grid
-from clsas.core.lines import RangeLines, wavelength_m
+from clsas.core.lines import RangeLines
+from clsas.core.wavelengths import cycles_per_m_at, wavelength_m
 from clsas.signal.spectrum import measure_spectrum
 from clsas.sonar.beam import BeamWindow
 
@@ -107,7 +108,7 @@ def band_of(lines: RangeLines) -> Band:
     spectrum = measure_spectrum(lines)
     used = np.flatnonzero(np.cumsum(spectrum.power[::-1])[::-1] > _UNUSED)[-1]
     half = float(spectrum.frequency[used] + spectrum.frequency[0])
-    cycles_per_m = lines.carrier_cycles_per_m + spectrum.centre / lines.range_step_m
+    cycles_per_m = cycles_per_m_at(lines, spectrum.centre)
     validate.positive("the middle frequency of lines", cycles_per_m, "cycles/m")
     return Band(2 * lines.wavenumber_rad_m, spectrum.centre, half, 2 / cycles_per_m)
 

@@ -22,12 +22,12 @@ from clsas.aperture.phase_rates import cycles_per_extent, drift, own_drift, stre
 from clsas.aperture.virtual_channels import ChannelRanges, VirtualChannels
 from clsas.core.geometry import pairwise_range_m
 from clsas.core.lines import RangeLines, antennas_of, some_channels
+from clsas.core.wavelengths import band_wavelength_m
 from clsas.factorized import visibility
 from clsas.factorized.plan import Plan
 from clsas.factorized.surface import Surface
 from clsas.factorized.tree import Division, channel_ranges
 from clsas.opencl.buffers import MARGIN
-from clsas.signal.spectrum import band_wavelength_m
 
 _ON_TRACK = 1e-4  # wavelengths; closer, channels lie on the mean track
 _SHAPES = {"strips": "several passes", "sheet": "a sheet"}

@@ -11,6 +11,7 @@ from clsas.core import validate
 from clsas.core.grid import Grid
 from clsas.core.lines import RangeLines
 from clsas.core.pings import Transmissions
+from clsas.core.wavelengths import wavelength_between_m
 from clsas.inspection.phase_sign import check_sign, phase_sign
 from clsas.inspection.range_checks import check_ranges
 from clsas.inspection.recording_checks import (
@@ -162,20 +163,9 @@ class _Moving:
             pings,
             spectrum,
             band_hz,
-            wavelength_m=lines.sound_speed_m_s / _mean_frequency_hz(*band_hz),
+            wavelength_m=wavelength_between_m(lines, *band_hz),
             cell_m=lines.range_step_m * oversampling,
         )
-
-
-def _mean_frequency_hz(low_hz: float, high_hz: float) -> float:
-    """Return the mean of the frequencies of a band, all counted as positive.
-
-    That is the middle of a band, unless it reaches below 0 Hz. Where the middle of such a band lies
-    is chance: it may be 0 Hz, where the wavelength is infinite.
-    """
-    if low_hz * high_hz >= 0:
-        return abs(low_hz + high_hz) / 2
-    return (low_hz**2 + high_hz**2) / (2 * (high_hz - low_hz))
 
 
 def _check_samples(moving: _Moving) -> list[Finding]:

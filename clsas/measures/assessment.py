@@ -14,6 +14,7 @@ from clsas.core.decibels import in_db, power
 from clsas.core.geometry import pairwise_range_m
 from clsas.core.grid import Grid
 from clsas.core.lines import RangeLines
+from clsas.core.wavelengths import band_wavelength_m
 from clsas.exact.backprojection import prepare
 from clsas.exact.run import execute
 from clsas.factorized.factorization import Factorization
@@ -36,7 +37,7 @@ from clsas.planning.planner import BEST_TOLERANCE_DB, TOLERANCE_DB, WORST_TOLERA
 from clsas.planning.prediction import half_precision_error
 from clsas.signal.compression import Window
 from clsas.signal.compression import check_options as check_compression
-from clsas.signal.spectrum import band_wavelength_m, measure_spectrum
+from clsas.signal.spectrum import measure_spectrum
 from clsas.simulation.scenes import PointTargets
 from clsas.simulation.simulator import simulate_lines
 from clsas.sonar.beam import BeamWindow

@@ -7,8 +7,8 @@ import numpy as np
 from clsas.core import validate
 from clsas.core.lines import RangeLines
 from clsas.core.pings import Transmissions
+from clsas.core.wavelengths import band_wavelength_m, is_about_zero
 from clsas.signal.readout import Readout
-from clsas.signal.spectrum import band_wavelength_m, is_about_zero
 
 _REMEDY = "lines.without_still_pings() drops them"
 

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from clsas.core.conditioning import are_dead
 from clsas.core.lines import RangeLines
+from clsas.core.wavelengths import cycles_per_m_at
 from clsas.navigation.directions import Alignment, Frame, alignment, ranges_m
 from clsas.navigation.echoes import (
     Window,
@@ -30,7 +31,6 @@ from clsas.navigation.echoes import (
 from clsas.navigation.overlap import Array, Overlap
 from clsas.navigation.swath import Swath
 from clsas.signal.readout import Readout
-from clsas.signal.spectrum import cycles_per_m_at
 
 _CANCELLED = 1e-6  # length of the sum of two unit vectors, up to which they are opposite
 _SLOPES = np.linspace(-0.2, 0.2, 81)  # yaw between pings that is tried first, rad

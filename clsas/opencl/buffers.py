@@ -11,8 +11,9 @@ import numpy as np
 import pyopencl as cl
 from numpy.typing import DTypeLike, NDArray
 
-from clsas.core.lines import RangeLines, wavelength_m
+from clsas.core.lines import RangeLines
 from clsas.core.threads import in_threads
+from clsas.core.wavelengths import wavelength_m
 from clsas.opencl import phases
 from clsas.opencl.device import Device, aligned
 from clsas.opencl.kernels import Kernel

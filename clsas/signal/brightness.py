@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from clsas.core.geometry import pairwise_range_m
 from clsas.core.grid import Grid
-from clsas.core.lines import RangeLines, some_channels, wavelength_m
+from clsas.core.lines import RangeLines, some_channels
+from clsas.core.wavelengths import wavelength_m
 from clsas.signal.spectrum import Spectrum
 from clsas.sonar.beam import BeamWindow
 from clsas.sonar.visibility import sines

@@ -13,7 +13,8 @@ from scipy.linalg import cho_factor, cho_solve, toeplitz
 
 from clsas.core import reprs, validate
 from clsas.core.lines import RangeLines
-from clsas.signal.spectrum import Spectrum, cycles_per_m_at
+from clsas.core.wavelengths import cycles_per_m_at
+from clsas.signal.spectrum import Spectrum
 
 TAPS = (2, 4, 6, 8)
 UPSAMPLINGS = (1.0, 1.25, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0, 12.0, 16.0)

@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 from clsas.core.decibels import power
 from clsas.core.geometry import pairwise_range_m
 from clsas.core.grid import Grid
-from clsas.core.lines import GOLDEN, RangeLines, antennas_of, wavelength_m
-from clsas.signal.spectrum import Spectrum, cycles_per_m_at, representative_channels
+from clsas.core.lines import GOLDEN, RangeLines, antennas_of
+from clsas.core.wavelengths import cycles_per_m_at, wavelength_m
+from clsas.signal.spectrum import Spectrum, representative_channels
 from clsas.sonar.beam import BeamWindow
 from clsas.sonar.visibility import sines
 

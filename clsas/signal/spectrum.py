@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, overload
+from typing import Any
 
 import numpy as np
 import scipy.fft
@@ -13,6 +13,7 @@ from scipy.ndimage import uniform_filter1d
 from clsas.core.geometry import pairwise_range_m
 from clsas.core.grid import Grid
 from clsas.core.lines import RangeLines, some_channels
+from clsas.core.wavelengths import cycles_per_m_at
 
 MEASURED_CHANNELS = 256
 """Channels sampled for a spectrum. Half and twice as many move predicted errors by less than
@@ -21,7 +22,6 @@ FEW_CHANNELS = 32
 """Channels sampled for a quick estimate of the power outside a band."""
 NEEDED_OVERSAMPLING = 1.05
 """Sample rate over occupied bandwidth above which a guard band separates the band's edges."""
-_LEAST_CYCLES = 0.02  # per sample, at the middle of a band that shows the carrier
 _FREQUENCIES = 128  # bins; with half as many measured errors move by 0.2 dB, with twice by 0.1 dB
 _FLOOR_WIDTH = 1 / 64  # cycles per sample; the quietest part of this width is taken as noise
 _FLOOR_MARGIN = 2.0  # scatter of the mean of a few periodograms
@@ -357,40 +357,3 @@ def _largest_part(samples: NDArray[np.complex64]) -> np.float32:
     """Largest real or imaginary part. Magnitudes might overflow."""
     parts = samples.view(samples.real.dtype)
     return max(parts.max(initial=0.0), -parts.min(initial=0.0))
-
-
-def band_wavelength_m(lines: RangeLines, centre: float) -> float:
-    """Return the wavelength in the middle of the band that lines occupy, metres.
-
-    Lengths are compared with it, whether the carrier was mixed out or not. Lines about 0 Hz do not
-    show their carrier: the wavelength is then that of the highest frequency sampled.
-
-    Parameters
-    ----------
-    lines : RangeLines
-    centre : float
-        Middle of the band, cycles per sample: `Spectrum.centre`, or that of a plan's lines.
-    """
-    if is_about_zero(lines, centre):
-        return 4 * lines.range_step_m
-    return 2 / abs(cycles_per_m_at(lines, centre))
-
-
-def is_about_zero(lines: RangeLines, centre: float) -> bool:
-    """Return whether a band is so near to 0 Hz that it does not show the carrier of its lines."""
-    return abs(cycles_per_m_at(lines, centre)) * lines.range_step_m <= _LEAST_CYCLES
-
-
-@overload
-def cycles_per_m_at(lines: RangeLines, frequency: float) -> float: ...
-
-
-@overload
-def cycles_per_m_at(lines: RangeLines, frequency: NDArray[np.float64]) -> NDArray[np.float64]: ...
-
-
-def cycles_per_m_at(
-    lines: RangeLines, frequency: float | NDArray[np.float64]
-) -> float | NDArray[np.float64]:
-    """Return the phase per metre of range, cycles, at a frequency in cycles per sample."""
-    return lines.carrier_cycles_per_m + frequency / lines.range_step_m

@@ -34,14 +34,13 @@ def track_directions(lines: RangeLines, pings: int | None = None) -> NDArray[np.
     ValueError
         If there is only one ping, or the track stands still.
     """
-    first, channels_m = lines.ping_starts, lines.phase_centres_m
-    count = len(first)
+    channels_m = lines.phase_centres_m
+    count = len(lines.ping_starts)
     if count < 2:
         raise ValueError(
             f"along must be given: {lines.channels} channels of one transmitter position have "
             f"no track"
         )
-    receivers = np.diff(np.append(first, lines.channels))
     centres_m = lines.ping_centres_m
     span = pings or min(max(count // _SMOOTHED_SHARE, 5), MOST_TRACK_PINGS)
     tangent = np.concatenate([_tangents(leg_m, span) for leg_m in _legs(centres_m)])
@@ -55,7 +54,7 @@ def track_directions(lines: RangeLines, pings: int | None = None) -> NDArray[np.
         )
     tangent /= speed[:, None]
     # The front channels of a long array lie where the middles of later pings will be.
-    ping = np.repeat(np.arange(count), receivers)
+    ping = lines.ping_numbers
     steps_m = np.linalg.norm(np.diff(centres_m, axis=0), axis=1)
     travelled_m = np.concatenate([[0.0], np.cumsum(steps_m)])
     ahead_m = channels_m - centres_m[ping]

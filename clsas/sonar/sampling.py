@@ -14,6 +14,7 @@ from clsas.core import validate
 from clsas.core.geometry import bistatic_range_m
 from clsas.core.grid import Grid
 from clsas.core.lines import RangeLines
+from clsas.core.wavelengths import wavelength_m as carrier_wavelength_m
 from clsas.sonar.beam import BeamWindow
 from clsas.sonar.system import Sonar
 from clsas.sonar.track import Track, channels
@@ -154,7 +155,7 @@ def _spacing_limit(
     elif isinstance(survey, Sonar):
         wavelength = survey.wavelength_m
     elif survey.carrier_hz:
-        wavelength = survey.sound_speed_m_s / survey.carrier_hz
+        wavelength = carrier_wavelength_m(survey)
     else:
         raise ValueError("wavelength_m must be given for lines with carrier_hz 0")
     if element_length_m is None and isinstance(survey, Sonar):

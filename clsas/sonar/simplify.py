@@ -22,6 +22,7 @@ from clsas.core.decibels import power
 from clsas.core.geometry import pairwise_range_m
 from clsas.core.grid import Grid
 from clsas.core.lines import RangeLines, some_channels
+from clsas.core.wavelengths import wavelength_m
 from clsas.sonar.beam import BeamWindow
 from clsas.sonar.visibility import sines
 
@@ -244,7 +245,7 @@ def _fitted(
     if beam is not None and along is not None:
         some = some_channels(lines.channels, 4 * _CHECKED_CHANNELS)
         sine = sines(dense_m, lines.phase_centres_m[some], along[some])
-        fullness = beam.fullness(sine, _wavelength_m(lines), len(some) / lines.channels)
+        fullness = beam.fullness(sine, wavelength_m(lines), len(some) / lines.channels)
 
     def amplitude(range_m: float, sine: float) -> float:
         weights = 0.0 if beam is None else math.sqrt(_shift_error(beam, sine, lines)) / fullness
@@ -314,14 +315,10 @@ def _shift_error(beam: BeamWindow, shift: float, lines: RangeLines) -> float:
     """Relative error power of a beam's weights whose sines are shifted."""
     low, high = np.clip(beam.limits, -1, 1)
     sine = np.linspace(low, high, _WEIGHTS + 2)[1:-1]
-    weights = beam.weights(sine, _wavelength_m(lines))
+    weights = beam.weights(sine, wavelength_m(lines))
     smooth = np.mean((np.gradient(weights, sine) * shift) ** 2)
     jumps = (weights[0] ** 2 + weights[-1] ** 2) * abs(shift) / (high - low)
     return float((smooth + jumps) / np.mean(weights**2))
-
-
-def _wavelength_m(lines: RangeLines) -> float:
-    return lines.sound_speed_m_s / lines.carrier_hz if lines.carrier_hz else math.inf
 
 
 def _with_directions(beam: BeamWindow | None, lines: RangeLines) -> BeamWindow | None:

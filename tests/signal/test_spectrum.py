@@ -4,8 +4,9 @@ from cases import noise
 
 from clsas.core.grid import Grid
 from clsas.core.lines import RangeLines
+from clsas.core.wavelengths import band_wavelength_m
 from clsas.exact.reference import ideal
-from clsas.signal.spectrum import band_wavelength_m, measure_spectrum
+from clsas.signal.spectrum import measure_spectrum
 
 
 def lines_of(samples):
