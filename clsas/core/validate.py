@@ -33,7 +33,10 @@ _REPR.maxstring = _REPR.maxother = _REPR.maxlong = 2 * _LONGEST
 _GROUP_LIMITS = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes")
 
 MOST_HZ, MOST_M_S = 1e15, 3e8
-"""Largest frequency and speed of waves that recordings may have: those of light."""
+"""Largest frequency and speed of waves in a recording: those of light."""
+FARTHEST_M = 1e9
+"""Largest distance from antennas to pixels, and largest coordinate of a simulated point. Up to it
+squares of distances stay within float32, and float64 resolves ranges to 1e-7 m."""
 _MOST_COUNT = 2**63 - 1
 _MOST_OVERSAMPLING = 1e4  # far beyond what any interpolation gains from
 _MOST_CYCLES = 1e10  # of phase: float64 holds them to 1e-6 of a cycle

@@ -14,7 +14,6 @@ from clsas.exact.groups import Groups
 from clsas.exact.tiles import Tiles
 from clsas.sonar.beam import BeamWindow
 
-_LARGEST_DISTANCE_M = 1e9
 _SMALLEST_STEP_M = 1e-9
 _LARGEST_SUM = 1e37
 _NUMBERS_AT_ONCE = 1 << 18  # stay in a core's cache between two passes over them
@@ -58,7 +57,7 @@ def check_numbers(lines: RangeLines, beam: BeamWindow | None) -> float:
             raise ValueError("carrier_hz must be above 0 for a beam of the shape 'inverse'")
         heaviest = max(float(beam.table(wavelength_m(lines)).max()), 1.0)
     validate.number(
-        "range_step_m", lines.range_step_m, "m", least=_SMALLEST_STEP_M, most=_LARGEST_DISTANCE_M
+        "range_step_m", lines.range_step_m, "m", least=_SMALLEST_STEP_M, most=validate.FARTHEST_M
     )
     farthest_m = np.abs([lines.first_range_m, lines.last_range_m]).max()
     validate.phase(lines.carrier_hz, lines.sound_speed_m_s, float(farthest_m))
@@ -81,8 +80,8 @@ def check_distances(antennas_m: NDArray[np.float64], layout: Tiles | Groups) -> 
     """Refuse distances so large that a square overflows float32."""
     points_m = np.concatenate([antennas_m, layout.centres_m(slice(None))])
     extent_m = float(np.ptp(points_m, axis=0).max())
-    if extent_m > _LARGEST_DISTANCE_M:
+    if extent_m > validate.FARTHEST_M:
         raise ValueError(
-            f"lines and grid must lie within {_LARGEST_DISTANCE_M:g} m of each other, "
+            f"lines and grid must lie within {validate.FARTHEST_M:g} m of each other, "
             f"got {extent_m:g} m"
         )

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from clsas.core.grid import Grid
-from clsas.exact.tiles import BLOCKS, STACK
+from clsas.exact.tiles import BLOCKS, STACK, item_pixels
 from clsas.sonar.beam import BeamWindow
 from clsas.sonar.visibility import Boxes
 
@@ -161,7 +161,7 @@ class GroupsEstimate:
 def gather(grid: Grid, largest_radius_m: float, width: int) -> Groups:
     """Return groups whose pixels lie within a radius of their centre."""
     position_m = grid.positions_m().reshape(-1, 3)
-    size = STACK * width
+    size = item_pixels(width)
     rest = _neighbours(grid, position_m, width)
     # Runs of neighbours that are too wide are halved until they fit or hold one pixel.
     found = []
@@ -202,7 +202,7 @@ def groups_within(
     part : int64 [groups]
         Number of the part that holds each group, ascending.
     """
-    size = STACK * width
+    size = item_pixels(width)
     order = np.argsort(part * (rank.max() + 1) + rank)
     held = np.bincount(part, minlength=len(middle_m))
     counts = -(-held // size)
@@ -224,7 +224,7 @@ def groups_within(
 def _neighbours(grid: Grid, position_m: NDArray[np.float64], width: int) -> NDArray[np.int64]:
     """Return every pixel's flat index, neighbours in sequence; edge pixels may stand twice."""
     if grid.points_m is not None:
-        return KDTree(position_m, leafsize=STACK * width).indices
+        return KDTree(position_m, leafsize=item_pixels(width)).indices
     rows, columns = BLOCKS[width]
     rows *= STACK
     index = np.arange(grid.size).reshape(grid.shape)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from clsas.core.grid import Grid
 from clsas.exact.groups import Groups, GroupsEstimate, gather
-from clsas.exact.tiles import STACK, Tiles
+from clsas.exact.tiles import Tiles, item_pixels
 from clsas.sonar.beam import BeamWindow
 
 GEOMETRY_ERROR = 3.2e-5
@@ -132,7 +132,7 @@ def estimate_layout(
     if found is not None:
         return found
     radius_m = min(conditions.largest_radius_m, longest_m)
-    return GroupsEstimate(grid, STACK * conditions.width, radius_m, windows)
+    return GroupsEstimate(grid, item_pixels(conditions.width), radius_m, windows)
 
 
 def fitting_tiles(grid: Grid, conditions: Conditions) -> Tiles | None:

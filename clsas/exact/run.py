@@ -19,7 +19,7 @@ from clsas.exact.buffers import block_buffers, is_bistatic, part_buffers
 from clsas.exact.lookup import lookup_options
 from clsas.exact.preparation import Preparation
 from clsas.exact.references import geometry_rows, references_of
-from clsas.exact.tiles import STACK, Tiles
+from clsas.exact.tiles import Tiles, item_pixels
 from clsas.opencl.buffers import (
     Slot,
     beam_table,
@@ -313,7 +313,7 @@ class _Run:
             expansions=expansions,
             wait_for=job.filled,
         )
-        size = (layout.part_pixels // (device.info.width * STACK), count)
+        size = (layout.part_pixels // item_pixels(device.info.width), count)
         return size, {
             "expansions": expansions,
             "columns": layout.across * layout.side,

@@ -24,6 +24,12 @@ STACK = 4
 BLOCKS = {16: (4, 4), 8: (2, 4), 4: (2, 2), 1: (1, 1)}
 """Rows and columns of a block, by float lanes."""
 
+
+def item_pixels(width: int) -> int:
+    """Return the number of pixels of a work-item: `STACK` blocks of one pixel per float lane."""
+    return STACK * width
+
+
 HELD = 16
 """Lanes of vectors whose windows registers hold, so that blocks may share them (cl/lookup.h).
 Samples of narrower vectors are loaded tap by tap."""

@@ -31,7 +31,7 @@ from clsas.signal.spectrum import Spectrum, measure_spectrum
 from clsas.sonar.beam import BeamWindow
 from clsas.sonar.sampling import Finding
 
-_FARTHEST_M = 1e12
+_FARTHEST_M = 1e3 * validate.FARTHEST_M  # coordinates in mm are reported, not refused
 _SLOWEST_M_S = 1.0  # of sound in km/s, a slip that is to be shown
 
 

@@ -19,8 +19,6 @@ from clsas.core import reprs, validate
 from clsas.simulation.height_field import HeightField
 from clsas.simulation.scatterers import Scatterers, draw_scatterers
 
-_FARTHEST_M = 1e9  # farthest coordinate of a point: float64 then resolves its range to 1e-7 m
-
 
 class Observer(NamedTuple):
     """Position of some channels, and how their elements direct sound.
@@ -77,7 +75,7 @@ class PointTargets:
         """Check every field and convert it."""
         positions = validate.array("positions_m", self.positions_m, np.float64, (None, 3))
         farthest_m = float(np.abs(positions).max())
-        validate.number("the farthest of positions_m", farthest_m, "m", most=_FARTHEST_M)
+        validate.number("the farthest of positions_m", farthest_m, "m", most=validate.FARTHEST_M)
         amplitudes = validate.real_or_complex(
             "amplitudes", self.amplitudes, np.complex128, (len(positions),), broadcast=True
         )

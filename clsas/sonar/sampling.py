@@ -241,36 +241,6 @@ def phase_centres_m(tx_m: ArrayLike, rx_m: ArrayLike) -> NDArray[np.float64]:
     return (tx + rx) / 2
 
 
-def phase_centre_error_m(separation_m: float, beam_width_rad: float, range_m: float) -> float:
-    """Return the error of the phase-centre approximation within the beam, as two-way path.
-
-    For tx and rx a distance D apart, the path is D^2 cos^2(theta)/(4 R) longer than the path from
-    and to their midpoint. Over a beam of full width W it varies by D^2/(4 R) (1 - cos^2(W/2)). The
-    approximation holds if that is well below the wavelength, for instance below an eighth of it as
-    in [34]. This is equation [33], D^2/(4 lambda) (1 - cos^2(W/2)) << R. The thesis calls the
-    right-hand side the distance from phase centre to receiver, but it is the range.
-
-    Parameters
-    ----------
-    separation_m : float
-        Distance between transmitter and receiver.
-    beam_width_rad : float
-        Full azimuth beam width, at most pi.
-    range_m : float
-        Distance to the target.
-    """
-    separation = validate.number("separation_m", separation_m, "m", least=0.0)
-    width = validate.number("beam_width_rad", beam_width_rad, "rad", least=0.0, most=np.pi)
-    distance = validate.positive("range_m", range_m, "m")
-    return separation**2 / (4 * distance) * float(np.sin(width / 2)) ** 2
-
-
-def far_field_m(half_aperture_m: float, wavelength_m: float) -> float:
-    """Return the range 4 u^2/lambda beyond which waves are plane over +-u; equation [34]."""
-    half = validate.number("half_aperture_m", half_aperture_m, "m", least=0.0)
-    return 4 * half**2 / validate.positive("wavelength_m", wavelength_m, "m")
-
-
 def receive_interval_s(
     near_m: float, far_m: float, duration_s: float, sound_speed_m_s: float = 1500.0
 ) -> tuple[float, float]:
@@ -280,50 +250,6 @@ def receive_interval_s(
     duration = validate.number("duration_s", duration_s, "s", least=0.0)
     sound = validate.positive("sound_speed_m_s", sound_speed_m_s, "m/s")
     return 2 * near / sound, 2 * far / sound + duration
-
-
-def ping_advance_m(sonar: Sonar) -> float:
-    """Return the largest advance per ping that leaves no gap between phase centres, metres.
-
-    It is the length of the phase-centre array, half that of the receiver array: N d/2 for N
-    receivers d apart (the thesis, section 2.5), and half the element's length for one receiver
-    [31].
-
-    Raises
-    ------
-    TypeError
-        If `sonar` is not a Sonar.
-    ValueError
-        If the sonar has one receiver and no element length.
-    """
-    validate.instance("sonar", sonar, Sonar)
-    if sonar.receivers > 1:
-        return float(np.ptp(sonar.rx_m[:, 0]) / (sonar.receivers - 1) * sonar.receivers / 2)
-    if sonar.element_length_m is None:
-        raise ValueError("sonar must have an element length or several receivers, got neither")
-    return sonar.element_length_m / 2
-
-
-def ping_rate_limits_hz(
-    speed_m_s: float, advance_m: float, last_echo_s: float
-) -> tuple[float, float]:
-    """Return the lowest and highest ping rate, v/advance <= PRF <= 1/Tf; [24], [30].
-
-    With an advance of L/2 the lower limit is the thesis's 2 v/L. If the lower limit exceeds the
-    upper one, no ping rate satisfies both.
-
-    Parameters
-    ----------
-    speed_m_s : float
-        Platform speed.
-    advance_m : float
-        Largest advance per ping (`ping_advance_m`).
-    last_echo_s : float
-        End of the last echo, Tf (`receive_interval_s`).
-    """
-    speed = validate.number("speed_m_s", speed_m_s, "m/s", least=0.0)
-    advance = validate.positive("advance_m", advance_m, "m")
-    return speed / advance, 1 / validate.positive("last_echo_s", last_echo_s, "s")
 
 
 def grating_lobe_m(wavelength_m: float, spacing_m: float, range_m: float) -> float:
