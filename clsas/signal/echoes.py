@@ -60,7 +60,7 @@ class Echoes:
     pulse: Pulse | None = None
     rx_velocity_m_s: NDArray[np.float64] | None = None
 
-    if TYPE_CHECKING:  # arrays are converted: the constructor takes what holds numbers
+    if TYPE_CHECKING:  # the constructor converts array_like arguments
 
         def __init__(
             self,

@@ -35,7 +35,7 @@ class Replica:
     samples: NDArray[np.complex128]
     sample_rate_hz: float
 
-    if TYPE_CHECKING:  # arrays are converted: the constructor takes what holds numbers
+    if TYPE_CHECKING:  # the constructor converts array_like arguments
 
         def __init__(self, samples: ArrayLike, sample_rate_hz: float) -> None: ...
 

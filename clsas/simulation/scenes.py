@@ -63,7 +63,7 @@ class PointTargets:
     positions_m: NDArray[np.float64]
     amplitudes: NDArray[np.complex128] = 1.0  # type: ignore[assignment]
 
-    if TYPE_CHECKING:  # arrays are converted: the constructor takes what holds numbers
+    if TYPE_CHECKING:  # the constructor converts array_like arguments
 
         def __init__(
             self,
@@ -176,7 +176,7 @@ class Seabed:
     seed: int = 0
     floor_db: float = -50.0
 
-    if TYPE_CHECKING:  # arrays are converted: the constructor takes what holds numbers
+    if TYPE_CHECKING:  # the constructor converts array_like arguments
 
         def __init__(
             self,

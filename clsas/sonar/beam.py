@@ -83,7 +83,7 @@ class BeamWindow:
     normalise: bool = False
     track_pings: int | None = None
 
-    if TYPE_CHECKING:  # arrays are converted: the constructor takes what holds numbers
+    if TYPE_CHECKING:  # the constructor converts array_like arguments
 
         def __init__(
             self,

@@ -192,7 +192,7 @@ class Sonar:
     tx_height_m: float | None = None
     rx_height_m: float | None = None
 
-    if TYPE_CHECKING:  # arrays are converted: the constructor takes what holds numbers
+    if TYPE_CHECKING:  # the constructor converts array_like arguments
 
         def __init__(
             self,

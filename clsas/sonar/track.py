@@ -50,7 +50,7 @@ class Track:
     pitch_rad: NDArray[np.float64] = 0.0  # type: ignore[assignment]
     roll_rad: NDArray[np.float64] = 0.0  # type: ignore[assignment]
 
-    if TYPE_CHECKING:  # arrays are converted: the constructor takes what holds numbers
+    if TYPE_CHECKING:  # the constructor converts array_like arguments
 
         def __init__(
             self,

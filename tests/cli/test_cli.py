@@ -471,7 +471,7 @@ FIXED = ["--taps", "4", "--upsampling", "2"]
         (
             ["image", "lines.h5", "--x", "0:1:1", *GRID[2:], "-o", "new.h5"],
             1,
-            "x must be one position for 1 pixel, got 0.0 m to 1.0 m",
+            "x must start and stop at one position for 1 pixel, got 0.0 m to 1.0 m",
         ),
         (["simulate", "lines.h5", "-o", "new.h5"], 1, "lines.h5: is an HDF5 file, not a scene"),
         (["simulate", "typo.toml", "-o", "new.h5"], 1, "in [grid]: did you mean 'z_m'?"),

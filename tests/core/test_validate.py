@@ -136,7 +136,7 @@ def test_array_speaks_of_phase_only_where_samples_are_real(name, given, got):
 
 def test_array_refuses_masked_values():
     given = np.ma.array([1.0, 2.0, 3.0], mask=[False, True, False])
-    with pytest.raises(ValueError, match="x must hold no masked value, got 1 of 3"):
+    with pytest.raises(ValueError, match="x must have no masked value, got 1 of 3"):
         validate.array("x", given, np.float64, (None,))
     result = validate.array("x", np.ma.array([1.0, 2.0]), np.float64, (None,))
     np.testing.assert_array_equal(result, [1.0, 2.0])
