@@ -60,8 +60,8 @@ def test_spacing_finding_carries_its_numbers():
     assert finding.name == "along_track_spacing"
     assert finding.value == pytest.approx(8.25e-3)
     assert finding.limit == pytest.approx(7.5e-3)
-    assert "0.00825 m apart along the track, more than 0.0075 m" in finding.message
-    assert "half the element length of 0.015 m" in finding.message
+    assert "8.25 mm apart along the track, but should be at most 7.5 mm apart" in finding.message
+    assert "half the element length of 15 mm" in finding.message
     ranges = [float(part) for part in finding.message.split("(")[1].split() if part[0].isdigit()]
     lobes = finding.message.split("grating lobes ")[1].split()
     assert float(lobes[0]) == pytest.approx(grating_lobe_m(1.5e-3, 8.25e-3, ranges[0]), rel=1e-3)
@@ -69,7 +69,7 @@ def test_spacing_finding_carries_its_numbers():
 
 
 def test_sway_of_a_course_hardly_changes_its_spacing():
-    """At exactly the limit the course's direction, turned a little by sway, decides nothing."""
+    """A spacing of exactly the limit passes, although sway turns the course a little."""
     sonar = replace(WIDE, rx_m=line_array(64, 15e-3))
     for sway_m in (0.0, 0.005):
         survey = Track.straight(
@@ -97,8 +97,8 @@ def test_ping_rate_finding_carries_its_numbers():
     assert "the ping rate of 20 Hz is above" in finding.message
 
 
-def test_omnidirectional_elements_are_held_to_the_grid():
-    """Grating lobes of anything on the grid stay off the grid, with nothing to spare."""
+def test_the_grid_limits_the_spacing_of_omnidirectional_elements():
+    """At the limit, the grating lobes of targets on the grid lie just off the grid."""
     sonar = Sonar(Pulse(100e3, 20e3, 1e-3), [[0, 0, 0]])
     grid = Grid.plane(x=(-5, 5, 11), y=(40, 50, 11))
     # At sin theta = 5/sqrt(5^2 + 40^2) to either side.
@@ -110,7 +110,7 @@ def test_omnidirectional_elements_are_held_to_the_grid():
     )
     (finding,) = check_sampling(sonar, sparse, grid)
     assert finding.limit == pytest.approx(limit, rel=0.01)
-    assert "keeps grating lobes off the grid" in finding.message
+    assert "to keep grating lobes off the grid" in finding.message
     assert check_sampling(sonar, dense, grid) == []
 
 
@@ -151,7 +151,7 @@ def test_a_beam_leaves_grating_lobes_out():
     limit = 0.015 / (4 * np.sin(np.radians(10)))
     (finding,) = check_sampling(lines, beam=BeamWindow(20.0))
     assert finding.limit == pytest.approx(limit)
-    assert finding.message.endswith("what keeps grating lobes out of the beam of 20 degrees")
+    assert finding.message.endswith("to keep grating lobes out of the beam of 20 degrees")
     assert "with a beam" in finding.remedy
     assert check_sampling(lines, beam=BeamWindow(8.0)) == []
     # The narrower of beam and grid decides.
@@ -202,7 +202,7 @@ def test_arguments_beside_lines(arguments, message):
     ("arguments", "message"),
     [
         ((None, track(WIDE, 0.5), GRID), "sonar must be of type Sonar, got NoneType"),
-        (("a", None, GRID), r"must be of type Sonar, got str; RangeLines may stand in its place"),
+        (("a", None, GRID), r"must be of type Sonar, got str; RangeLines may be given instead"),
         ((WIDE, GRID, GRID), "track must be of type Track, got Grid"),
         (
             (lines_of(WIDE, track(WIDE, 0.5)), track(WIDE, 0.5), GRID),
