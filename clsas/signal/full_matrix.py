@@ -71,11 +71,12 @@ def from_full_matrix(
     >>> import clsas
     >>> import numpy as np
     >>> elements_m = 0.3e-3 * np.array([[n, 0, 0] for n in range(4)])
-    >>> clsas.from_full_matrix(
+    >>> lines = clsas.from_full_matrix(
     ...     np.zeros((4, 4, 400)), elements_m,
     ...     sample_rate_hz=50e6, carrier_hz=5e6, sound_speed_m_s=6300.0,
     ... )
-    RangeLines(16 channels of 160 samples, range 0 to 0.025042 m in steps of 157.5 µm, carrier 5 MHz)
+    >>> lines.samples.shape, f"{1e3 * lines.last_range_m[0]:.2f} mm"
+    ((16, 160), '25.04 mm')
     """
     elements_m = validate.array("elements_m", elements_m, np.float64, (None, 3))
     count = len(elements_m)

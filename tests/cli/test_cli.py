@@ -379,7 +379,8 @@ def test_devices(monkeypatch):
     assert "CLSAS_DEVICE" in run("devices")[0]
     monkeypatch.setenv("CLSAS_DEVICE", "abacus")
     assert (
-        "Error: No device matches 'abacus', asked for by CLSAS_DEVICE" in run("devices", code=1)[1]
+        "Error: No device matches 'abacus', which was requested by CLSAS_DEVICE"
+        in run("devices", code=1)[1]
     )
 
 

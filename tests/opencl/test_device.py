@@ -92,7 +92,7 @@ def test_chosen_by_index():
         for wish in (info.index, str(info.index)):
             chosen, why = choose(wish)
             assert chosen.index == info.index
-            assert why == f"asked for as {info.index}"
+            assert why == f"requested as {info.index}"
 
 
 def test_chosen_by_a_part_of_its_name():
@@ -124,14 +124,16 @@ def several_devices():
 )
 def test_chosen_by_kind_and_platform(wish, index, monkeypatch):
     monkeypatch.setattr(module, "list_devices", several_devices)
-    assert choose(wish) == (several_devices()[index], f"asked for as {wish!r}")
+    assert choose(wish) == (several_devices()[index], f"requested as {wish!r}")
     monkeypatch.setenv(ENVIRONMENT_VARIABLE, wish)
     assert choose()[0].index == index
 
 
 def test_a_kind_that_is_not_there_is_told(monkeypatch):
     monkeypatch.setattr(module, "list_devices", lambda: several_devices()[:2])
-    words = "No device matches 'gpu', asked for. Available: 0: Portable Computing Language: "
+    words = (
+        "No device matches 'gpu', which was requested. Available: 0: Portable Computing Language: "
+    )
     with pytest.raises(DeviceError, match=re.escape(words)):
         choose("gpu")
 

@@ -219,7 +219,9 @@ def test_bad_seabeds(arguments, error, message):
 
 
 def test_a_seabed_without_scatterers():
-    with pytest.raises(ValueError, match="density_m2 must put some scatterer on the seabed"):
+    with pytest.raises(
+        ValueError, match="density_m2 must put at least one scatterer on the seabed"
+    ):
         Seabed(**GOOD, density_m2=1e-6).points  # noqa: B018
 
 

@@ -79,7 +79,7 @@ def test_without_element_patterns_elements_have_no_sizes():
     sized = replace(SMOOTH, tx_length_m=0.015, rx_length_m=0.015, rx_height_m=0.01)
     without = simulate(sized, TRACK, SCENE, element_pattern=False)
     assert np.array_equal(without.samples, simulate(SMOOTH, TRACK, SCENE).samples)
-    with pytest.raises(ValueError, match="nothing to act on: element_pattern is off"):
+    with pytest.raises(ValueError, match="must be left out: element_pattern is off"):
         simulate(sized, TRACK, SCENE, element_pattern=False, pointing=Pointing.squint(0.1))
     for name in ("element_pattern", "phase_centres"):
         with pytest.raises(TypeError, match=f"{name} must be of type bool"):
@@ -451,7 +451,7 @@ def test_result_does_not_depend_on_threads_or_groups(monkeypatch):
 
 def test_a_seabed_behind_the_sonar_is_silent():
     track = Track([[0, 80, 10.0]], [0.0])
-    with pytest.warns(ClsasWarning, match="no echo falls within the receive window"):
+    with pytest.warns(ClsasWarning, match="no echo arrives within the receive window"):
         assert not simulate(NARROW, track, box_on_sand()).samples.any()
 
 
@@ -598,7 +598,7 @@ def test_points_outside_a_line_give_it_nothing():
         ({"range_m": (0, 1e12)}, ValueError, r"range_m must ask for at most .* GiB, .* got .* GiB"),
         ({"range_m": (0, 1e308)}, ValueError, "range_m must ask for at most .* got inf GiB"),
         ({"workers": 0}, ValueError, "workers must be at least 1, got 0"),
-        ({"pointing": Pointing.squint(0.1)}, ValueError, "pointing has nothing to act on"),
+        ({"pointing": Pointing.squint(0.1)}, ValueError, "pointing must be left out"),
     ],
 )
 def test_bad_arguments(arguments, error, message):
@@ -622,12 +622,12 @@ def test_platform_faster_than_sound():
 
 
 def test_nothing_in_the_window():
-    with pytest.warns(ClsasWarning, match="no echo falls within the receive window"):
+    with pytest.warns(ClsasWarning, match="no echo arrives within the receive window"):
         echoes = simulate(SMOOTH, TRACK, SCENE, range_m=(100, 110))
     assert not echoes.samples.any()
     with (
         pytest.warns(ClsasWarning),
-        pytest.raises(ValueError, match="snr_db needs an echo to refer to"),
+        pytest.raises(ValueError, match="snr_db must be left out without an echo"),
     ):
         simulate(SMOOTH, TRACK, SCENE, range_m=(100, 110), snr_db=10)
 
