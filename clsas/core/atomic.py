@@ -51,8 +51,8 @@ def replacing(path: str | os.PathLike) -> Iterator[Path]:
         before = path.stat()
     with _temporary(path, _make_file) as (temporary, descriptor):
         if before is not None:
-            # Done while the file is still empty, so that nobody reads it who must not. The writer
-            # must be able to open it.
+            # Done while the file is still empty, so that no other user can read its contents in the
+            # meantime. The writer must be able to open it.
             _own_as(descriptor, before)
             os.fchmod(descriptor, stat.S_IMODE(before.st_mode) | stat.S_IWUSR)
         yield temporary

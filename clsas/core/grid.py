@@ -274,7 +274,7 @@ class Grid:
         Raises
         ------
         ValueError
-            If the grid holds arbitrary points.
+            If the grid consists of arbitrary points.
         """
         if self.origin_m is None or self.row_step_m is None or self.column_step_m is None:
             raise ValueError("grid must be a plane or height map to have steps, got points")
@@ -313,7 +313,7 @@ class Grid:
         Raises
         ------
         ValueError
-            If the grid holds arbitrary points.
+            If the grid consists of arbitrary points.
         """
         if self.points_m is not None:
             raise ValueError("grid must be a plane or height map to have axes, got points")

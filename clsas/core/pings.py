@@ -1,6 +1,6 @@
 """Pings: which channels were received from one transmission, and whether the platform moved.
 
-Range lines hold positions but no times, so pings follow from the positions. Consecutive channels
+Range lines have positions but no times, so pings follow from the positions. Consecutive channels
 with one transmitter position are a ping (`ping_starts`). A platform that stands still transmits
 several times from one position. Where that matters, `transmission_starts` also begins a ping where
 the first receiver's position comes again, and `Transmissions` describes the pings found in this

@@ -107,7 +107,7 @@ def from_phase_history(
     samples = validate.array("samples", samples, np.complex64, (None, None))
     channels, count = samples.shape
     if count < 2:
-        raise ValueError(f"samples must hold at least 2 frequencies, got {count}")
+        raise ValueError(f"samples must have at least 2 frequencies, got {count}")
     try:
         sign = validate.one_of("sign", sign, (-1, 1))
     except ValueError:

@@ -299,7 +299,7 @@ class BeamWindow:
         Raises
         ------
         TypeError, ValueError
-            If `q` does not hold finite real numbers, or the wavelength is not positive.
+            If `q` does not consist of finite real numbers, or the wavelength is not positive.
         """
         q = validate.array("q", q, np.float64, None)
         wavelength_m = _positive_or_infinite(wavelength_m)

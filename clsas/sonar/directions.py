@@ -86,7 +86,7 @@ def _tangents(centres_m: NDArray[np.float64], pings: int) -> NDArray[np.float64]
     powers = np.vander(np.arange(-half, half + 1), min(3, window - 1) + 1, increasing=True)
     fit = np.linalg.pinv(powers.astype(np.float64))  # coefficients of the cubic, from positions
     tangents = correlate1d(centres_m, fit[1], axis=0)
-    # The first and the last cubic also serve the pings before and after their middle.
+    # The first and the last cubic are also used for the pings before and after their middle.
     orders = np.arange(powers.shape[1])
     slopes = orders[1:] * np.vander(np.arange(-half, half + 1), len(orders) - 1, increasing=True)
     tangents[: half + 1] = slopes[: half + 1] @ (fit @ centres_m[:window])[1:]

@@ -41,7 +41,8 @@ it saves less time than it takes."""
 
 _POINTS = 5  # sample points along either side of the grid, to which all antennas are fitted
 _CHECKED_POINTS = 20  # sample points along either side, at which some channels are checked first
-# Channels checked first, spread evenly, besides the one with the widest separation and the fastest.
+# Evenly spread channels that are checked first, together with the ends of the track, the widest
+# separation and the fastest receiver.
 _CHECKED_CHANNELS = 32
 # Least range over the spacing of sample points. At closer range, ranges bend between the points.
 _LEAST_STEPS = 2.0

@@ -162,7 +162,7 @@ def test_arrays_are_read_only():
         for name in ("origin_m", "row_step_m", "column_step_m", "height_m", "points_m"):
             value = getattr(grid, name)
             assert value is None or not value.flags.writeable
-        grid.positions_m()[...] = 0  # a result is the caller's own
+        grid.positions_m()[...] = 0  # results may be changed by the caller
 
 
 ZERO, ONE, TWO = [0.0, 0, 0], [1.0, 0, 0], [2.0, 0, 0]

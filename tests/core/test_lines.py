@@ -59,7 +59,7 @@ def test_it_cannot_be_changed():
         lines.samples[0, 0] = 0
     with pytest.raises(dataclasses.FrozenInstanceError):
         lines.carrier_hz = 1.0
-    samples[0, 0] = 2  # the caller's own array stays the caller's
+    samples[0, 0] = 2  # the caller's array stays writeable
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""Ends of lines that do not fade, in images of both imagers."""
+"""Lines whose ends do not fade, in exact and factorized images."""
 
 import dataclasses
 import math

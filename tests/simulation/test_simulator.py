@@ -66,7 +66,7 @@ def test_antennas_at_phase_centres_are_those_of_a_monostatic_sonar():
 
 
 def test_a_seabed_looks_the_same_from_phase_centres():
-    """From the middle between antennas nothing else is lit or in shadow; ranges differ a little."""
+    """The same points are lit from the middle between antennas; ranges differ a little."""
     options = {"range_m": (25, 45)}
     apart, together = (
         simulate(SMOOTH, TRACK, box_on_sand(), phase_centres=on, **options) for on in (False, True)
@@ -107,7 +107,7 @@ def test_rectangular_chirp_through_the_receivers_filter(rate):
     expected = np.exp(2j * np.pi * f * (t[:, None] - tau)) @ spectrum * step
     expected *= 1j * np.exp(-2j * np.pi * CARRIER * tau)
     assert db(echoes.samples[0] - expected) < -100
-    # The filter is no small thing here: the plain rectangular pulse is far from it.
+    # The filter matters here: the echo differs strongly from a rectangular pulse.
     assert db(echoes.samples[0] - closed_form(echoes, PointTargets([[0.1, 30, 0]], [1j]))) > -30
 
 
@@ -208,7 +208,7 @@ def test_element_patterns_against_a_direct_sum(sizes, pointing):
 
 
 def test_patterns_are_frequency_dependent():
-    """At the null of the carrier the edges of the band still come through."""
+    """In the direction of the carrier's null, the edges of the band still pass."""
     sonar = replace(SMOOTH, rx_m=[[0, 0, 0]], rx_length_m=0.15)
     angle = np.arcsin(C / CARRIER / 0.15 * 5)
     scene = PointTargets([[40 * np.sin(angle), 40 * np.cos(angle), 0]])
@@ -238,7 +238,7 @@ def test_pointing_moves_the_beam():
 
 
 def test_window_given_cuts_and_never_wraps():
-    """Echoes that begin before, end after, lie beside: the window holds what lies in it."""
+    """Echoes begin before, end after or lie outside the window, which keeps its part."""
     near, far = 39.0, 40.0
     scene = PointTargets([[0, r, 0] for r in (1.0, 38.5, 39.2, 39.9, 40.3, 41.5, 500.0)])
     track = Track([[0, 0, 0]], [0.0])
@@ -265,7 +265,7 @@ def test_automatic_window_holds_every_echo():
 
 
 def test_rectangular_chirp_never_wraps():
-    """Its spectrum fills the whole band, so this is where ringing could come round."""
+    """The spectrum of the chirp fills the whole band, so that ringing could wrap around."""
     sonar = Sonar(Pulse(CARRIER, 100e3, 1e-3), [[0, 0, 0]])
     track = Track([[0, 0, 0]], [0.0])
     scene = PointTargets([[0, 40, 0]])
@@ -365,7 +365,7 @@ def box_on_sand(**others):
     ],
 )
 def test_a_seabed_sounds_like_its_points_that_are_seen(sonar, options):
-    """Ping by ping they are the point targets, and right to a third of the floor."""
+    """In every ping the echoes are those of the visible points, to a third of the floor."""
     seabed = box_on_sand(floor_db=-60)
     echoes = simulate(sonar, SWATH, seabed, **options)
     for ping in range(SWATH.pings):
@@ -422,7 +422,7 @@ def test_echoes_of_several_parts_add():
     noisy = simulate(NARROW, SWATH, (seabed, targets), **limits, snr_db=20.0).samples
     ratio = np.abs(both).max() ** 2 / np.mean(np.abs(noisy - both) ** 2)
     assert 10 * np.log10(ratio) == pytest.approx(20, abs=0.3)
-    # In single precision or not, a part is summed by its own error only.
+    # The accuracy of a part's sum depends only on that part's own error.
     alone = simulate(NARROW, SWATH, targets, **limits).samples
     np.testing.assert_array_equal(alone, simulate(NARROW, SWATH, (targets,), **limits).samples)
 
