@@ -292,7 +292,7 @@ def test_relative_error_is_of_one_place():
         (Grid.plane((1e6, 1e6 + 1, 40), (1, 0, 30)), "1"),
         (grid.with_height(np.full(grid.shape, 2.0)), "2"),
     ):
-        with pytest.raises(ValueError, match=f"image and ref.* one grid, got .* to {apart} m apa"):
+        with pytest.raises(ValueError, match=f"image and ref.* one grid, got .* by up to {apart} m"):
             relative_error_db(image, Image(pixels, other))
 
 
