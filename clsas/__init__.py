@@ -15,7 +15,6 @@ if TYPE_CHECKING:
     from clsas.core.validate import ClsasWarning
     from clsas.exact.backprojection import backproject
     from clsas.exact.wavenumber import wavenumber
-    from clsas.factorized.plan import Plan
     from clsas.files.airsas import read_airsas
     from clsas.files.cphd import read_cphd
     from clsas.files.cphd_writing import write_cphd
@@ -38,7 +37,9 @@ if TYPE_CHECKING:
     from clsas.navigation.micronavigation import Micronavigation, micronavigate
     from clsas.opencl.device import DeviceError, list_devices
     from clsas.planning.factorize import factorize
+    from clsas.planning.imager import Imager
     from clsas.planning.planner import plan
+    from clsas.plans.plan import Plan
     from clsas.processing.chain import Processed, process
     from clsas.signal.compression import compress
     from clsas.signal.echoes import Echoes
@@ -67,6 +68,7 @@ __all__ = [
     "Finding",
     "Grid",
     "Image",
+    "Imager",
     "Inspection",
     "Micronavigation",
     "Mosaic",
@@ -129,7 +131,7 @@ _MODULES = {
     "core.validate": "ClsasWarning",
     "exact.backprojection": "backproject",
     "exact.wavenumber": "wavenumber",
-    "factorized.plan": "Plan",
+    "plans.plan": "Plan",
     "files.airsas": "read_airsas",
     "files.cphd": "read_cphd",
     "files.cphd_writing": "write_cphd",
@@ -152,6 +154,7 @@ _MODULES = {
     "navigation.micronavigation": "Micronavigation micronavigate",
     "opencl.device": "DeviceError list_devices",
     "planning.factorize": "factorize",
+    "planning.imager": "Imager",
     "planning.planner": "plan",
     "processing.chain": "Processed process",
     "signal.compression": "compress",

@@ -218,3 +218,21 @@ def lattice(seabed):
     rows, columns = seabed.heights_m.shape
     x, y = np.meshgrid(np.linspace(*seabed.x_m, columns), np.linspace(*seabed.y_m, rows))
     return np.stack([x, y, seabed.heights_m], axis=-1)
+
+
+def bright_where_coverage_ends(x_m, *, seabed=0):
+    """Echoes of points about x_m and of a seabed; beyond 3 m only the track's end sees them."""
+    random = np.random.default_rng(7)
+    track, cycles_per_m, step_m = along_x(300, 0.02), 2 * 30e3 / 1500, 0.06
+    near = random.uniform([x_m - 0.3, 8.3, 0], [x_m + 0.3, 10.7, 0], (40, 3))
+    anywhere = random.uniform([-6, 8, 0], [6, 11, 0], (seabed, 3))
+    amplitude = random.normal(size=(40 + seabed, 2)) @ [1, 1j]
+    amplitude[40:] *= 0.1
+    points_m = np.concatenate([near, anywhere])
+    range_m = np.linalg.norm(points_m - track[:, None], axis=2)
+    amplitude = amplitude * np.exp(-2j * np.pi * (cycles_per_m * range_m % 1))
+    at_m = 4.0 + step_m * np.arange(200)
+    away = (at_m[:, None, None] - range_m) * 10
+    samples = np.einsum("rcp,cp->cr", np.sinc(away) * np.exp(-(away**2) / 128), amplitude)
+    grid = Grid.plane((-6, 6, 640), (8, 11, 160))
+    return RangeLines(samples, 4.0, step_m, track, track, 30e3, 1500.0), grid

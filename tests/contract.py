@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from functools import cache
 
 from cases import along_x, bistatic, moving, oriented, points
-from factorizing import EXACT_IS_SLOW, bistatic_array, swaying
+from factorizing import EXACT_IS_SLOW, bistatic_array, changed, swaying
 
 from clsas import backproject, factorize, mosaic, plan, wavenumber
 from clsas.core.grid import Grid
@@ -110,7 +110,7 @@ def planned(scene, tolerance_db, half=False):
     )
     if chosen.is_exact:
         return chosen
-    return chosen.changed(half_precision=half and chosen.factorization.upsampler is not None)
+    return changed(chosen, half_precision=half and chosen.factorization.upsampler is not None)
 
 
 def _factorizer(tolerance_db, half):

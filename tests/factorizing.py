@@ -157,3 +157,9 @@ def peak_device_bytes(monkeypatch, run, image_shape):
     monkeypatch.setattr(device, "share", shared)
     run()
     return peak[0]
+
+
+def changed(chosen, **fields):
+    """A plan with other values of some fields of its method."""
+    method = dataclasses.replace(chosen.method, **fields)
+    return dataclasses.replace(chosen, method=method)

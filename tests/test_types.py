@@ -1,4 +1,4 @@
-"""What type checkers see: the README's own code, and constructors that take array-likes."""
+"""Type checkers accept the code of the README and the tour, and array-likes in constructors."""
 
 import ast
 import inspect
@@ -22,9 +22,10 @@ ROOT = Path(__file__).parents[1]
 
 
 @pytest.mark.slow
-def test_the_readme_passes_mypy(tmp_path, monkeypatch):
+def test_the_readme_and_the_tour_pass_mypy(tmp_path, monkeypatch):
     api = pytest.importorskip("mypy.api")
-    snippets = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
+    text = "".join(path.read_text() for path in (ROOT / "README.md", ROOT / "docs" / "tour.md"))
+    snippets = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
     assert len(snippets) > 2
     program = tmp_path / "readme.py"
     program.write_text("\n".join(snippets))

@@ -81,11 +81,11 @@ EVERY_VARIANT = {
     ),
     "test_beam.py::test_a_window_open_on_all_sides_changes_nothing": (),
     # Stages and leaves, in single and in half precision, with filters of each length.
-    "test_run.py::test_the_error_is_what_was_asked_for": ("--20", "--60"),
-    "test_run.py::test_pixels_much_coarser_than_the_resolution": ("--40",),
-    "test_run.py::test_half_precision_adds_what_is_predicted": EVERY_CASE,
-    "test_run.py::test_a_plan_serves_another_device": EVERY_CASE,
-    "test_run.py::test_overlapping_pings_of_a_swaying_array": ("--45-beam", "beam--45"),
+    "test_stages.py::test_the_error_is_what_was_asked_for": ("--20", "--60"),
+    "test_stages.py::test_pixels_much_coarser_than_the_resolution": ("--40",),
+    "test_stages.py::test_half_precision_adds_what_is_predicted": EVERY_CASE,
+    "test_stages.py::test_a_plan_serves_another_device": EVERY_CASE,
+    "test_stages.py::test_overlapping_pings_of_a_swaying_array": ("--45-beam", "beam--45"),
     # All of them read buffers that are padded to whole vectors.
     "test_unused_memory.py::test_what_unused_memory_holds_does_not_matter": (
         "exact--80", "factorized", "plane-half",

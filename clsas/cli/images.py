@@ -29,11 +29,11 @@ from clsas.core import validate
 from clsas.core.image import holds_any
 from clsas.exact.backprojection import prepare
 from clsas.exact.run import execute
-from clsas.factorized.factorization import ExactImage
 from clsas.files.scene_tables import PLAN_KEYS
 from clsas.measures.tradeoff import summary
 from clsas.opencl.device import Device, KernelTimes, open_device
 from clsas.planning.planner import WORST_TOLERANCE_DB
+from clsas.plans.factorization import UNREACHED, ExactImage
 from clsas.signal.interpolation import MOST_UPSAMPLING, TAPS
 
 _BUILD_SHARE = 0.1  # of an image's time, from which building kernels is reported
@@ -220,11 +220,11 @@ def _exactly(
 ) -> _Formed:
     """Form an exact image as requested, or because a plan chose it."""
     why, warned = "", False
-    if chosen is not None and isinstance(chosen.image, ExactImage):
-        request = {"accuracy_db": chosen.image.accuracy_db}
+    if chosen is not None and isinstance(chosen.method, ExactImage):
+        request = {"accuracy_db": chosen.method.accuracy_db}
         if chosen.tolerance_db is not None:
             why = f"exact: nothing faster within {chosen.tolerance_db:.4g} dB; "
-        warned = chosen.kept["warned"]
+        warned = chosen.method.reason == UNREACHED
     preparation = prepare(lines, grid, device=device, beam=beam, **request)
     if chosen is None:  # otherwise the plan has warned
         preparation.warn_of_ambiguity()

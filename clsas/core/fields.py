@@ -104,7 +104,8 @@ def explained(error: ValidationError, values: Any) -> str:
         return f"{where}: {mistake['msg'].removeprefix('Value error, ')}"
     given, allowed = mistake["input"], mistake["msg"].removeprefix("Input should be ")
     if mistake["type"].startswith("union_tag"):
-        where, given = f"{where}.method", dict(given).get("method")
+        key = mistake["ctx"]["discriminator"].strip("'")
+        where, given = f"{where}.{key}", dict(given).get(key)
         allowed = mistake["ctx"].get("expected_tags", "given")
     elif given != given:
         allowed = "a number"

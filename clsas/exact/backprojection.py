@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+from clsas.core.decibels import power
 from clsas.core.grid import Grid
 from clsas.core.image import Image
 from clsas.core.lines import RangeLines
@@ -14,7 +15,7 @@ from clsas.exact.preparation import Preparation
 from clsas.exact.run import execute
 from clsas.opencl.device import Device, open_device
 from clsas.signal.ambiguity import BEST_DB, ambiguity
-from clsas.signal.spectrum import line_energy, measure_spectrum
+from clsas.signal.spectrum import OUTSIDE, line_energy, measure_spectrum, occupied_band
 from clsas.sonar.beam import BeamWindow
 from clsas.sonar.coverage import reaches
 from clsas.sonar.simplify import simplify
@@ -203,6 +204,7 @@ def prepare(
         left_out=model.left_out,
         left_out_error=model.error,
         is_reached=is_reached,
+        band=occupied_band(spectrum, OUTSIDE * power(accuracy_db)),
     )
 
 

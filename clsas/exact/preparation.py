@@ -54,6 +54,8 @@ class Preparation:
     is_reached : bool
         False if no line reaches any pixel. The image is then zero, and `layout` is that of a single
         pixel.
+    band : (centre, half width)
+        Band for which the interpolation is made, cycles per sample.
     """
 
     device: Device
@@ -72,6 +74,7 @@ class Preparation:
     left_out: tuple[str, ...] = ()
     left_out_error: float = 0.0
     is_reached: bool = True
+    band: tuple[float, float] = (0.0, 0.5)
 
     @property
     def predicted_error_db(self) -> float:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -16,6 +16,8 @@ from clsas.core.image import Image, holds_any
 from clsas.core.lines import RangeLines
 from clsas.exact.blocks import band_parts, blocks_of
 from clsas.exact.buffers import block_buffers, is_bistatic, part_buffers
+from clsas.exact.checks import check_numbers
+from clsas.exact.kept import Kept
 from clsas.exact.lookup import lookup_options
 from clsas.exact.preparation import Preparation
 from clsas.exact.references import geometry_rows, references_of
@@ -37,6 +39,7 @@ from clsas.sonar.coverage import warn_unreached
 from clsas.sonar.visibility import BeamTrack
 
 _SINE_ROUNDING = 1e-5  # upper bound on the device's rounding error of a sine
+_MOST_KEPT_BYTES = 256 << 20  # of references that are kept: more than 20 million of 12 bytes each
 
 
 def execute(
@@ -45,49 +48,83 @@ def execute(
     progress: Callable[[int, int], None] | None = None,
     warned: bool = False,
 ) -> Image:
-    """Return the image that was prepared.
+    """Return the one image that was prepared; see `ExactImager`."""
+    imager = ExactImager(preparation, warned=warned, most_kept_bytes=0)
+    return imager.form(preparation.lines, progress)
 
-    The image is formed band by band, each band from blocks of channels, and each block in jobs for
-    some of the parts. The host prepares a job while the device runs the one before. With a beam, it
-    only prepares pairs of parts and channels that the beam connects.
+
+class ExactImager:
+    """Imager that forms exact images of any samples of the lines for which it was prepared.
 
     Parameters
     ----------
     preparation : Preparation
-    progress : callable, optional
-        Called as progress(pairs done, pairs).
     warned : bool
         True if the user has already been warned that no line contributes to the image.
+    most_kept_bytes : int
+        Largest memory of the references that are kept for the next image.
     """
-    validate.progress(progress)
-    p = preparation
-    layout, device, grid = p.layout, p.device, p.given_grid or p.grid
-    if not p.is_reached:
-        if not warned:
-            warn_unreached(p.lines, grid, p.beam, p.along)
-        return Image(np.zeros(grid.shape, np.complex64), grid)
-    pixels = np.empty(layout.parts * layout.part_pixels, np.complex64)
-    normalise = p.beam is not None and p.beam.normalise
-    try:
-        run = _Run(p, progress)
-        at_once = band_parts(device, layout.part_pixels, layout.across, normalise)
-        for band in slices(slice(0, layout.parts), at_once):
-            part = slice(band.start * layout.part_pixels, band.stop * layout.part_pixels)
-            buffers = pixel_buffers(part.stop - part.start, p.beam)
-            on_device = {name: device.zeros(buffer.nbytes) for name, buffer in buffers.items()}
-            for channels in slices(slice(0, p.lines.channels), run.blocks.channels_at_once):
-                run.add(channels, band, on_device)
-            cl.enqueue_copy(device.queue, pixels[part], on_device["pixels"])
-            if normalise:
-                sums = np.empty_like(pixels[part])
-                cl.enqueue_copy(device.queue, sums, on_device["weight_sums"])
-                pixels[part] *= normalising(sums.real, p.lines.channels)
-    finally:
-        device.finish()  # an interrupted run leaves nothing in use
-    image = Image(layout.collect(pixels), grid)
-    if not warned and not holds_any(image.pixels):
-        warn_unreached(p.lines, grid, p.beam, p.along)
-    return image
+
+    def __init__(
+        self,
+        preparation: Preparation,
+        *,
+        warned: bool = False,
+        most_kept_bytes: int = _MOST_KEPT_BYTES,
+    ) -> None:
+        self.preparation, self._warned = preparation, warned
+        self._kept = Kept(most_kept_bytes)
+
+    def form(self, lines: RangeLines, progress: Callable[[int, int], None] | None = None) -> Image:
+        """Return the image of lines of the same geometry.
+
+        The image is formed band by band, each band from blocks of channels, and each block in jobs
+        for some of the parts. The host prepares a job while the device runs the one before. With a
+        beam, it only prepares pairs of parts and channels that the beam connects.
+
+        Parameters
+        ----------
+        lines : RangeLines
+        progress : callable, optional
+            Called as progress(pairs done, pairs).
+        """
+        validate.progress(progress)
+        p = self.preparation
+        if lines.samples is not p.lines.samples:
+            check_numbers(lines, p.beam)
+            p = replace(p, lines=replace(p.lines, samples=lines.samples))
+        layout, device, grid = p.layout, p.device, p.given_grid or p.grid
+        if not p.is_reached:
+            self._warn_unreached()
+            return Image(np.zeros(grid.shape, np.complex64), grid)
+        pixels = np.empty(layout.parts * layout.part_pixels, np.complex64)
+        normalise = p.beam is not None and p.beam.normalise
+        try:
+            run = _Run(p, self._kept, progress)
+            at_once = band_parts(device, layout.part_pixels, layout.across, normalise)
+            for band in slices(slice(0, layout.parts), at_once):
+                part = slice(band.start * layout.part_pixels, band.stop * layout.part_pixels)
+                buffers = pixel_buffers(part.stop - part.start, p.beam)
+                on_device = {name: device.zeros(buffer.nbytes) for name, buffer in buffers.items()}
+                for channels in slices(slice(0, p.lines.channels), run.blocks.channels_at_once):
+                    run.add(channels, band, on_device)
+                cl.enqueue_copy(device.queue, pixels[part], on_device["pixels"])
+                if normalise:
+                    sums = np.empty_like(pixels[part])
+                    cl.enqueue_copy(device.queue, sums, on_device["weight_sums"])
+                    pixels[part] *= normalising(sums.real, p.lines.channels)
+        finally:
+            device.finish()  # an interrupted run leaves nothing in use
+        image = Image(layout.collect(pixels), grid)
+        if not holds_any(image.pixels):
+            self._warn_unreached()
+        return image
+
+    def _warn_unreached(self) -> None:
+        """Warn once that no line contributes to the image."""
+        if not self._warned:
+            self._warned, p = True, self.preparation
+            warn_unreached(p.lines, p.given_grid or p.grid, p.beam, p.along)
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,9 +160,13 @@ class _Run:
     """Running image: its preparation, kernels and buffers, and the number of pairs done."""
 
     def __init__(
-        self, preparation: Preparation, progress: Callable[[int, int], None] | None
+        self,
+        preparation: Preparation,
+        kept: Kept,
+        progress: Callable[[int, int], None] | None,
     ) -> None:
         p = self.p = preparation
+        self.kept = kept
         self.tiled = isinstance(p.layout, Tiles)
         self.bistatic = is_bistatic(p.lines)
         self.origin_m = p.layout.centres_m(slice(0, 1))[0]
@@ -174,23 +215,21 @@ class _Run:
     def add(self, channels: slice, band: slice, pixels: dict[str, Any]) -> None:
         """Add some channels to the pixels of a band of parts, and to the sums of their weights."""
         count = channels.stop - channels.start
-        ranges = self._ranges(channels, band)
+        key = channels.start, channels.stop, band.start, band.stop
+        ranges = self.kept.get(key, lambda: {"ranges": self._ranges(channels, band)})["ranges"]
         visible = ranges[:, 1] > ranges[:, 0]
         if not visible.any():
             self._report((band.stop - band.start) * count)
             return
         # Lines that no part needs are left out.
         first, end = int(ranges[visible].min()), int(ranges[visible].max())
-        ranges[visible] -= first
-        lines, geometry, line_slot = self._upload_lines(
-            slice(channels.start + first, channels.start + end)
-        )
+        ranges = np.where(visible[:, None], ranges - np.int32(first), ranges)
+        some = slice(channels.start + first, channels.start + end)
+        lines, geometry, line_slot = self._upload_lines(some)
         for parts in slices(band, self.blocks.parts_at_once):
             of_parts = ranges[parts.start - band.start : parts.stop - band.start]
             if of_parts.any():
-                job = self._job(
-                    lines, geometry, line_slot, parts, of_parts, parts.start - band.start
-                )
+                job = self._job(lines, some, geometry, line_slot, parts, of_parts, band)
                 job.slot.busy = line_slot.busy = self._launch(job, pixels)
                 self.p.device.queue.flush()
             self._report((parts.stop - parts.start) * count)
@@ -228,11 +267,12 @@ class _Run:
     def _job(
         self,
         lines: RangeLines,
+        channels: slice,
         geometry: dict[str, Any],
         line_slot: Slot,
         parts: slice,
         ranges: NDArray[np.int32],
-        first_part: int,
+        band: slice,
     ) -> _Job:
         """Start copying the centres, ranges and references of some parts to the device."""
         slot = next(self.part_slots)
@@ -243,7 +283,10 @@ class _Run:
         centres_m = layout.centres_m(parts)
         slot.fill("centres", float_pairs(centres_m - self.origin_m))
         slot.fill("ranges", np.column_stack([ranges, ranges[:, 0]]))
-        references = references_of(centres_m, lines, ranges, self.p.resampling, self.blocks)
+        references = self.kept.get(
+            (channels.start, channels.stop, parts.start, parts.stop, band.start, band.stop),
+            lambda: references_of(centres_m, lines, ranges, self.p.resampling, self.blocks),
+        )
         for name, values in references.items():
             slot.fill(name, values)
         return _Job(
@@ -256,7 +299,7 @@ class _Run:
                 "channel_pitch": references["sample"].shape[1],
             },
             parts,
-            first_part,
+            parts.start - band.start,
         )
 
     def _launch(self, job: _Job, pixels: dict[str, Any]) -> cl.Event:

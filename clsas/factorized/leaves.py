@@ -18,7 +18,7 @@ from clsas.exact.groups import Groups
 from clsas.exact.lookup import lookup_options
 from clsas.exact.tiles import Tiles
 from clsas.factorized.buffers import Level, leaf_tables
-from clsas.factorized.sector import Geometry, Sector
+from clsas.factorized.sectors import Roots, Sector
 from clsas.opencl.buffers import (
     Slot,
     beam_table,
@@ -28,6 +28,7 @@ from clsas.opencl.buffers import (
     pixel_buffers,
 )
 from clsas.opencl.device import Device
+from clsas.plans.plan import Plan
 from clsas.sonar.beam import INTERVALS
 from clsas.sonar.visibility import sines
 
@@ -46,15 +47,18 @@ class Leaves:
     def __init__(
         self,
         lines: RangeLines,
-        geometry: Geometry,
+        roots: Roots,
+        plan: Plan,
         level: Level,
         device: Device,
         image: NDArray[np.complex64],
         half_precision: bool,
         gain: float,
     ) -> None:
-        self.lines, self.geometry, self.level, self.device = lines, geometry, level, device
-        self.plan, self.factorization = geometry.plan, geometry.factorization
+        geometry = roots.geometry
+        self.lines, self.roots, self.geometry = lines, roots, geometry
+        self.level, self.device, self.plan = level, device, plan
+        self.factorization = geometry.factorization
         self.surface, self.width = geometry.surface, device.info.width
         beam = geometry.beam
         self.normalise = beam is not None and beam.normalise
@@ -77,22 +81,25 @@ class Leaves:
 
     def _options(self, layout: Tiles | Groups) -> dict[str, int]:
         """Return the kernels' build options."""
-        chosen, taps, one_cubic = self.plan, self.factorization.final.taps, False
-        if chosen.beam is not None and self.geometry.along is not None:
+        taps, one_cubic = self.factorization.final.taps, False
+        beam, along, nearest_m = (
+            self.geometry.beam, self.geometry.along, self.geometry.nearest_m,
+        )  # fmt: skip
+        if beam is not None and along is not None and nearest_m is not None:
             radius_m = self.surface.radius_m(self.geometry.division.sides[0])
-            nearest_m = max(self.geometry.nearest_m - radius_m, 1e-6)
+            nearest_m = max(nearest_m - radius_m, 1e-6)
             wave_m, track = wavelength_m(self.lines), self.geometry.track
             on_track = track.on_track
             centres_m = self.geometry.division.centres_m(0, self.geometry.division.roots)
-            sine = sines(centres_m, track.sampled_m[0][on_track], self.geometry.along[on_track])
-            error = layout.one_cubic_error(chosen.beam, nearest_m, wave_m)
-            error /= chosen.beam.fullness(sine, wave_m, on_track.sum() / self.lines.channels)
-            allowed_db = min(chosen.predicted_error_db, chosen.tolerance_db or 0.0)
+            sine = sines(centres_m, track.sampled_m[0][on_track], along[on_track])
+            error = layout.one_cubic_error(beam, nearest_m, wave_m)
+            error /= beam.fullness(sine, wave_m, on_track.sum() / self.lines.channels)
+            allowed_db = min(self.plan.predicted_error_db, self.plan.tolerance_db or 0.0)
             one_cubic = error**2 < _SHARE * power(allowed_db)
         return {
             "WIDTH": self.width,
             "TAPS": taps,
-            "BEAM": 0 if chosen.beam is None else INTERVALS,
+            "BEAM": 0 if beam is None else INTERVALS,
             "ONE_CUBIC": int(one_cubic),
             "NORMALISE": int(self.normalise),
             "OVERWRITE": 1,
@@ -114,7 +121,7 @@ class Leaves:
             values["represented"] = represented(sector, self.geometry.track).reshape(1, -1)
         parts = values["ranges"].size // 3
         points = values["offsets"].shape[1] if "offsets" in values else None
-        tables = leaf_tables(len(rows[0]), parts, points, self.plan.beam)
+        tables = leaf_tables(len(rows[0]), parts, points, self.geometry.beam)
         for name, buffer in tables.items():
             slot.fill(name, buffer.holding(values[name]))
 
@@ -160,7 +167,7 @@ class Leaves:
 
     def _pixels(self, tables: Slot, count: int) -> dict[str, Any]:
         """Return the arguments of kernels that form some pixels."""
-        found = self.slot.make(pixel_buffers(count, self.plan.beam))
+        found = self.slot.make(pixel_buffers(count, self.geometry.beam))
         if self.normalise and self.aligned:
             found["represented"] = tables["represented"]
         return found

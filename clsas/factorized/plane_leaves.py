@@ -13,7 +13,7 @@ from clsas.core.geometry import bistatic_range_m
 from clsas.exact.tiles import Tiles, item_pixels
 from clsas.factorized.buffers import tile_buffers
 from clsas.factorized.leaves import Finish, Leaves
-from clsas.factorized.sector import Sector
+from clsas.factorized.sectors import Sector
 from clsas.factorized.tree import Division
 from clsas.opencl.buffers import VECTOR_ROOM, Slot, channel_pitch, expansion_kernel, float_pairs
 from clsas.sonar.beam import normalising

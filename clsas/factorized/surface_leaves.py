@@ -6,10 +6,8 @@ import numpy as np
 import pyopencl as cl
 from numpy.typing import NDArray
 
-from clsas.exact.groups import groups_within
-from clsas.exact.tiles import BLOCKS
 from clsas.factorized.leaves import Finish, Leaves
-from clsas.factorized.sector import MOST_KEPT_BYTES, Sector
+from clsas.factorized.sectors import Sector
 from clsas.opencl.buffers import VECTOR_ROOM, Slot, float_pairs
 from clsas.sonar.beam import normalising
 
@@ -20,46 +18,14 @@ class SurfaceLeaves(Leaves):
     """Leaves off a plane, in groups of points about their centres."""
 
     def _prepare(self) -> None:
-        device, geometry = self.device, self.geometry
-        division = geometry.division
-        roots, last = geometry.roots, len(division.sides) - 1
-        corners = division.corners(last, roots)
-        key = "groups", self.width
-        if key in geometry.kept:
-            self.groups, self.leaf, held = geometry.kept[key]
-        else:
-            middles_m = division.centres_m(last, corners).reshape(-1, 3)
-            leaf, place = (each.ravel()[self.surface.cell] for each in self._cells(corners))
-            grid = self.surface.grid
-            self.groups, self.leaf = groups_within(grid, leaf, place, middles_m, self.width)
-            held = np.bincount(leaf // corners.shape[1], minlength=len(roots))
-            if self.groups.index.nbytes + self.groups.offset_m.nbytes <= MOST_KEPT_BYTES:
-                geometry.kept[key] = self.groups, self.leaf, held
-        self.number = {tuple(root): n for n, root in enumerate(roots)}
-        self.ends = np.searchsorted(self.leaf, np.arange(len(roots) + 1) * corners.shape[1])
-        self.pixels_before = np.concatenate([[0], np.cumsum(held)])
+        found = self.roots.groups(self.width)
+        self.groups, self.leaf, self.ends = found.groups, found.leaf, found.ends
+        self.pixels_before = found.pixels_before
+        self.number = {tuple(root): n for n, root in enumerate(self.geometry.roots)}
         options = self._options(self.groups)
-        self.backproject = device.kernel("backproject_points", **options)
+        self.backproject = self.device.kernel("backproject_points", **options)
 
-    def _cells(self, corners: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return the leaf of every cell, and the cell's number in it, [rows, columns] each.
-
-        Leaves are numbered in the order of their corners, [roots, leaves, 2], cells block by block.
-        """
-        side = self.geometry.division.sides[-1]
-        number = np.empty(corners.max(axis=(0, 1)) // side + 1, np.int64)
-        count = corners[..., 0].size
-        number[tuple(np.moveaxis(corners // side, -1, 0))] = np.arange(count).reshape(
-            corners.shape[:-1]
-        )
-        row, column = (np.arange(n) for n in self.surface.plane.shape)
-        height, width = BLOCKS[self.width]
-        down = row % side[0] // height * side[1] * height + row % height * width
-        across = column % side[1] // width * height * width + column % width
-        leaf = number[np.ix_(row // side[0], column // side[1])]
-        return leaf, down[:, None] + across
-
-    def _roots(self, sector: Sector, batch: slice = _ALL) -> slice:
+    def _numbers(self, sector: Sector, batch: slice = _ALL) -> slice:
         """Return the numbers of a sector's roots, or of some of these, among all roots."""
         first = self.number[tuple(sector.roots[0])]
         some = range(first, first + len(sector.roots))[batch]
@@ -70,7 +36,7 @@ class SurfaceLeaves(Leaves):
         return slice(int(self.ends[roots.start]), int(self.ends[roots.stop]))
 
     def _parts(self, sector: Sector) -> dict[str, NDArray]:
-        roots = self._roots(sector)
+        roots = self._numbers(sector)
         groups = self._groups(roots)
         root, leaf = np.divmod(self.leaf[groups], sector.relative_m[-1].shape[1])
         root -= roots.start
@@ -82,8 +48,8 @@ class SurfaceLeaves(Leaves):
 
     def form(self, tables: Slot, sector: Sector, batch: slice, samples: cl.Buffer) -> Finish:
         """Start forming the pixels of some roots; see `Leaves.form`."""
-        first = self._groups(self._roots(sector)).start
-        roots = self._roots(sector, batch)
+        first = self._groups(self._numbers(sector)).start
+        roots = self._numbers(sector, batch)
         groups = self._groups(roots)
         count, size = self.groups.index[groups].shape
         formed = [np.empty((count, size), np.complex64) for _ in range(1 + self.normalise)]
@@ -103,7 +69,7 @@ class SurfaceLeaves(Leaves):
                 geometry_pitch=sector.nodes[-1].coordinate.size + VECTOR_ROOM,
                 centres=tables["centres"],
                 offsets=tables["offsets"],
-                points=size * (self._groups(self._roots(sector)).stop - first),
+                points=size * (self._groups(self._numbers(sector)).stop - first),
                 samples_per_m=self.geometry.samples_per_m,
                 **self.arguments,
                 **pixels,
@@ -129,7 +95,7 @@ class SurfaceLeaves(Leaves):
 
     def blank(self, sector: Sector, batch: slice) -> Finish:
         """Return a function that sets pixels to 0; see `Leaves.blank`."""
-        return lambda: self._put(self._roots(sector, batch), np.complex64(0))
+        return lambda: self._put(self._numbers(sector, batch), np.complex64(0))
 
     def _put(self, roots: slice, pixels: NDArray[np.complex64] | np.complex64) -> int:
         """Set the pixels of some roots; return their number."""

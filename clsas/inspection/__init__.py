@@ -1,1 +1,1 @@
-"""Inspections: what a recording says about its own geometry, clocks and conventions."""
+"""Checks of a recording's track, samples and units before an image is formed."""

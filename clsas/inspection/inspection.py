@@ -1,8 +1,6 @@
-"""Inspection of a recording before it is imaged: its numbers, and what is wrong with it."""
+"""Inspection of a recording before an image is formed from it."""
 
 from __future__ import annotations
-
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,29 +8,17 @@ from numpy.typing import NDArray
 from clsas.core import validate
 from clsas.core.grid import Grid
 from clsas.core.lines import RangeLines
-from clsas.core.pings import Transmissions
-from clsas.core.wavelengths import wavelength_between_m
-from clsas.inspection.phase_sign import check_sign, phase_sign
-from clsas.inspection.range_checks import check_ranges
-from clsas.inspection.recording_checks import (
-    Levels,
-    check_background,
-    check_band,
-    check_ends,
-    check_levels,
-    check_offset,
-)
-from clsas.inspection.result import Inspection, PhaseSign
-from clsas.inspection.track_checks import check_spacing, check_track
+from clsas.inspection.checks import CHECKS
+from clsas.inspection.recording import Recording
+from clsas.inspection.result import Inspection
 from clsas.opencl.device import Device, open_device
 from clsas.signal.compression import compress
 from clsas.signal.echoes import Echoes
-from clsas.signal.spectrum import Spectrum, measure_spectrum
 from clsas.sonar.beam import BeamWindow
 from clsas.sonar.sampling import Finding
 
 _FARTHEST_M = 1e3 * validate.FARTHEST_M  # coordinates in mm are reported, not refused
-_SLOWEST_M_S = 1.0  # of sound in km/s, a slip that is to be shown
+_SLOWEST_M_S = 1.0  # accepts a sound speed in km/s, so that the checks can report the slip
 
 
 def inspect(
@@ -43,47 +29,68 @@ def inspect(
     beam: BeamWindow | None = None,
     element_length_m: float | None = None,
 ) -> Inspection:
-    """Say what a recording looks like and what is wrong with it, before an image is formed.
+    """Return the properties of a recording and its defects, before an image is formed.
 
     Parameters
     ----------
     lines : RangeLines or Echoes
-        The recording. Channels of echoes are looked at as they were recorded, the rest after
-        compression.
+        The recording. Echoes are compressed first, except to find dead and clipped channels.
     grid : Grid, optional
-        Grid of the image to come: its ranges are compared with those of the lines, and the spacing
-        of pings with what it needs.
+        Grid of the image to come. With it, ranges are compared with those of the lines, and the
+        spacing of pings with what the grid requires.
     device : Device, str or int, optional
-        Device that forms the patch that tells the sign of the phase. See
+        Device that forms small images to find the sign of the phase. See
         `clsas.opencl.device.choose`.
     beam : BeamWindow, optional
-        Beam of the image to come, for the spacing.
+        Beam of the image to come, for the limit of the spacing.
     element_length_m : float, optional
-        Length of the elements, metres, for the spacing: at most half of it.
+        Length of the elements in metres, for the limit of the spacing: half an element.
 
     Returns
     -------
     Inspection
-        `print(inspection.describe())` shows it.
+        Properties and findings; `describe` returns them as text.
 
     Raises
     ------
     TypeError, ValueError
-        If an argument is of the wrong kind or outside its limits.
+        If an argument has the wrong type or is out of bounds.
     DeviceError
-        If there is no such device.
+        If the device does not exist.
+
+    See Also
+    --------
+    check_sampling : Limits of the spacing of phase centres.
+    plot.inspection : Draw an inspection.
 
     Notes
     -----
-    "Look before you image" in the guide to recordings lists the names of findings, what each means,
-    and its limit.
+    "Look before you image" in the guide to recordings lists all findings with their limits.
 
-    Pings taken standing still are found first and left out: a halt of hundreds of equal pings
-    would hide the rest. Dead and clipped channels are told from what was recorded, ranges from
-    the lines as given; band, offset, background, ends, spacing and phase from the moving pings.
+    Pings taken standing still are found first, and left out when the band, constants, ends of
+    lines, spacing and sign of the phase are checked: a halt of hundreds of equal pings would hide
+    everything else. Dead and clipped channels are found in the samples as recorded, and ranges are
+    those of all lines.
 
-    Samples that are NaN or infinite never get here: `RangeLines` and `load` refuse them, and say
+    Samples that are NaN or infinite never get here: `RangeLines` and `load` refuse them, and report
     how many there are and where the first one is.
+
+    Examples
+    --------
+    Pings 20 mm apart, three of which were lost:
+
+    >>> import clsas
+    >>> import numpy as np
+    >>> tx_m = np.outer(np.delete(np.arange(12), [5, 6, 7]), [0.02, 0, 0])
+    >>> point = clsas.PointTargets([[0.1, 20.0, 0.0]], [1.0])
+    >>> lines = clsas.simulate_lines(
+    ...     tx_m, tx_m, point, carrier_hz=100e3, bandwidth_hz=20e3, window="hann"
+    ... )
+    >>> found = clsas.inspect(lines)
+    >>> found
+    Inspection(9 channels, 9 pings, monostatic, findings: gaps)
+    >>> print(found["gaps"].message)
+    the track has 1 gap, after ping 4. The widest is 80 mm; the limit there is 35 mm
     """
     validate.instance("lines", lines, RangeLines, Echoes)
     if grid is not None:
@@ -92,31 +99,12 @@ def inspect(
         validate.instance("beam", beam, BeamWindow)
     if element_length_m is not None:
         element_length_m = validate.positive("element_length_m", element_length_m, "m")
-    if device is not None:  # whether it is used or not; none is needed to look at the track
+    if device is not None:  # opened even if no patch is imaged, so that a wrong name is refused
         device = open_device(device)
-    # Compression would spread clipped samples over a line: levels are those of what was recorded.
-    recorded, is_echoes = lines.samples, isinstance(lines, Echoes)
     given = compress(lines) if isinstance(lines, Echoes) else lines
     _check_numbers(given)
-    # A halt weighs as much as all of a track: everything but levels and ranges is that of the
-    # moving pings.
-    pings = Transmissions.of(given)
-    moving = _Moving.of(given, pings)
-    alike = None if np.ptp(pings.receivers) else int(pings.receivers[0])
-    found = check_track(pings, given, moving.wavelength_m)
-    found += check_levels(Levels.of(recorded, magnitudes=not is_echoes), alike)
-    found += _check_samples(moving)
-    found += check_spacing(
-        moving.lines, moving.pings, grid, beam=beam, element_length_m=element_length_m,
-        wavelength_m=moving.wavelength_m,
-    )  # fmt: skip
-    found += check_ranges(given, grid)
-    # A background is as bright in every ping, and would be taken for the brightest echoes.
-    clean = moving.lines
-    if any(finding.name == "background" for finding in found):
-        clean = clean.without_background("median", receivers=alike)
-    sign, reason = phase_sign(clean, grid, moving.wavelength_m, moving.cell_m, device)
-    return _inspection(given, pings, moving, (sign, reason), found + check_sign(sign, reason))
+    recording = Recording(lines, given, grid, beam, element_length_m, device)
+    return _inspection(recording, [found for check in CHECKS for found in check(recording)])
 
 
 def _check_numbers(lines: RangeLines) -> None:
@@ -134,85 +122,37 @@ def _check_numbers(lines: RangeLines) -> None:
     validate.number("the length of lines", extent_m, "m", most=_FARTHEST_M)
 
 
-@dataclass(frozen=True)
-class _Moving:
-    """Lines of the pings that move, and their occupied band."""
-
-    lines: RangeLines
-    pings: Transmissions
-    spectrum: Spectrum
-    band_hz: tuple[float, float]
-    wavelength_m: float
-    cell_m: float
-
-    @classmethod
-    def of(cls, lines: RangeLines, pings: Transmissions) -> _Moving:
-        """Drop pings taken standing still, unless all were, and measure the band."""
-        advancing = pings.advancing()
-        if pings.usual_step_m and not advancing.all():
-            lines = lines.select(pings.channels(advancing))
-            pings = Transmissions.of(lines)
-        spectrum = measure_spectrum(lines)
-        rate_hz = lines.sound_speed_m_s / (2 * lines.range_step_m)
-        middle_hz = lines.carrier_hz + spectrum.centre * rate_hz
-        oversampling = max(spectrum.oversampling, 1.0)
-        half_hz = rate_hz / oversampling / 2
-        band_hz = middle_hz - half_hz, middle_hz + half_hz
-        return cls(
-            lines,
-            pings,
-            spectrum,
-            band_hz,
-            wavelength_m=wavelength_between_m(lines, *band_hz),
-            cell_m=lines.range_step_m * oversampling,
-        )
-
-
-def _check_samples(moving: _Moving) -> list[Finding]:
-    """Return what is wrong with samples, unless all of them are zero."""
-    lines = moving.lines
-    if not lines.samples.any():
-        return []
-    found = check_offset(lines) + check_background(lines, moving.pings) + check_ends(lines)
-    return found + check_band(lines, moving.spectrum, moving.band_hz)
-
-
-def _inspection(
-    lines: RangeLines,
-    pings: Transmissions,
-    moving: _Moving,
-    told: tuple[PhaseSign | None, str],
-    found: list[Finding],
-) -> Inspection:
-    receivers, depths_m = pings.receivers, lines.phase_centres_m[:, 2]
-    if receivers.max() > 1:
+def _inspection(recording: Recording, findings: list[Finding]) -> Inspection:
+    lines, pings = recording.lines, recording.pings
+    if pings.receivers.max() > 1:
         geometry = "array"
     else:
         geometry = "monostatic" if np.array_equal(lines.tx_m, lines.rx_m) else "bistatic"
     speed_m_s = None
     if lines.rx_velocity_m_s is not None:
         speed_m_s = float(np.median(np.linalg.norm(lines.rx_velocity_m_s, axis=1)))
+    sign, undetermined = recording.sign
     return Inspection(
         lines=lines,
         geometry=geometry,
         channels=lines.channels,
         pings=pings.count,
-        receivers=(int(receivers.min()), int(receivers.max())),
+        receivers=(int(pings.receivers.min()), int(pings.receivers.max())),
         track_m=float(pings.steps_m.sum()),
         advance_m=pings.usual_step_m,
-        depths_m=_span(depths_m),
+        depths_m=_span(lines.phase_centres_m[:, 2]),
         speed_m_s=speed_m_s,
         carrier_hz=lines.carrier_hz,
-        band_hz=moving.band_hz,
-        oversampling=moving.spectrum.oversampling,
-        wavelength_m=moving.wavelength_m,
+        band_hz=recording.band_hz,
+        oversampling=recording.spectrum.oversampling,
+        wavelength_m=recording.wavelength_m,
         length=lines.length,
         range_step_m=lines.range_step_m,
         first_range_m=_span(lines.first_range_m),
         last_range_m=_span(lines.last_range_m),
-        sign=told[0],
-        sign_not_told=told[1],
-        findings=tuple(found),
+        sign=sign,
+        sign_not_told=undetermined,
+        findings=tuple(findings),
     )
 
 

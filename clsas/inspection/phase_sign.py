@@ -1,4 +1,4 @@
-"""Sign of a recording's phase: small patches imaged from its lines and from their conjugates."""
+"""Sign of a recording's phase: small images formed from its lines and from their conjugates."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter1d
+from scipy.spatial import cKDTree
 
 from clsas.core.geometry import pairwise_range_m
 from clsas.core.grid import Grid
@@ -19,42 +20,43 @@ from clsas.exact.backprojection import backproject
 from clsas.exact.checks import check_numbers
 from clsas.inspection.result import PhaseSign
 from clsas.opencl.device import Device
-from clsas.sonar.sampling import Finding
 
 CLEAR = 1.5
-"""Ratio of sharpness above which the sign is told: seeds of speckle differ by 1.1."""
+"""Least ratio of the two sharpnesses that determines the sign. In speckle it reaches 1.1."""
 _SHARP = 10.0
-"""Sharpness along the track above which a patch is in focus: 80 for a point, 2 for speckle. Where
-arcs of several targets cross, or on a noisy track, either sign has up to 7."""
-_SPOTS = 5  # judged, and all in focus must agree
-_PRODUCT = 100.0  # length of the aperture over the resolution that it gives; wrong signs blur by it
-_LEAST_PRODUCT = 8.0  # below this both signs look alike
+"""Least sharpness along the track of a patch in focus. A point has 80 and speckle 2. Where the arcs
+of several targets cross, or on a noisy track, it reaches 7 with either sign."""
+_TARGETS = 5  # targets whose patches are compared; all that are in focus must agree
+_BLUR = 100.0
+"""Length of the aperture relative to the resolution it gives. The wrong sign blurs a point by this
+factor."""
+_LEAST_BLUR = 8.0  # below it, both signs look alike
 _LEAST_CHANNELS, _MOST_CHANNELS = 16, 1024
 _MOST_BEND = 0.25
-"""Bend of a track, over that of ranges, up to which the direction of a place need not be known. On
-a circle about the scene ranges do not bend at all, and both signs look alike."""
-_PIXELS = 256  # along a side, at most
-_CELLS = 24.0  # range resolution cells of a patch
-_SEARCHED_CHANNELS = 128  # searched for bright places, spread evenly
-_GRID_POINTS = 24  # along either side of a grid, at which the search begins
-_FINER = 4  # refinement of the search per step
+"""Bend of the track relative to that of the ranges, up to which the direction of a target need not
+be known. On a circle around the scene, ranges do not bend at all and both signs look alike."""
+_PIXELS = 256  # most columns of a patch
+_CELLS = 24.0  # length of a patch in range, in resolution cells
+_SEARCHED_CHANNELS = 128  # channels searched for targets, spread evenly
+_GRID_POINTS = 24  # points along either side of a grid at which the search starts
+_FINER = 4  # factor by which each step of the search is finer
 _ACCURACY_DB = -40.0
 
 
-class _NotToldError(Exception):
-    """A place whose images cannot tell the sign; the message says why."""
+class _UndeterminedError(Exception):
+    """The sign cannot be determined from a target; the message says why."""
 
 
 @dataclass(frozen=True, eq=False)
-class _Spot:
-    """A place with strong echoes, and the channel at which half of their energy has arrived.
+class _Target:
+    """A position with strong echoes, and the channel by which half of its energy has arrived.
 
-    It is `known` on a grid. Without a grid its range is known, and its direction is assumed.
+    If it is not located, only its range is known and its direction is assumed.
     """
 
-    place_m: NDArray[np.float64]
+    position_m: NDArray[np.float64]
     channel: int
-    known: bool
+    is_located: bool
 
 
 def phase_sign(
@@ -62,107 +64,69 @@ def phase_sign(
     grid: Grid | None,
     wavelength_m: float,
     cell_m: float,
-    device: Device | str | int | None,
+    device: Device | None,
 ) -> tuple[PhaseSign | None, str]:
-    """Image patches about the brightest echoes both ways.
+    """Return the sharpest of a few patches about the brightest targets, or None.
 
-    The right sign gives an image of the resolution that the aperture allows, the wrong one blurs
-    it to the length of the aperture.
-
-    Parameters
-    ----------
-    lines : RangeLines
-    grid : Grid or None
-        Where to look. Without it, places beside the track are tried.
-    wavelength_m, cell_m : float
-        Wavelength, and resolution in range, metres.
-    device : Device, str, int or None
-        See `clsas.opencl.device.choose`.
-
-    Returns
-    -------
-    sign : PhaseSign or None
-        The sharpest patch; None if none could be imaged.
-    reason : str
-        Why the sign is not told; "" if it is.
+    Each patch is imaged from the lines and from their conjugates. The correct sign gives the
+    resolution that the aperture allows; the wrong one blurs a point over the length of the
+    aperture. Targets are searched on the grid or, without one, beside the track. Also return the
+    reason why the sign is undetermined, or "".
     """
     if not lines.samples.any():
-        return None, "nothing is left to image: lines are silent, or alike in all pings"
+        return None, "the lines are silent, or the same in all pings"
     if not lines.carrier_hz:
-        return None, (
-            "the lines still have their carrier: conjugate lines give the conjugate image, which "
-            "is as sharp"
-        )
+        return None, "the lines still have their carrier: images of conjugates are as sharp"
     try:
-        if grid is None:
-            spots = _brightest_beside(lines, cell_m)
-        else:
-            spots = _brightest_of(lines, grid, cell_m)
-    except _NotToldError as error:
+        targets = _beside_track(lines, cell_m) if grid is None else _on_grid(lines, grid, cell_m)
+    except _UndeterminedError as error:
         return None, str(error)
-    judged, reason = [], ""
-    for spot in spots:
+    signs, reasons = [], []
+    for target in targets:
         try:
-            judged.append(_judged(lines, spot, wavelength_m, cell_m, device))
-        except _NotToldError as error:
-            reason = reason or str(error)
-    if not judged:
-        return None, reason
-    sharp = [sign for sign in judged if max(sign.as_given, sign.conjugate) >= _SHARP]
+            part, patch = _patch(lines, target, wavelength_m, cell_m)
+        except _UndeterminedError as error:
+            reasons.append(str(error))
+        else:
+            signs.append(_compared(part, patch, target.position_m, device))
+    if not signs:
+        return None, reasons[0]
+    sharp = [sign for sign in signs if _best_sharpness(sign) >= _SHARP]
     clear = [sign for sign in sharp if not 1 / CLEAR < sign.ratio < CLEAR]
-    best = max(clear or judged, key=lambda sign: max(sign.as_given, sign.conjugate))
+    best = max(clear or signs, key=_best_sharpness)
     if not sharp:
-        return best, f"no patch is in focus (sharpness of {_SHARP:g}; speckle has 2)"
+        return best, f"no patch is in focus, with a sharpness of {_SHARP:g} (speckle has 2)"
     if not clear:
-        return best, "both signs look alike"
+        return best, "both signs give equally sharp images"
     if len({sign.ratio > 1 for sign in clear}) > 1:
         return best, "patches disagree"
     return best, ""
 
 
-def check_sign(sign: PhaseSign | None, reason: str) -> list[Finding]:
-    """Return a phase of the wrong sign, unless there is a reason why the sign is not told."""
-    if sign is None or reason or sign.ratio < CLEAR:
-        return []
-    x, y, z = sign.centre_m
-    return [
-        Finding(
-            "phase_sign",
-            f"the conjugate lines give a sharper image, {sign.conjugate:.3g} against "
-            f"{sign.as_given:.3g} (mean squared intensity over the squared mean, along the track "
-            f"about ({x:.4g}, {y:.4g}, {z:.4g}) m): the phase has the opposite sign of "
-            "exp(-j 4 pi carrier range/c)",
-            sign.ratio,
-            CLEAR,
-            "dataclasses.replace(lines, samples=lines.samples.conj()); for phase histories sign=+1",
-        )
-    ]
+def _best_sharpness(sign: PhaseSign) -> float:
+    return max(sign.as_given, sign.conjugate)
 
 
-def _judged(
-    lines: RangeLines,
-    spot: _Spot,
-    wavelength_m: float,
-    cell_m: float,
-    device: Device | str | int | None,
+def _compared(
+    part: RangeLines, patch: Grid, centre_m: NDArray[np.float64], device: Device | None
 ) -> PhaseSign:
-    part, patch = _patch(lines, spot, wavelength_m, cell_m)
+    """Return the sharpness of a patch with both signs of the phase."""
     conjugate = replace(part, samples=part.samples.conj())
-    with warnings.catch_warnings():  # of accuracy, which matters little here
+    with warnings.catch_warnings():  # about accuracy, which is not needed here
         warnings.simplefilter("ignore", ClsasWarning)
-        images = [
-            backproject(each, patch, device=device, accuracy_db=_ACCURACY_DB)
+        as_given, of_conjugate = (
+            _sharpness_along(backproject(each, patch, device=device, accuracy_db=_ACCURACY_DB))
             for each in (part, conjugate)
-        ]
-    x, y, z = spot.place_m.tolist()
-    as_given, of_conjugate = (_sharpness_along(image) for image in images)
+        )
+    x, y, z = centre_m.tolist()
     return PhaseSign(as_given, of_conjugate, centre_m=(x, y, z))
 
 
 def _sharpness_along(image: Image) -> float:
-    """Return the mean squared intensity of rows over their squared mean.
+    """Return the mean squared intensity over the squared mean intensity, row by row.
 
-    Rows lie along the track. That echoes fill few ranges, as blurred ones do too, does not count.
+    Rows lie along the track. Echoes confined to a few ranges do not count as sharp, since blurred
+    ones are too.
     """
     amplitude = np.abs(image.pixels)
     intensity = (amplitude / (amplitude.max() or 1.0)).astype(np.float64) ** 2
@@ -170,85 +134,65 @@ def _sharpness_along(image: Image) -> float:
     return float((intensity**2).mean(axis=1).sum()) / squared_mean if squared_mean else 0.0
 
 
-def _brightest_beside(lines: RangeLines, cell_m: float) -> list[_Spot]:
-    """Return places on either side of the track, at the ranges of the brightest samples.
-
-    Raises
-    ------
-    _NotToldError
-        If no place has such a range.
-    """
-    part_of = some_channels(lines.channels, _SEARCHED_CHANNELS)
-    level = np.abs(lines.samples[part_of])
+def _beside_track(lines: RangeLines, cell_m: float) -> list[_Target]:
+    """Return positions on both sides of the track, at the ranges of the brightest samples."""
+    searched = some_channels(lines.channels, _SEARCHED_CHANNELS)
+    level = np.abs(lines.samples[searched])
     centres_m = lines.phase_centres_m
     course = _course(centres_m)
     across = np.cross([0.0, 0.0, 1.0], course)
-    if np.linalg.norm(across) < 0.1:  # a course up or down
+    if np.linalg.norm(across) < 0.1:  # the course is vertical
         across = np.cross([1.0, 0.0, 0.0], course)
     across /= np.linalg.norm(across)
-    range_m = lines.first_range_m[part_of, None] + np.arange(lines.length) * lines.range_step_m
-    spots: list[_Spot] = []
-    reason = "no samples are left to look at"
-    for _ in range(_SPOTS):
+    range_m = lines.first_range_m[searched, None] + np.arange(lines.length) * lines.range_step_m
+    targets: list[_Target] = []
+    reason = "no samples are left to search"
+    for _ in range(_TARGETS):
         row, sample = np.unravel_index(int(level.argmax()), level.shape)
         if not level[row, sample]:
             break
-        channel, found_m = int(part_of[row]), float(range_m[row, sample])
-        # A range is half the path from and to both antennas.
+        channel, found_m = int(searched[row]), float(range_m[row, sample])
+        # Range is half the path, to one antenna and back to the other.
         apart_m = float(np.linalg.norm(lines.tx_m[channel] - lines.rx_m[channel])) / 2
         if found_m > apart_m:
             distance_m = math.sqrt(found_m**2 - apart_m**2)
-            spots += [
-                _Spot(centres_m[channel] + side * distance_m * across, channel, known=False)
+            targets += [
+                _Target(centres_m[channel] + side * distance_m * across, channel, is_located=False)
                 for side in (1, -1)
             ]
-        elif not spots:
+        elif not targets:
             reason = (
-                f"no place has the range of the brightest echoes, {found_m:.4g} m: its transmitter "
-                f"and receiver are {2 * apart_m:.4g} m apart"
+                f"the brightest echoes have an impossible range of {found_m:.4g} m, since their "
+                f"transmitter and receiver are {2 * apart_m:.4g} m apart"
             )
         level[np.abs(range_m - found_m) <= _CELLS / 2 * cell_m] = 0
-    if not spots:
-        raise _NotToldError(reason)
-    return spots
+    if not targets:
+        raise _UndeterminedError(reason)
+    return targets
 
 
-def _brightest_of(lines: RangeLines, grid: Grid, cell_m: float) -> list[_Spot]:
-    """Return the places of a grid from which channels receive most.
-
-    Raises
-    ------
-    _NotToldError
-        If they receive nothing from it.
-    """
+def _on_grid(lines: RangeLines, grid: Grid, cell_m: float) -> list[_Target]:
+    """Return the positions on a grid from which channels receive most."""
     energy = _Energy(lines)
     points_m = grid.spread(_GRID_POINTS)
-    pitch_m = _pitch_m(points_m)
+    pitch_m = 0.0  # the largest distance from a point to its nearest neighbour
+    if len(points_m) > 1:
+        pitch_m = float(cKDTree(points_m).query(points_m, k=2)[0][:, 1].max())
     left = energy.around(points_m, pitch_m).sum(axis=1)
-    spots = []
-    for _ in range(_SPOTS):
+    targets = []
+    for _ in range(_TARGETS):
         brightest = int(left.argmax())
         if not left[brightest] > 0:
             break
-        spot = energy.spot(points_m[brightest], pitch_m)
-        spots.append(energy.refined(spot, pitch_m, cell_m))
+        targets.append(energy.target(points_m[brightest], pitch_m, cell_m))
         left[np.linalg.norm(points_m - points_m[brightest], axis=1) < 3 * pitch_m] = 0
-    if not spots:
-        raise _NotToldError("no echoes come from the grid")
-    return spots
-
-
-def _pitch_m(points_m: NDArray[np.float64]) -> float:
-    """Return the largest distance from a point to its nearest neighbour; 0 for a single point."""
-    if len(points_m) < 2:
-        return 0.0
-    away_m = np.linalg.norm(points_m[:, None] - points_m, axis=-1)
-    np.fill_diagonal(away_m, np.inf)
-    return float(away_m.min(axis=1).max())
+    if not targets:
+        raise _UndeterminedError("no echoes come from the grid")
+    return targets
 
 
 class _Energy:
-    """Power of some channels, summed over channels without regard to phase."""
+    """Power that some channels receive from positions, summed without regard to phase."""
 
     def __init__(self, lines: RangeLines) -> None:
         self.lines = lines
@@ -258,10 +202,10 @@ class _Energy:
         self.power = (level / (level.max() or np.float32(1))) ** 2
 
     def around(self, points_m: NDArray[np.float64], pitch_m: float) -> NDArray[np.float32]:
-        """Return the largest power within a square about each point, [points, channels].
+        """Return the largest power within a square of side `pitch_m` about each point.
 
-        Points of a pitch then miss no target between them: one counts in all channels, and a
-        crossing of the arcs of two targets only in those of the arcs.
+        The result is [points, channels]. Points at this pitch miss no target between them. A target
+        has power in all channels, but a crossing of the arcs of two targets only in some.
         """
         part = self.part
         reach = math.ceil(min(math.sqrt(0.5) * pitch_m / part.range_step_m, part.length))
@@ -273,81 +217,75 @@ class _Energy:
         found: NDArray[np.float32] = power[np.arange(len(power)), index] * inside
         return found
 
-    def spot(self, place_m: NDArray[np.float64], pitch_m: float) -> _Spot:
-        """Return a place with the channel at which half of its energy has arrived."""
-        held = np.cumsum(self.around(place_m[None], pitch_m)[0])
-        middle = int(np.searchsorted(held, held[-1] / 2))
-        return _Spot(place_m, int(self.some[middle]), known=True)
+    def channel(self, position_m: NDArray[np.float64], pitch_m: float) -> int:
+        """Return the channel by which half of the energy of a position has arrived."""
+        arrived = np.cumsum(self.around(position_m[None], pitch_m)[0])
+        return int(self.some[np.searchsorted(arrived, arrived[-1] / 2)])
 
-    def refined(self, spot: _Spot, pitch_m: float, cell_m: float) -> _Spot:
-        """Return the brightest place about a spot, to a resolution cell in range."""
-        place_m = spot.place_m
-        along = _course(self.lines.phase_centres_m)
-        across = _across(place_m - self.lines.phase_centres_m[spot.channel], along)
+    def target(self, position_m: NDArray[np.float64], pitch_m: float, cell_m: float) -> _Target:
+        """Return the brightest position near a point of a grid, to a resolution cell in range."""
+        centres_m = self.lines.phase_centres_m
+        channel, along = self.channel(position_m, pitch_m), _course(centres_m)
+        across = _across(position_m - centres_m[channel], along)
         if across is None:
-            return spot
+            return _Target(position_m, channel, is_located=True)
         while pitch_m > cell_m:
             pitch_m /= _FINER
             offsets_m = pitch_m * np.arange(1 - _FINER, _FINER)
             moves_m = offsets_m[:, None, None] * across + offsets_m[:, None] * along
-            places_m = place_m + moves_m.reshape(-1, 3)
-            place_m = places_m[int(self.around(places_m, pitch_m).sum(axis=1).argmax())]
-        return self.spot(place_m, cell_m)
+            tried_m = position_m + moves_m.reshape(-1, 3)
+            position_m = tried_m[int(self.around(tried_m, pitch_m).sum(axis=1).argmax())]
+        return _Target(position_m, self.channel(position_m, cell_m), is_located=True)
 
 
 def _patch(
-    lines: RangeLines, spot: _Spot, wavelength_m: float, cell_m: float
+    lines: RangeLines, target: _Target, wavelength_m: float, cell_m: float
 ) -> tuple[RangeLines, Grid]:
-    """Return a part of the lines, and a patch about the spot in their slant plane.
-
-    Raises
-    ------
-    _NotToldError
-        If the part is too short, leads straight to the spot, or bends about it, or if its numbers
-        are beyond what can be imaged.
-    """
+    """Return lines near a target, and a patch about it in their slant plane."""
     centres_m = lines.phase_centres_m
-    middle_m = centres_m[spot.channel]
-    look = spot.place_m - middle_m
-    range_m = float(np.linalg.norm(look))
-    wanted_m = math.sqrt(_PRODUCT / 2 * wavelength_m * range_m)
-    near = np.flatnonzero(np.linalg.norm(centres_m - middle_m, axis=1) <= wanted_m / 2)
+    middle_m = centres_m[target.channel]
+    look_m = target.position_m - middle_m
+    range_m = float(np.linalg.norm(look_m))
+    aperture_m = math.sqrt(_BLUR / 2 * wavelength_m * range_m)
+    near = np.flatnonzero(np.linalg.norm(centres_m - middle_m, axis=1) <= aperture_m / 2)
     if len(near) < _LEAST_CHANNELS:
-        raise _NotToldError(
-            f"channels on {wanted_m:.3g} m of the track: {len(near)}, fewer than {_LEAST_CHANNELS}"
+        raise _UndeterminedError(
+            f"{aperture_m:.3g} m of the track have {len(near)} channels; at least "
+            f"{_LEAST_CHANNELS} are needed"
         )
     part = lines.select(near[some_channels(len(near), _MOST_CHANNELS)])
     # Sums of very large samples would overflow float32.
     part = replace(part, samples=part.samples / (np.abs(part.samples).max() or np.float32(1)))
     along = _course(part.phase_centres_m)
-    across = _across(look, along)
+    across = _across(look_m, along)
     if across is None:
-        raise _NotToldError("the track leads straight to the brightest echoes")
-    length_m = float(np.ptp(part.phase_centres_m @ along)) * float(look @ across) / range_m
-    if 2 * length_m**2 < _LEAST_PRODUCT * wavelength_m * range_m:
-        raise _NotToldError(
-            f"the track is too short: {length_m:.3g} m of it see the brightest echoes at "
-            f"{range_m:.4g} m"
+        raise _UndeterminedError("the track leads straight to the brightest echoes")
+    length_m = float(np.ptp(part.phase_centres_m @ along)) * float(look_m @ across) / range_m
+    if 2 * length_m**2 < _LEAST_BLUR * wavelength_m * range_m:
+        raise _UndeterminedError(
+            f"the track is too short: the brightest echoes, at {range_m:.4g} m, have an effective "
+            f"aperture of {length_m:.3g} m"
         )
-    if not spot.known and _bend_m(part, along) > _MOST_BEND * length_m**2 / (8 * range_m):
-        raise _NotToldError("the track is not straight, so that a grid is needed")
-    # Two pixels per resolution cell; the patch is as long as a wrong sign blurs a point.
+    bend_m = length_m**2 / (8 * range_m)
+    if not target.is_located and _bend_m(part, along) > _MOST_BEND * bend_m:
+        raise _UndeterminedError("the track is not straight: a grid is needed")
+    # There are two pixels per resolution cell. The patch is as long as the blur of a wrong sign.
     pitch_m = wavelength_m * range_m / (2 * length_m) / 2
     columns = min(math.ceil(1.2 * length_m / pitch_m), _PIXELS)
     rows = int(2 * _CELLS)
     steps_m = cell_m / 2 * across, pitch_m * along
-    origin_m = spot.place_m - steps_m[0] * (rows - 1) / 2 - steps_m[1] * (columns - 1) / 2
+    origin_m = target.position_m - steps_m[0] * (rows - 1) / 2 - steps_m[1] * (columns - 1) / 2
     try:
         check_numbers(part, None)
         return part, Grid.oriented(origin_m, *steps_m, (rows, columns))
-    except ValueError as error:  # numbers that no image can be formed of
-        raise _NotToldError(str(error)) from error
+    except ValueError as error:
+        raise _UndeterminedError(str(error)) from error
 
 
-def _across(look: NDArray[np.float64], along: NDArray[np.float64]) -> NDArray[np.float64] | None:
-    """Return the unit vector of a look's part across a course; None if it has hardly any."""
-    across = look - along * (look @ along)
-    size, least = float(np.linalg.norm(across)), 0.1 * float(np.linalg.norm(look))
+def _across(look_m: NDArray[np.float64], along: NDArray[np.float64]) -> NDArray[np.float64] | None:
+    """Return the direction of a vector's component across a course; None if that is tiny."""
+    across = look_m - along * (look_m @ along)
+    size, least = float(np.linalg.norm(across)), 0.1 * float(np.linalg.norm(look_m))
     return across / size if size > least else None
 
 

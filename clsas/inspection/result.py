@@ -1,4 +1,4 @@
-"""Results of `clsas.inspect`: a recording in numbers, and what is wrong with it."""
+"""Results of `clsas.inspect`: properties of a recording, and its defects, as a table."""
 
 from __future__ import annotations
 
@@ -14,20 +14,24 @@ from clsas.core.lines import RangeLines
 from clsas.core.tables import Report, Table
 from clsas.sonar.sampling import Finding
 
-_MOST_RUNS = 12  # of indices that are written out
+_MOST_RUNS = 12  # runs of indices that are written out
 
 
 @dataclass(frozen=True, eq=False)
 class PhaseSign:
-    """Sharpness of a patch of the lines as they are, and of their conjugates.
+    """Sharpness of a small image of the lines as given, and of their conjugates.
 
     Attributes
     ----------
     as_given, conjugate : float
         Mean squared intensity along the track over the squared mean: 2 for speckle and for blurred
-        points, the more the sharper.
-    centre_m : tuple of three floats
-        Middle of the patch.
+        points, more for sharper images.
+    centre_m : (float, float, float)
+        Centre of the image in metres.
+
+    See Also
+    --------
+    Inspection.sign : Where `inspect` reports it.
     """
 
     as_given: float
@@ -36,53 +40,64 @@ class PhaseSign:
 
     @property
     def ratio(self) -> float:
-        """Sharpness of the conjugates over that of the lines as they are."""
+        """Sharpness with conjugate lines relative to that with the lines as given."""
         return self.conjugate / self.as_given if self.as_given else 1.0
 
 
 @dataclass(frozen=True, eq=False)
 class Inspection:
-    """A recording in numbers, and what is wrong with it; made by `inspect`.
+    """Properties of a recording and its defects, as returned by `inspect`.
 
     Attributes
     ----------
     lines : RangeLines
-        The lines inspected; those of echoes after compression.
+        The lines inspected; echoes are compressed first.
     geometry : str
         "monostatic", "bistatic" or "array".
     channels, pings : int
-        A ping ends where the transmitter moves, or its first receiver's position comes again.
-    receivers : tuple of int
+        Number of channels and pings. A ping ends where the transmitter moves, or where the position
+        of its first receiver comes again.
+    receivers : (int, int)
         Fewest and most channels of a ping.
     track_m : float
-        Distance travelled, from ping to ping.
+        Distance travelled, in metres: the sum of the steps from ping to ping.
     advance_m : float
-        Median advance of a ping while the platform moves; 0 if it never does.
-    depths_m : tuple of float
-        Lowest and highest z of the phase centres.
+        Median advance per ping while the platform moves, in metres; 0 if it never does.
+    depths_m : (float, float)
+        Lowest and highest z of the phase centres, in metres.
     speed_m_s : float or None
-        Median speed of the receivers; None if the lines have no velocities. Lines have no times.
+        Median speed of the receivers. None if the lines have no velocities; they have no times
+        either.
     carrier_hz : float
-        Frequency that was mixed out; 0 if lines still have their carrier.
-    band_hz : tuple of float
-        Lower and upper end of the occupied band, measured.
+        Frequency that was mixed out; 0 if the lines still have their carrier.
+    band_hz : (float, float)
+        Lower and upper end of the occupied band, as measured.
     oversampling : float
-        Sample rate over the width of that band.
+        Sample rate relative to the width of the occupied band.
     wavelength_m : float
-        Wavelength at the mean frequency of the band: at its middle, unless the band reaches below
-        0 Hz.
+        Wavelength at the mean magnitude of the band's frequencies. This is the middle of the band
+        unless it reaches below 0 Hz.
     length : int
         Samples per channel.
     range_step_m : float
-        Range between samples.
-    first_range_m, last_range_m : tuple of float
-        Least and largest range of the first and of the last samples.
+        Range between samples, in metres.
+    first_range_m, last_range_m : (float, float)
+        Smallest and largest range of the first samples, and of the last, in metres.
     sign : PhaseSign or None
-        Sharpest patch imaged both ways; None if none could be imaged.
+        Sharpest patch that was imaged with both signs of the phase; None if there is none.
     sign_not_told : str
-        Why the sign of the phase is not told; "" if it is.
+        Reason why the sign of the phase is undetermined; "" if it is determined.
     findings : tuple of Finding
-        What is wrong, each with its number and what to do.
+        Defects, each with its value, limit and remedy.
+
+    See Also
+    --------
+    inspect : Function that returns it, with an example.
+
+    Notes
+    -----
+    ``inspection["gaps"]`` is the finding of that name, and ``"gaps" in inspection`` is True if
+    there is one.
     """
 
     lines: RangeLines
@@ -120,36 +135,36 @@ class Inspection:
         return self._report().html()
 
     def __getitem__(self, name: str) -> Finding:
-        """Return the finding of a name; raises KeyError if there is none."""
+        """Return the finding with a name; raise KeyError if there is none."""
         return {finding.name: finding for finding in self.findings}[name]
 
     def __contains__(self, name: str) -> bool:
-        """Return whether there is a finding of a name."""
+        """Return True if there is a finding with a name."""
         return any(finding.name == name for finding in self.findings)
 
     @property
     def unambiguous_deg(self) -> float:
-        """Angle from broadside, degrees, to which the usual advance keeps grating lobes out.
+        """Angle from broadside, in degrees, within which the usual advance causes no grating lobes.
 
-        For one receiver per ping: sin(angle) = wavelength/(4 advance).
+        With one receiver per ping, sin(angle) = wavelength/(4 advance).
         """
         sine = self.wavelength_m / (4 * self.advance_m) if self.advance_m else math.inf
         return math.degrees(math.asin(min(sine, 1.0)))
 
     def describe(self) -> str:
-        """Return a table of the recording, and the findings."""
+        """Return a table of the properties, and the findings with their remedies, as text."""
         return self._report().text()
 
     def _report(self) -> Report:
         table = Table(("quantity", "value"), self._rows(), align="left")
         if not self.findings:
-            return Report([table, "Nothing found that is wrong."])
+            return Report([table, "No defects found."])
         lines = []
         for number, finding in enumerate(self.findings, start=1):
             lines.append(f"{number}. {finding.name}: {finding.message}")
             if finding.where:
-                lines.append(f"   Which: {runs(finding.where)}")
-            lines.append(f"   Do: {finding.remedy}")
+                lines.append(f"   Where: {runs(finding.where)}")
+            lines.append(f"   Remedy: {finding.remedy}")
         return Report([table, "Findings:", *lines])
 
     def _rows(self) -> list[tuple[str, str]]:
@@ -157,39 +172,27 @@ class Inspection:
         several = f"{fewest}" if fewest == most else f"{fewest} to {most}"
         array = f", {several} receivers per ping" if most > 1 else ""
         low_hz, high_hz = self.band_hz
-        middle_hz = (low_hz + high_hz) / 2
+        speed = "unknown: the lines have neither times nor velocities"
+        if self.speed_m_s is not None:
+            speed = measured(self.speed_m_s, "m/s")
+        carrier = "0: the lines still have their carrier"
+        if self.carrier_hz:
+            carrier = reprs.quantity(self.carrier_hz, "Hz")
+        band = f"{measured(high_hz - low_hz, 'Hz')} about {measured((low_hz + high_hz) / 2, 'Hz')}"
+        length = measured((self.length - 1) * self.range_step_m, "m")
+        advance = f"{measured(self.advance_m, 'm')} per ping"
         rows = [
             ("channels", f"{self.channels} in {self.pings} pings"),
             ("geometry", f"{self.geometry}{array}"),
-            (
-                "track",
-                f"{reprs.quantity(_rounded(self.track_m), 'm')} long, "
-                f"{reprs.quantity(_rounded(self.advance_m), 'm')} per ping",
-            ),
+            ("track", f"{measured(self.track_m, 'm')} long, {advance}"),
             ("depth (z)", _span(*self.depths_m)),
-            (
-                "speed",
-                "not known: lines have no times"
-                if self.speed_m_s is None
-                else reprs.quantity(_rounded(self.speed_m_s), "m/s"),
-            ),
-            (
-                "carrier",
-                reprs.quantity(self.carrier_hz, "Hz")
-                if self.carrier_hz
-                else "0, the lines still have it",
-            ),
-            (
-                "band found",
-                f"{reprs.quantity(_rounded(high_hz - low_hz), 'Hz')} about "
-                f"{reprs.quantity(_rounded(middle_hz), 'Hz')}, wavelength "
-                f"{reprs.quantity(_rounded(self.wavelength_m), 'm')}",
-            ),
-            ("oversampling found", f"{self.oversampling:.3g}"),
+            ("speed", speed),
+            ("carrier", carrier),
+            ("measured band", f"{band}, wavelength {measured(self.wavelength_m, 'm')}"),
+            ("oversampling", f"{self.oversampling:.3g}"),
             (
                 "samples",
-                f"{self.length} per line, {reprs.quantity(_rounded(self.range_step_m), 'm')} "
-                f"apart: {reprs.quantity(_rounded((self.length - 1) * self.range_step_m), 'm')}",
+                f"{self.length} per line, {measured(self.range_step_m, 'm')} apart: {length}",
             ),
             ("first range", _span(*self.first_range_m)),
             ("last range", _span(*self.last_range_m)),
@@ -199,20 +202,19 @@ class Inspection:
             rows.append(
                 ("spacing", f"{self.advance_m / self.wavelength_m:.3g} wavelengths: {angle}")
             )
-        rows.append(("sign of phase", self._sign()))
-        return rows
+        return [*rows, ("sign of phase", self._sign())]
 
     def _sign(self) -> str:
         if self.sign is None:
-            return f"not told: {self.sign_not_told}"
-        both = f"sharpness {self.sign.as_given:.3g}, of the conjugate {self.sign.conjugate:.3g}"
+            return f"undetermined: {self.sign_not_told}"
+        both = f"sharpness {self.sign.as_given:.3g}, with conjugate lines {self.sign.conjugate:.3g}"
         if self.sign_not_told:
-            return f"not clear, {both}: {self.sign_not_told}"
-        return f"opposite, {both}" if self.sign.ratio > 1 else f"as it should be, {both}"
+            return f"unclear, {both}: {self.sign_not_told}"
+        return f"opposite, {both}" if self.sign.ratio > 1 else f"correct, {both}"
 
 
 def runs(indices: Iterable[int]) -> str:
-    """Return ascending indices as runs: "0-12, 40"; the first dozen of them."""
+    """Return ascending indices as runs, such as "0-12, 40"; at most the first dozen runs."""
     ordered = np.unique(np.fromiter(indices, np.int64))
     breaks = [0, *(np.flatnonzero(np.diff(ordered) > 1) + 1).tolist(), len(ordered)]
     parts = []
@@ -223,12 +225,12 @@ def runs(indices: Iterable[int]) -> str:
     return ", ".join(parts[:_MOST_RUNS]) + (f" and {rest} more runs" if rest > 0 else "")
 
 
+def measured(value: float, unit: str) -> str:
+    """Return a measured value to four digits, with a prefixed unit that suits it."""
+    return reprs.quantity(float(f"{value:.4g}"), unit)
+
+
 def _span(low_m: float, high_m: float) -> str:
-    """Return "low to high" in metres or millimetres; one value if both look alike."""
+    """Return "low to high" in metres or millimetres, or one value if both look alike."""
     ends = dict.fromkeys((reprs.quantity(low_m, "m"), reprs.quantity(high_m, "m")))
     return " to ".join(ends)
-
-
-def _rounded(value: float) -> float:
-    """Return a measured value to four digits."""
-    return float(f"{value:.4g}")

@@ -1,11 +1,13 @@
-"""Effects that an image needs: the error without each, and the time that each takes."""
+"""Effects that an image needs: the error without each of them, and the time that it costs."""
 
 from __future__ import annotations
 
 import math
 import time
 import warnings
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -17,8 +19,6 @@ from clsas.core.lines import RangeLines
 from clsas.core.wavelengths import band_wavelength_m
 from clsas.exact.backprojection import prepare
 from clsas.exact.run import execute
-from clsas.factorized.factorization import Factorization
-from clsas.factorized.plan import Plan
 from clsas.measures.assessment_result import Assessment, Effect
 from clsas.measures.effects import (
     BEAM,
@@ -28,6 +28,7 @@ from clsas.measures.effects import (
     ErrorWithout,
     Survey,
     errors_without,
+    lines_without,
     track_errors_m,
 )
 from clsas.opencl.device import Device, open_device
@@ -35,18 +36,21 @@ from clsas.planning.costs import Costs
 from clsas.planning.factorize import factorize
 from clsas.planning.planner import BEST_TOLERANCE_DB, TOLERANCE_DB, WORST_TOLERANCE_DB, plan
 from clsas.planning.prediction import half_precision_error
+from clsas.plans.factorization import Factorization
+from clsas.plans.plan import Plan
 from clsas.signal.compression import Window
 from clsas.signal.compression import check_options as check_compression
 from clsas.signal.spectrum import measure_spectrum
 from clsas.simulation.scenes import PointTargets
 from clsas.simulation.simulator import simulate_lines
 from clsas.sonar.beam import BeamWindow
-from clsas.sonar.simplify import APART, MOTION, RELIEF, SHARE, leave_out, simplify
+from clsas.sonar.simplify import APART, MOTION, RELIEF, SHARE, leave_out
 from clsas.sonar.system import Sonar
 from clsas.sonar.track import Pointing, Track, channels
 
-_POINTS = 16  # grid points along either side at which ranges bound the extent of lines
-_ROOM = 32  # samples of a survey's lines beyond the grid
+_FULL, _FORMED = "full", "formed"  # images beside those without one effect
+_POINTS = 16  # grid points along either side whose ranges determine the extent of lines
+_MARGIN = 32  # samples of the lines of a survey on either side of the grid
 
 
 def assess(
@@ -64,7 +68,7 @@ def assess(
     repeats: int = 0,
     ends: bool = True,
 ) -> Assessment:
-    """Find out which effects an image needs: the error that it would have without each of them.
+    """Return which effects an image needs, by its error and its time without each of them.
 
     Parameters
     ----------
@@ -75,21 +79,21 @@ def assess(
     beam : BeamWindow, optional
         Weights of the channels.
     tolerance_db : float
-        Relative rms error allowed of the image, dB, from -75 to -10.
+        Relative rms error of the image that is allowed, in dB, from -75 to -10.
     sonar, track : Sonar, Track, optional
-        Survey that the lines come from. It gives element patterns, and the receivers' velocity if
-        the lines have none. Channels must be those of `clsas.channels`.
+        Survey that the lines come from, with the channels of `clsas.channels`. It determines the
+        element patterns, and the velocity of the receivers if the lines have none.
     pointing : Pointing, optional
-        Directions of the elements.
+        Directions of the elements; by default to broadside.
     element_pattern : bool
-        True if the lines hold the sonar's element patterns.
+        True if the lines contain the sonar's element patterns.
     device : Device, str or int, optional
         Device that forms the image; see `clsas.opencl.device.choose`.
     costs : Costs, optional
         Costs to use instead of those stored for the device.
     repeats : int
-        Measure times instead of predicting them: form the image this many times with and without
-        every effect, in turns, and take the shortest times.
+        If not 0, measure times instead of predicting them: form the images with all effects and
+        without each of them in turns, this many times, and take the shortest times.
     ends : bool
         True if recorded data end where the lines do.
 
@@ -100,32 +104,59 @@ def assess(
     Raises
     ------
     TypeError, ValueError
-        If an argument is not what is allowed, or sonar and track do not have the lines' channels.
+        If an argument has the wrong type or is out of bounds, or sonar and track have other
+        channels than the lines.
     DeviceError
-        If there is no such device.
+        If the device does not exist.
+
+    See Also
+    --------
+    survey_lines : Lines of a survey that has not been simulated yet.
+    plan : Leaves out effects whose error is far below the tolerance.
 
     Notes
     -----
-    `clsas.measures.effects.errors_without` explains how errors are found.
+    Errors are computed in float64 for a sample of channels and pixels:
+    `clsas.measures.effects.errors_without` has the equation. Without an effect, an image is planned
+    like the one with all effects, and the difference of their times is the cost of the effect.
+
+    Examples
+    --------
+    Receivers at 1 m/s move on while the echoes of targets at 20 m travel:
+
+    >>> import clsas
+    >>> import numpy as np
+    >>> tx_m = np.outer(np.arange(32), [0.02, 0, 0])
+    >>> grid = clsas.Grid.plane((0.2, 0.4, 16), (19.9, 20.1, 16))
+    >>> lines = clsas.simulate_lines(
+    ...     tx_m, tx_m, clsas.PointTargets([[0.3, 20.0, 0.0]], [1.0]), carrier_hz=100e3,
+    ...     bandwidth_hz=20e3, window="hann", rx_velocity_m_s=[1.0, 0, 0],
+    ... )
+    >>> motion = clsas.assess(lines, grid, tolerance_db=-30)["motion during flight"]
+    >>> print(f"{motion.error_db:.0f} dB without it")
+    -19 dB without it
+    >>> motion.needed
+    True
     """
     tolerance_db = validate.number(
         "tolerance_db", tolerance_db, "dB", least=BEST_TOLERANCE_DB, most=WORST_TOLERANCE_DB
     )
     repeats = validate.count("repeats", repeats, least=0)
-    survey = _checked_survey(lines, grid, beam, sonar, track, pointing, element_pattern, ends)
+    survey = Survey(lines, grid, beam, sonar, track, pointing, element_pattern, ends)
     device = open_device(device)
-    left_out = simplify(lines, grid, beam, tolerance_db).left_out
-    images = _images(survey, bool(left_out), tolerance_db, device, costs)
-    full = images[_FULL].plan
+    images = _images(survey, partial(plan, tolerance_db=tolerance_db, device=device, costs=costs))
+    full, left_out = images[_FULL].plan, images.get(_FORMED, images[_FULL]).plan.left_out
+    if repeats and full.half_precision:
+        single = replace(full, method=replace(full.factorization, half_precision=False))
+        images[SINGLE] = replace(images[_FULL], plan=single)
     seconds = {name: image.plan.predicted_seconds for name, image in images.items()}
     if repeats:
-        if full.half_precision:
-            images[SINGLE] = replace(images[_FULL], plan=full.changed(half_precision=False))
         seconds = _measured(images, device, repeats)
     errors, modelled = errors_without(survey), survey.modelled
+    modelled[SINGLE] = not full.half_precision
     if not full.is_exact and device.info.half_precision:
         errors[SINGLE] = ErrorWithout(in_db(half_precision_error(len(full.sides))))
-    modelled[SINGLE] = not full.half_precision
+    allowed = SHARE * power(tolerance_db)
     return Assessment(
         tolerance_db=tolerance_db,
         wavelength_m=band_wavelength_m(lines, measure_spectrum(lines).centre),
@@ -134,73 +165,43 @@ def assess(
         device=device.info.label,
         measured=repeats > 0,
         seconds=seconds[_FULL],
-        simple_seconds=seconds.get(_SIMPLE, seconds[_FULL]),
+        simple_seconds=seconds.get(_FORMED, seconds[_FULL]),
         effects=tuple(
-            _effect(
-                name,
-                modelled[name],
-                errors.get(name),
-                SHARE * power(tolerance_db),
-                name in left_out,
-                seconds[_FULL] - seconds[name] if name in seconds else None,
+            Effect(
+                name=name,
+                modelled=modelled[name],
+                **vars(errors.get(name, ErrorWithout())),
+                needed=_is_needed(name, modelled[name], errors.get(name), allowed),
+                left_out=name in left_out,
+                seconds=_costs_s(name, seconds),
+                key=KEYS[name],
             )
             for name in KEYS
         ),
     )
 
 
-def _checked_survey(
-    lines: RangeLines,
-    grid: Grid,
-    beam: BeamWindow | None,
-    sonar: Sonar | None,
-    track: Track | None,
-    pointing: Pointing | None,
-    element_pattern: bool,
-    ends: bool,
-) -> Survey:
-    """Return a survey; raise TypeError or ValueError for arguments that do not fit together."""
-    validate.instance("lines", lines, RangeLines)
-    validate.instance("grid", grid, Grid)
-    if beam is not None:
-        validate.instance("beam", beam, BeamWindow)
-    validate.instance("sonar", sonar, Sonar, type(None))
-    validate.instance("track", track, Track, type(None))
-    validate.instance("pointing", pointing, Pointing, type(None))
-    validate.flag("element_pattern", element_pattern)
-    validate.flag("ends", ends)
-    if sonar is not None and track is not None and sonar.receivers * track.pings != lines.channels:
-        raise ValueError(
-            f"sonar and track must have the channels of the lines, {lines.channels}, got "
-            f"{sonar.receivers} receivers and {track.pings} pings"
-        )
-    return Survey(lines, grid, beam, sonar, track, pointing, element_pattern, ends)
+def _is_needed(
+    name: str, modelled: bool, error: ErrorWithout | None, allowed: float
+) -> bool | None:
+    """Return True if the error power without an effect exceeds `allowed`; None if it is unknown.
+
+    The plan has decided about single precision already.
+    """
+    if error is None or error.error_db is None:
+        return None
+    return modelled if name == SINGLE else power(error.error_db) > allowed
 
 
-def _effect(
-    name: str,
-    modelled: bool,
-    error: ErrorWithout | None,
-    allowed: float,
-    left_out: bool,
-    seconds: float | None,
-) -> Effect:
-    """Return one effect; it is needed if the power of its error is more than `allowed`."""
-    needed = None if error is None else power(error.error_db) > allowed
-    if name == SINGLE:  # images are formed in half precision where the plan says so
-        needed = None if error is None else modelled
-        seconds = None if seconds is None else -seconds
-    return Effect(
-        name,
-        modelled,
-        None if error is None else error.error_db,
-        None if error is None else error.range_wavelengths,
-        None if error is None else error.most_wavelengths,
-        needed,
-        left_out,
-        seconds,
-        KEYS[name],
-    )
+def _costs_s(name: str, seconds: dict[str, float]) -> float | None:
+    """Return the time that an effect costs, from images without it; None if there is none.
+
+    Only the image for single precision has the effect that the full image lacks.
+    """
+    if name not in seconds:
+        return None
+    saved_s = seconds[_FULL] - seconds[name]
+    return -saved_s if name == SINGLE else saved_s
 
 
 def survey_lines(
@@ -213,23 +214,45 @@ def survey_lines(
     window: Window = "none",
     oversampling: float = 2.0,
 ) -> RangeLines:
-    """Return the lines of one point, with the geometry and the band of a survey's lines.
+    """Return range lines of a single point, with the geometry and the band of a survey.
 
-    They take little time, and are long enough for the grid.
+    They take little time, and stand for the survey's own lines in `assess` and `plan`. They reach
+    from the nearest to the farthest pixel of the grid, with some samples beyond.
 
     Parameters
     ----------
-    sonar, track, grid
-        The survey, and the pixels of its image.
-    motion_in_flight, phase_centres
+    sonar : Sonar
+    track : Track
+    grid : Grid
+        Pixels of the image. The point lies in the middle of the grid.
+    motion_in_flight, phase_centres : bool
         As for `clsas.simulate`.
     window, oversampling
         As for `clsas.compress`.
 
+    Returns
+    -------
+    RangeLines
+
     Raises
     ------
     TypeError, ValueError
-        As `clsas.simulate_lines` does.
+        If an argument has the wrong type or is out of bounds, or the lines are too long for the
+        memory.
+
+    See Also
+    --------
+    assess : Effects that the image of a survey needs.
+
+    Examples
+    --------
+    >>> import clsas
+    >>> sonar = clsas.Sonar(clsas.Pulse(100e3, 20e3, 1e-3), [[0.0, 0, 0]])
+    >>> track = clsas.Track.straight((0, 0, 0), (1.0, 0, 0), pings=32, ping_interval_s=0.1)
+    >>> grid = clsas.Grid.plane((1.0, 2.0, 101), (20.0, 21.0, 101))
+    >>> lines = clsas.survey_lines(sonar, track, grid)
+    >>> lines.samples.shape
+    (32, 122)
     """
     geometry = channels(sonar, track, motion_in_flight=motion_in_flight)
     validate.instance("grid", grid, Grid)
@@ -240,10 +263,10 @@ def survey_lines(
     pulse = sonar.pulse
     step_m = sonar.sound_speed_m_s / (2 * float(oversampling) * pulse.bandwidth_hz)
     range_m = pairwise_range_m(grid.spread(_POINTS), *geometry, sonar.sound_speed_m_s)
-    first_m = range_m.min(axis=0) - _ROOM * step_m
+    first_m = range_m.min(axis=0) - _MARGIN * step_m
     extent = float((range_m.max(axis=0) - first_m).max() / step_m)
     validate.memory("oversampling", 8 * len(first_m) * extent)
-    length = math.ceil(extent) + _ROOM
+    length = math.ceil(extent) + _MARGIN
     middle = np.ravel_multi_index([n // 2 for n in grid.shape], grid.shape)
     return simulate_lines(
         geometry.tx_m,
@@ -260,9 +283,6 @@ def survey_lines(
     )
 
 
-_FULL, _SIMPLE = "full", "simple"  # images beside those without one effect
-
-
 @dataclass(frozen=True, eq=False)
 class _Image:
     """An image to be formed: its inputs and its plan."""
@@ -274,68 +294,59 @@ class _Image:
     full_model: bool
 
     def form(self, device: Device) -> None:
-        """Form the image with a fresh copy of the plan, which has kept nothing of earlier runs."""
-        image = self.plan.image
-        if isinstance(image, Factorization):
-            factorize(self.lines, self.grid, replace(self.plan), device=device)
+        """Form the image."""
+        method = self.plan.method
+        if isinstance(method, Factorization):
+            factorize(self.lines, self.grid, self.plan, device=device)
             return
         preparation = prepare(
             self.lines,
             self.grid,
             device=device,
-            accuracy_db=image.accuracy_db,
+            accuracy_db=method.accuracy_db,
             beam=self.beam,
             full_model=self.full_model,
         )
         execute(preparation)
 
 
-def _images(
-    survey: Survey, simple: bool, tolerance_db: float, device: Device, costs: Costs | None
-) -> dict[str, _Image]:
-    """Return the image in full, without each effect that it models, and as it is formed."""
+def _images(survey: Survey, planned: Callable[..., Plan]) -> dict[str, _Image]:
+    """Return the image with all effects, without each effect that it models, and as it is formed.
+
+    The last is there only if the planner leaves out effects. `planned` is `clsas.plan` with the
+    request.
+    """
     lines, grid, beam = survey.lines, survey.grid, survey.beam
-    given: dict[str, tuple[RangeLines, Grid, BeamWindow | None]] = {_FULL: (lines, grid, beam)}
-    if simple:
-        given[_SIMPLE] = lines, grid, beam
-    modelled = survey.modelled
+    inputs: dict[str, tuple[RangeLines, Grid, BeamWindow | None]] = {}
     if beam is not None:
-        given[BEAM] = lines, grid, None
-        # The directions of these lines, which moving antennas would change.
+        inputs[BEAM] = lines, grid, None
+        # Moving antennas changes the directions of a track: keep those of the given lines.
         beam = replace(beam, along=beam.directions(lines))
-    if modelled[MOTION]:
-        given[MOTION] = replace(lines, rx_velocity_m_s=None), grid, beam
-    if modelled[APART]:
-        middle_m = lines.phase_centres_m
-        given[APART] = replace(lines, tx_m=middle_m, rx_m=middle_m), grid, beam
+    modelled, off_m = survey.modelled, track_errors_m(lines)
+    for name in (MOTION, APART, SWAY):
+        if modelled[name]:
+            inputs[name] = lines_without(name, lines, off_m), grid, beam
     if modelled[RELIEF] and len(grid.shape) == 2:
         flat = leave_out(lines, grid, beam, (RELIEF,)).grid
         if flat.is_planar:
-            given[RELIEF] = lines, flat, beam
-    if modelled[SWAY]:
-        off_m = track_errors_m(lines)
-        straight = replace(lines, tx_m=lines.tx_m - off_m, rx_m=lines.rx_m - off_m)
-        given[SWAY] = straight, grid, beam
-    images = {}
+            inputs[RELIEF] = lines, flat, beam
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", validate.ClsasWarning)  # of ends, which are an effect
-        for name, (some_lines, some_grid, some_beam) in given.items():
-            full_model = name != _SIMPLE
-            chosen = plan(
-                some_lines,
-                some_grid,
-                tolerance_db=tolerance_db,
-                beam=some_beam,
-                device=device,
-                costs=costs,
-                full_model=full_model,
-            )
-            images[name] = _Image(some_lines, some_grid, some_beam, chosen, full_model)
+        formed = planned(lines, grid, beam=survey.beam)
+        full = formed
+        if formed.left_out:
+            full = planned(lines, grid, beam=survey.beam, full_model=True)
+        images = {_FULL: _Image(lines, grid, survey.beam, full, full_model=True)}
+        if formed.left_out:
+            images[_FORMED] = _Image(lines, grid, survey.beam, formed, full_model=False)
+        for name, given in inputs.items():
+            chosen = planned(*given[:2], beam=given[2], full_model=True)
+            images[name] = _Image(*given, chosen, full_model=True)
     return images
 
 
 def _measured(images: dict[str, _Image], device: Device, repeats: int) -> dict[str, float]:
-    """Return the least time of every image, formed in turns after an untimed one."""
+    """Return the shortest time of every image; they are formed in turns, after an untimed one."""
     seconds: dict[str, list[float]] = {name: [] for name in images}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", validate.ClsasWarning)

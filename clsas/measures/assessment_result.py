@@ -1,4 +1,4 @@
-"""Results of `clsas.assess`: effects with their errors and times, as a table."""
+"""Results of `clsas.assess`: effects, with the errors and times they cause, as a table."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from clsas.core.tables import Report, Table
 from clsas.measures.effects import ENDS, KEYS
 
 NONE_DB = -250.0
-"""Errors below this level, dB, count as none."""
+"""Errors below this level, in dB, are shown as "none"."""
 
 
 @dataclass(frozen=True)
 class Effect:
-    """An effect, and the error and the time that an image has without it.
+    """An effect that an image may model, with the error without it and the time it costs.
 
     Attributes
     ----------
@@ -22,20 +22,26 @@ class Effect:
     modelled : bool
         True if the image as given models the effect.
     error_db : float or None
-        Relative rms error of the image without it, dB; -300 if it has no influence, None if the
-        inputs do not tell.
+        Relative rms error of the image without the effect, in dB: -300 if it has no influence, None
+        if the inputs are not sufficient to know.
     range_wavelengths, most_wavelengths : float or None
-        Errors of ranges without it, rms and at most, wavelengths; None for effects on amplitudes.
+        Rms and largest error of the ranges without the effect, in wavelengths; None for effects on
+        amplitudes.
     needed : bool or None
-        True if the power of its error is more than `clsas.sonar.simplify.SHARE` of the power that
-        the tolerance allows; None if the error is not known.
+        True if the error power is more than `clsas.sonar.simplify.SHARE` of the power that the
+        tolerance allows; None if the error is not known.
     left_out : bool
-        True if `clsas.plan` and `clsas.backproject` leave it out by themselves; they move antennas
-        to make up for it.
+        True if `clsas.plan` and `clsas.backproject` leave the effect out of their own accord. They
+        move antennas to compensate for it.
     seconds : float or None
-        Time that the image takes longer because of it; negative if it saves time.
+        Time by which the effect makes the image slower; negative if it makes it faster. None if
+        there is no image without it.
     key : str
-        Key of a scene file that leaves it out; "" if there is none.
+        Key of a scene file that leaves the effect out; "" if there is none.
+
+    See Also
+    --------
+    assess : Function that returns it, with an example.
     """
 
     name: str
@@ -53,15 +59,16 @@ class Effect:
 
 @dataclass(frozen=True)
 class Assessment:
-    """Effects of an image, with errors and times; made by `assess`.
+    """Effects of an image, with errors and times, as returned by `assess`.
 
     Attributes
     ----------
     tolerance_db : float
-        Relative rms error allowed.
+        Relative rms error that is allowed, in dB.
     wavelength_m : float
-        Wavelength at the middle of the band.
+        Wavelength at the middle of the band, in metres.
     channels : int
+        Number of range lines.
     pixels : tuple of int
         Shape of the grid.
     device : str
@@ -69,9 +76,14 @@ class Assessment:
     measured : bool
         True if times were measured, False if the cost model predicts them.
     seconds, simple_seconds : float
-        Time of the image with all modelled effects, and as it is formed: without those that are
-        left out.
+        Time of the image with all modelled effects, and of the image as it is formed, without
+        those that are left out.
     effects : tuple of Effect
+        All effects; ``assessment[name]`` is the one with a name.
+
+    See Also
+    --------
+    assess : Function that returns it, with an example.
     """
 
     tolerance_db: float
@@ -85,7 +97,7 @@ class Assessment:
     effects: tuple[Effect, ...]
 
     def __repr__(self) -> str:
-        """Return the tolerance, and which effects are missing and which could be left out."""
+        """Return a summary: the tolerance, and which effects are missing or not needed."""
         return reprs.summary(
             self,
             f"tolerance {reprs.quantity(self.tolerance_db, 'dB')}",
@@ -99,23 +111,23 @@ class Assessment:
         return self._report().html()
 
     def __getitem__(self, name: str) -> Effect:
-        """Return the effect of a name."""
+        """Return the effect with a name; raise KeyError if there is none."""
         return {effect.name: effect for effect in self.effects}[name]
 
     @property
     def spare(self) -> tuple[str, ...]:
-        """Effects that are modelled and not needed."""
+        """Names of the effects that are modelled but not needed."""
         return tuple(
             e.name for e in self.effects if e.modelled and e.needed is False and e.name != ENDS
         )
 
     @property
     def missing(self) -> tuple[str, ...]:
-        """Effects that are needed and not modelled."""
+        """Names of the effects that are needed but not modelled."""
         return tuple(e.name for e in self.effects if e.needed and not e.modelled)
 
     def describe(self) -> str:
-        """Return a table of the effects."""
+        """Return a table of the effects as text."""
         return self._report().text()
 
     def _report(self) -> Report:

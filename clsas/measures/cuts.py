@@ -1,4 +1,4 @@
-"""Cuts: lines of pixels through a point response, with their measures."""
+"""Cuts through a point response, with their resolution and side lobes."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ from numpy.typing import ArrayLike, NDArray
 from clsas.core import reprs
 from clsas.core.grid import Axis
 
-_LOBES = 10  # side lobes on each side that the ISLR counts
+_LOBES = 10  # side lobes on each side that count in the ISLR
 _UPSAMPLING = 32  # points of a cut per pixel
 
 
 @dataclass(frozen=True, eq=False)
 class Cut:
-    """A point response along one axis, with its measures.
+    """Cut through a point response along one axis, with its resolution and side lobes.
 
-    The main lobe lies between the first minimum on each side. Side lobes are numbered from there
-    outwards and end at minima of the amplitude. Pairs are (towards smaller, towards larger
-    coordinate).
+    The main lobe lies between the first minima on both sides. Side lobes follow outwards, each
+    between two minima of the amplitude. The first value of a pair is for the side of smaller
+    coordinates, the second for that of larger ones.
 
     Attributes
     ----------
@@ -28,19 +28,19 @@ class Cut:
         Direction of the cut: "x", "y" or "z", or "along columns" or "along rows" if it is parallel
         to none of them.
     offset_m : ndarray of float64, shape [points]
-        Distance from the peak, metres.
+        Distance from the peak in metres.
     level_db : ndarray of float64, shape [points]
-        Amplitude over the peak's, dB.
+        Amplitude relative to the peak, in dB.
     resolution_m : float
-        Width of the main lobe at half the peak's power (-3.01 dB), metres.
+        Width of the main lobe at half the power of the peak (-3.01 dB), in metres.
     pslr_nearest_db : (float, float)
-        Peak of the first side lobe over the main lobe's, dB.
+        Peak of the first side lobe relative to that of the main lobe, in dB.
     pslr_db : (float, float)
-        Peak of the highest side lobe over the main lobe's, dB, as far as the cut reaches.
+        Peak of the highest side lobe within the cut, relative to that of the main lobe, in dB.
     islr_db : float
-        Energy of the `lobes` nearest side lobes on both sides over that of the main lobe, dB.
+        Energy of the nearest side lobes on both sides relative to that of the main lobe, in dB.
     lobes : (int, int)
-        Number of whole side lobes in the ISLR: 10, or less if the cut ends before.
+        Number of whole side lobes in the ISLR: 10, or fewer if the cut ends before.
     """
 
     axis: str
@@ -62,13 +62,26 @@ def measure_cut(
     amplitude: float,
     extent_m: float | None,
 ) -> Cut:
-    """Measure a line of pixels through the peak, which lies at index `peak` in it."""
+    """Return the cut of a line of pixels through a peak.
+
+    Parameters
+    ----------
+    axis : Axis
+        Axis along which the pixels lie.
+    samples : complex128 [pixels]
+    peak : float
+        Index of the peak, between pixels.
+    amplitude : float
+        Amplitude of the peak.
+    extent_m : float or None
+        Distance from the peak at which the cut ends, in metres; None for that of the last pixel.
+    """
     from scipy import signal  # slow to import
 
     step_m = axis.step_m
     fine = signal.resample(samples, _UPSAMPLING * len(samples))
     offset = (np.arange(len(fine)) / _UPSAMPLING - peak) * step_m
-    # Behind the last sample the periodic interpolation returns to the first one.
+    # Beyond the last sample, the periodic interpolation returns to the first one.
     inside = np.arange(len(fine)) <= _UPSAMPLING * (len(samples) - 1)
     if extent_m is not None:
         inside &= np.abs(offset) <= extent_m
@@ -80,7 +93,7 @@ def measure_cut(
     top = int(np.abs(offset).argmin())
     before = _Flank.of(power[top::-1], f"smaller {axis.name}")
     after = _Flank.of(power[top:], f"larger {axis.name}")
-    main = before.main + after.main - float(power[top])  # the peak is in both flanks
+    main = before.main + after.main - float(power[top])  # both flanks contain the peak
     return Cut(
         axis=axis.name,
         offset_m=offset,
@@ -95,7 +108,7 @@ def measure_cut(
 
 @dataclass(frozen=True)
 class _Flank:
-    """Half of a cut, from the peak outwards; energies are sums of its power.
+    """Half of a cut, from the peak outwards. Energies are sums of the power of its points.
 
     Attributes
     ----------
@@ -104,7 +117,7 @@ class _Flank:
     main, side_lobes : float
         Energy of the main lobe, and of the nearest side lobes.
     nearest_db, highest_db : float
-        Peak of the first and of the highest side lobe, dB.
+        Peak of the first and of the highest side lobe, in dB.
     lobes : int
         Number of whole side lobes in `side_lobes`.
     """
@@ -118,14 +131,15 @@ class _Flank:
 
     @classmethod
     def of(cls, power: NDArray[np.float64], where: str) -> _Flank:
-        """Measure a flank from its power over the peak's; `where` names it in messages."""
+        """Measure a flank from its power relative to the peak; `where` names it in messages."""
         from scipy import signal  # slow to import
 
         minima = signal.argrelmin(power)[0]
         if len(minima) < 2 or power[: minima[0] + 1].min() > 0.5:
             raise ValueError(
-                f"no whole side lobe at {where} within the image (or extent_m): the "
-                "point is too near the border, or what is around it is not a point response"
+                f"no whole side lobe at {where} within the image (or extent_m): choose a larger "
+                "image or extent_m; the point is too close to the border, or the peak does not "
+                "belong to a point"
             )
         first, second, last = minima[0], minima[1], minima[: _LOBES + 1][-1]
         below = int(np.argmax(power < 0.5))

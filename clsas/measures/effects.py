@@ -1,4 +1,4 @@
-"""Effects that a model of an image holds, and the error of an image without each of them."""
+"""Effects that an image may model, and the error of an image without each of them."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from clsas.core import validate
 from clsas.core.decibels import in_db
 from clsas.core.geometry import pairwise_range_m
 from clsas.core.grid import Grid
@@ -39,9 +40,9 @@ KEYS = {
 }
 """Key of a scene file that leaves each effect out; "" where the grid or the device decides."""
 
-_CHANNELS, _PIXELS = 256, 16  # sampled: channels, and pixels along either side of the grid
-_FREQUENCIES = 8  # samples of the band, each with an equal part of the power
-_BEFORE = 1e-12  # sine: points in the plane of an element's face count as before it
+_CHANNELS, _PIXELS = 256, 16  # channels sampled, and pixels along either side of the grid
+_FREQUENCIES = 8  # frequencies of the band sampled, each with an equal share of the power
+_IN_FRONT = 1e-12  # sine by which a point may lie behind an element's face, for rounding
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,10 +55,15 @@ class Survey:
         Inputs of the image.
     sonar, track, pointing
         Survey that the lines come from; None if not known.
-    has_pattern : bool
-        True if the lines hold the sonar's element patterns.
-    has_ends : bool
+    element_pattern : bool
+        True if the lines contain the sonar's element patterns.
+    ends : bool
         True if recorded data end where the lines do.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If a field has the wrong type, or the survey has other channels than the lines.
     """
 
     lines: RangeLines
@@ -66,15 +72,27 @@ class Survey:
     sonar: Sonar | None = None
     track: Track | None = None
     pointing: Pointing | None = None
-    has_pattern: bool = True
-    has_ends: bool = True
+    element_pattern: bool = True
+    ends: bool = True
 
-    @property
-    def directive(self) -> tuple[Sonar, Track] | None:
-        """Sonar and track if they are known and the elements are directive, else None."""
-        if self.sonar is None or self.track is None or self.sonar.is_omnidirectional:
-            return None
-        return self.sonar, self.track
+    def __post_init__(self) -> None:
+        """Check the fields."""
+        validate.instance("lines", self.lines, RangeLines)
+        validate.instance("grid", self.grid, Grid)
+        if self.beam is not None:
+            validate.instance("beam", self.beam, BeamWindow)
+        validate.instance("sonar", self.sonar, Sonar, type(None))
+        validate.instance("track", self.track, Track, type(None))
+        validate.instance("pointing", self.pointing, Pointing, type(None))
+        validate.flag("element_pattern", self.element_pattern)
+        validate.flag("ends", self.ends)
+        if self.sonar is None or self.track is None:
+            return
+        if self.sonar.receivers * self.track.pings != self.lines.channels:
+            raise ValueError(
+                f"sonar and track must have the channels of the lines, {self.lines.channels}, got "
+                f"{self.sonar.receivers} receivers and {self.track.pings} pings"
+            )
 
     @property
     def modelled(self) -> dict[str, bool]:
@@ -85,10 +103,17 @@ class Survey:
             APART: not np.array_equal(lines.tx_m, lines.rx_m),
             RELIEF: not surface_of(self.grid).is_plane,
             SWAY: bool(track_errors_m(lines).any()),
-            PATTERN: self.directive is not None and self.has_pattern,
+            PATTERN: self.directive is not None and self.element_pattern,
             BEAM: self.beam is not None,
             ENDS: True,
         }
+
+    @property
+    def directive(self) -> tuple[Sonar, Track] | None:
+        """Sonar and track if both are known and the elements are directive, else None."""
+        if self.sonar is None or self.track is None or self.sonar.is_omnidirectional:
+            return None
+        return self.sonar, self.track
 
     @property
     def full_lines(self) -> RangeLines:
@@ -105,13 +130,13 @@ class ErrorWithout:
 
     Attributes
     ----------
-    error_db : float
-        Relative rms error, dB.
+    error_db : float or None
+        Relative rms error in dB; None if it is not known.
     range_wavelengths, most_wavelengths : float or None
-        Error of ranges, rms and at most, wavelengths; None for effects on amplitudes.
+        Rms and largest error of the ranges in wavelengths; None for effects on amplitudes.
     """
 
-    error_db: float
+    error_db: float | None = None
     range_wavelengths: float | None = None
     most_wavelengths: float | None = None
 
@@ -120,30 +145,30 @@ def errors_without(survey: Survey) -> dict[str, ErrorWithout]:
     """Return the error of an image without each effect, for the effects whose error is known.
 
     The error is a mean over a sample of channels i and of pixels x all over the grid. Without an
-    effect, ranges differ by d from the full model's (float64), and weights are w' instead of w. The
-    relative error of an image whose channels add up incoherently is then
+    effect, ranges differ by d from those of the full model (in float64), and weights are w' instead
+    of w. If the channels of a pixel add up incoherently, the relative error power is
 
         sum_ix |w - w' exp(j 2 pi f d)|^2 / sum_ix w^2,
 
-    averaged over the frequencies f of the lines' band (cycles per metre of range). It holds the
-    errors of phases and of envelopes, and grows to +3 dB where phases have nothing in common.
+    averaged over the frequencies f of the lines' band (cycles per metre of range). It includes the
+    errors of phases and of envelopes, and reaches +3 dB where phases are unrelated.
     """
     lines, beam = survey.lines, survey.beam
     sample = _Sample.of(survey.full_lines, survey.grid, beam)
     pattern = None
     if survey.directive is not None:
         pattern = _pattern(sample, *survey.directive, survey.pointing)
-    of_lines = pattern if pattern is not None and survey.has_pattern else 1.0
+    of_lines = pattern if pattern is not None and survey.element_pattern else 1.0
     errors = {
         name: sample.error_of_ranges(range_m, sample.weights * of_lines)
-        for name, range_m in _ranges_without(sample, lines).items()
+        for name, range_m in _ranges_without(sample, track_errors_m(lines)).items()
     }
     if pattern is not None:
         errors[PATTERN] = _error_of_weights(sample.weights * pattern, sample.weights)
     if beam is not None:
         with_it, without = sample.weights * of_lines, sample.inside * of_lines
         errors[BEAM] = _error_of_weights(with_it, without)
-    if survey.has_ends:
+    if survey.ends:
         along = None if beam is None else beam.directions(lines)
         errors[ENDS] = ErrorWithout(
             in_db(ends_error(lines, survey.grid, measure_spectrum(lines), beam, along))
@@ -151,26 +176,47 @@ def errors_without(survey: Survey) -> dict[str, ErrorWithout]:
     return errors
 
 
-def _ranges_without(sample: _Sample, lines: RangeLines) -> dict[str, NDArray[np.float64]]:
-    """Return the ranges of a sample of lines without each effect on them."""
-    some, points_m = sample.lines, sample.points_m
-    moving = some.rx_velocity_m_s, some.sound_speed_m_s
-    middle_m, off_m = some.phase_centres_m, track_errors_m(lines)[sample.channels]
+def _ranges_without(sample: _Sample, off_m: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:
+    """Return the ranges of a sample without each effect on them.
+
+    `off_m` holds the distances of all channels from a straight track.
+    """
+    lines = sample.lines
+    effects = [APART, SWAY] if lines.rx_velocity_m_s is None else [APART, SWAY, MOTION]
     ranges_m = {
-        APART: pairwise_range_m(points_m, middle_m, middle_m, *moving),
-        RELIEF: pairwise_range_m(sample.flat_m, some.tx_m, some.rx_m, *moving),
-        SWAY: pairwise_range_m(points_m, some.tx_m - off_m, some.rx_m - off_m, *moving),
+        effect: ranges_of(sample.points_m, lines_without(effect, lines, off_m[sample.channels]))
+        for effect in effects
     }
-    if some.rx_velocity_m_s is not None:
-        ranges_m[MOTION] = pairwise_range_m(points_m, some.tx_m, some.rx_m)
-    return ranges_m
+    return ranges_m | {RELIEF: ranges_of(sample.flat_m, lines)}
+
+
+def lines_without(effect: str, lines: RangeLines, off_m: NDArray[np.float64]) -> RangeLines:
+    """Return lines without one effect of their antennas.
+
+    Without `MOTION` receivers stay where they were at transmission. Without `APART` transmitter and
+    receiver are both at the phase centre. Without `SWAY` they are moved by -`off_m`, [channels, 3],
+    onto a straight track.
+    """
+    if effect == MOTION:
+        return replace(lines, rx_velocity_m_s=None)
+    if effect == APART:
+        return replace(lines, tx_m=lines.phase_centres_m, rx_m=lines.phase_centres_m)
+    return replace(lines, tx_m=lines.tx_m - off_m, rx_m=lines.rx_m - off_m)
+
+
+def ranges_of(points_m: NDArray[np.float64], lines: RangeLines) -> NDArray[np.float64]:
+    """Return the ranges of points for every channel of some lines, [points, channels]."""
+    return pairwise_range_m(
+        points_m, lines.tx_m, lines.rx_m, lines.rx_velocity_m_s, lines.sound_speed_m_s
+    )
 
 
 def track_errors_m(lines: RangeLines) -> NDArray[np.float64]:
-    """Return the distances of channels from a straight track, [channels, 3], metres.
+    """Return the distances of channels from a straight track, [channels, 3], in metres.
 
-    The track is the line that fits the pings' phase centres best. If all pings have the same number
-    of channels, the mean distance of a channel over the pings is the array's shape, and no error.
+    The track is the line that fits the phase centres of the pings best. If all pings have the same
+    number of channels, the mean distance of a channel over all pings is the shape of the array and
+    not an error.
     """
     centres_m = lines.phase_centres_m
     starts = lines.ping_starts
@@ -197,15 +243,15 @@ class _Sample:
     channels : int [channels]
         Indices of the channels.
     lines : RangeLines
-        Lines of the channels, with everything modelled.
+        Lines of the channels, with all effects.
     points_m, flat_m : float64 [pixels, 3]
         Positions of the pixels, with relief and without.
     range_m : float64
-        Ranges of the full model.
+        Ranges with all effects.
     inside, weights : float64
-        1 where a channel's line holds the pixel; the beam's weights there.
+        1 where a line contains the pixel, else 0; this times the beam's weights.
     cycles_per_m : float64 [frequencies]
-        Frequencies of the band, each with an equal part of the power.
+        Frequencies of the band, each with an equal share of the power.
     wavelength_m : float
         Wavelength at the middle of the band.
     """
@@ -226,11 +272,9 @@ class _Sample:
         some = some_channels(lines.channels, _CHANNELS)
         part = lines.select(some)
         points_m, flat_m = _pixels_m(grid)
-        range_m = pairwise_range_m(
-            points_m, part.tx_m, part.rx_m, part.rx_velocity_m_s, part.sound_speed_m_s
-        )
-        holds = (range_m >= part.first_range_m) & (range_m <= part.last_range_m)
-        inside = holds.astype(np.float64)
+        range_m = ranges_of(points_m, part)
+        contains = (range_m >= part.first_range_m) & (range_m <= part.last_range_m)
+        inside = contains.astype(np.float64)
         weights = inside
         if beam is not None:
             sine = sines(points_m, part.phase_centres_m, beam.directions(lines)[some]).T
@@ -251,7 +295,7 @@ class _Sample:
     def error_of_ranges(
         self, range_m: NDArray[np.float64], weights: NDArray[np.float64]
     ) -> ErrorWithout:
-        """Return the error of other ranges."""
+        """Return the error of an image with other ranges."""
         away_m = range_m - self.range_m
         square = weights**2
         total = max(square.sum(), 1e-30)
@@ -259,21 +303,20 @@ class _Sample:
         wrong = np.mean([4 * np.sin(np.pi * f * away_m) ** 2 for f in self.cycles_per_m], axis=0)
         rms_m = np.sqrt(np.sum(square * away_m**2) / total)
         most_m = np.abs(away_m).max(where=weights > 0, initial=0.0)
-        # A path is there and back.
-        waves = 2 / self.wavelength_m
+        waves = 2 / self.wavelength_m  # the path is twice the range
         error_db = in_db(np.sum(square * wrong) / total)
         return ErrorWithout(error_db, float(rms_m * waves), float(most_m * waves))
 
 
 def _error_of_weights(with_it: NDArray[np.float64], without: NDArray[np.float64]) -> ErrorWithout:
-    """Return the error of other weights."""
+    """Return the error of an image with other weights."""
     return ErrorWithout(in_db(np.sum((with_it - without) ** 2) / max(np.sum(with_it**2), 1e-30)))
 
 
 def _pixels_m(grid: Grid) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return pixels all over a grid and those of most relief, with the relief and without."""
-    places = [np.unique(np.linspace(0, n - 1, _PIXELS).round().astype(int)) for n in grid.shape]
-    index = np.ravel_multi_index(np.ix_(*places), grid.shape).ravel()
+    sides = [np.unique(np.linspace(0, n - 1, _PIXELS).round().astype(int)) for n in grid.shape]
+    index = np.ravel_multi_index(np.ix_(*sides), grid.shape).ravel()
     surface = surface_of(grid)
     if surface.is_plane:
         points_m = grid.at(index)
@@ -287,24 +330,24 @@ def _pixels_m(grid: Grid) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 def _pattern(
     sample: _Sample, sonar: Sonar, track: Track, pointing: Pointing | None
 ) -> NDArray[np.float64]:
-    """Return the two-way pattern at the carrier, 0 behind an element's face."""
+    """Return the two-way pattern at the carrier; it is 0 behind an element's face."""
     lines = sample.lines
     axes = (pointing or Pointing.broadside()).axes(track)
     axes = axes[sample.channels // sonar.receivers]
-    heard_m = np.broadcast_to(lines.rx_m, (len(sample.points_m), *lines.rx_m.shape))
+    received_m = np.broadcast_to(lines.rx_m, (len(sample.points_m), *lines.rx_m.shape))
     if lines.rx_velocity_m_s is not None:
         speed = lines.rx_velocity_m_s / lines.sound_speed_m_s
-        heard_m = heard_m + 2 * sample.range_m[..., None] * speed
+        received_m = received_m + 2 * sample.range_m[..., None] * speed
     pattern = np.ones_like(sample.range_m)
-    ends = (
+    antennas = (
         (lines.tx_m, sonar.tx_length_m, sonar.tx_height_m),
-        (heard_m, sonar.rx_length_m, sonar.rx_height_m),
+        (received_m, sonar.rx_length_m, sonar.rx_height_m),
     )
-    for position_m, length_m, height_m in ends:
-        way = sample.points_m[:, None] - position_m
-        way /= np.maximum(np.linalg.norm(way, axis=-1, keepdims=True), 1e-30)
-        components = np.einsum("pci,cai->apc", way, axes)
-        pattern *= components[1] > -_BEFORE
+    for position_m, length_m, height_m in antennas:
+        look = sample.points_m[:, None] - position_m
+        look /= np.maximum(np.linalg.norm(look, axis=-1, keepdims=True), 1e-30)
+        components = np.einsum("pci,cai->apc", look, axes)
+        pattern *= components[1] > -_IN_FRONT
         for size_m, sine in ((length_m, components[0]), (height_m, components[2])):
             if size_m is not None:
                 frequency_hz, sound = sonar.pulse.carrier_hz, sonar.sound_speed_m_s

@@ -1,4 +1,4 @@
-"""Image quality: point responses."""
+"""Image quality: position, resolution and side lobes of point responses."""
 
 from __future__ import annotations
 
@@ -14,24 +14,23 @@ from clsas.core.grid import Axis, Grid
 from clsas.core.image import Image
 from clsas.measures.cuts import Cut, measure_cut
 
-_SEARCH = 10  # pixels around the given position within which the peak is searched
-_REACH = 1024  # pixels on either side of the peak that enter a measurement, at most
+_SEARCH = 10  # pixels around the given position in which the peak is searched
+_REACH = 1024  # most pixels on either side of the peak that are measured
 
 
 @dataclass(frozen=True, eq=False)
 class PointResponse:
-    """A point in an image.
+    """Response of a point in an image, as returned by `clsas.measure_point`.
 
     Attributes
     ----------
     x_m, y_m, z_m : float
-        Position of its peak, metres.
+        Position of the peak in metres.
     amplitude : float
-        Amplitude of the peak. The phase is not known between pixels, since these hold the range
-        carrier as an alias.
+        Amplitude of the peak. Its phase is not known between pixels, which alias the range carrier.
     azimuth, range : Cut
-        The cuts through the peak along the image's columns and rows: x and y of a horizontal
-        plane, x and z of one in depth.
+        Cuts through the peak along the columns and rows of the image: x and y of a horizontal
+        plane, x and z of a vertical one.
     """
 
     x_m: float
@@ -42,11 +41,11 @@ class PointResponse:
     range: Cut
 
     def __repr__(self) -> str:
-        """Return where the peak is, its amplitude and the resolutions."""
-        place = zip("xyz", (self.x_m, self.y_m, self.z_m), strict=True)
+        """Return a summary: position and amplitude of the peak, and the resolutions."""
+        position = zip("xyz", (self.x_m, self.y_m, self.z_m), strict=True)
         return reprs.summary(
             self,
-            *(f"{name} {value:.7g} m" for name, value in place),
+            *(f"{name} {value:.7g} m" for name, value in position),
             f"amplitude {self.amplitude:.4g}",
             f"azimuth resolution {reprs.quantity(self.azimuth.resolution_m, 'm')}",
             f"range resolution {reprs.quantity(self.range.resolution_m, 'm')}",
@@ -60,23 +59,23 @@ def measure_point(
     search_m: float | None = None,
     extent_m: float | None = None,
 ) -> PointResponse:
-    """Measure the point response nearby: position, resolution and side lobes.
+    """Return the response of a point in an image: its position, resolution and side lobes.
 
     Parameters
     ----------
     image : Image
-        An image on a plane of any direction or a height map, with pixels no larger than its
-        bandwidth asks for (1 / bandwidth: the carrier need not be sampled).
+        Image on a plane of any direction or a height map. Its pixels must be small enough to sample
+        the bandwidth (at most 1 / bandwidth apart), but need not sample the carrier.
     near : (float, float) or (float, float, float)
-        Approximate position of the point, metres. Two numbers are coordinates on the axes of the
-        image (`Grid.sides`), as pictures show them: x, y of a horizontal plane, x, z of one in
-        depth. Three are a position x, y, z; the nearest one on the plane is taken.
+        Approximate position of the point in metres. Two numbers are coordinates on the axes of the
+        image (`Grid.sides`), as pictures show them: x and y of a horizontal plane, x and z of a
+        vertical one. Three numbers are a position x, y, z, which is projected onto the plane.
     search_m : float, optional
-        Distance from there, along columns and along rows, within which the largest pixel is taken
-        for the point; by default 10 pixels.
+        Distance from `near`, along columns and along rows, within which the largest pixel is
+        searched, in metres; by default 10 pixels.
     extent_m : float, optional
-        Distance from the peak within which side lobes count, metres, to exclude other targets; by
-        default that of the image's border, at most 1024 pixels.
+        Distance from the peak up to which side lobes count, in metres, in order to exclude other
+        targets; by default up to the border of the image, but at most 1024 pixels.
 
     Returns
     -------
@@ -85,11 +84,11 @@ def measure_point(
     Raises
     ------
     ValueError
-        If the image has arbitrary points, `near` is outside it, it is zero there or has no
-        peak, its peak is at the border, `extent_m` is less than a pixel, or the main lobe and a
-        side lobe on each side do not fit into it.
+        If the image has arbitrary points or is zero near the point; if `near` is outside the image;
+        if there is no peak, or the peak is at the border; if `extent_m` is less than a pixel, or
+        too small for the main lobe and a side lobe on each side.
     TypeError
-        If an argument is of a wrong kind.
+        If an argument has the wrong type.
 
     Warns
     -----
@@ -97,12 +96,31 @@ def measure_point(
         If a side lobe is higher than the peak. The peak is then itself a side lobe, or there are
         other targets.
 
+    See Also
+    --------
+    plot.cuts : Draw the cuts.
+
     Notes
     -----
-    An image carries the phase exp(j 2 k rho(x)) of its points, which wraps from pixel to pixel
-    where these are larger than a quarter of a wavelength: its spectrum lies anywhere, across the
-    edge of the FFT's too. The phase step between the pixels of the main lobe gives the centre
-    of that spectrum modulo the sampling; with it removed, sinc interpolation is exact.
+    The pixels of a point have the phase exp(j 2 k rho(x)), which wraps from pixel to pixel if these
+    are larger than a quarter of a wavelength. The spectrum of the image may therefore lie anywhere,
+    even across the edge of an FFT's band. The phase step between pixels of the main lobe gives the
+    centre of the spectrum modulo the sampling. Once this carrier is removed, sinc interpolation is
+    exact.
+
+    Examples
+    --------
+    A point whose image is a product of two sinc functions, whose first zeros are 20 mm from the
+    peak along x and 40 mm along y. The resolution is 0.886 times these distances:
+
+    >>> import clsas
+    >>> import numpy as np
+    >>> grid = clsas.Grid.plane(x=(0.0, 2.0, 201), y=(40.0, 41.5, 151))
+    >>> x, y = grid.axes_m
+    >>> pixels = np.outer(np.sinc((y - 40.6) / 0.04), np.sinc((x - 0.803) / 0.02)) + 0j
+    >>> point = clsas.measure_point(clsas.Image(pixels, grid), near=(0.8, 40.6))
+    >>> print(f"x = {point.x_m:.3f} m, resolution {point.azimuth.resolution_m:.4f} m")
+    x = 0.803 m, resolution 0.0177 m
     """
     validate.instance("image", image, Image)
     across, upward = axes = image.grid.sides
@@ -114,8 +132,8 @@ def measure_point(
     dx, dy = across.step_m, upward.step_m
     if extent_m is not None:
         validate.number("extent_m", extent_m, "m", least=max(abs(dx), abs(dy)))
-    place = _on_axes(image.grid, axes, near)
-    peak_row, peak_column = _find_peak(image.pixels, axes, place, search_m)
+    near_m = _on_axes(image.grid, axes, near)
+    peak_row, peak_column = _find_peak(image.pixels, axes, near_m, search_m)
 
     top, left = max(peak_row - _REACH, 0), max(peak_column - _REACH, 0)
     around = image.pixels[top : peak_row + _REACH + 1, left : peak_column + _REACH + 1]
@@ -136,9 +154,9 @@ def measure_point(
     highest_db = max(*response.azimuth.pslr_db, *response.range.pslr_db)
     if highest_db > 0:
         validate.warn(
-            f"the peak near ({place[0]:.9g}, {place[1]:.9g}) m is {highest_db:.1f} dB lower than a "
-            "side lobe of it: give a nearer place or a larger search_m, or keep other targets out "
-            "by extent_m"
+            f"the peak near ({near_m[0]:.9g}, {near_m[1]:.9g}) m is {highest_db:.1f} dB lower than "
+            "a side lobe of it: give a position closer to the point or a larger search_m, or "
+            "exclude other targets with extent_m"
         )
     return response
 
@@ -146,14 +164,14 @@ def measure_point(
 def _find_peak(
     pixels: NDArray,
     axes: tuple[Axis, Axis],
-    place: NDArray[np.float64],
+    near_m: NDArray[np.float64],
     search_m: float | None,
 ) -> tuple[int, int]:
     """Return row and column of the largest pixel near coordinates on the axes."""
     if search_m is not None:
         validate.positive("search_m", search_m, "m")
     windows = []
-    for axis, at in zip(axes, place, strict=True):
+    for axis, at in zip(axes, near_m, strict=True):
         count, index = len(axis.places_m), (at - axis.places_m[0]) / axis.step_m
         if not -0.5 <= index <= count - 0.5:
             ends = sorted((axis.places_m[0], axis.places_m[-1]))
@@ -169,26 +187,26 @@ def _find_peak(
     amplitude = np.abs(pixels[rows, columns])
     row, column = np.unravel_index(amplitude.argmax(), amplitude.shape)
     if amplitude[row, column] == 0:
-        raise ValueError(f"image is zero around near = ({place[0]:g}, {place[1]:g}) m")
+        raise ValueError(f"image is zero around near = ({near_m[0]:g}, {near_m[1]:g}) m")
     row, column = int(row) + rows.start, int(column) + columns.start
     for axis, index in zip(axes, (column, row), strict=True):
         if not 0 < index < len(axis.places_m) - 1:
             raise ValueError(
-                f"the peak near ({place[0]:g}, {place[1]:g}) m lies at the image's border "
+                f"the peak near ({near_m[0]:g}, {near_m[1]:g}) m lies at the border of the image "
                 f"({axis.name} = {axis.places_m[index]:g} m): a larger image is needed"
             )
     if np.abs(pixels[row - 1 : row + 2, column - 1 : column + 2]).max() > np.abs(
         pixels[row, column]
     ):
         raise ValueError(
-            f"there is no peak around near = ({place[0]:g}, {place[1]:g}) m, only the flank of one "
-            "outside the search: give a nearer place or a larger search_m"
+            f"there is no peak around near = ({near_m[0]:g}, {near_m[1]:g}) m, only the flank of "
+            "one outside the search: give a position closer to the point or a larger search_m"
         )
     return row, column
 
 
 def _on_axes(grid: Grid, axes: tuple[Axis, Axis], near: Sequence[float]) -> NDArray[np.float64]:
-    """Return where a place, given by two numbers or as a position, is on the axes, metres."""
+    """Return the coordinates on the axes, in metres, of two numbers or of a position."""
     position_m = validate.array("near", near, np.float64, None)
     if position_m.shape != (3,):
         return validate.array("near", position_m, np.float64, (2,))
@@ -199,7 +217,7 @@ def _on_axes(grid: Grid, axes: tuple[Axis, Axis], near: Sequence[float]) -> NDAr
 
 
 def _position_m(grid: Grid, row: float, column: float) -> tuple[float, float, float]:
-    """Return the position at a row and column between pixels, at the height of the nearest one."""
+    """Return the position of a row and column between pixels, at the height of the nearest."""
     origin_m, row_step_m, column_step_m = grid.vectors_m
     x_m, y_m, z_m = origin_m + row * row_step_m + column * column_step_m
     height_m = 0.0 if grid.height_m is None else grid.height_m[round(row), round(column)]
@@ -211,7 +229,7 @@ def _word(axis: Axis) -> str:
 
 
 def _without_carrier(pixels: NDArray, row: int, column: int) -> NDArray:
-    """Shift the spectrum of the point at a pixel to zero frequency, on both axes."""
+    """Return pixels with the spectrum of the point at one of them shifted to zero frequency."""
     main_lobe = pixels[row - 1 : row + 2, column - 1 : column + 2]
     down = np.angle(np.vdot(main_lobe[:-1], main_lobe[1:]))
     across = np.angle(np.vdot(main_lobe[:, :-1], main_lobe[:, 1:]))
@@ -225,7 +243,7 @@ def _sinc(positions: ArrayLike, count: int) -> NDArray:
 
 
 def _refine_peak(pixels: NDArray, row: float, column: float) -> tuple[float, float, float]:
-    """Return row, column and amplitude of the peak of the band-limited image near a pixel."""
+    """Return row, column and amplitude of the peak of the interpolated image near a pixel."""
     zoom = np.arange(-16, 17)
     for step in (1 / 16, 1 / 256, 1 / 4096):
         rows, columns = row + step * zoom, column + step * zoom

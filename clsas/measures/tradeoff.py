@@ -1,4 +1,4 @@
-"""Speed against accuracy: images of one scene by many methods, timed and compared."""
+"""Time against error: one image formed by many methods, timed and compared."""
 
 from __future__ import annotations
 
@@ -8,8 +8,7 @@ import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import product
-from typing import Any
+from itertools import count, product
 
 import numpy as np
 
@@ -20,7 +19,6 @@ from clsas.core.image import Image
 from clsas.core.image_error import relative_error_db
 from clsas.core.lines import RangeLines
 from clsas.exact.backprojection import ACCURACY_DB, form_exactly
-from clsas.factorized.plan import Plan
 from clsas.measures.cuts import Cut
 from clsas.measures.quality import measure_point
 from clsas.measures.shadows import DARKEST, dark_level_db
@@ -28,18 +26,19 @@ from clsas.measures.tradeoff_result import Response, Row, Tradeoff
 from clsas.opencl.device import Device, open_device
 from clsas.planning.factorize import factorize
 from clsas.planning.planner import BEST_TOLERANCE_DB, WORST_TOLERANCE_DB, checked_pairs, plan
+from clsas.plans.plan import Plan
 from clsas.sonar.beam import BeamWindow
 
 TOLERANCES_DB = (-20.0, -30.0, -40.0, -50.0, -60.0, -70.0)
 STAGES = (*(((2, 2),) * count for count in range(1, 6)), ((2, 4),) * 2)
-"""Plans of the thesis (chapter 4): 1 to 5 stages of 2 x 2, and 2 stages of QR = 2, QI = 4."""
+"""Stages of Ødegaard (2004), chapter 4: 1 to 5 of QR = QI = 2, and 2 of QR = 2 and QI = 4."""
 
 STUDIED_TAPS = tuple(product(ALIGN_TAPS, APERTURE_TAPS))
 STUDIED_DEPTHS = (1, 2, 3, 4)
-"""Pairs of taps (in range, along the aperture) and numbers of stages that a study tries."""
+"""Taps (in range, along the aperture) and numbers of stages that a study tries."""
 
 REFERENCE_DB = -85.0
-"""Accuracy of the exact image that all errors are relative to."""
+"""Accuracy of the exact image that all errors are relative to, in dB."""
 
 
 def tradeoff(
@@ -54,10 +53,10 @@ def tradeoff(
     study: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> Tradeoff:
-    """Form one image by many methods; measure time and error of each.
+    """Return the measured time and error of one image formed by many methods.
 
-    Every method runs once before any is timed. The timed runs then take turns, so that a machine
-    that slows down slows all of them.
+    Every method forms the image once before any is timed. The timed runs take turns, so that a
+    machine that becomes slower affects all methods alike.
 
     Parameters
     ----------
@@ -68,8 +67,8 @@ def tradeoff(
     tolerances_db : sequence of float
         Tolerances as for `clsas.plan`.
     stages : sequence of sequences of (QR, QI), optional
-        Stages of the thesis's method, as for `clsas.plan`; an empty sequence for none. By default
-        those of `STAGES` that the lines and the grid allow.
+        Stages of the method of Ødegaard (2004), as for `clsas.plan`; an empty sequence for none.
+        By default all of `STAGES` that lines and grid allow.
     beam : BeamWindow, optional
         Weights of the channels, also for the exact image.
     device : Device, str or int, optional
@@ -77,23 +76,47 @@ def tradeoff(
     repeats : int
         Number of timed runs.
     study : bool
-        For every tolerance, also form the image with all of `STUDIED_TAPS` and `STUDIED_DEPTHS`
-        that can keep to it: the planner chooses from them. That takes long.
+        True to form the image also with all of `STUDIED_TAPS` and `STUDIED_DEPTHS` that can keep
+        each tolerance. The planner chooses from these. This takes long.
     progress : callable, optional
-        Called as progress(images done, images).
+        Called as progress(images formed, all images).
 
     Returns
     -------
     Tradeoff
-        The timed exact image has an accuracy of -60 dB, or of the tightest tolerance; errors are
-        relative to one of -85 dB.
+        The timed exact image has an accuracy of -60 dB, or of the tightest tolerance. Errors are
+        relative to an exact image with an accuracy of -85 dB.
 
     Raises
     ------
     TypeError, ValueError
-        If an argument is not what is allowed, see also `clsas.plan`; before anything is timed.
+        If an argument has the wrong type or is out of bounds (see also `clsas.plan`), before
+        anything is timed; or if the exact image is zero.
     DeviceError
-        If there is no such device.
+        If the device does not exist.
+
+    See Also
+    --------
+    plot.tradeoff : Draw the result.
+    plan : The fastest image within a tolerance.
+
+    References
+    ----------
+    Ødegaard (2004), "Fast time domain beamforming for synthetic aperture sonar", chapter 4.
+
+    Examples
+    --------
+    >>> import clsas
+    >>> import numpy as np
+    >>> tx_m = np.outer(np.arange(64), [0.02, 0, 0])
+    >>> point = clsas.PointTargets([[0.6, 20.0, 0.0]], [1.0])
+    >>> lines = clsas.simulate_lines(tx_m, tx_m, point, carrier_hz=100e3, bandwidth_hz=20e3)
+    >>> grid = clsas.Grid.plane((0.4, 0.8, 32), (19.8, 20.2, 32))
+    >>> measured = clsas.tradeoff(lines, grid, tolerances_db=[-30], stages=[], repeats=1)
+    >>> [row.label for row in measured.rows]
+    ['-30 dB', 'exact']
+    >>> measured.rows[0].error_db < -30
+    True
     """
     repeats = _check(lines, grid, beam, repeats, study)
     validate.progress(progress)
@@ -108,18 +131,17 @@ def tradeoff(
     candidates = list(_planned(requests, lines, grid, beam, device))
     candidates.append(_exactly(min([ACCURACY_DB, *tolerances]), lines, grid, beam, device))
 
-    total = 1 + len(candidates) * (1 + repeats)
-    done = 0
+    total, done = 1 + len(candidates) * (1 + repeats), count(1)
 
     def step() -> None:
-        nonlocal done
-        done += 1
         if progress is not None:
-            progress(done, total)
+            progress(next(done), total)
 
     reference = form_exactly(lines, grid, accuracy_db=REFERENCE_DB, beam=beam, device=device)
     if not reference.pixels.any():
-        raise ValueError("grid must lie where the lines hold anything: the exact image is zero")
+        raise ValueError(
+            "grid must lie where the lines have echoes: the exact image is zero everywhere"
+        )
     step()
     rows = []
     for each in candidates:  # the first run builds the kernels, and its image is measured
@@ -137,16 +159,28 @@ def tradeoff(
     )
 
 
+@dataclass(frozen=True)
+class _Request:
+    """Arguments of `clsas.plan` for one method, and how its row is labelled."""
+
+    label: str
+    method: str
+    tolerance_db: float | None = None
+    stages: Sequence[tuple[int, int]] | None = None
+    taps: tuple[int, int] | None = None
+    depth: int | None = None
+
+
 @dataclass(frozen=True, eq=False)
 class _Candidate:
-    """A method: its row as far as the plan tells, and the function that forms its image."""
+    """A method: its row as planned, without measurements, and a function that forms its image."""
 
     row: Row
     form: Callable[[], Image]
 
 
 def _check(lines: object, grid: object, beam: object, repeats: int, study: object) -> int:
-    """Raise TypeError or ValueError for arguments of a wrong kind; return the repeats."""
+    """Return the repeats; raise TypeError or ValueError if an argument has the wrong type."""
     validate.instance("lines", lines, RangeLines)
     validate.instance("grid", grid, Grid)
     validate.flag("study", study)
@@ -156,7 +190,7 @@ def _check(lines: object, grid: object, beam: object, repeats: int, study: objec
 
 
 def _checked_tolerances(tolerances_db: Sequence[float]) -> list[float]:
-    """Return the tolerances, of which there may be none."""
+    """Return the tolerances, which may be an empty list."""
     given = validate.array("tolerances_db", tolerances_db, np.float64, None)
     return [
         validate.number(
@@ -169,39 +203,47 @@ def _checked_tolerances(tolerances_db: Sequence[float]) -> list[float]:
 
 def _requests(
     tolerances_db: Sequence[float], study: bool, stages: Sequence[Sequence[tuple[int, int]]]
-) -> list[dict[str, Any]]:
-    """Return the arguments of `clsas.plan` for every method but the exact one."""
-    requests: list[dict[str, Any]] = [{"tolerance_db": each} for each in tolerances_db]
+) -> list[_Request]:
+    """Return a request for every method but the exact one."""
+    requests = [_Request(f"{each:g} dB", "tolerance", each) for each in tolerances_db]
     if study:
-        requests += [
-            {"tolerance_db": each, "taps": taps, "depth": depth}
-            for each, taps, depth in product(tolerances_db, STUDIED_TAPS, STUDIED_DEPTHS)
-        ]
-    return requests + [{"stages": each} for each in stages]
+        for each, taps, depth in product(tolerances_db, STUDIED_TAPS, STUDIED_DEPTHS):
+            label = f"{each:g} dB, {taps[0]}+{taps[1]} taps, {depth} stage{'s' * (depth > 1)}"
+            requests.append(_Request(label, "study", each, taps=taps, depth=depth))
+    return requests + [_Request(_label(each), "stages", stages=each) for each in stages]
+
+
+def _label(stages: Sequence[tuple[int, int]]) -> str:
+    """Return "3 of 2x2" for equal stages, "2x2,4x2" for others."""
+    each = [f"{beams}x{divisions}" for beams, divisions in stages]
+    return f"{len(each)} of {each[0]}" if len(set(each)) == 1 else ",".join(each)
 
 
 def _planned(
-    requests: Sequence[dict[str, Any]],
+    requests: Sequence[_Request],
     lines: RangeLines,
     grid: Grid,
     beam: BeamWindow | None,
     device: Device,
 ) -> Iterator[_Candidate]:
-    """Yield the planned methods, without those of a study that cannot keep to the tolerance."""
+    """Yield the planned methods, without those of a study that cannot keep the tolerance."""
     for request in requests:
         start = time.perf_counter()
-        chosen = plan(lines, grid, **request, beam=beam, device=device)
+        chosen = plan(
+            lines, grid, tolerance_db=request.tolerance_db, stages=request.stages,
+            taps=request.taps, depth=request.depth, beam=beam, device=device,
+        )  # fmt: skip
         plan_seconds = time.perf_counter() - start
-        if "taps" in request and chosen.is_exact:
+        if request.taps is not None and chosen.is_exact:
             continue
         form = partial(factorize, lines, grid, chosen, device=device)
-        yield _Candidate(_row(*_name(request), chosen, plan_seconds), form)
+        yield _Candidate(_row(request.label, request.method, chosen, plan_seconds), form)
 
 
 def _exactly(
     accuracy_db: float, lines: RangeLines, grid: Grid, beam: BeamWindow | None, device: Device
 ) -> _Candidate:
-    """Return the exact image as a method."""
+    """Return the exact image as a candidate."""
     chosen = plan(lines, grid, stages=[], beam=beam, device=device)
     row = replace(_row("exact", "exact", chosen, 0.0), predicted_error_db=accuracy_db)
     form = partial(form_exactly, lines, grid, accuracy_db=accuracy_db, beam=beam, device=device)
@@ -209,7 +251,7 @@ def _exactly(
 
 
 def _timed(candidates: Sequence[_Candidate], repeats: int, step: Callable[[], None]) -> list[float]:
-    """Return the median seconds of every method, formed in turns."""
+    """Return the median time of every candidate in seconds; they are formed in turns."""
     seconds: list[list[float]] = [[] for _ in candidates]
     for _ in range(repeats):
         for each, taken in zip(candidates, seconds, strict=True):
@@ -221,7 +263,7 @@ def _timed(candidates: Sequence[_Candidate], repeats: int, step: Callable[[], No
 
 
 def summary(chosen: Plan) -> str:
-    """Return a plan in a line: its subimages (rows x columns) stage by stage, and its filters."""
+    """Return a plan as one line: the subimages (rows x columns) of every stage, and its filters."""
     if chosen.is_exact:
         return "plain backprojection"
     sides = ", ".join(f"{rows}x{columns}" for rows, columns in chosen.sides)
@@ -235,9 +277,9 @@ def summary(chosen: Plan) -> str:
 def _feasible(
     lines: RangeLines, grid: Grid, beam: BeamWindow | None
 ) -> list[tuple[tuple[int, int], ...]]:
-    """Return the plans of `STAGES` for which lines and pixels suffice."""
-    one_place = not np.ptp(lines.tx_m + lines.rx_m, axis=0).any()
-    if not grid.is_planar or one_place or (beam is not None and beam.normalise):
+    """Return those of `STAGES` for which there are enough lines and pixels."""
+    at_one_position = not np.ptp(lines.tx_m + lines.rx_m, axis=0).any()
+    if not grid.is_planar or at_one_position or (beam is not None and beam.normalise):
         return []
     return [
         stages
@@ -245,18 +287,6 @@ def _feasible(
         if np.prod([beams for beams, _ in stages]) <= lines.channels
         and np.prod([divisions for _, divisions in stages]) <= min(grid.shape)
     ]
-
-
-def _name(request: dict[str, Any]) -> tuple[str, str]:
-    """Return label and method: "-50 dB", "3 of 2x2" for equal stages, "2x2,4x2" for others."""
-    if "taps" in request:
-        (in_range, along), depth = request["taps"], request["depth"]
-        taps = f"{in_range}+{along} taps, {depth} stage{'s' * (depth > 1)}"
-        return f"{request['tolerance_db']:g} dB, {taps}", "study"
-    if "stages" not in request:
-        return f"{request['tolerance_db']:g} dB", "tolerance"
-    each = [f"{beams}x{divisions}" for beams, divisions in request["stages"]]
-    return f"{len(each)} of {each[0]}" if len(set(each)) == 1 else ",".join(each), "stages"
 
 
 def _row(label: str, method: str, chosen: Plan, plan_seconds: float) -> Row:
@@ -273,7 +303,7 @@ def _row(label: str, method: str, chosen: Plan, plan_seconds: float) -> Row:
 
 
 def _measured(row: Row, image: Image, reference: Image) -> Row:
-    """Return a row with the error of its image, and the response of the strongest point."""
+    """Return a row with the error of its image and the response of the strongest point."""
     azimuth, range_ = _responses(image, reference)
     return replace(
         row,
@@ -292,9 +322,9 @@ def _responses(image: Image, reference: Image) -> tuple[Response | None, Respons
     row, column = np.unravel_index(np.abs(reference.pixels).argmax(), reference.grid.shape)
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", validate.ClsasWarning)  # of other targets around
+            warnings.simplefilter("ignore", validate.ClsasWarning)  # about other targets nearby
             point = measure_point(image, (across.places_m[column], upward.places_m[row]))
-    except ValueError:  # no point response, or too near the border
+    except ValueError:  # there is no point response, or it is too close to the border
         return None, None
     return _response(point.azimuth), _response(point.range)
 

@@ -1,4 +1,4 @@
-"""Results of `clsas.tradeoff`: rows of time against error, as a table, CSV and a picture."""
+"""Results of `clsas.tradeoff`: time against error, as a table, CSV and a picture."""
 
 from __future__ import annotations
 
@@ -42,16 +42,16 @@ _COLUMNS = (
 
 @dataclass(frozen=True)
 class Response:
-    """A point's response along an axis; see `clsas.measures.cuts.Cut`.
+    """Response of a point along one axis; see `clsas.measures.cuts.Cut`.
 
     Attributes
     ----------
     resolution_m : float
-        Width at -3 dB, metres.
+        Width at -3 dB in metres.
     pslr_db : float
-        The higher one of the two side lobes next to the main lobe, dB.
+        Higher one of the two side lobes next to the main lobe, in dB.
     islr_db : float
-        Energy of side lobes over that of the main lobe, dB.
+        Energy of the side lobes relative to that of the main lobe, in dB.
     """
 
     resolution_m: float
@@ -61,28 +61,29 @@ class Response:
 
 @dataclass(frozen=True)
 class Row:
-    """An image formed by one method: its time and its errors.
+    """Time and errors of an image formed by one method.
 
     Attributes
     ----------
     label : str
-        The tolerance, the stages given ("3 of 2x2"), or "exact". In a study: tolerance, taps in
-        range and along the aperture, and stages ("-50 dB, 8+6 taps, 3 stages").
+        The tolerance, the given stages ("3 of 2x2"), or "exact". In a study, the tolerance, taps
+        in range and along the aperture, and number of stages ("-50 dB, 8+6 taps, 3 stages").
     method : str
         "tolerance", "study", "stages" or "exact".
     plan : str
-        Subimages of every stage, and filters.
+        Subimages of every stage, and the filters.
     plan_seconds : float
-        Time of planning; 0 for the exact image.
+        Time that planning took; 0 for the exact image.
     seconds : float
         Median time of the image, without planning.
     predicted_seconds : float
+        Time that the plan predicts.
     error_db, predicted_error_db : float
-        Relative rms error against the exact image.
+        Measured and predicted relative rms error, in dB.
     azimuth, range : Response or None
-        Response of the exact image's strongest point; None if it cannot be measured.
+        Response at the strongest point of the exact image; None if it cannot be measured.
     dark_error_db : float
-        Error in the darkest tenth of the exact image, relative to the level there; see
+        Error in the darkest tenth of the exact image, relative to the level there, in dB; see
         `clsas.measures.shadows`.
     """
 
@@ -101,12 +102,12 @@ class Row:
 
 @dataclass(frozen=True)
 class Tradeoff:
-    """Time against error, measured.
+    """Measured times and errors of one image by many methods, as returned by `tradeoff`.
 
     Attributes
     ----------
     device, driver : str
-        Device that formed the images.
+        Device that formed the images, and its driver.
     channels : int
         Number of range lines.
     pixels : (rows, columns)
@@ -114,9 +115,14 @@ class Tradeoff:
     repeats : int
         Number of timed runs; `seconds` are their medians.
     rows : tuple of Row
-        Images by tolerance, of a study, by stages, and the exact image last.
+        Images to a tolerance, then those of a study, then those by given stages, and the exact
+        image last.
     dark_level_db : float
-        Level of the darkest tenth of the exact image relative to the whole image.
+        Level of the darkest tenth of the exact image relative to the whole image, in dB.
+
+    See Also
+    --------
+    tradeoff : Function that returns it, with an example.
     """
 
     device: str
@@ -145,12 +151,12 @@ class Tradeoff:
 
     @property
     def exact(self) -> Row:
-        """The exact image."""
+        """Row of the exact image."""
         return self.rows[-1]
 
     @property
     def front(self) -> tuple[Row, ...]:
-        """The rows that no other beats in both time and error (Pareto front), fastest first."""
+        """Rows that no other row beats in both time and error (Pareto front), fastest first."""
         best = math.inf
         front: list[Row] = []
         for row in sorted(self.rows, key=lambda row: (row.seconds, row.error_db)):
@@ -160,9 +166,10 @@ class Tradeoff:
         return tuple(front)
 
     def describe(self) -> str:
-        """Return a table of all rows; resolutions are shown over those of the exact image.
+        """Return a table of all rows as text.
 
-        "In the dark" is the error in the darkest tenth of the image, relative to the level there.
+        Resolutions are relative to those of the exact image. "In the dark" is the error in the
+        darkest tenth of the image, relative to the level there.
         """
         return self._report().text()
 
@@ -175,7 +182,7 @@ class Tradeoff:
         Raises
         ------
         ValueError
-            If the file's name ends in another suffix than .csv.
+            If the suffix is not .csv.
         OSError
             If the folder does not exist or the file cannot be written.
         """
@@ -195,7 +202,7 @@ class Tradeoff:
                 )
 
     def save_png(self, path: str | os.PathLike, *, title: str = "") -> None:
-        """Draw time against error; see `clsas.plot.tradeoff`.
+        """Write a picture of time against error as PNG; see `clsas.plot.tradeoff`.
 
         Raises
         ------
@@ -204,13 +211,13 @@ class Tradeoff:
         OSError
             If the folder does not exist or the file cannot be written.
         """
-        import clsas  # the public face, which imports the room of pictures when it is used
+        import clsas  # the public face, which imports the room plot only when it is used
 
         clsas.plot.save_png(clsas.plot.tradeoff(self, title=title), path)
 
 
 def _cells(row: Row, exact: Row) -> Iterator[str]:
-    """Yield the cells of one row of the table; times and resolutions relative to `exact` too."""
+    """Yield the cells of a row of the table; some are relative to the exact image."""
     yield row.label
     yield f"{row.seconds:.3g}"
     yield f"{row.predicted_seconds:.3g}"
@@ -225,5 +232,5 @@ def _cells(row: Row, exact: Row) -> Iterator[str]:
 
 
 def _figures(response: Response | None) -> list[float | None]:
-    """Return the cells of one response in a CSV file."""
+    """Return the cells of a response in a CSV file."""
     return [getattr(response, figure, None) for figure in _FIGURES]

@@ -18,7 +18,6 @@ from clsas.core.image import Image, holds_any
 from clsas.core.lines import RangeLines
 from clsas.exact.backprojection import prepare
 from clsas.exact.run import execute
-from clsas.factorized.plan import Plan
 from clsas.mosaics.devices import process_device, thread_device
 from clsas.mosaics.patches import PatchWindow, host_bytes
 from clsas.mosaics.provenance import REQUESTS, beam_json
@@ -27,8 +26,9 @@ from clsas.mosaics.store import Store
 from clsas.mosaics.survey import Survey, largest_gap_m, open_files
 from clsas.mosaics.visibility import SurveyVisibility
 from clsas.opencl.device import Device
-from clsas.planning.factorize import factorize
-from clsas.planning.planner import plan, tolerance_in_db
+from clsas.planning.former import former
+from clsas.planning.planner import planned, tolerance_in_db
+from clsas.plans.plan import Plan
 from clsas.sonar.beam import BeamWindow
 from clsas.sonar.coverage import reaches
 
@@ -196,7 +196,8 @@ def _formed(
         return execute(preparation, warned=True), how  # records say which patches are zero
     before = time.perf_counter()
     available = min(job.memory_bytes - patch_bytes, device.info.memory_bytes // 2)
-    chosen = plan(lines, grid, **job.request, beam=beam, device=device, memory_bytes=available)
+    found = planned(lines, grid, **job.request, beam=beam, device=device, memory_bytes=available)
+    chosen = found.plan
     how = {
         "plan_seconds": time.perf_counter() - before,
         "predicted_error_db": chosen.predicted_error_db,
@@ -204,8 +205,10 @@ def _formed(
         "memory_bytes": patch_bytes + int(chosen.memory_bytes),
         "plan": json.loads(_without_directions(chosen).to_json()),
     }
-    chosen.kept["warned"] = True
-    return factorize(lines, grid, chosen, device=device), how
+    imager = former(
+        lines, grid, chosen, device, track=found.track, surface=found.surface, warned=True
+    )
+    return imager.form(lines), how
 
 
 def _check_memory(job: Job, lines: RangeLines, grid: Grid) -> None:

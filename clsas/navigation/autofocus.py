@@ -36,7 +36,7 @@ from clsas.navigation.responses import (
 )
 from clsas.navigation.speed_check import check_speed
 from clsas.opencl.device import Device, open_device
-from clsas.planning.factorize import factorize
+from clsas.planning.former import former
 from clsas.planning.planner import plan
 from clsas.signal.readout import Readout
 from clsas.sonar.beam import BeamWindow
@@ -362,7 +362,7 @@ class _Focus:
 
     def _form(self, moved_m: NDArray[np.float64]) -> Image:
         lines = self._lines(moved_m)
-        return factorize(lines, self.grid, self.plan.moved(lines), device=self.device)
+        return former(lines, self.grid, self.plan, self.device).form(lines)
 
     def _lines(self, moved_m: NDArray[np.float64]) -> RangeLines:
         vectors_m = self.passage.vectors_m(moved_m)

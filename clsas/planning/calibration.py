@@ -13,7 +13,6 @@ from scipy.optimize import nnls
 from clsas.core import validate
 from clsas.core.grid import Grid
 from clsas.core.lines import RangeLines
-from clsas.factorized.plan import Plan
 from clsas.opencl.device import Device, open_device
 from clsas.planning import costs as stored
 from clsas.planning import scaling
@@ -27,6 +26,7 @@ from clsas.planning.timed_images import (
     scene,
     with_relief,
 )
+from clsas.plans.plan import Plan
 from clsas.sonar.beam import BeamWindow
 
 _SIZES = ((500, 768), (1500, 512))

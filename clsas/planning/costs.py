@@ -15,9 +15,8 @@ from clsas.core import reading, validate
 from clsas.core.atomic import replacing
 from clsas.core.cache import cache_folder, private_folder, trusted_cache
 from clsas.core.version import __version__
-from clsas.factorized.estimates import Work
-from clsas.factorized.plan import CostSource
 from clsas.opencl.device import Device, DeviceInfo
+from clsas.plans.predictions import CostSource, Work
 
 _MOST_NS = 1e15  # arbitrary: eleven days for one unit; times of any image stay finite
 

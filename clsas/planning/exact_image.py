@@ -11,10 +11,11 @@ from clsas.exact.buffers import block_buffers, part_buffers
 from clsas.exact.decision import decide
 from clsas.exact.groups import Groups, GroupsEstimate
 from clsas.exact.tiles import STACK, Tiles
-from clsas.factorized.estimates import Work, backprojecting, upsampling
 from clsas.opencl.buffers import beam_buffers, pixel_buffers, total_bytes
 from clsas.opencl.device import Device
 from clsas.planning.visibility_model import VisibilityModel
+from clsas.planning.work import backprojecting, upsampling
+from clsas.plans.predictions import Work
 
 _LARGE = (64, 64)  # rows and columns of a subimage that holds any part of an exact image
 

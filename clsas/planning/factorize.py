@@ -2,21 +2,16 @@
 
 from __future__ import annotations
 
-import weakref
 from collections.abc import Callable
 
 from clsas.core import validate
-from clsas.core.decibels import in_db
 from clsas.core.grid import Grid
 from clsas.core.image import Image
 from clsas.core.lines import RangeLines
-from clsas.exact.checks import check_accumulate
-from clsas.factorized.left_out import without_left_out
-from clsas.factorized.plan import Plan
-from clsas.factorized.run import form
-from clsas.opencl.device import Device, open_device
-from clsas.planning.planner import BEST_TOLERANCE_DB, WORST_TOLERANCE_DB, plan
-from clsas.signal.spectrum import FEW_CHANNELS, MEASURED_CHANNELS, power_outside
+from clsas.opencl.device import Device
+from clsas.planning.imager import Imager
+from clsas.planning.planner import BEST_TOLERANCE_DB, WORST_TOLERANCE_DB
+from clsas.plans.plan import Plan
 from clsas.sonar.beam import BeamWindow
 
 
@@ -79,55 +74,25 @@ def factorize(
     lines are weighted sums of aligned lines, and so on from stage to stage. A plan may hold these
     lines in half precision; sums are single.
 
-    A plan keeps the geometry of its first image, in `Plan.kept`, for the images after it.
+    `clsas.Imager` forms several images of the same geometry in less time.
     """
     validate.instance("lines", lines, RangeLines)
     validate.instance("grid", grid, Grid)
-    validate.memory("grid", 8 * grid.size)
     validate.progress(progress)
-    device = open_device(device)
-    if not isinstance(plan_or_tolerance, Plan):
-        if isinstance(plan_or_tolerance, str):
-            got = validate.shown(plan_or_tolerance)
-            raise TypeError(
-                f"plan_or_tolerance must be a Plan (Plan.from_json reads texts) or dB, got {got}"
-            )
-        validate.number(
-            "plan_or_tolerance",
-            plan_or_tolerance,
-            "dB",
-            least=BEST_TOLERANCE_DB,
-            most=WORST_TOLERANCE_DB,
+    if isinstance(plan_or_tolerance, Plan):
+        imager = Imager(lines, grid, plan_or_tolerance, beam=beam, device=device)
+        return imager(lines, accumulate=accumulate, progress=progress)
+    if isinstance(plan_or_tolerance, str):
+        got = validate.shown(plan_or_tolerance)
+        raise TypeError(
+            f"plan_or_tolerance must be a Plan (Plan.from_json reads texts) or dB, got {got}"
         )
-        chosen = plan(lines, grid, tolerance_db=plan_or_tolerance, beam=beam, device=device)
-    elif beam is not None:
-        raise ValueError("beam must be left out with a plan, which holds its own")
-    else:
-        chosen = plan_or_tolerance
-        chosen.check(lines, grid)
-        _check_band(lines, chosen)
-    if accumulate is not None:
-        check_accumulate(accumulate, grid, chosen.beam)
-    if chosen.left_out:
-        image = Image(form(*without_left_out(chosen, lines, grid), device, progress).pixels, grid)
-    else:
-        image = form(lines, grid, chosen, device, progress)
-    return image if accumulate is None else Image(image.pixels + accumulate.pixels, grid)
-
-
-def _check_band(lines: RangeLines, chosen: Plan) -> None:
-    """Warn where a plan was made for lines of another band."""
-    known, band, tolerance_db = chosen.kept.get("lines"), chosen.image.band, chosen.tolerance_db
-    if band is None or tolerance_db is None or (known is not None and known() is lines):
-        return
-    for channels in (FEW_CHANNELS, MEASURED_CHANNELS):
-        outside_db = in_db(power_outside(lines, *band, channels))
-        if outside_db <= tolerance_db:
-            chosen.kept["lines"] = weakref.ref(lines)
-            return
-    if lines.samples.any():
-        validate.warn(
-            f"the lines hold {outside_db:.0f} dB of their power outside the band that the plan was "
-            f"made for, so that the error may be more than {tolerance_db:g} dB: plan anew "
-            "with clsas.plan"
-        )
+    tolerance_db = validate.number(
+        "plan_or_tolerance",
+        plan_or_tolerance,
+        "dB",
+        least=BEST_TOLERANCE_DB,
+        most=WORST_TOLERANCE_DB,
+    )
+    imager = Imager(lines, grid, tolerance_db=tolerance_db, beam=beam, device=device)
+    return imager(lines, accumulate=accumulate, progress=progress)

@@ -13,18 +13,15 @@ from dataclasses import dataclass, field, replace
 
 from clsas.aperture.filters import FilterRates, Filters, steering_spectrum
 from clsas.aperture.interpolated import InterpolatedAperture
+from clsas.aperture.mean_track import MeanTrack
 from clsas.core.decibels import in_db, power
-from clsas.factorized.estimates import ErrorBudget
-from clsas.factorized.plan import Plan
 from clsas.opencl import phases
 from clsas.planning.beam_coverage import trimmed
 from clsas.planning.channels import frequencies
 from clsas.planning.errors import Errors, other_errors, root_error, spaced_stages
 from clsas.planning.prediction import (
-    OUTSIDE,
     Candidate,
     Conditions,
-    band_of,
     margin_db,
     predicted_plan,
 )
@@ -33,6 +30,9 @@ from clsas.planning.sizes import largest_root, root_limits
 from clsas.planning.spacing_errors import spacing_error
 from clsas.planning.stretches import aligned_spectrum
 from clsas.planning.visibility_model import VisibilityModel
+from clsas.plans.plan import Plan
+from clsas.plans.predictions import ErrorBudget
+from clsas.signal.spectrum import OUTSIDE, occupied_band
 
 # Shares of the allowed error power. `scripts/bench sensitivity` measured what half and twice do.
 _ROOTS_SHARE = 0.25  # for roots; twice: up to 5 % slower
@@ -141,6 +141,8 @@ class Outcome:
     ----------
     plan : Plan or None
         The fastest factorization; None if there is none, or none as fast as asked for.
+    track : MeanTrack or None
+        The plan's mean track.
     least_bytes : float
         Without a plan, the least memory of those that did not fit.
     obstacle : str
@@ -148,6 +150,7 @@ class Outcome:
     """
 
     plan: Plan | None = None
+    track: MeanTrack | None = None
     least_bytes: float = math.inf
     obstacle: str = ""
 
@@ -184,8 +187,7 @@ def fastest(
             smaller = (rows // 2, columns) if rows > columns else (rows, columns // 2)
             trial = replace(trial, most_root=smaller, tree=None)
         else:
-            found.kept.update(track=model.track, surface=model.surface)
-            return Outcome(found)
+            return Outcome(found, model.track)
     return Outcome(least_bytes=needed)
 
 
@@ -262,7 +264,7 @@ def _estimated(
         oversampling=trial.oversampling,
         beam_cycles=trial.beam_cycles,
         shape=within.shape,
-        band=band_of(within, OUTSIDE * problem.allowed),
+        band=occupied_band(within.spectrum, OUTSIDE * problem.allowed),
     )
     candidate = Candidate(
         sides=sides,

@@ -3,23 +3,22 @@
 from __future__ import annotations
 
 import math
-import weakref
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from clsas.aperture.dense_tracks import shapes_after
 from clsas.aperture.filters import ALIGN_TAPS
+from clsas.aperture.mean_track import MeanTrack
 from clsas.aperture.nearest import NearestBeams
 from clsas.core import validate
 from clsas.core.decibels import in_db, power
+from clsas.core.digests import grid_digest, lines_digest
 from clsas.core.grid import Grid
 from clsas.core.lines import RangeLines
 from clsas.exact.backprojection import ACCURACY_DB
-from clsas.factorized.estimates import ErrorBudget
-from clsas.factorized.left_out import with_left_out
-from clsas.factorized.plan import Plan
+from clsas.factorized.surface import Surface
 from clsas.opencl.device import Device, open_device
 from clsas.planning import costs as stored_costs
 from clsas.planning import scaling
@@ -30,7 +29,6 @@ from clsas.planning.exact_image import Exact, expect
 from clsas.planning.fastest import Outcome, fastest, off_track
 from clsas.planning.prediction import (
     MARGIN_DB,
-    OUTSIDE,
     Candidate,
     Conditions,
     exact_plan,
@@ -38,7 +36,11 @@ from clsas.planning.prediction import (
 )
 from clsas.planning.search import MOST_STAGES, Allowed
 from clsas.planning.visibility_model import VisibilityModel
+from clsas.plans.factorization import UNREACHED
+from clsas.plans.plan import Plan
+from clsas.plans.predictions import ErrorBudget
 from clsas.signal import interpolation
+from clsas.signal.spectrum import OUTSIDE
 from clsas.sonar.beam import BeamWindow
 from clsas.sonar.coverage import reaches, warn_unreached
 from clsas.sonar.simplify import Model, simplify
@@ -133,6 +135,56 @@ def plan(
         any line's range, or the beam, so that the image will be zero; or if costs stored for the
         device cannot be read, or those measured cannot be stored.
     """
+    return planned(
+        lines,
+        grid,
+        tolerance_db=tolerance_db,
+        tolerance_wavelengths=tolerance_wavelengths,
+        stages=stages,
+        beam=beam,
+        device=device,
+        memory_bytes=memory_bytes,
+        costs=costs,
+        taps=taps,
+        depth=depth,
+        full_model=full_model,
+    ).plan
+
+
+@dataclass(frozen=True, eq=False)
+class Planned:
+    """A plan, and what planning found on the way that its image needs again.
+
+    Attributes
+    ----------
+    plan : Plan
+    track : MeanTrack or None
+        The mean track of a factorization.
+    surface : Surface or None
+        The surface of the grid without the effects that the plan leaves out.
+    """
+
+    plan: Plan
+    track: MeanTrack | None = None
+    surface: Surface | None = None
+
+
+def planned(
+    lines: RangeLines,
+    grid: Grid,
+    *,
+    tolerance_db: float | None = None,
+    tolerance_wavelengths: float | None = None,
+    stages: Sequence[tuple[int, int]] | None = None,
+    beam: BeamWindow | None = None,
+    device: Device | str | int | None = None,
+    memory_bytes: int | None = None,
+    costs: Costs | None = None,
+    taps: tuple[int, int] | None = None,
+    depth: int | None = None,
+    full_model: bool = False,
+) -> Planned:
+    """Return what `plan` does, with what its image needs again."""
     validate.instance("lines", lines, RangeLines)
     validate.instance("grid", grid, Grid)
     if beam is not None:
@@ -178,9 +230,9 @@ def plan(
     room = device.info.memory_bytes // 2 if memory_bytes is None else memory_bytes
     conditions = Conditions(of_passed_db, exact, device.for_stages(), known.costs, room)
     if is_reached:
-        found = _chosen(model, stages, conditions, exact_fits, allowed)
+        found, track = _chosen(model, stages, conditions, exact_fits, allowed)
     else:  # an image of zeros needs no search, nor memory
-        found = exact_plan(model, conditions, "no line reaches the grid")
+        found, track = exact_plan(model, conditions, UNREACHED), None
     errors = found.errors
     if not found.is_exact:
         errors = errors.times(1 / model.ambiguity.least_brightness)
@@ -197,17 +249,18 @@ def plan(
         cost_source=known.source,
         costs_measured=known.measured,
     )
-    kept = found.kept
-    found = replace(found, tolerance_db=tolerance_db, prediction=prediction)
-    found.kept.update(kept)
-    if scene.left_out:
-        found = with_left_out(found, scene, lines, grid, beam)
-    found.kept["lines"] = weakref.ref(lines)
-    found.kept["reached"] = is_reached
-    found.kept["warned"] = not is_reached  # the image need not warn again
+    found = replace(
+        found,
+        tolerance_db=tolerance_db,
+        prediction=prediction,
+        left_out=scene.left_out,
+        beam=beam,
+        lines_digest=lines_digest(lines) if scene.left_out else found.lines_digest,
+        grid_digest=grid_digest(grid) if scene.left_out else found.grid_digest,
+    )
     if not is_reached:
         warn_unreached(lines, grid, beam, model.channels_along)
-    return found
+    return Planned(found, track, None if found.is_exact else model.surface)
 
 
 def _chosen(
@@ -216,8 +269,8 @@ def _chosen(
     conditions: Conditions,
     exact_fits: bool,
     allowed: Allowed | None,
-) -> Plan:
-    """Return the plan of checked arguments."""
+) -> tuple[Plan, MeanTrack | None]:
+    """Return the plan of checked arguments, and the mean track of a factorization."""
     beam, exact, room = model.beam, conditions.exact, conditions.memory_bytes
     least: float = exact.memory_bytes
     reason = ""
@@ -228,21 +281,21 @@ def _chosen(
             raise ValueError("beam must not normalise with stages; clsas.backproject does")
         found = _nearest(model, stages, conditions)
         if found.memory_bytes <= room:
-            return found
+            return found, model.track
         exact_fits, least = False, found.memory_bytes
     elif stages is None and _worth_a_search(exact, conditions.costs, exact_fits, allowed):
         is_free = exact_fits and allowed is None
         to_beat = _WORTH * conditions.costs.seconds(exact.work) if is_free else math.inf
         outcome = _fastest_of_shapes(model, conditions, to_beat, allowed or Allowed())
         if outcome.plan is not None:
-            return outcome.plan
+            return outcome.plan, outcome.track
         least, reason = min(least, outcome.least_bytes), outcome.obstacle
     if not exact_fits:
         raise ValueError(
             f"memory_bytes must be at least {math.ceil(10 * least / 2**20) / 10:.1f} MiB for this "
             f"image, got {room / 2**20:.3g} MiB"
         )
-    return exact_plan(model, conditions, reason)
+    return exact_plan(model, conditions, reason), None
 
 
 def _fastest_of_shapes(

@@ -17,16 +17,6 @@ from clsas.core.decibels import in_db, power
 from clsas.core.digests import grid_digest, lines_digest
 from clsas.exact.lookup import lookup_room
 from clsas.factorized.buffers import CHUNK, Level
-from clsas.factorized.estimates import (
-    ErrorBudget,
-    Work,
-    adding_in_rows,
-    backprojecting_leaves,
-    combining,
-    upsampling,
-)
-from clsas.factorized.factorization import ExactImage, Factorization
-from clsas.factorized.plan import Plan, Prediction, Stage
 from clsas.opencl import phases
 from clsas.opencl.buffers import padded_length
 from clsas.opencl.device import Device
@@ -38,6 +28,10 @@ from clsas.planning.memory import BufferSizes, batches_within
 from clsas.planning.range_extents import half_line_lengths
 from clsas.planning.stretches import stretch_of, uncompensated
 from clsas.planning.visibility_model import VisibilityModel
+from clsas.planning.work import adding_in_rows, backprojecting_leaves, combining, upsampling
+from clsas.plans.factorization import ExactImage, Factorization
+from clsas.plans.plan import Plan
+from clsas.plans.predictions import ErrorBudget, Prediction, Stage, Work
 from clsas.signal import interpolation
 from clsas.signal.interpolation import PHASES, Interpolator, Resampling, Upsampler
 
@@ -45,8 +39,6 @@ HALF_ROUNDING = 4e-8
 """Power of the error that rounding lines to half precision once adds: 2^-11/sqrt(6) rms."""
 MARGIN_DB = 1.0
 """Margin of predicted errors for the scatter of measured ones."""
-OUTSIDE = 0.1
-"""Share of the allowed error power that may come from outside the nominal band."""
 _ROUNDING_SHARE = 0.1  # of an image's error power, for half precision; half or twice: the same
 _MOST_CHUNKS = 16  # in a sum rounded to half precision; more lose what is added
 _FEW_CHANNELS = 7.0, 30.0  # per pixel, that double the scatter of errors; the latter with steps
@@ -82,7 +74,7 @@ class Candidate:
     Attributes
     ----------
     sides, tile, align, final, aperture
-        As those of `clsas.factorized.plan.Factorization`.
+        As those of `clsas.plans.plan.Factorization`.
     margin : float
         Factor of the predicted error power, for the scatter of measured errors.
     """
@@ -208,13 +200,6 @@ def margin_db(model: VisibilityModel) -> float:
     return MARGIN_DB + in_db(model.spectrum.scatter * (1 + few / max(channels, 1.0)))
 
 
-def band_of(model: VisibilityModel, outside: float) -> tuple[float, float]:
-    """Return the centre and half width of the band that holds all but a share of the power."""
-    spectrum = model.spectrum
-    bins = np.searchsorted(np.cumsum(spectrum.share), 1 - outside)
-    return spectrum.centre, float(min((bins + 1) / (2 * len(spectrum.power)), 0.5))
-
-
 def half_precision_error(stages: int) -> float:
     """Return the least error power that half precision adds through some stages.
 
@@ -246,7 +231,7 @@ def _plan(
     )
     return Plan(
         tolerance_db=conditions.tolerance_db,
-        image=image,
+        method=image,
         prediction=prediction,
         beam=model.beam,
         lines_digest=model.from_cache("lines", lambda: lines_digest(model.lines)),

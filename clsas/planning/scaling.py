@@ -25,7 +25,7 @@ from clsas.planning import costs as stored
 from clsas.planning.costs import Costs, KnownCosts
 from clsas.planning.exact_image import expect
 from clsas.planning.fastest import fastest
-from clsas.planning.prediction import OUTSIDE, Conditions
+from clsas.planning.prediction import Conditions
 from clsas.planning.search import Allowed
 from clsas.planning.timed_images import (
     TimedImage,
@@ -38,6 +38,7 @@ from clsas.planning.timed_images import (
 from clsas.planning.visibility_model import VisibilityModel
 from clsas.signal import interpolation
 from clsas.signal.interpolation import Resampling
+from clsas.signal.spectrum import OUTSIDE
 
 GROUPS = {
     "host": ("call_ns", "reference_ns", "batch_ns", "group_ns", "part_ns"),
@@ -255,7 +256,8 @@ def _built(device: Device, side: int) -> tuple[_Images, float]:
     found = fastest(model, conditions, math.inf, _ALLOWED).plan
     assert found is not None  # the scene is made so
     # Kernels that touch a buffer first take twice as long. Large images have many batches.
-    found = found.changed(roots_at_once=_ROOTS, roots_prepared=8 * _ROOTS)
+    method = replace(found.factorization, roots_at_once=_ROOTS, roots_prepared=8 * _ROOTS)
+    found = replace(found, method=method)
     factorized = planned_image(device, lines, grid, found)
     resampling = interpolation.resampling(lines.length, found.factorization.final, model.spectrum)
     images = _Images(exact, points, factorized, lines, resampling)

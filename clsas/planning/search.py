@@ -23,13 +23,6 @@ from clsas.aperture.filters import (
 )
 from clsas.core.decibels import in_db, power
 from clsas.factorized.buffers import LEAST_BATCH
-from clsas.factorized.estimates import (
-    Work,
-    adding_in_rows,
-    backprojecting_leaves,
-    combining,
-    upsampling,
-)
 from clsas.opencl.buffers import GUARD
 from clsas.opencl.device import Device
 from clsas.planning.aperture_phases import AperturePhases
@@ -39,6 +32,8 @@ from clsas.planning.sizes import Division, Sizes, all_sizes
 from clsas.planning.stretches import aligned_spectrum
 from clsas.planning.subimages import Side
 from clsas.planning.visibility_model import VisibilityModel
+from clsas.planning.work import adding_in_rows, backprojecting_leaves, combining, upsampling
+from clsas.plans.predictions import Work
 from clsas.signal.interpolation import PHASES, upsampler
 from clsas.signal.spectrum import Spectrum
 

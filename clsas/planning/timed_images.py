@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import partial
 
 import numpy as np
@@ -13,13 +13,13 @@ import numpy as np
 from clsas.core.grid import Grid
 from clsas.core.lines import RangeLines
 from clsas.exact.backprojection import form_exactly
-from clsas.factorized import run
-from clsas.factorized.estimates import Work
-from clsas.factorized.plan import Plan
 from clsas.opencl.device import Device
 from clsas.planning.costs import Costs
 from clsas.planning.exact_image import Exact, expect
+from clsas.planning.former import former
 from clsas.planning.visibility_model import VisibilityModel
+from clsas.plans.plan import Plan
+from clsas.plans.predictions import Work
 from clsas.sonar.beam import BeamWindow
 
 _SOUND_M_S = 1500.0
@@ -169,5 +169,5 @@ def exact_image(
 def planned_image(device: Device, lines: RangeLines, grid: Grid, chosen: Plan) -> TimedImage:
     """Return an image by a plan, to be timed as its first: nothing is kept from run to run."""
     return TimedImage(
-        lambda: run.form(lines, grid, replace(chosen), device, None), chosen, grid.is_planar
+        lambda: former(lines, grid, chosen, device).form(lines), chosen, grid.is_planar
     )

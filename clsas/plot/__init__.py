@@ -1,7 +1,8 @@
-"""Pictures: images, mosaics, volumes, points, geometry, lines, recordings, tracks, trade-offs.
+"""Pictures of images, mosaics, volumes, points, geometry, lines, recordings, tracks and trade-offs.
 
-Functions that return a `matplotlib.figure.Figure` touch no window and no global state; `save`
-writes it as PNG, PDF or SVG. `image` draws into axes of your own, or into a new pyplot figure.
+Most functions return a `matplotlib.figure.Figure` that belongs to no window and changes no global
+state; `save` writes it as PNG, PDF or SVG. `image` draws into axes of your own, or into a new
+pyplot figure.
 """
 
 from clsas.plot.canvas import save as save

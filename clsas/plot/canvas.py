@@ -1,4 +1,4 @@
-"""Figures, axes in metres, and files of pictures."""
+"""Figures, axes in metres or millimetres, and files of pictures."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 SUFFIXES = (".png", ".pdf", ".svg")
-"""Suffixes of pictures."""
+"""Suffixes of the files that `save` writes."""
 
 _NAMES = {"x": "Along-track", "y": "Across-track", "z": "Height"}
-_LEAST_DPI, _MOST_DPI = 10.0, 10_000.0  # letters of less have no pixels
-_PNG_DPI, _VECTOR_DPI = 150.0, 300.0  # for screens, and for images on a printed page
+_LEAST_DPI, _MOST_DPI = 10.0, 10_000.0  # below 10, letters have no pixels
+_PNG_DPI, _VECTOR_DPI = 150.0, 300.0  # for screens, and for the images on a printed page
 _SETTINGS: Any = {
     "pdf.fonttype": 42,  # TrueType: publishers refuse matplotlib's default, Type 3
     "svg.hashsalt": "clsas",  # the same picture gives the same file
@@ -34,18 +34,18 @@ def save(figure: Figure, path: str | os.PathLike, *, dpi: float | None = None) -
     ----------
     figure : matplotlib.figure.Figure
     path : path-like
-        The suffix decides the format: .png, .pdf or .svg; PNG without a suffix.
+        File to write. Its suffix determines the format: .png, .pdf or .svg; PNG without a suffix.
     dpi : float, optional
-        Pixels per inch; by default 150 for PNG, and 300 for the images within PDF and SVG, whose
-        lines and labels have no pixels.
+        Pixels per inch, by default 150 for PNG and 300 for PDF and SVG. In PDF and SVG this applies
+        only to images: lines and labels have no pixels.
 
     Raises
     ------
     ImportError
         If matplotlib is not installed.
     TypeError, ValueError
-        If `figure` is not a Figure, `path` ends in another suffix, or `dpi` is not a number
-        from 10 to 10 000.
+        If `figure` is not a Figure, `path` has another suffix, or `dpi` is not a number from 10 to
+        10 000.
     OSError
         If the folder does not exist or the file cannot be written.
     """
@@ -60,7 +60,7 @@ def save(figure: Figure, path: str | os.PathLike, *, dpi: float | None = None) -
 
     options: Any = {"metadata": _DATES[kind]} if kind in _DATES else {}
     with replacing(path) as temporary, mpl.rc_context(_SETTINGS):
-        # "tight" includes labels that the layout leaves outside, as beside square axes.
+        # "tight" includes labels that the layout leaves outside, such as those of square axes.
         figure.savefig(temporary, format=kind, dpi=dpi, bbox_inches="tight", **options)
 
 
@@ -70,9 +70,9 @@ def save_png(figure: Figure, path: str | os.PathLike, *, dpi: float | None = Non
     Raises
     ------
     ImportError, TypeError, OSError
-        As `save` does.
+        As for `save`.
     ValueError
-        If `path` ends in another suffix than .png, or `dpi` is not a number from 10 to 10 000.
+        If `path` has another suffix than .png, or `dpi` is not a number from 10 to 10 000.
     """
     validate.instance("figure", figure, figure_class())
     validate.suffix("path", validate.path("path", path), ".png")
@@ -80,7 +80,7 @@ def save_png(figure: Figure, path: str | os.PathLike, *, dpi: float | None = Non
 
 
 def with_fewer_colours(png: str | os.PathLike | BytesIO, colours: int) -> bytes:
-    """Return a PNG of at most `colours` colours, up to 256, in a third of the bytes."""
+    """Return a PNG with at most `colours` colours, up to 256; it takes a third of the bytes."""
     from PIL import Image  # a dependency of matplotlib
 
     reduced = BytesIO()
@@ -91,13 +91,7 @@ def with_fewer_colours(png: str | os.PathLike | BytesIO, colours: int) -> bytes:
 
 
 def figure_class() -> type[Figure]:
-    """Return matplotlib's class of figures.
-
-    Raises
-    ------
-    ImportError
-        If matplotlib is not installed; the message says how to install it.
-    """
+    """Return the class of matplotlib's figures; raise ImportError if it is not installed."""
     try:
         from matplotlib.figure import Figure
     except ImportError:
@@ -113,28 +107,28 @@ def new_figure(
 
 
 def length_unit(length_m: float) -> tuple[float, str]:
-    """Return the factor and the unit in which a length is shown: millimetres below half a metre."""
+    """Return the factor and unit in which lengths are shown: millimetres if below half a metre."""
     return (1e3, "mm") if length_m < 0.5 else (1.0, "m")
 
 
 def axis_label(name: str, unit: str, of: str = "") -> str:
-    """Return the label of a coordinate's axis, such as "Along-track (m)".
+    """Return the label of an axis, such as "Along-track (m)".
 
     Parameters
     ----------
     name : str
-        "x", "y" or "z", or "along columns" or "along rows" as of `clsas.core.grid.Axis`.
+        Name of a `clsas.core.grid.Axis`: "x", "y" or "z", "along columns" or "along rows".
     unit : str
     of : str
-        Origin of the coordinate, as in "Along-track from the peak (mm)".
+        Words for the origin, as in "Along-track from the peak (mm)".
     """
     return " ".join(filter(None, (_NAMES.get(name, f"Distance {name}"), of, f"({unit})")))
 
 
 def drawable(name: str, value: object) -> str:
-    """Return a text that matplotlib can draw; raises TypeError or ValueError.
+    """Return a text that matplotlib can draw; raise TypeError or ValueError for others.
 
-    Between dollar signs matplotlib reads mathematics, and control characters have no glyph.
+    Text between dollar signs must be valid mathematics, and control characters have no glyphs.
     """
     from matplotlib import cbook
     from matplotlib.mathtext import MathTextParser
@@ -150,7 +144,7 @@ def drawable(name: str, value: object) -> str:
 
 
 def plain_ticks(axes: Axes) -> None:
-    """Write coordinates in full, however far the origin is, and only as many as fit."""
+    """Let axes show whole coordinates, however far the origin is, and only as many as fit."""
     from clsas.plot.ticks import FittingLocator
 
     axes.ticklabel_format(style="plain", useOffset=False)

@@ -1,4 +1,4 @@
-"""Colour maps of pictures: matplotlib's own, and one after the colours of sonar displays."""
+"""Colour maps of pictures: those of matplotlib, and one with the colours of sonar displays."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ if TYPE_CHECKING:
     from matplotlib.colors import Colormap
 
 COLOUR_MAP = "inferno"
-"""Default colour map: perceptually even, from black to pale yellow."""
+"""Default colour map, which is perceptually even from black to pale yellow."""
 
-# Black over copper to cream, as sidescan displays show sand. The colours lie on a curve through
-# CIELAB from lightness 1 to 96, hue 50 to 88 degrees and chroma 42 sin(pi t)(1 - t/4) + 8 t^4, at
-# equal distances along it: equal steps in dB look equally large. Differences between
-# neighbouring colours (CIE76) stay within 0.8 and 1.3 of their mean; those of matplotlib's "copper"
-# within 0.65 and 1.5, of "inferno" within 0.5 and 1.7.
+# From black over copper to cream, as sidescan displays show sand. The colours lie at equal
+# distances on a curve through CIELAB, with lightness from 1 to 96, hue from 50 to 88 degrees and
+# chroma 42 sin(pi t)(1 - t/4) + 8 t^4, so that equal steps in dB look equally large. Differences
+# between neighbouring colours (CIE76) are 0.8 to 1.3 times their mean. For matplotlib's "copper"
+# they are 0.65 to 1.5 times the mean, and for "inferno" 0.5 to 1.7 times.
 _SONAR = (
     "#040404", "#1b1008", "#29180d", "#381f11", "#482813", "#593317", "#6b401c", "#7e5025",
     "#916131", "#a27542", "#b28856", "#bf9b6c", "#ccad82", "#d7be9a", "#e3cfb2", "#eee1cb",
@@ -30,13 +30,13 @@ def colour_map(name: str | Colormap) -> Colormap:
     Parameters
     ----------
     name : str or matplotlib.colors.Colormap
-        "sonar" (black, copper, cream; perceptually even), any of matplotlib's names, such as
-        "inferno", "gray" or "cividis", or a colour map itself.
+        "sonar" (black, copper, cream; perceptually even), a name that matplotlib knows, such as
+        "inferno", "gray" or "cividis", or a colour map.
 
     Raises
     ------
     TypeError, ValueError
-        If it is neither.
+        If `name` is neither a known name nor a colour map.
     """
     from matplotlib import colormaps
     from matplotlib.colors import Colormap, LinearSegmentedColormap

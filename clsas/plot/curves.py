@@ -1,4 +1,4 @@
-"""Curves: cuts through a point response, and time over error."""
+"""Pictures of curves: cuts through a point response, and time over error."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import numpy as np
 from clsas.core import validate
 from clsas.measures.cuts import Cut
 from clsas.measures.quality import PointResponse
+from clsas.measures.tradeoff_result import Row, Tradeoff
 from clsas.plot.canvas import axis_label, drawable, length_unit, new_figure
 
 if TYPE_CHECKING:
@@ -17,30 +18,40 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from matplotlib.text import Annotation
 
-    from clsas.measures.tradeoff_result import Row, Tradeoff
-
-_DISTANCES = (10, 18, 28, 40, 54, 70, 88, 108)  # from points to labels, tried in turn
+_DISTANCES = (10, 18, 28, 40, 54, 70, 88, 108)  # points from marks to labels, tried in turn
 _ANGLES_DEG = (-45, 45, -90, 90, -20, 20, -135, 135, 180)
 
 
 def cuts(response: PointResponse, *, floor_db: float = -60.0, resolutions: float = 12.0) -> Figure:
-    """Draw the cuts through a point along columns and rows, with the measured figures.
+    """Draw the cuts through a point along columns and rows, with resolutions and side lobes.
 
     Parameters
     ----------
     response : PointResponse
-        From `clsas.measures.quality.measure_point`.
+        Response that `clsas.measure_point` returned.
     floor_db : float
-        Lower end of the level axis, dB.
+        Lower end of the axis of levels, in dB.
     resolutions : float
-        Extent of the distance axis on each side, in resolutions of the point.
+        Largest distance from the peak that is shown, in resolutions of the point.
 
     Raises
     ------
     ImportError
         If matplotlib is not installed.
     TypeError, ValueError
-        If an argument is of a wrong kind, `floor_db` not negative or `resolutions` not positive.
+        If an argument has the wrong type, `floor_db` is not negative, or `resolutions` is not
+        positive.
+
+    Examples
+    --------
+    >>> import clsas
+    >>> import numpy as np
+    >>> grid = clsas.Grid.plane(x=(0.0, 2.0, 201), y=(40.0, 41.5, 151))
+    >>> x, y = grid.axes_m
+    >>> pixels = np.outer(np.sinc((y - 40.6) / 0.04), np.sinc((x - 0.8) / 0.02)) + 0j
+    >>> figure = clsas.plot.cuts(clsas.measure_point(clsas.Image(pixels, grid), (0.8, 40.6)))
+    >>> [axes.get_xlabel() for axes in figure.axes]
+    ['Along-track from the peak (mm)', 'Across-track from the peak (mm)']
     """
     validate.instance("response", response, PointResponse)
     floor_db = validate.number("floor_db", floor_db, "dB", below=0.0)
@@ -66,12 +77,12 @@ def cuts(response: PointResponse, *, floor_db: float = -60.0, resolutions: float
 
 
 def tradeoff(measured: Tradeoff, *, title: str = "") -> Figure:
-    """Draw measured and predicted time of every image over its error.
+    """Draw the measured and predicted time of every image over its error.
 
     Parameters
     ----------
     measured : Tradeoff
-        From `clsas.tradeoff`.
+        Result of `clsas.tradeoff`.
     title : str
         Beginning of the title; sizes and device follow.
 
@@ -79,11 +90,9 @@ def tradeoff(measured: Tradeoff, *, title: str = "") -> Figure:
     ------
     ImportError
         If matplotlib is not installed.
-    TypeError
-        If `measured` is of another type.
+    TypeError, ValueError
+        If an argument has the wrong type, or `title` cannot be drawn.
     """
-    from clsas.measures.tradeoff_result import Tradeoff
-
     validate.instance("measured", measured, Tradeoff)
     title = drawable("title", title)
     figure = new_figure(7.0, 6.0)
@@ -106,7 +115,7 @@ def tradeoff(measured: Tradeoff, *, title: str = "") -> Figure:
             axes.plot(errors_db, seconds, ":", color=color, linewidth=0.8, alpha=0.5)
             axes.plot(errors_db[1:], seconds[1:], marker, color=color, fillstyle="none")
             axes.plot(errors_db[:1], seconds[:1], marker, color=color, label=label)
-            label = ""  # one entry in the legend
+            label = ""  # only the first one has an entry in the legend
         if method != "study":
             labels += _labels(axes, rows, color)
     axes.plot([], [], "o", color="0.5", fillstyle="none", label="predicted (hollow)")
@@ -119,7 +128,7 @@ def tradeoff(measured: Tradeoff, *, title: str = "") -> Figure:
     axes.yaxis.set_major_formatter(ticker.StrMethodFormatter("{x:g}"))
     axes.yaxis.set_minor_formatter(ticker.NullFormatter())
     axes.margins(x=0.08)
-    axes.invert_xaxis()  # the better the further right
+    axes.invert_xaxis()  # smaller errors to the right
     sizes = f"{measured.channels} lines, {' x '.join(map(str, measured.pixels))} pixels"
     axes.set_title(
         ", ".join(filter(None, (title, sizes))) + f"\n{measured.device}", fontsize="small"
@@ -131,7 +140,7 @@ def tradeoff(measured: Tradeoff, *, title: str = "") -> Figure:
 
 
 def _labels(axes: Axes, rows: list[Row], color: str) -> list[Annotation]:
-    """Return labels of rows beside their points, to be moved apart."""
+    """Return labels at the marks of rows; `_spread` moves them apart."""
     line = {"arrowstyle": "-", "color": color, "linewidth": 0.5, "alpha": 0.6, "shrinkB": 3}
     return [
         axes.annotate(
@@ -161,7 +170,7 @@ def _spread(axes: Axes, labels: list[Annotation]) -> None:
 
     figure: Any = axes.get_figure(root=True)
     renderer = FigureCanvasAgg(figure).get_renderer()
-    figure.draw_without_rendering()  # places the axes
+    figure.draw_without_rendering()  # to place the axes
     point, inside = figure.dpi / 72, axes.get_window_extent()
     marks = [
         place for line in axes.get_lines() if line.get_marker() not in ("None", "none", None)
@@ -174,16 +183,16 @@ def _spread(axes: Axes, labels: list[Annotation]) -> None:
             away = np.array([1.6 * np.cos(np.radians(angle)), np.sin(np.radians(angle))])
             label.set_position(tuple(distance * away))
             label.update_positions(renderer)
-            box = Text.get_window_extent(label, renderer).padded(point)  # without the line
-            held = inside.containsx(box.x0) and inside.containsx(box.x1)
-            held = held and inside.containsy(box.y0) and inside.containsy(box.y1)
-            if held and not box.count_overlaps(taken):
+            box = Text.get_window_extent(label, renderer).padded(point)  # without its arrow
+            fits = inside.containsx(box.x0) and inside.containsx(box.x1)
+            fits = fits and inside.containsy(box.y0) and inside.containsy(box.y1)
+            if fits and not box.count_overlaps(taken):
                 break
         taken.append(box)
 
 
 def _figures_of(cut: Cut) -> str:
-    """Return the figures of a cut, one a line."""
+    """Return resolution and side lobes of a cut, one per line."""
     scale, unit = length_unit(cut.resolution_m)
     return (
         f"resolution {scale * cut.resolution_m:.4g} {unit} (−3 dB)\n"

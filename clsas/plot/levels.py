@@ -1,4 +1,4 @@
-"""Pictures of levels in dB: images and range lines."""
+"""Pictures of images and range lines, as levels in dB."""
 
 from __future__ import annotations
 
@@ -34,20 +34,20 @@ if TYPE_CHECKING:
     from matplotlib.image import AxesImage
 
 DYNAMIC_RANGE_DB = 60.0
-"""Default dynamic range of a picture below the reference, dB."""
+"""Default dynamic range of a picture, in dB below the reference."""
 FLAT = 0.4
-"""Height over width; flatter images have the scale of levels below them."""
+"""Height relative to width, below which the colour bar is drawn below an image."""
 
-_MOST_PIXELS = 1500  # along an axis; pictures have fewer dots
-_SAME_DB = 1e-3  # levels closer than this differ by rounding only
+_MOST_PIXELS = 1500  # pixels drawn along an axis; pictures have fewer dots
+_SAME_DB = 1e-3  # largest difference of levels that may come from rounding
 _COUNTED = 1 << 22  # most pixels from which percentiles are computed
-_WIDTH_IN = 7.0  # width of figures; nearly the height of those that are higher than wide
-_PREVIEW_IN, _PREVIEW_DPI, _PREVIEW_COLOURS = 4.5, 96.0, 64  # in a notebook: 20 to 90 kB
+_WIDTH_IN = 7.0  # width of figures; about the height of those that are higher than wide
+_PREVIEW_IN, _PREVIEW_DPI, _PREVIEW_COLOURS = 4.5, 96.0, 64  # for 20 to 90 kB in a notebook
 
 
 @dataclass(frozen=True)
 class Scale:
-    """Levels and colours of a picture; the fields are arguments of `image`."""
+    """Levels and colours of a picture. The fields are arguments of `image`."""
 
     dynamic_range_db: float | None = None
     percentiles: tuple[float, float] | None = None
@@ -55,7 +55,7 @@ class Scale:
     colour_map: str | Colormap = COLOUR_MAP
 
     def __post_init__(self) -> None:
-        """Check every field but the colours, which need matplotlib, and convert it."""
+        """Check and convert all fields but the colours, which need matplotlib."""
 
         def put(name: str, value: object) -> None:
             object.__setattr__(self, name, value)
@@ -87,7 +87,7 @@ class Scale:
         return f"Amplitude (dB re {self.reference:g})"
 
     def limits(self, level: NDArray[np.float32]) -> tuple[float, float]:
-        """Return the levels of the first and the last colour, dB."""
+        """Return the levels of the first and of the last colour, in dB."""
         if self.percentiles is None:
             return -(self.dynamic_range_db or DYNAMIC_RANGE_DB), 0.0
         some = level.ravel()[:: -(-level.size // _COUNTED)]
@@ -95,7 +95,7 @@ class Scale:
         if not some.size:
             return -DYNAMIC_RANGE_DB, 0.0
         low, high = np.percentile(some, self.percentiles).tolist()
-        return min(low, high - 1.0), high  # colours need a range, also of equal pixels
+        return min(low, high - 1.0), high  # colours need a range even if all pixels are equal
 
 
 def image(
@@ -109,31 +109,31 @@ def image(
     colour_bar: bool = True,
     title: str = "",
 ) -> Axes:
-    """Draw the amplitude of an image in dB over metres.
+    """Draw the amplitude of an image in dB over metres or millimetres.
 
     Parameters
     ----------
     image : Image
-        Image on a plane of any direction or a height map. The axes are the coordinates along
-        columns and rows (x and y, or x and z of a plane in depth), or else distances along them.
-        They are in millimetres if all are less than 0.5 m, else in metres. Columns and rows are
-        always drawn at right angles.
+        Image on a plane of any direction or a height map. The axes show the coordinates along
+        columns and rows: x and y of a horizontal plane, x and z of a vertical one, and distances
+        along columns and rows of other planes. Units are millimetres if all coordinates are below
+        0.5 m, otherwise metres. Columns and rows are always drawn at right angles.
     axes : matplotlib.axes.Axes, optional
-        Axes to draw into. By default those of a new pyplot figure, which notebooks and
-        `pyplot.show` show.
+        Axes to draw into; by default those of a new pyplot figure, which notebooks and
+        `pyplot.show` display.
     dynamic_range_db : float, optional
-        Levels between the first colour and the reference, which has the last colour; 60 dB by
-        default.
+        Level of the first colour below that of the last one, which is the reference; by default
+        60 dB.
     percentiles : (low, high), optional
-        Let the colours span these percentiles, 0 to 100, of the levels of all pixels that are not
-        0, instead of `dynamic_range_db`. (1, 99.5) shows speckle beside bright targets.
+        Percentiles, from 0 to 100, that the colours span instead of `dynamic_range_db`. Pixels that
+        are 0 do not count. With (1, 99.5), speckle is visible beside bright targets.
     reference : float, optional
-        Amplitude of 0 dB; by default the image's largest.
+        Amplitude that is 0 dB; by default the largest of the image.
     colour_map : str or matplotlib.colors.Colormap
-        "sonar" (black, copper, cream), or any of matplotlib's names. "inferno", "sonar",
+        "sonar" (black, copper, cream), or a name that matplotlib knows. "inferno", "sonar",
         "cividis" and "gray" are perceptually even: equal steps in dB look equally large.
     colour_bar : bool
-        True draws the scale of levels beside the axes.
+        True to draw the scale of levels beside the axes.
     title : str
         Title above the axes.
 
@@ -146,8 +146,13 @@ def image(
     ImportError
         If matplotlib is not installed.
     TypeError, ValueError
-        If an argument is of a wrong kind or outside its limits, or the image is one of arbitrary
-        points (`volume` draws those of a box).
+        If an argument has the wrong type or is out of bounds, or the image has arbitrary points
+        (`volume` draws those of a box).
+
+    See Also
+    --------
+    image_db : Draw an image in a figure that belongs to no window.
+    Image.plot : The same as a method.
     """
     validate.instance("image", image, Image)
     if image.grid.points_m is not None:
@@ -155,7 +160,7 @@ def image(
     scale = Scale(dynamic_range_db, percentiles, reference, colour_map)
     validate.flag("colour_bar", colour_bar)
     title = drawable("title", title)
-    figure_class()  # raises where matplotlib is missing
+    figure_class()  # raises if matplotlib is missing
     if axes is None:
         from matplotlib import pyplot
 
@@ -176,7 +181,7 @@ def image(
 
 
 def image_db(image: Image, *, title: str = "", **options: Any) -> Figure:
-    """Draw the amplitude of an image in dB over metres, in a figure that belongs to no window.
+    """Draw the amplitude of an image in dB, in a figure that belongs to no window.
 
     Parameters
     ----------
@@ -189,7 +194,16 @@ def image_db(image: Image, *, title: str = "", **options: Any) -> Figure:
     Raises
     ------
     ImportError, TypeError, ValueError
-        As `image` does.
+        As for `image`.
+
+    Examples
+    --------
+    >>> import clsas
+    >>> import numpy as np
+    >>> grid = clsas.Grid.plane((0.0, 2.0, 21), (20.0, 21.0, 11))
+    >>> figure = clsas.plot.image_db(clsas.Image(np.ones(grid.shape, complex), grid))
+    >>> figure.axes[0].get_xlabel()
+    'Along-track (m)'
     """
     validate.instance("image", image, Image)
     figure = new_figure(*_size_in(image), layout="compressed")
@@ -197,14 +211,14 @@ def image_db(image: Image, *, title: str = "", **options: Any) -> Figure:
     return figure
 
 
-_draw_image = image  # functions with an argument `image` need another name for it
+_draw_image = image  # for functions with an argument `image`
 
 
 def image_html(image: Image) -> str:
-    """Return an image as HTML for notebooks: a small picture and its summary.
+    """Return an image as HTML for notebooks: a small picture and a summary.
 
-    The picture is a PNG within the HTML. Without matplotlib, and of arbitrary points, there is only
-    the summary.
+    The picture is a PNG within the HTML. There is only the summary if matplotlib is not installed,
+    or the image has arbitrary points.
 
     Raises
     ------
@@ -231,21 +245,21 @@ def range_lines(
     colour_map: str | Colormap = COLOUR_MAP,
     title: str = "",
 ) -> Figure:
-    """Draw the amplitude of range lines in dB: channels across, range upward.
+    """Draw the amplitude of range lines in dB over channel and range.
 
     Parameters
     ----------
     lines : RangeLines
-        Lines to draw, each at its own ranges.
+        Lines to draw; each is drawn at its own ranges.
     dynamic_range_db, percentiles, colour_map, title
-        As for `image`; levels are relative to the largest sample.
+        As for `image`. Levels are relative to the largest sample.
 
     Raises
     ------
     ImportError
         If matplotlib is not installed.
     TypeError, ValueError
-        If an argument is of a wrong kind or outside its limits.
+        If an argument has the wrong type or is out of bounds.
     """
     validate.instance("lines", lines, RangeLines)
     scale = Scale(dynamic_range_db, percentiles, None, colour_map)
@@ -268,7 +282,7 @@ def draw_levels(
 ) -> AxesImage:
     """Draw levels [upward, across] in dB over `extent` (left, right, bottom, top).
 
-    The scale of levels goes to the side `bar` of the axes, "right" or "bottom", or nowhere.
+    The colour bar is drawn on the side `bar` of the axes, "right" or "bottom"; None draws none.
     """
     low, high = scale.limits(level)
     drawn = axes.imshow(
@@ -292,7 +306,7 @@ def draw_levels(
 def add_colour_bar(
     drawn: AxesImage, scale: Scale, level: NDArray[np.float32], **where: Any
 ) -> None:
-    """Draw the scale of levels; an end is pointed if there are levels beyond it."""
+    """Draw a colour bar. An end is pointed if there are levels beyond it."""
     pointed = {(True, True): "both", (True, False): "min", (False, True): "max"}
     low, high = drawn.get_clim()
     ends = bool(level.min() < low - _SAME_DB), bool(level.max() > high + _SAME_DB)
@@ -302,13 +316,16 @@ def add_colour_bar(
 
 
 def edges(axis: NDArray, other: NDArray) -> tuple[float, float]:
-    """Return the outer edges of the pixels of an axis; a single one is as wide as the other's."""
+    """Return the outer edges of the pixels along an axis.
+
+    A single pixel is as wide as those of the other axis.
+    """
     step = next((a[1] - a[0] for a in (axis, other) if len(a) > 1), 1.0)
     return axis[0] - step / 2, axis[-1] + step / 2
 
 
 def _greatest(level: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return the largest level of the pixels that share a dot; a mean would hide points."""
+    """Return the largest level of pixels that share a dot, since a mean would hide points."""
     for axis in (0, 1):
         count = level.shape[axis]
         first = np.linspace(0, count, min(count, _MOST_PIXELS), endpoint=False).astype(int)
@@ -317,16 +334,16 @@ def _greatest(level: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def _size_in(image: Image, width_in: float = _WIDTH_IN) -> tuple[float, float]:
-    """Return the size of a figure, inches, with as much room as an image and its labels take."""
+    """Return the size of a figure in inches that an image and its labels fill."""
     high = height_per_width(image)
-    if high < FLAT:  # with the scale of levels below
+    if high < FLAT:  # with the colour bar below
         return width_in, max((width_in - 1.2) * high, 0.5) + 1.7
     axes_in = min(width_in - 1.9, width_in / high)
     return axes_in + 1.9, axes_in * high + 0.9
 
 
 def height_per_width(image: Image) -> float:
-    """Return height over width of an image as it is drawn; a default for lines and points."""
+    """Return the height of an image relative to its width; 0.75 for single lines and points."""
     if image.grid.points_m is not None or min(image.shape) == 1:
         return 0.75
     across_m, upward_m = (abs(s.step_m) * len(s.places_m) for s in image.grid.sides)
@@ -340,7 +357,7 @@ def _check_axes(axes: object) -> None:
 
 
 def _aligned(lines: RangeLines) -> tuple[NDArray, float, float]:
-    """Return amplitudes [range, channel] on one range axis, and that axis's outer edges."""
+    """Return amplitudes [range, channel] on a common range axis, and its outer edges."""
     first_m, step_m = lines.first_range_m.min(), lines.range_step_m
     start = np.rint((lines.first_range_m - first_m) / step_m).astype(int)
     amplitude = np.zeros((start.max() + lines.length, lines.channels), np.float32)

@@ -1,4 +1,4 @@
-"""Pictures of mosaics in a store, with the borders of their patches on request."""
+"""Pictures of mosaics, with or without the borders of their patches."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from clsas.mosaics.store import Store
 
-_MOST_PIXELS = 1024  # along the longer side of an overview
+_MOST_PIXELS = 1024  # pixels along the longer side of an overview
 
 
 def mosaic(
@@ -35,10 +35,10 @@ def mosaic(
     store : Store or path
         The mosaic on disk.
     most : int
-        Pixels of the overview along its longer side, at most; each is the root of the mean power of
-        those it covers.
+        Most pixels along the longer side of the overview. Each is the rms of the pixels of the
+        mosaic that it covers.
     borders : bool
-        True draws the borders of the patches.
+        True to draw the borders of the patches.
     **options
         Further arguments of `clsas.plot.image_db`.
 
@@ -47,9 +47,10 @@ def mosaic(
     ImportError
         If matplotlib or Zarr is not installed.
     TypeError, ValueError
-        If an argument is not what is allowed, the store is damaged, or it is a mosaic of points.
+        If an argument has the wrong type or is out of bounds, the store is damaged, or the mosaic
+        has arbitrary points.
     OSError
-        If there is no store, or it cannot be read.
+        If the store does not exist or cannot be read.
     """
     from clsas.mosaics.store import Store
 
@@ -64,22 +65,22 @@ def mosaic(
 
 
 def patch_borders(axes: Axes, grid: Grid, patch_shape: tuple[int, int]) -> None:
-    """Draw the borders between patches into axes that show an image or an overview of a grid.
+    """Draw the borders between patches into axes that show an image or overview of a grid.
 
     Parameters
     ----------
     axes : matplotlib.axes.Axes
-        As `clsas.plot.image` drew them.
+        Axes that `clsas.plot.image` drew into.
     grid : Grid
-        Of the whole mosaic, such as `Mosaic.grid`.
+        Grid of the whole mosaic, such as `Mosaic.grid`.
     patch_shape : (rows, columns)
         Pixels of a patch, such as `Mosaic.patch_shape`.
 
     Raises
     ------
     TypeError, ValueError
-        If `grid` is not a plane or height map, or a side of `patch_shape` is not a whole number
-        from 1.
+        If `grid` is not a plane or height map, or a side of `patch_shape` is not a positive
+        integer.
     """
     from matplotlib.axes import Axes
 

@@ -1,4 +1,4 @@
-"""Pictures of corrected tracks: corrections with their intervals, coherence, sharpness."""
+"""Pictures of corrected tracks: corrections with their intervals, coherence and sharpness."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-_INTERVAL = 1.96  # standard deviations to either side: 95 %
-_PANEL_IN, _LEAST_PANEL_IN = 4.3, 1.7  # widths of two images side by side
-_HIGHEST_IN = 8.0  # of an image
-_LEAST_SHOWN = 1e-9  # metres and radians: what is smaller everywhere is not drawn
+_INTERVAL = 1.96  # standard deviations on each side that make 95 %
+_PANEL_IN, _LEAST_PANEL_IN = 4.3, 1.7  # largest and smallest width of each of two images
+_HIGHEST_IN = 8.0  # largest height of an image
+_LEAST_SHOWN = 1e-9  # corrections that never exceed this, in metres or radians, are not drawn
 
 
 def corrections(found: Micronavigation | Autofocus) -> Figure:
@@ -32,16 +32,17 @@ def corrections(found: Micronavigation | Autofocus) -> Figure:
     Parameters
     ----------
     found : Micronavigation or Autofocus
-        Of micronavigation the interval of the whole track includes its unknown start and heading.
-        That of its shape does not: it is what an image's sharpness depends on. Of autofocus the
-        interval is that of the changes from ping to ping, about the correction.
+        Result with the corrections. Micronavigation has two intervals. That of the whole track
+        includes its unknown start and heading; that of its shape does not, and is the one that the
+        sharpness of an image depends on. The interval of autofocus is that of the changes from ping
+        to ping.
 
     Raises
     ------
     ImportError
         If matplotlib is not installed.
     TypeError
-        If `found` is of another type.
+        If `found` has another type.
     """
     validate.instance("found", found, Micronavigation, Autofocus)
     curves = _curves(found)
@@ -58,7 +59,7 @@ def corrections(found: Micronavigation | Autofocus) -> Figure:
 
 
 def _draw_curve(values: Axes, widths: Axes, curve: _Curve) -> None:
-    """Draw values over pings, and beside them half the widths of their intervals."""
+    """Draw values over pings, and half the widths of their intervals beside them."""
     ping, value = np.arange(len(curve.value)), curve.value
     values.plot(ping, value, linewidth=1.0)
     reach = max(float(np.ptp(value)), 1e-6)
@@ -66,7 +67,7 @@ def _draw_curve(values: Axes, widths: Axes, curve: _Curve) -> None:
         width = _INTERVAL * deviation
         if not (np.isfinite(width) & (width > 0)).any():
             continue
-        if width[np.isfinite(width)].max() < reach:  # wider ones would fill the panel
+        if width[np.isfinite(width)].max() < reach:  # wider intervals would fill the panel
             values.fill_between(
                 ping, value - width, value + width, alpha=0.4, linewidth=0, color=colour
             )
@@ -84,7 +85,7 @@ def _draw_curve(values: Axes, widths: Axes, curve: _Curve) -> None:
 
 
 def _show_decades(axes: Axes) -> None:
-    """Let a logarithmic axis begin and end at powers of ten, written as plain numbers."""
+    """Let a logarithmic axis begin and end at powers of ten, shown as plain numbers."""
     from matplotlib.ticker import LogLocator, NullLocator, StrMethodFormatter
 
     drawn = [np.asarray(line.get_ydata()) for line in axes.lines]
@@ -99,21 +100,21 @@ def _show_decades(axes: Axes) -> None:
 
 
 def coherence(found: Micronavigation, *, range_m: tuple[float, float] | None = None) -> Figure:
-    """Draw the coherence of consecutive pings over range, window by window.
+    """Draw the coherence of consecutive pings over ping and range.
 
     Parameters
     ----------
     found : Micronavigation
     range_m : (near, far), optional
-        Ranges that `micronavigate` was given, which its windows fill. By default a window is as
-        wide as the next one is away, and a single one reaches as far as the lines.
+        The argument `range_m` of `micronavigate`: range windows fill this interval. By default
+        windows are as wide as their distance, and a single one reaches as far as the lines.
 
     Raises
     ------
     ImportError
         If matplotlib is not installed.
-    TypeError
-        If `found` is of another type.
+    TypeError, ValueError
+        If `found` has another type, or `range_m` is not in ascending order.
     """
     validate.instance("found", found, Micronavigation)
     values, edges_m = found.coherence, _edges_m(found, range_m)
@@ -139,7 +140,7 @@ def coherence(found: Micronavigation, *, range_m: tuple[float, float] | None = N
 
 
 def _edges_m(found: Micronavigation, range_m: tuple[float, float] | None) -> NDArray[np.float64]:
-    """Return the ranges between windows, which are equally wide and fill `range_m`."""
+    """Return the ranges at which windows begin and end; they are equally wide."""
     middles_m, windows = found.range_m, len(found.range_m)
     if range_m is not None:
         near_m, far_m = validate.array("range_m", range_m, np.float64, (2,))
@@ -156,7 +157,7 @@ def _edges_m(found: Micronavigation, range_m: tuple[float, float] | None) -> NDA
 
 
 def sharpness(found: Autofocus) -> Figure:
-    """Draw the sharpness of the image after every step of an autofocus.
+    """Draw the sharpness of the image after every step of autofocus.
 
     Parameters
     ----------
@@ -167,7 +168,7 @@ def sharpness(found: Autofocus) -> Figure:
     ImportError
         If matplotlib is not installed.
     TypeError
-        If `found` is of another type.
+        If `found` has another type.
     """
     validate.instance("found", found, Autofocus)
     names = ["before", *(name for name, _ in found.sharpness)]
@@ -180,7 +181,7 @@ def sharpness(found: Autofocus) -> Figure:
     axes.plot(step[kept], values[kept], "o", label="kept")
     if not kept.all():
         axes.plot(step[~kept], values[~kept], "o", fillstyle="none", label="tried, and left out")
-    axes.set(ylabel="Sharpness (2 is that of speckle)")
+    axes.set(ylabel="Sharpness (speckle has 2)")
     axes.set_xticks(step, names, rotation=45, ha="right")
     axes.grid(alpha=0.3)
     axes.legend(loc="lower right", fontsize="small")
@@ -188,21 +189,21 @@ def sharpness(found: Autofocus) -> Figure:
 
 
 def before_and_after(before: Image, after: Image, **options: Any) -> Figure:
-    """Draw an image before and after its track was corrected, with one scale of levels.
+    """Draw an image before and after the correction of its track, with a common scale of levels.
 
     Parameters
     ----------
     before, after : Image
-        Images on one grid.
+        Images on the same grid.
     **options
-        Further arguments of `image`: `dynamic_range_db`, `percentiles`, `colour_map`.
+        Further arguments of `image`: `dynamic_range_db`, `percentiles` and `colour_map`.
 
     Raises
     ------
     ImportError
         If matplotlib is not installed.
     TypeError, ValueError
-        If an argument is of a wrong kind, or the images differ in shape.
+        If an argument has the wrong type, or the images differ in shape.
     """
     validate.instance("before", before, Image)
     validate.instance("after", after, Image)
@@ -211,7 +212,7 @@ def before_and_after(before: Image, after: Image, **options: Any) -> Figure:
     largest = max(float(np.abs(each.pixels).max()) for each in (before, after)) or 1.0
     scale = Scale(reference=largest, **options)
     high = height_per_width(before)
-    # Titles and labels have room beside each other however narrow the images are.
+    # Narrow images leave room for titles and labels beside each other.
     axes_in = min(_PANEL_IN, _HIGHEST_IN / high)
     narrow = axes_in < _LEAST_PANEL_IN
     between = "\n" if narrow else " "
@@ -237,7 +238,7 @@ def before_and_after(before: Image, after: Image, **options: Any) -> Figure:
 
 @dataclass(frozen=True, eq=False)
 class _Curve:
-    """Corrections ping by ping, with standard deviations, their labels and colours."""
+    """Corrections ping by ping; intervals are (standard deviations, label, colour)."""
 
     name: str
     unit: str
@@ -246,7 +247,7 @@ class _Curve:
 
 
 def _curves(found: Micronavigation | Autofocus) -> list[_Curve]:
-    """Return all that was corrected."""
+    """Return the corrections that differ from zero, or else the first."""
     if isinstance(found, Micronavigation):
         every = [
             _Curve("Sway", "mm", 1e3 * found.sway_m, [

@@ -1,4 +1,4 @@
-"""Pictures of recordings: levels of lines over pings, their spectrum, and the track."""
+"""Pictures of recordings: levels of the lines, their spectrum, and the track."""
 
 from __future__ import annotations
 
@@ -22,30 +22,31 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-_MOST_CHANNELS, _MOST_ROWS = 1500, 800  # drawn; pictures have fewer dots
-_LEVELS_DB = 30.0, 80.0  # least and most dynamic range of the levels
-_SPECTRUM_DB = 80.0  # below the strongest frequency
+_MOST_CHANNELS, _MOST_ROWS = 1500, 800  # columns and rows drawn; pictures have fewer dots
+_LEVELS_DB = 30.0, 80.0  # least and largest dynamic range of the levels
+_SPECTRUM_DB = 80.0  # level below the strongest frequency at which the axis ends
 _PREFIXES = ((1e9, "GHz"), (1e6, "MHz"), (1e3, "kHz"))
 
 
 def inspection(found: Inspection, grid: Grid | None = None) -> Figure:
-    """Draw what `inspect` found: levels of the lines, their spectrum, and the track.
+    """Draw an inspected recording: levels of its lines, their spectrum, and the track.
 
     The track is drawn twice: as the advance from ping to ping, and from above. Dead and clipped
-    channels and pings taken standing still are marked over the levels, halts and gaps on the track.
+    channels and pings taken standing still are marked on the levels, halts and gaps on the track.
 
     Parameters
     ----------
     found : Inspection
+        Result of `clsas.inspect`.
     grid : Grid, optional
-        Grid whose outline the track's picture shows.
+        Grid whose outline is drawn beside the track.
 
     Raises
     ------
     ImportError
         If matplotlib is not installed.
     TypeError
-        If an argument is of another type.
+        If an argument has another type.
     """
     validate.instance("found", found, Inspection)
     if grid is not None:
@@ -57,7 +58,7 @@ def inspection(found: Inspection, grid: Grid | None = None) -> Figure:
     _draw_steps(figure.add_subplot(places[1, 1]), found)
     _draw_track(figure.add_subplot(places[1, 2]), found, grid)
     names = ", ".join(each.name.replace("_", " ") for each in found.findings)
-    figure.suptitle(f"Found: {names}" if names else "Nothing found that is wrong", fontsize=11)
+    figure.suptitle(f"Found: {names}" if names else "No defects found", fontsize=11)
     return figure
 
 
@@ -96,10 +97,10 @@ def _draw_lines(axes: Axes, found: Inspection) -> None:
 
 
 def _pooled(lines: RangeLines) -> tuple[NDArray[np.float32], float, float]:
-    """Return the largest amplitudes of few ranges and channels, [range, channel], and both ends.
+    """Return the largest amplitudes of fewer ranges and channels, and the ends of the ranges.
 
-    The ranges that nearly all lines begin and end within are drawn: a slip of single ones would
-    hide the rest.
+    The result is [range, channel]. Ranges outside those of nearly all lines are left out, since
+    single lines with wrong ranges would hide the rest.
     """
     first_m, step_m = lines.first_range_m, lines.range_step_m
     low_m = float(np.quantile(first_m, 0.01)) - step_m / 2
@@ -127,7 +128,7 @@ def _draw_spectrum(axes: Axes, found: Inspection) -> None:
     frequency, power = power_spectrum(lines)
     rate_hz = lines.sound_speed_m_s / (2 * lines.range_step_m)
     low_hz, high_hz = found.band_hz
-    # The band is shown whole, also where it lies across the edge of the sampled frequencies.
+    # The band is drawn in one piece even if it lies across the edge of the sampled frequencies.
     middle = ((low_hz + high_hz) / 2 - lines.carrier_hz) / rate_hz
     frequency = middle + (frequency - middle + 0.5) % 1.0 - 0.5
     order = np.argsort(frequency)
@@ -161,12 +162,12 @@ def _draw_steps(axes: Axes, found: Inspection) -> None:
         ("order", "tab:purple", "Turns back", 1),
     ):
         if name in found:
-            # A halt is known by the ping that does not advance, a gap by the ping before it.
+            # Halts are listed by the ping that does not advance, gaps by the ping before them.
             at = np.array(found[name].where, np.int64) + later
             at = at[(at > 0) & (at <= len(steps_m))]
             axes.plot(at, scale * steps_m[at - 1], "o", color=colour, fillstyle="none",
                       markersize=6, label=f"{label} ({len(at)})")  # fmt: skip
-    axes.set(xlabel="Ping", ylabel=f"Advance ({unit})", title="Advance from the ping before")
+    axes.set(xlabel="Ping", ylabel=f"Advance ({unit})", title="Advance from the previous ping")
     if largest_m:
         axes.set_ylim(-0.05 * scale * largest_m, 1.1 * scale * largest_m)
     axes.grid(alpha=0.3)

@@ -1,4 +1,4 @@
-"""The geometry of a survey: antennas and the outline of the grid."""
+"""Pictures of the geometry of a survey: antennas, and the outline of the grid."""
 
 from __future__ import annotations
 
@@ -18,29 +18,40 @@ if TYPE_CHECKING:
 
 
 def geometry(lines: RangeLines | Echoes, grid: Grid | None = None) -> Figure:
-    """Draw the positions of transmitters and receivers, and the grid's outline.
+    """Draw the positions of transmitters and receivers, and the outline of a grid.
 
-    The view is from above, x and y. For a grid in depth along x or y it is from the side.
+    The view is from above, over x and y. For a vertical grid along x or y it is from the side.
 
     Parameters
     ----------
     lines : RangeLines or Echoes
-        Lines or echoes with the positions `tx_m` and `rx_m`.
+        Data with the positions `tx_m` and `rx_m`.
     grid : Grid, optional
-        Grid of an image; arbitrary points are all drawn.
+        Grid of an image. If it has arbitrary points, all of them are drawn.
 
     Raises
     ------
     ImportError
         If matplotlib is not installed.
     TypeError
-        If `lines` or `grid` is of another type.
+        If `lines` or `grid` has another type.
+
+    Examples
+    --------
+    >>> import clsas
+    >>> import numpy as np
+    >>> tx_m = np.outer(np.arange(8), [0.02, 0, 0])
+    >>> point = clsas.PointTargets([[0.1, 20.0, 0.0]], [1.0])
+    >>> lines = clsas.simulate_lines(tx_m, tx_m, point, carrier_hz=100e3, bandwidth_hz=20e3)
+    >>> figure = clsas.plot.geometry(lines, clsas.Grid.plane((0.0, 0.2, 21), (19.0, 21.0, 21)))
+    >>> [line.get_label() for line in figure.axes[0].get_lines()]
+    ['Receiver (8 positions)', 'Transmitter (8 positions)', 'Grid 21 × 21']
     """
     validate.instance("lines", lines, RangeLines, Echoes)
     if grid is not None:
         validate.instance("grid", grid, Grid)
     shown = _coordinates(grid)
-    # Metres, unless the whole geometry is small.
+    # Units are metres unless the whole geometry is small.
     ends_m = [lines.rx_m, lines.tx_m] + ([] if grid is None else [outline(grid)[0]])
     scale, unit = length_unit(max(float(np.abs(each[:, shown]).max()) for each in ends_m))
     figure = new_figure(7.0, 6.0)
@@ -72,7 +83,7 @@ def geometry(lines: RangeLines | Echoes, grid: Grid | None = None) -> Figure:
 
 
 def _coordinates(grid: Grid | None) -> list[int]:
-    """Return the two coordinates that the view shows, across and upward."""
+    """Return the indices of the coordinates that the view shows across and upward."""
     if grid is not None and grid.points_m is None and min(grid.shape) > 1:
         names = "".join(sorted(side.name for side in grid.sides))
         if names in ("xz", "yz"):
@@ -81,7 +92,7 @@ def _coordinates(grid: Grid | None) -> list[int]:
 
 
 def outline(grid: Grid) -> tuple[NDArray, str]:
-    """Return the points or corners to draw for a grid, [n, 3], and the style of their line."""
+    """Return the corners of a grid, or all its points, [n, 3], and the style to draw them."""
     if grid.points_m is not None:
         return grid.points_m.reshape(-1, 3), "."
     down, right = (count - 1 for count in grid.shape)

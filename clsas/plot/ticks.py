@@ -1,4 +1,4 @@
-"""Ticks whose labels fit: imported with matplotlib, when a picture is drawn."""
+"""Ticks whose labels fit. This module imports matplotlib, so it is imported late."""
 
 from __future__ import annotations
 
@@ -10,22 +10,22 @@ from matplotlib.font_manager import FontProperties
 from numpy.typing import NDArray
 
 _MOST_BINS = 8
-_DIGIT_EM = 0.66  # width of a digit, amply
-_GAP_EM = 0.8  # between two labels
+_DIGIT_EM = 0.66  # width of a digit in em, rounded up
+_GAP_EM = 0.8  # least distance of two labels in em
 
 
 class FittingLocator(ticker.MaxNLocator):
-    """At most 9 ticks at round numbers, and no more than have room for their labels, one at least.
+    """Locator of 1 to 9 ticks at round numbers, as many as have room for their labels.
 
-    The number follows the size of the axes when they are drawn, so it stays right when a figure
-    is resized.
+    The number depends on the size of the axes at the time they are drawn, so that it also suits
+    resized figures.
     """
 
     def __init__(self) -> None:
         super().__init__(nbins=_MOST_BINS, steps=(1, 2, 2.5, 5, 10))
 
     def tick_values(self, vmin: float, vmax: float) -> Any:
-        """Return the places of the ticks between two ends of an axis."""
+        """Return the coordinates of the ticks between the ends of an axis."""
         for bins in range(_MOST_BINS, 0, -1):
             self.set_params(nbins=bins)
             places = np.asarray(super().tick_values(vmin, vmax))
@@ -36,7 +36,7 @@ class FittingLocator(ticker.MaxNLocator):
         return inside[:1]
 
     def _fit(self, places: NDArray[np.float64], vmin: float, vmax: float) -> bool:
-        """Return whether labels at some places lie beside each other."""
+        """Return True if labels at some coordinates do not overlap."""
         if len(places) < 2:
             return True
         axis: Any = self.axis

@@ -21,20 +21,20 @@ if TYPE_CHECKING:
 
 KINDS = ("maximum", "slices")
 _VIEWS = (("x", "y", "z"), ("z", "y", "x"), ("x", "z", "y"))  # across, upward, line of sight
-_IN, _LEAST_IN = 6.0, 0.8  # width of two views beside each other, and least size of a view
-_LEFT, _BOTTOM, _GAP, _RIGHT, _TOP = 0.9, 0.6, 0.4, 1.3, 0.7  # inches about the views
-_TOLERANCE = 1e-3  # largest deviation of a point from the box, in steps
+_IN, _LEAST_IN = 6.0, 0.8  # total width of two views, and least size of a view
+_LEFT, _BOTTOM, _GAP, _RIGHT, _TOP = 0.9, 0.6, 0.4, 1.3, 0.7  # margins of the views in inches
+_TOLERANCE = 1e-3  # largest deviation of a point from the regular box, in steps
 
 
 @dataclass(frozen=True, eq=False)
 class _Box:
-    """Levels on a regular box of points, and the places along its axes.
+    """Levels on a regular box of points.
 
     Parameters
     ----------
     level : ndarray, [z, y, x]
     places_m : dict of ndarray
-        By "x", "y" and "z".
+        Coordinates along "x", "y" and "z".
     """
 
     level: NDArray[np.float32]
@@ -56,34 +56,35 @@ def volume(
     title: str = "",
     **options: Any,
 ) -> Figure:
-    """Draw a volume from above, from its side and from its front, in dB over metres.
+    """Draw a volume from above, from the side and from the front, in dB over metres.
 
     Parameters
     ----------
     image : Image
-        Image on points [n, m, k, 3] that form a regular box with sides along x, y and z, in any
-        order, such as::
+        Image on points [n, m, k, 3] that form a regular box. Its sides lie along x, y and z, in any
+        order, for example::
 
             z, y, x = np.meshgrid(z_m, y_m, x_m, indexing="ij")
             grid = clsas.Grid.points(np.stack([x, y, z], axis=-1))
 
     kind : str
-        "maximum": the largest amplitude along the line of sight. "slices": three planes through
-        a point, with dashed lines at their positions.
+        "maximum" draws the largest amplitude along the line of sight. "slices" draws three planes
+        through a point, with dashed lines at their positions.
     at : (x, y, z), optional
-        Point of "slices", metres; the nearest pixel is taken. By default the brightest pixel.
+        Point of "slices" in metres, which is rounded to the nearest pixel. By default the brightest
+        pixel.
     title : str
         Title above the views.
     **options
-        `dynamic_range_db`, `percentiles`, `reference` and `colour_map` of `clsas.plot.image`; one
-        scale holds for all views.
+        `dynamic_range_db`, `percentiles`, `reference` and `colour_map` of `clsas.plot.image`. All
+        views have the same scale.
 
     Raises
     ------
     ImportError
         If matplotlib is not installed.
     TypeError, ValueError
-        If an argument is of a wrong kind or outside its limits, the image is not on such a box, or
+        If an argument has the wrong type or is out of bounds, the image is not on such a box, or
         `at` lies outside it.
     """
     validate.instance("image", image, Image)
@@ -118,7 +119,7 @@ def volume(
     top.set_ylabel(axis_label("y", unit))
     side.set_xlabel(axis_label("z", unit))
     front.set(xlabel=axis_label("x", unit), ylabel=axis_label("z", unit))
-    top.tick_params(labelbottom=False)  # those of the views below and to the left
+    top.tick_params(labelbottom=False)  # the views below and to the left have these labels
     side.tick_params(labelleft=False)
     add_colour_bar(drawn, scale, box.level, cax=beside)
     figure.suptitle(title)
@@ -126,9 +127,9 @@ def volume(
 
 
 def _panels(box: _Box) -> tuple[Figure, list[Axes], Axes]:
-    """Return a figure, the axes of the views from above, side and front, and of the colour bar.
+    """Return a figure with the axes of the views from above, side and front, and the colour bar.
 
-    Views have one scale, except that a flat view is drawn large enough to be seen.
+    All views have the same scale, except that flat views are enlarged.
     """
     lengths_m = {
         name: float(np.ptp(place)) * len(place) / max(len(place) - 1, 1)
@@ -148,12 +149,12 @@ def _panels(box: _Box) -> tuple[Figure, list[Axes], Axes]:
 
 
 def _box_of(image: Image, reference: float | None) -> _Box:
-    """Return the levels of a volume in the order [z, y, x], all axes ascending.
+    """Return a volume with axes in the order [z, y, x] and all coordinates ascending.
 
-    Raises ValueError if its points form no regular box.
+    Raise ValueError if its points are not a regular box.
     """
     places_m = _sides_m(image.grid)
-    order = list(places_m)  # the coordinate of every axis of the points
+    order = list(places_m)  # the coordinate that changes along each axis of the points
     level = image.db(reference=reference).transpose([order.index(name) for name in "zyx"])
     turned = {name: slice(None, None, -1 if p[-1] < p[0] else 1) for name, p in places_m.items()}
     level = level[tuple(turned[name] for name in "zyx")]
@@ -161,9 +162,9 @@ def _box_of(image: Image, reference: float | None) -> _Box:
 
 
 def _sides_m(grid: Grid) -> dict[str, NDArray[np.float64]]:
-    """Return the places along the axes of a regular box of points, by the coordinates they change.
+    """Return the coordinates along the axes of a regular box of points, by their names.
 
-    Raises ValueError if the points form none.
+    Raise ValueError if the points are not a regular box.
     """
     wanted = "image must be on points [n, m, k, 3] that form a regular box along x, y and z"
     points_m = grid.points_m
@@ -173,7 +174,8 @@ def _sides_m(grid: Grid) -> dict[str, NDArray[np.float64]]:
     lines_m = points_m[:, 0, 0], points_m[0, :, 0], points_m[0, 0, :]
     changes_m = np.array([np.abs(line[-1] - line[0]) for line in lines_m])
     free, order = {0, 1, 2}, [0, 1, 2]
-    for axis in np.argsort([-len(line) for line in lines_m], kind="stable"):  # of one point last
+    # Axes with a single point come last, and take the coordinates that are left.
+    for axis in np.argsort([-len(line) for line in lines_m], kind="stable"):
         order[axis] = max(free, key=lambda c: (changes_m[axis, c], c))
         free.remove(order[axis])
     places_m = {"xyz"[c]: line[:, c] for c, line in zip(order, lines_m, strict=True)}
@@ -184,12 +186,12 @@ def _sides_m(grid: Grid) -> dict[str, NDArray[np.float64]]:
         shape = [-1 if other == axis else 1 for other in range(3)]
         off_m = np.abs(points_m[..., c] - even_m.reshape(shape)).max()
         if off_m > room_m or (len(place_m) > 1 and place_m[0] == place_m[-1]):
-            raise ValueError(f"{wanted}, got points that do not, by {off_m:.3g} m along {'xyz'[c]}")
+            raise ValueError(f"{wanted}, got points up to {off_m:.3g} m off it along {'xyz'[c]}")
     return places_m
 
 
 def _nearest(box: _Box, at: Sequence[float] | None) -> dict[str, int]:
-    """Return the indices of the pixel at a place, or of the brightest one, by coordinate."""
+    """Return the indices of the pixel nearest to a position, or of the brightest, by coordinate."""
     if at is None:
         brightest = np.unravel_index(box.level.argmax(), box.level.shape)
         return {name: int(index) for name, index in zip("zyx", brightest, strict=True)}

@@ -21,7 +21,6 @@ from clsas.core.image import Image
 from clsas.core.lines import RangeLines
 from clsas.core.validate import warn
 from clsas.exact.backprojection import backproject
-from clsas.factorized.factorization import ExactImage
 from clsas.files.hdf5 import save
 from clsas.files.process_tables import CORRECTIONS
 from clsas.files.scene_files import SceneFile
@@ -35,6 +34,7 @@ from clsas.navigation.micronavigation import Micronavigation, micronavigate
 from clsas.opencl.device import Device
 from clsas.planning.factorize import factorize
 from clsas.planning.planner import TOLERANCE_DB, plan
+from clsas.plans.factorization import ExactImage
 from clsas.processing import numbers
 from clsas.processing.record import StepRecord
 
@@ -307,9 +307,9 @@ def _formed(
         image = backproject(lines, grid, **request, beam=beam, device=job.device, progress=progress)
         return image, None
     chosen = plan(lines, grid, **request, beam=beam, device=job.device)
-    if isinstance(chosen.image, ExactImage):
+    if isinstance(chosen.method, ExactImage):
         image = backproject(
-            lines, grid, accuracy_db=chosen.image.accuracy_db, beam=beam, device=job.device,
+            lines, grid, accuracy_db=chosen.method.accuracy_db, beam=beam, device=job.device,
             progress=progress,
         )  # fmt: skip
     else:

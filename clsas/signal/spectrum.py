@@ -27,6 +27,8 @@ _FREQUENCIES = 128
 _FLOOR_WIDTH = 1 / 64  # cycles per sample; the quietest part of this width is taken as noise
 _FLOOR_MARGIN = 2.0  # scatter of the mean of a few periodograms
 _NOISE_LEFT = 0.1  # share of the noise power in peaks above that margin
+OUTSIDE = 0.1
+"""Share of the allowed error power that may come from outside the nominal band."""
 # Shares of the signal power that may lie outside the band, in tails of windows and finite lines.
 _OUTSIDE_BAND = (1e-8, 1e-6, 1e-4)
 _CLOSING = 1 / 300  # cycles per sample around the point opposite the centre, which may alias
@@ -221,6 +223,12 @@ def _aliasing(distance: NDArray[np.float64], power: NDArray[np.float64], width: 
         return 0.0
     closing = max(_CLOSING, 1.5 / len(power))
     return 2 * float(power[distance > 0.5 - closing].sum())
+
+
+def occupied_band(spectrum: Spectrum, outside: float) -> tuple[float, float]:
+    """Return centre and half width of the band that contains all but a share of the power."""
+    bins = np.searchsorted(np.cumsum(spectrum.share), 1 - outside)
+    return spectrum.centre, float(min((bins + 1) / (2 * len(spectrum.power)), 0.5))
 
 
 def power_outside(lines: RangeLines, centre: float, half_width: float, most_channels: int) -> float:

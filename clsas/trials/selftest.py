@@ -13,12 +13,12 @@ from clsas.core import validate
 from clsas.core.image import Image
 from clsas.exact.backprojection import backproject
 from clsas.exact.wavenumber import wavenumber
-from clsas.factorized.plan import Plan
 from clsas.mosaics.mosaic import mosaic
 from clsas.opencl.device import Device, DeviceInfo, open_device
 from clsas.planning.costs import Costs
 from clsas.planning.factorize import factorize
 from clsas.planning.planner import plan
+from clsas.plans.plan import Plan
 from clsas.sonar.beam import BeamWindow
 from clsas.trials import extremes
 from clsas.trials.extremes import Known, along_x

@@ -8,7 +8,7 @@ x = np.linspace(-4, 4, 200)
 above.plot(x, 0.25 * np.sin(1.3 * x), color=BLUE, lw=1.5)
 pings = np.linspace(-3.6, 3.6, 13)
 above.plot(pings, 0.25 * np.sin(1.3 * pings), "o", ms=3.5, color=BLUE)
-above.text(-4, 0.6, "track, one dot a ping", color=BLUE, size=9)
+above.text(-4, 0.6, "track, one dot per ping", color=BLUE, size=9)
 tx, rx, point = np.array([0.5, 0.15]), np.array([1.6, 0.2]), np.array([2.6, 5.0])
 centre = (tx + rx) / 2
 above.plot(*zip(tx, point, strict=True), color=TEAL, lw=1)

@@ -67,7 +67,7 @@ whole.plot(
     x_m[near], np.exp(4j * np.pi / WAVELENGTH_M * ranges(corner_m)).real[near], lw=0.8, color=BLUE
 )
 whole.set(
-    title="What a pixel multiplies the lines by, exp(j 2 k ρ): as it is",
+    title="Phase factor of a pixel before alignment, exp(j 2 k ρ)",
     ylabel="real part",
     xlim=(-0.6, 0.6),
 )
@@ -82,7 +82,9 @@ aligned.plot(
 aligned.plot(x_m, stairs.real, lw=0.8, color=RED, label="the nearest virtual channel")
 aligned.plot(nodes_m, values.real, "o", ms=5, color=ORANGE, label="virtual channels")
 aligned.set(
-    title="Aligned on the subimage's centre it varies slowly", ylabel="real part", xlim=(-0.6, 0.6)
+    title="Steering function: after alignment on the subimage's centre it varies slowly",
+    ylabel="real part",
+    xlim=(-0.6, 0.6),
 )
 aligned.set(xlabel="along the track (m)", ylim=(-1.2, 2.3))
 aligned.legend(loc="upper center", ncols=2, fontsize="small", frameon=False)
@@ -104,7 +106,7 @@ for taps, colour, name in (
         counts.append(place(oversampling)[-1] + 1)
     errors.plot(counts, levels, "o-", color=colour, label=name)
 errors.set(
-    title=f"What that errs by: subimage of {SIDE_M} m, {CHANNELS} channels",
+    title=f"Error of the interpolation: subimage of {SIDE_M} m, {CHANNELS} channels",
     xlabel="virtual channels",
     ylabel="error (dB)",
     xlim=(0, 250),

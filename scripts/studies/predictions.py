@@ -9,7 +9,6 @@ from dataclasses import replace
 from functools import partial
 
 from clsas.exact.backprojection import form_exactly
-from clsas.factorized.report import costs_in_words
 from clsas.opencl.device import Device
 from clsas.planning import costs, scaling
 from clsas.planning.costs import KnownCosts
@@ -17,6 +16,7 @@ from clsas.planning.exact_image import expect
 from clsas.planning.factorize import factorize
 from clsas.planning.planner import plan
 from clsas.planning.visibility_model import VisibilityModel
+from clsas.plans.report import costs_in_words
 from clsas.trials import cases
 from studies.tables import TOLERANCES_DB
 

@@ -29,7 +29,7 @@ from clsas.trials import cases, demo
 pytest.importorskip("matplotlib")
 
 ROOT = Path(__file__).parents[2]
-README = (ROOT / "README.md").read_text()
+TOUR = (ROOT / "docs" / "tour.md").read_text()
 (EXAMPLE,) = re.findall(
     r"```toml\n(.*?)```", (ROOT / "docs" / "scene-files.md").read_text(), re.DOTALL
 )
@@ -834,12 +834,11 @@ def test_progress_is_shown_on_a_terminal(made, tmp_path):
 
 
 @pytest.mark.slow
-def test_readme_tour(tmp_path, monkeypatch):
-    """Every command of the README's tour does what it says, in its order."""
+def test_tour(tmp_path, monkeypatch):
+    """Every command of the documentation's tour does what it says, in its order."""
     monkeypatch.chdir(tmp_path)
-    tour = README[README.index("## Five minutes") :]
     commands, program = (
-        "\n".join(re.findall(rf"```{kind}\n(.*?)```", tour, re.DOTALL)) for kind in ("sh", "python")
+        "\n".join(re.findall(rf"```{kind}\n(.*?)```", TOUR, re.DOTALL)) for kind in ("sh", "python")
     )
     monkeypatch.setattr(cases, "FACTORIZED_CASES", {"ffbp-thesis": SMALL})
     shown = {}

@@ -22,7 +22,7 @@ from clsas.aperture.virtual_channels import interpolated_channels, nearest_nodes
 from clsas.core.grid import Grid
 from clsas.core.image_error import relative_error_db
 from clsas.exact.backprojection import backproject
-from clsas.factorized import sector, tree, visibility
+from clsas.factorized import sectors, tree, visibility
 from clsas.factorized.surface import surface_of
 from clsas.factorized.tree import Division
 from clsas.planning.factorize import factorize
@@ -193,7 +193,7 @@ def everything(monkeypatch):
         return ranges(division, nodes, place, everywhere, np.ones_like(inside))
 
     ranges = tree.channel_ranges
-    monkeypatch.setattr(sector, "channel_ranges", widened)
+    monkeypatch.setattr(sectors, "channel_ranges", widened)
 
 
 @pytest.mark.slow

@@ -115,7 +115,7 @@ def test_every_key_is_documented_with_its_default():
         for name, info in model.model_fields.items():
             default = documented[path][name]
             if info.default is PydanticUndefined:
-                assert default == "needed", (path, name)
+                assert default == "required", (path, name)
             elif info.default is not None:
                 assert tomllib.loads(f"a = {default.strip('`')}")["a"] == info.default, (path, name)
 

@@ -7,21 +7,20 @@ import numpy as np
 import pytest
 from cases import lines_over
 from dense import TRACKS, headings, scene, to_and_fro, turning
-from factorizing import EXACT_IS_SLOW, peak_device_bytes
+from factorizing import EXACT_IS_SLOW, changed, peak_device_bytes
 
 from clsas.core.grid import Grid
 from clsas.core.image import Image
 from clsas.core.image_error import relative_error_db
 from clsas.exact import reference
 from clsas.exact.backprojection import backproject
-from clsas.factorized.plan import Plan
-from clsas.factorized.sector import Geometry
-from clsas.factorized.surface import surface_of
+from clsas.factorized.sectors import Roots
 from clsas.opencl.device import open_device
 from clsas.planning import planner
 from clsas.planning.costs import Costs
 from clsas.planning.factorize import factorize
 from clsas.planning.planner import plan
+from clsas.plans.plan import Plan
 from clsas.sonar.beam import BeamWindow
 from clsas.trials.selftest import driven
 
@@ -190,7 +189,7 @@ def test_a_plan_tells_why_an_image_is_exact(name, squint_deg, along, reason):
     chosen = planned(name, -40, beam=beam)
     assert chosen.is_exact
     assert reason in chosen.describe()
-    assert Plan.from_json(chosen.to_json()).image == chosen.image
+    assert Plan.from_json(chosen.to_json()).method == chosen.method
 
 
 @pytest.mark.parametrize("name", ["helix", "raster", "planar", "passes"])
@@ -198,8 +197,8 @@ def test_virtual_channels_are_as_many_as_predicted(name):
     """Filters of each stage extend past the ends of those before: these count too."""
     lines, grid = scene(name)
     chosen = planned(name, -60, depth=3)
-    geometry = Geometry(lines, surface_of(grid), chosen)
-    sectors = list(geometry.sectors(100, 100))
+    roots = Roots(lines, grid, chosen.factorization, chosen.beam)
+    sectors = list(roots.sectors(100, 100))
     for level, stage in enumerate(chosen.stages[:-1]):
         needs = [sector.needs[level] for sector in sectors]
         counts = np.concatenate([(need.last - need.first).ravel() for need in needs])
@@ -244,7 +243,7 @@ def test_a_plan_of_another_shape_is_refused(name, shape):
     chosen = plan(line, grid, tolerance_db=-40, costs=EXACT_IS_SLOW)
     aperture = dataclasses.replace(chosen.factorization.aperture, shape=shape)
     with pytest.raises(ValueError, match=r"lines must have channels that lie on (several|a sheet)"):
-        factorize(line, grid, chosen.changed(aperture=aperture))
+        factorize(line, grid, changed(chosen, aperture=aperture))
 
 
 @pytest.mark.parametrize(

@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 from judging import images_of
 
 MISSED = (
+    ("beam's edge", 40979, -30),
     ("dense, narrow, apart", 2131, -40),
     ("apart, narrow", 5025, -20),
     ("apart, narrow", 5061, -15),

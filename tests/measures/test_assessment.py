@@ -1,4 +1,4 @@
-"""What assess says an effect does to an image is what leaving it out does."""
+"""Assessed errors of leaving out effects agree with images formed without them."""
 
 import json
 from dataclasses import replace
@@ -32,7 +32,7 @@ def lines_on(grid, tx, rx=None, **others):
 
 
 def measured_db(lines, other, grid=GRID, on=None, beam=None, without=None):
-    """The error of other lines, pixels or weights, by float64 images."""
+    """Return the error of other lines, pixels or weights, from float64 images."""
     full = ideal(lines, grid.at(PIXELS), beam=beam)
     return relative_error_db(ideal(other, (on or grid).at(PIXELS), beam=without), full)
 
@@ -56,7 +56,7 @@ def test_transmitter_and_receiver_apart(apart_m):
     wanted_db = measured_db(lines, replace(lines, tx_m=middle_m, rx_m=middle_m))
     assert found.modelled
     assert found.error_db == pytest.approx(wanted_db, abs=1.0)
-    # b^2/8R of broadside, in wavelengths of the way there and back
+    # b^2/8R at broadside, in wavelengths of the two-way path
     assert found.most_wavelengths == pytest.approx(
         apart_m**2 / (8 * 20.2) / (1500 / CARRIER) * 2, rel=0.1
     )
@@ -94,7 +94,7 @@ def test_beam_window():
 
 
 def test_an_array_is_no_sway():
-    """Rows of receivers lie beside the track in every ping alike; a yaw turns them differently."""
+    """Receivers beside the track are no error if they are the same in all pings; a yaw differs."""
     sonar = replace(
         clsas.Sonar.edgetech(), rx_m=[[0.2, 0, 0.1], [0, 0, -0.1], [-0.2, 0, 0.1]], tx_m=[0, 0, 0.4]
     )
@@ -137,7 +137,7 @@ def test_element_patterns_are_those_of_the_simulator():
     assert MOTION in missing.missing or missing[MOTION].needed is False
 
 
-def test_what_is_needed_follows_the_tolerance():
+def test_needed_effects_depend_on_the_tolerance():
     lines = lines_on(GRID, APERTURE, velocity=[[0.01, 0.0, 0.0]] * CHANNELS)
     error_db = assess(lines, GRID)[MOTION].error_db
     for beyond_db, needed in ((12.5, True), (13.5, False)):  # a twentieth is 13 dB
@@ -146,13 +146,13 @@ def test_what_is_needed_follows_the_tolerance():
         assert (MOTION in found.spare) is not needed
 
 
-def test_effects_that_are_not_there_do_nothing():
+def test_absent_effects_have_no_error():
     found = assess(lines_on(GRID, APERTURE), GRID)
     for name in (APART, RELIEF, SWAY):
         assert not found[name].modelled
         assert found[name].error_db < -250
         assert found[name].needed is False
-    assert found[MOTION].error_db is None  # nobody knows how fast it was
+    assert found[MOTION].error_db is None  # the speed is not known
     assert found[MOTION].needed is None
     assert found[ENDS].error_db < -80  # these lines fade
     assert found.spare == () or found.spare == (ENDS,)
@@ -160,7 +160,7 @@ def test_effects_that_are_not_there_do_nothing():
 
 
 @pytest.mark.slow
-def test_imagers_leave_out_what_the_table_says():
+def test_imagers_leave_out_the_effects_of_the_table():
     grid = Grid.plane((-0.9, 0.9, 512), (20.0, 21.8, 512))
     lines = lines_on(grid, APERTURE, beside(APERTURE, 0.01, 0, 0))
     found = assess(lines, grid, tolerance_db=-40, repeats=1)
@@ -175,7 +175,7 @@ def test_imagers_leave_out_what_the_table_says():
 
 
 @pytest.mark.slow
-def test_half_precision_is_told_of(platform):
+def test_half_precision_is_assessed(platform):
     grid = Grid.plane((-0.9, 0.9, 512), (20.0, 21.8, 512))
     lines = lines_on(grid, APERTURE.repeat(4, axis=0) + along_x(4 * CHANNELS, 0.005))
     for tolerance_db in (-40, -70):
@@ -299,8 +299,8 @@ def test_a_scene_is_assessed_before_it_is_simulated(scene):
 
 
 @pytest.mark.slow
-def test_what_a_scene_may_leave_out_is_told_with_the_key(scene):
-    """And leaving it out, the scene images the same within the tolerance."""
+def test_effects_that_a_scene_may_leave_out_have_their_key(scene):
+    """Without them, the image of the scene stays within the tolerance."""
     slow = {
         "[1.0, 0": "[0.01, 0",
         "interval_s = 0.08": "interval_s = 8.0",
@@ -344,7 +344,7 @@ def test_lines_are_assessed_with_the_scene_that_made_them(scene, tmp_path):
     for name in (MOTION, APART, SWAY, PATTERN):
         assert effects[name]["error_db"] == pytest.approx(of_scene[name]["error_db"], abs=1.5)
     assert effects[ENDS]["error_db"] is not None
-    # Without the scene nobody knows patterns or velocities.
+    # Without the scene, patterns and velocities are not known.
     bare = table(lines, "--x", "-0.2:0.2:64", "--y", "10.4:10.6:64")[1]
     assert bare[PATTERN]["error_db"] is None
     assert bare[MOTION]["error_db"] is None
@@ -375,7 +375,7 @@ def test_a_scene_without_a_survey_is_refused(tmp_path):
 
 
 def test_every_key_is_one_of_scene_files():
-    """What leaves an effect out of a simulation can be written as the table tells it."""
+    """Scene files accept the keys of the table."""
     for name, key in KEYS.items():
         if " = " in key:
             table_, setting = key.split("] ")

@@ -212,10 +212,13 @@ def test_takes_the_greatest_pixel_within_the_search():
         ({"near": (np.nan, AT[1])}, "near must be finite"),
         ({"near": AT[0]}, r"near must have shape \(2\)"),
         ({"pixels": np.zeros(GRID.shape, complex)}, r"image is zero around near"),
-        ({"pixels": point(at=(X[0], AT[1])), "near": (X[0], AT[1])}, "at the image's border .x ="),
+        (
+            {"pixels": point(at=(X[0], AT[1])), "near": (X[0], AT[1])},
+            "at the border of the image .x =",
+        ),
         (
             {"pixels": point(at=(AT[0], Y[-1])), "near": (AT[0], Y[-1])},
-            "at the image's border .y =",
+            "at the border of the image .y =",
         ),
         (
             {"pixels": point(at=(X[2], AT[1])), "near": (X[2], AT[1])},
@@ -234,7 +237,7 @@ def test_bad_input_is_named(change, words):
         measure_point(image, **arguments)
 
 
-def test_a_side_lobe_taken_for_the_point_is_told():
+def test_a_side_lobe_taken_for_the_point_is_reported():
     side_lobe = AT[0] + 1.43 * 3 * DX, AT[1]
     with pytest.warns(ClsasWarning, match=r"is 13\.\d dB lower than a side lobe of it"):
         got = measure_point(Image(point(3.0), GRID), side_lobe, search_m=2 * DX)
@@ -292,7 +295,9 @@ def test_relative_error_is_of_one_place():
         (Grid.plane((1e6, 1e6 + 1, 40), (1, 0, 30)), "1"),
         (grid.with_height(np.full(grid.shape, 2.0)), "2"),
     ):
-        with pytest.raises(ValueError, match=f"image and ref.* one grid, got .* by up to {apart} m"):
+        with pytest.raises(
+            ValueError, match=f"image and ref.* one grid, got .* by up to {apart} m"
+        ):
             relative_error_db(image, Image(pixels, other))
 
 

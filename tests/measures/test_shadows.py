@@ -1,4 +1,4 @@
-"""Errors in dark places, against the level there."""
+"""Errors in dark parts of an image, relative to the level there."""
 
 import numpy as np
 import pytest
@@ -61,7 +61,7 @@ def test_units_do_not_matter(shadowed, scale):
 
 
 @pytest.mark.parametrize("darkest", [0.0, -1.0, 1.1, np.nan])
-def test_shares_that_are_none_are_refused(shadowed, darkest):
+def test_wrong_shares_are_refused(shadowed, darkest):
     with pytest.raises(ValueError, match="darkest must be"):
         clsas.relative_error_db(shadowed, shadowed, darkest=darkest)
 

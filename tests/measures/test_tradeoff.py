@@ -46,7 +46,7 @@ def lines():
 
 
 @pytest.mark.slow
-def test_every_way_is_measured_against_the_exact_image(lines):
+def test_every_method_is_measured_against_the_exact_image(lines):
     seen = []
     measured = clsas.tradeoff(
         lines, GRID, tolerances_db=(-30, -50), stages=[[(2, 2), (4, 2)]],
@@ -56,10 +56,10 @@ def test_every_way_is_measured_against_the_exact_image(lines):
     assert labels == ["-30 dB", "-50 dB", "2x2,4x2", "exact"]
     assert (measured.channels, measured.pixels, measured.repeats) == (200, (128, 96), 2)
     assert measured.device in [info.label for info in clsas.list_devices()]
-    assert seen == [(done, 13) for done in range(1, 14)]  # a reference, and 3 runs of 4 ways
+    assert seen == [(done, 13) for done in range(1, 14)]  # a reference, and 3 runs of 4 methods
     loose, tight, summed, exact = measured.rows
     assert measured.exact is exact
-    # Two points in the dark: what errors are spread over is far above the darkest tenth.
+    # Two points in a dark scene: errors are spread over levels far above the darkest tenth.
     assert measured.dark_level_db < -30
     assert all(row.dark_error_db > row.error_db for row in measured.rows)
     assert tight.error_db < -48
@@ -74,7 +74,7 @@ def test_every_way_is_measured_against_the_exact_image(lines):
 
 
 @pytest.mark.slow
-def test_a_study_sweeps_what_the_planner_chooses_from(lines):
+def test_a_study_sweeps_the_choices_of_the_planner(lines):
     measured = clsas.tradeoff(lines, GRID, tolerances_db=(-40,), stages=(), repeats=1, study=True)
     studied = [row for row in measured.rows if row.method == "study"]
     assert measured.rows[0].method == "tolerance"
@@ -97,10 +97,10 @@ def test_a_beam_counts_in_every_image(lines):
     assert narrow.exact.azimuth.resolution_m > 1.5 * exact.azimuth.resolution_m
 
 
-def test_what_no_point_is_has_no_response(lines):
+def test_an_image_on_points_has_no_response(lines):
     grid = Grid.points(GRID.positions_m(slice(0, 2), slice(0, 3)).reshape(-1, 3))
     measured = clsas.tradeoff(lines, grid, tolerances_db=(-40,), repeats=1)
-    # Points are no plane: the thesis's method is left out, and what is left is exact.
+    # Points are not a plane: the thesis's method is left out, and the plan is exact.
     assert [row.label for row in measured.rows] == ["-40 dB", "exact"]
     assert measured.rows[0].plan == "plain backprojection"
     assert all(row.azimuth is row.range is None for row in measured.rows)
@@ -137,13 +137,13 @@ def test_bad_input_is_refused_before_any_image(lines, monkeypatch, error, messag
         clsas.tradeoff(**{"lines": lines, "grid": GRID} | given)
 
 
-def test_a_grid_without_anything_is_refused(lines):
+def test_a_grid_without_echoes_is_refused(lines):
     silent = dataclasses.replace(lines, samples=np.zeros_like(lines.samples))
-    with pytest.raises(ValueError, match="grid must lie where the lines hold anything"):
+    with pytest.raises(ValueError, match="grid must lie where the lines have echoes"):
         clsas.tradeoff(silent, GRID, tolerances_db=[-30], stages=[], repeats=1)
 
 
-def test_the_front_holds_what_nothing_beats():
+def test_the_front_holds_rows_that_no_other_beats():
     assert [row.label for row in MADE.front] == ["-20 dB", "-50 dB", "exact"]
 
 

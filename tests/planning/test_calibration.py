@@ -4,7 +4,7 @@ import pytest
 
 from clsas.core.validate import ClsasWarning
 from clsas.opencl.device import open_device
-from clsas.planning import costs, timed_images
+from clsas.planning import costs
 from clsas.planning.calibration import calibrate
 from clsas.planning.costs import Costs
 
@@ -53,22 +53,6 @@ def test_what_is_measured_is_stored(cache, small, monkeypatch):
     assert found.pixel_ns > 0
     assert found.leaf_ns > 0
     assert found.sample_ns + found.sample_tap_ns > 0
-
-
-@pytest.mark.slow
-def test_first_images_of_plans_are_measured(cache, small, monkeypatch):
-    """Others find the geometry that the first has left."""
-    form, kept = timed_images.run.form, []
-
-    def looked_at(lines, grid, chosen, *others):
-        kept.append(dict(chosen.kept))
-        return form(lines, grid, chosen, *others)
-
-    monkeypatch.setattr(timed_images.run, "form", looked_at)
-    monkeypatch.setattr(module.validate, "warn", lambda _: None)  # whatever this machine does
-    calibrate()
-    assert len(kept) > 10
-    assert not any(kept)
 
 
 @pytest.mark.slow

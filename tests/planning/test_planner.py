@@ -26,7 +26,6 @@ from factorizing import (
 from clsas.core.grid import Grid
 from clsas.core.image_error import relative_error_db
 from clsas.exact.backprojection import backproject
-from clsas.factorized.plan import Plan
 from clsas.planning import fastest, planner, timed_images
 from clsas.planning.beam_coverage import trimmed
 from clsas.planning.channels import frequencies
@@ -34,6 +33,7 @@ from clsas.planning.costs import Costs
 from clsas.planning.factorize import factorize
 from clsas.planning.planner import plan
 from clsas.planning.visibility_model import VisibilityModel
+from clsas.plans.plan import Plan
 from clsas.sonar.beam import BeamWindow
 from clsas.sonar.visibility import sines
 

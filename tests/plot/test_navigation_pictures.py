@@ -1,4 +1,4 @@
-"""Pictures of corrected tracks: what they draw, and what they refuse."""
+"""Pictures of corrected tracks."""
 
 from dataclasses import replace
 from itertools import combinations
@@ -61,7 +61,7 @@ def legend(axes):
 
 
 def test_corrections_have_their_intervals():
-    sway, of_sway, yaw, of_yaw = clsas.plot.corrections(navigated()).axes  # there is no surge
+    sway, of_sway, yaw, of_yaw = clsas.plot.corrections(navigated()).axes  # the surge is zero
     assert sway.get_ylabel() == "Sway (mm)"
     assert yaw.get_ylabel() == "Yaw (mrad)"
     assert legend(of_sway) == ["whole track", "its shape"]
@@ -77,7 +77,7 @@ def test_corrections_have_their_intervals():
     assert not clsas.plot.corrections(focused(focused=False)).axes[1].lines
 
 
-def test_coherence_lies_over_pings_and_range():
+def test_coherence_is_drawn_over_pings_and_range():
     figure = clsas.plot.coherence(navigated())
     beside, levels, _ = figure.axes
     np.testing.assert_allclose(levels.images[0].get_extent(), (-0.5, PINGS - 1.5, 10, 18))
@@ -98,7 +98,7 @@ def test_a_single_window_is_drawn_over_its_extent(range_m, shown):
     np.testing.assert_allclose(beside.get_ylim(), shown or reach)
 
 
-def test_sharpness_tells_steps_that_were_left_out():
+def test_steps_that_autofocus_left_out_are_marked():
     (axes,) = clsas.plot.sharpness(focused()).axes
     names = [text.get_text() for text in axes.get_xticklabels()]
     assert names == ["before", "drift", "phase gradient", "phase gradient"]
@@ -118,7 +118,7 @@ def test_images_before_and_after_have_one_scale():
 
 
 @pytest.mark.parametrize("y", [(10, 50, 200), (10, 210, 200), (10, 14, 20), (10, 10.4, 2)])
-def test_images_of_any_shape_have_room_for_their_texts(y):
+def test_texts_of_images_of_any_shape_do_not_overlap(y):
     grid = clsas.Grid.plane((0, 4, 20), y)
     image = Image(np.ones(grid.shape, complex), grid)
     figure = clsas.plot.before_and_after(image, image)
@@ -135,7 +135,7 @@ def test_images_of_any_shape_have_room_for_their_texts(y):
     np.testing.assert_allclose(*size, rtol=1e-3)
 
 
-def test_images_of_zeros_are_called_so():
+def test_images_of_zeros_are_labelled():
     grid = clsas.Grid.plane((0, 1, 5), (0, 1, 4))
     zero, one = (Image(level * np.ones((4, 5), complex), grid) for level in (0.0, 1.0))
     for pair, words in (
@@ -147,6 +147,6 @@ def test_images_of_zeros_are_called_so():
 
 
 @pytest.mark.parametrize("draw", ["corrections", "coherence", "sharpness"])
-def test_other_things_are_refused(draw):
+def test_other_types_are_refused(draw):
     with pytest.raises(TypeError, match="found must be of type"):
         getattr(clsas.plot, draw)(1)

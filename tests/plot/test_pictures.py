@@ -1,4 +1,4 @@
-"""Pictures fit for a paper: formats, scales, colours, mosaics, volumes; labels keep apart."""
+"""Formats, scales, colours, mosaics and volumes in pictures, and labels that do not overlap."""
 
 import base64
 import io
@@ -35,7 +35,7 @@ def level_of(figure):
 
 
 def texts(figure):
-    """Every text of a figure that is drawn, and its box."""
+    """Return every text that a figure shows, with its box."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.text import Text
 
@@ -56,7 +56,7 @@ def texts(figure):
 
 
 def check_labels(figure):
-    """Check that no text lies over another."""
+    """Check that no texts overlap."""
     found = texts(figure)
     assert len(found) > 3
     for (one, a), (other, b) in combinations(found, 2):
@@ -77,18 +77,18 @@ GRIDS = {
 
 
 @pytest.mark.parametrize("grid", GRIDS.values(), ids=GRIDS.keys())
-def test_labels_of_images_lie_beside_each_other(grid):
+def test_labels_of_images_do_not_overlap(grid):
     check_labels(plot.image_db(speckle(grid), title="An image of speckle"))
 
 
-def test_labels_of_resized_figures_lie_beside_each_other():
+def test_labels_of_resized_figures_do_not_overlap():
     figure = plot.image_db(speckle(GRIDS["utm"]))
     for inches in ((3, 3), (4, 2), (12, 9)):
         figure.set_size_inches(inches)
         check_labels(figure)
 
 
-def test_labels_of_curves_and_geometry_lie_beside_each_other():
+def test_labels_of_curves_and_geometry_do_not_overlap():
     x, y = GRID.axes_m
     pixels = np.sinc((x - 0.1) / 0.05) * np.sinc((y - 41) / 0.08)[:, None] + 0j
     check_labels(plot.cuts(clsas.measure_point(Image(pixels, GRID), (0.1, 41))))
@@ -97,7 +97,7 @@ def test_labels_of_curves_and_geometry_lie_beside_each_other():
 
 
 @pytest.mark.parametrize("apart", [1.0, 0.1, 0.0])
-def test_labels_of_a_tradeoff_lie_beside_each_other(apart):
+def test_labels_of_a_tradeoff_do_not_overlap(apart):
     rows = [
         Row(f"{label} {k}", method, "", 0.0, 0.1 * 2 ** (apart * k), 0.1, -30 - 8 * apart * k, -25)
         for method, label in (("tolerance", "-50 dB"), ("stages", "2 of 2x2"))
@@ -120,7 +120,7 @@ def test_the_suffix_decides_the_format(tmp_path):
         assert (tmp_path / name).read_bytes().startswith(start)
     assert b"Along-track" in (tmp_path / "a.SVG").read_bytes()
     pdf = (tmp_path / "a.pdf").read_bytes()
-    assert b"/Type3" not in pdf  # which publishers refuse
+    assert b"/Type3" not in pdf  # publishers refuse these fonts
 
 
 def test_the_same_picture_is_the_same_file(tmp_path):
@@ -133,7 +133,7 @@ def test_the_same_picture_is_the_same_file(tmp_path):
 
 def test_colours_span_percentiles():
     pixels = SPECKLE.pixels.copy()
-    pixels[:20] = 0  # no pixel of these counts
+    pixels[:20] = 0  # these do not count
     image = Image(pixels, GRID)
     drawn = level_of(plot.image_db(image, percentiles=(5, 95)))
     level = image.db()[20:]
@@ -159,7 +159,7 @@ def test_the_scale_is_pointed_where_levels_lie_beyond_it(scale):
 
 
 def lightness_and_colour(colours):
-    """CIELAB of sRGB colours."""
+    """Return sRGB colours in CIELAB."""
     linear = np.where(colours <= 0.04045, colours / 12.92, ((colours + 0.055) / 1.055) ** 2.4)
     matrix = [[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]]
     xyz = linear @ np.transpose(matrix) / [0.9505, 1, 1.089]
@@ -291,7 +291,7 @@ BRIGHT = (5, 20, 12)  # z, y, x
 
 
 def box(order="zyx", turned=""):
-    """A volume with one bright pixel and one less so, its axes in some order and direction."""
+    """Return a volume with a bright and a dimmer pixel, its axes in some order and direction."""
     sides = {"x": X, "y": Y, "z": Z}
     sides = {name: side[::-1] if name in turned else side for name, side in sides.items()}
     places = np.meshgrid(*(sides[name] for name in order), indexing="ij")
@@ -328,7 +328,7 @@ def test_projections_of_a_volume_hold_its_maxima(order, turned):
     check_labels(figure)
 
 
-def test_views_of_a_volume_lie_at_one_scale_beside_each_other():
+def test_views_of_a_volume_have_one_scale_and_are_aligned():
     figure = plot.volume(VOLUME)
     figure.draw_without_rendering()
     above, beside, front = (axes.get_window_extent() for axes in figure.axes[:3])

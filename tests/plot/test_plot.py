@@ -26,7 +26,7 @@ def lines(samples, first_range_m=40.0):
 
 
 def shown(figure):
-    """The array, extent and colour limits of the picture in a figure."""
+    """Return the array, extent and colour limits of the picture in a figure."""
     (drawn,) = figure.axes[0].get_images()
     return drawn.get_array(), drawn.get_extent(), drawn.get_clim()
 
@@ -60,7 +60,7 @@ def test_zero_image_is_black():
 def test_image_may_run_backwards():
     backwards = Grid.plane(x=(1, -1, 5), y=(2, 0, 5))
     pixels = np.zeros((5, 5), complex)
-    pixels[0, 0] = 1  # at x = 1, y = 2: top right
+    pixels[0, 0] = 1  # at x = 1, y = 2, the top right
     figure = plot.image_db(Image(pixels, backwards))
     level, extent, _ = shown(figure)
     assert level[0, 0] == 0
@@ -98,7 +98,7 @@ def test_small_planes_in_depth_are_in_millimetres():
     np.testing.assert_allclose(shown(figure)[1], [-10.05, 9.95, -19.95, -34.95])
     axes = figure.axes[0]
     assert (axes.get_xlabel(), axes.get_ylabel()) == ("Along-track (mm)", "Height (mm)")
-    assert axes.get_ylim() == pytest.approx((-34.95, -19.95))  # up is up
+    assert axes.get_ylim() == pytest.approx((-34.95, -19.95))  # height increases upward
 
 
 def test_cuts_in_depth_name_their_axes():

@@ -17,7 +17,7 @@ from clsas.core.lines import RangeLines
 from clsas.exact.backprojection import backproject, prepare
 from clsas.exact.reference import ideal
 from clsas.exact.run import execute
-from clsas.factorized.plan import Plan, _json_digest
+from clsas.plans.plan import Plan, _json_digest
 from clsas.sonar.beam import BeamWindow
 from clsas.sonar.simplify import APART, MOTION, RELIEF, SHARE, leave_out, simplify
 from clsas.sonar.visibility import sines

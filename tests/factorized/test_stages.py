@@ -14,6 +14,7 @@ from factorizing import (
     arc,
     around,
     bistatic_array,
+    changed,
     exact,
     hills,
     made,
@@ -35,10 +36,10 @@ from clsas.core.image_error import relative_error_db
 from clsas.core.lines import RangeLines, some_channels
 from clsas.core.validate import ClsasWarning
 from clsas.exact.backprojection import backproject, form_exactly
-from clsas.factorized.plan import Plan
 from clsas.planning.costs import Costs
 from clsas.planning.factorize import factorize
 from clsas.planning.prediction import HALF_ROUNDING
+from clsas.plans.plan import Plan
 from clsas.simulation.scenes import PointTargets
 from clsas.simulation.simulator import simulate_lines
 from clsas.sonar.beam import BeamWindow
@@ -577,12 +578,12 @@ def test_a_grid_that_no_line_reaches_warns_and_is_zero():
 
 def halved(case, tolerance_db):
     """A plan whose lines are of half precision, whatever the device."""
-    return planned(case, tolerance_db).changed(half_precision=True)
+    return changed(planned(case, tolerance_db), half_precision=True)
 
 
 def test_half_precision_adds_what_is_predicted(device):
     chosen = halved(swaying, -50)
-    single = chosen.changed(half_precision=False)
+    single = changed(chosen, half_precision=False)
     image, better = (factorize(*made(swaying), each, device=device) for each in (chosen, single))
     expected_db = in_db(1.3 * HALF_ROUNDING * (len(chosen.sides) + 1))
     assert expected_db - 3 <= relative_error_db(image, better) <= expected_db
@@ -611,7 +612,7 @@ def test_loud_samples_that_no_pixel_sees(platform):
         first_range_m=lines.first_range_m - 300 * lines.range_step_m,
     )
     chosen = plan(longer, grid, tolerance_db=-50, costs=EXACT_IS_SLOW)
-    chosen = chosen.changed(half_precision=True)
+    chosen = changed(chosen, half_precision=True)
     with pytest.warns(ClsasWarning, match="single precision, not in half"):
         image = factorize(longer, grid, chosen, device=platform)
     assert relative_error_db(image, exact(straight)) <= -50
@@ -641,7 +642,7 @@ def test_what_is_faint_beside_what_is_strong_is_kept(platform):
     fades = 10.0 ** (-4 * np.clip(range_m - 39.5, 0, 1))
     fading = dataclasses.replace(lines, samples=(lines.samples * fades).astype(np.complex64))
     chosen = halved(straight, -50)
-    single = chosen.changed(half_precision=False)
+    single = changed(chosen, half_precision=False)
     with pytest.warns(ClsasWarning, match="outside the band"):  # which fading widens
         image, better = (
             factorize(fading, grid, each, device=platform).pixels for each in (chosen, single)
@@ -695,7 +696,7 @@ def test_a_plan_serves_other_samples(half, factor):
     """By a power of 2 they are rounded alike in half precision too."""
     lines, grid = made(straight)
     louder = dataclasses.replace(lines, samples=factor * lines.samples)
-    chosen = planned(straight, -50).changed(half_precision=half)
+    chosen = changed(planned(straight, -50), half_precision=half)
     image, loud = (factorize(each, grid, chosen).pixels for each in (lines, louder))
     assert relative_error_db(loud / factor, image) <= -100
 
@@ -761,7 +762,7 @@ def test_a_beam_beside_a_plan_is_refused():
 def test_progress_counts_pixels(platform):
     lines, grid = made(coarse_pixels)
     calls = []
-    chosen = planned(coarse_pixels, -20).changed(roots_at_once=3, roots_prepared=6)
+    chosen = changed(planned(coarse_pixels, -20), roots_at_once=3, roots_prepared=6)
     factorize(lines, grid, chosen, device=platform, progress=lambda *call: calls.append(call))
     done, total = zip(*calls, strict=True)
     assert len(calls) > 2

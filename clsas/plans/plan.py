@@ -1,113 +1,31 @@
-"""Plans: how an image is formed, decided before the device starts, and what is predicted of it."""
+"""How an image will be formed, with its predicted error, time and memory."""
 
 from __future__ import annotations
 
 import functools
 import hashlib
 import json
-import weakref
-from dataclasses import replace
-from typing import Annotated, Any, Literal, TypeAlias
+from typing import Annotated, Any
 
-import numpy as np
 from pydantic import Field, TypeAdapter, ValidationError
 from pydantic.dataclasses import dataclass
 
 from clsas.core import reprs, validate
 from clsas.core.digests import grid_digest, lines_digest
-from clsas.core.fields import CONFIG, Number, explained
+from clsas.core.fields import CONFIG, Number, StoredAs, explained
 from clsas.core.grid import Grid
 from clsas.core.lines import RangeLines
 from clsas.core.reading import parse_json
-from clsas.factorized import report
-from clsas.factorized.estimates import ErrorBudget, Work
-from clsas.factorized.factorization import ExactImage, Factorization
-from clsas.factorized.fields import StoredBeam, StoredErrors, StoredWork
+from clsas.core.tables import Report
+from clsas.plans import report
+from clsas.plans.factorization import ExactImage, Factorization
+from clsas.plans.predictions import ErrorBudget, Prediction, Stage, Work
+from clsas.sonar.beam import BeamWindow
 from clsas.sonar.simplify import EFFECTS
 
-COVERAGE = ("reached", "warned")
-"""Entries of `Plan.kept`: whether any line reaches the grid, and whether a warning said no."""
-VERSION = 4
-"""Version of a plan's JSON. Version 1, of clsas before 0.1.0, had no number; version 2 had one mean
-track; version 3 did not tell the origin of costs."""
-
-
-CostSource: TypeAlias = Literal["given", "calibrated", "scaled", "default"]
-"""Origin of the costs that make a prediction: see `clsas.planning.costs.KnownCosts`."""
-
-
-@dataclass(frozen=True, config=CONFIG)
-class Stage:
-    """Predicted work of one stage.
-
-    Attributes
-    ----------
-    rows, columns : int
-        Pixels of its subimages.
-    subimages : int
-        Their number in the grid.
-    channels : int
-        Virtual channels of each, on average.
-    samples : int
-        Range samples of each line.
-    operations : float
-        Samples times channels that are aligned and combined; for the last row of a plan pixels
-        times channels that are backprojected.
-    error_db : float
-        Relative rms error that its interpolations add.
-    seconds : float
-        Expected time.
-    """
-
-    rows: int
-    columns: int
-    subimages: int
-    channels: int
-    samples: int
-    operations: float
-    error_db: float
-    seconds: float
-
-
-@dataclass(frozen=True, eq=False, config=CONFIG)
-class Prediction:
-    """Error, time and memory that an image is predicted to take.
-
-    Attributes
-    ----------
-    error_db : float
-        Relative rms error against the exact image, as a bound.
-    seconds, exact_seconds : float
-        Time of the image, and of `clsas.backproject`.
-    memory_bytes : int
-        Largest amount of device memory needed.
-    device : str
-        Device whose times these are.
-    cost_source : str
-        Origin of the costs that make the times: "given", "calibrated" on the device, "scaled" to it
-        by a short measurement, or "default".
-    costs_measured : str
-        Time of that measurement, UTC, in ISO 8601; "" without one.
-    stages : tuple of Stage
-        Every stage, and the backprojection at the end. Empty for an exact image.
-    work : Work
-        Counted operations, which make the time.
-    errors : ErrorBudget
-        Contributions, which make the error.
-    """
-
-    error_db: Number
-    seconds: Number
-    exact_seconds: Number
-    memory_bytes: Annotated[int, Field(ge=0)]
-    device: str
-    stages: tuple[Stage, ...]
-    work: StoredWork
-    errors: StoredErrors
-    cost_source: CostSource = "given"
-    costs_measured: str = ""
-
-    __repr__ = reprs.of_fields
+VERSION = 5
+"""Version of a plan's JSON. Version 1, of clsas before 0.1.0, had no number; version 2 had a single
+mean track; version 3 lacked the origin of costs; in version 4 `method` was `image`."""
 
 
 @dataclass(frozen=True, eq=False, config=CONFIG)
@@ -118,8 +36,8 @@ class Plan:
     ----------
     tolerance_db : float or None
         Relative rms error asked for; None where stages were given.
-    image : Factorization or ExactImage
-        How the image is formed. Exact, if nothing is faster within the tolerance.
+    method : Factorization or ExactImage
+        How the image is formed: exactly, if nothing is faster within the tolerance.
     prediction : Prediction
         Predicted error, time and memory.
     beam : BeamWindow or None
@@ -132,9 +50,9 @@ class Plan:
     """
 
     tolerance_db: Number | None
-    image: Annotated[Factorization | ExactImage, Field(discriminator="method")]
+    method: Annotated[Factorization | ExactImage, Field(discriminator="kind")]
     prediction: Prediction
-    beam: StoredBeam | None
+    beam: Annotated[BeamWindow, StoredAs(dict[str, Any])] | None
     lines_digest: str
     grid_digest: str
     left_out: tuple[str, ...] = ()
@@ -147,36 +65,27 @@ class Plan:
         if not self.is_exact and (self.factorization.limits is None) != (self.beam is None):
             raise ValueError("limits must be given with a beam, and left out without one")
 
-    @functools.cached_property
-    def kept(self) -> dict[str, Any]:
-        """Geometry that an image by this plan leaves for the next; see `factorize`."""
-        return {}
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Return the fields: what is kept for other images is not sent to other processes."""
-        return {name: value for name, value in self.__dict__.items() if name != "kept"}
-
     @property
     def is_exact(self) -> bool:
         """True for exact backprojection."""
-        return isinstance(self.image, ExactImage)
+        return isinstance(self.method, ExactImage)
 
     @property
     def factorization(self) -> Factorization:
         """How the image is divided; raises TypeError for an exact one."""
-        if isinstance(self.image, ExactImage):
+        if isinstance(self.method, ExactImage):
             raise TypeError("the plan must divide the image, got one of an exact image")
-        return self.image
+        return self.method
 
     @property
     def sides(self) -> tuple[tuple[int, int], ...]:
         """Rows and columns of subimages, stage by stage. Empty for an exact image."""
-        return self.image.sides
+        return self.method.sides
 
     @property
     def half_precision(self) -> bool:
         """True if lines are handed on from stage to stage in half precision."""
-        return self.image.half_precision
+        return self.method.half_precision
 
     @property
     def stages(self) -> tuple[Stage, ...]:
@@ -215,47 +124,17 @@ class Plan:
 
     def __repr__(self) -> str:
         """Return the request, the prediction and the sides of the subimages."""
-        return report.summary(self)
+        return reprs.summary(self, *report.summary(self.tolerance_db, self.method, self.prediction))
 
     def _repr_html_(self) -> str:
-        return report.report(self).html()
+        return self._report().html()
 
     def describe(self) -> str:
         """Return a table of what is predicted, stage by stage."""
-        return report.report(self).text()
+        return self._report().text()
 
-    def changed(self, **fields: Any) -> Plan:
-        """Return this plan with other values of some fields of its `image`, for study.
-
-        The prediction stays as it was.
-
-        Raises
-        ------
-        TypeError, ValueError
-            If there is no such field, or its value is not allowed.
-        """
-        plain = {name: _without_numpy(value) for name, value in fields.items()}
-        try:
-            return replace(self, image=replace(self.image, **plain))
-        except ValidationError as error:
-            raise ValueError(explained(error, fields)) from None
-
-    def moved(self, lines: RangeLines) -> Plan:
-        """Return this plan for lines whose channels lie a little beside those it was made for.
-
-        For navigation, which forms many images of the same samples. The predictions hold as far as
-        both tracks are equally smooth.
-
-        Raises
-        ------
-        TypeError
-            If `lines` is not a RangeLines.
-        """
-        validate.instance("lines", lines, RangeLines)
-        plan = replace(self, lines_digest=lines_digest(lines))
-        plan.kept["lines"] = weakref.ref(lines)  # their band is that of the plan
-        plan.kept.update({name: self.kept[name] for name in COVERAGE if name in self.kept})
-        return plan
+    def _report(self) -> Report:
+        return report.report(self.tolerance_db, self.method, self.prediction, self.left_out)
 
     def to_json(self, *, filters: bool = True) -> str:
         """Return this plan as text that `from_json` reads.
@@ -291,6 +170,7 @@ class Plan:
                 raise ValueError(f"it must be an object, got {validate.shown(values)}")
             _check_version(values)
             _check_digest(values)
+            values = _renamed(values) if values["version"] == 4 else values
             values = {name: values[name] for name in values if name not in ("version", "digest")}
             return _stored().validate_json(json.dumps(values))
         except ValidationError as error:
@@ -319,22 +199,30 @@ class Plan:
             validate.number("highest_cycles_per_m", given, "cycles/m", most=most)
 
 
-def _without_numpy(value: Any) -> Any:
-    """Return a value of NumPy as Python's, which fields of plans are."""
-    return value.tolist() if isinstance(value, (np.generic, np.ndarray)) else value
-
-
 def _check_version(values: dict[str, Any]) -> None:
-    """Raise ValueError unless a text is of the version that this clsas writes."""
+    """Raise ValueError unless a text is of a version that this clsas reads."""
     version = values.get("version", 1 if "roots_at_once" in values else None)
     if version is None:
         raise ValueError("it lacks 'version'")
-    if version != VERSION:
+    if version not in (4, VERSION):
         by = "clsas before 0.1.0" if version == 1 else "another clsas"
         raise ValueError(
-            f"it has version {validate.shown(version)}, made by {by}; this clsas reads version "
-            f"{VERSION}: make it anew with clsas.plan"
+            f"it has version {validate.shown(version)}, made by {by}; this clsas reads versions 4 "
+            f"and {VERSION}: make it anew with clsas.plan"
         )
+
+
+def _renamed(values: dict[str, Any]) -> dict[str, Any]:
+    """Return the values of a text of version 4 with the names of version 5."""
+    image = values.get("image")
+    method = (
+        {"kind" if name == "method" else name: value for name, value in image.items()}
+        if isinstance(image, dict)
+        else image
+    )
+    return {("method" if name == "image" else name): values[name] for name in values} | (
+        {"method": method} if "image" in values else {}
+    )
 
 
 def _check_digest(values: dict[str, Any]) -> None:

@@ -17,6 +17,9 @@ from clsas.opencl.phases import TERMS
 from clsas.signal.fields import RangeFilter, StoredResampling, StoredUpsampler
 from clsas.signal.interpolation import PHASES
 
+UNREACHED = "no line reaches the grid"
+"""Reason of an exact image of zeros, of which `clsas.plan` has warned."""
+
 
 @dataclass(frozen=True, config=CONFIG)
 class ExactImage:
@@ -32,7 +35,7 @@ class ExactImage:
 
     accuracy_db: Number
     reason: str = ""
-    method: Literal["exact"] = "exact"
+    kind: Literal["exact"] = "exact"
 
     sides: ClassVar[tuple[Size, ...]] = ()
     half_precision: ClassVar[bool] = False
@@ -99,7 +102,7 @@ class Factorization:
     roots_prepared: Whole
     phase_terms: Annotated[int, Field(ge=TERMS[0], le=TERMS[-1])] = TERMS[-1]
     stretch: Annotated[float, Field(ge=-0.5, le=1.0)] = 0.0
-    method: Literal["factorized"] = "factorized"
+    kind: Literal["factorized"] = "factorized"
 
     __repr__ = reprs.of_fields
 

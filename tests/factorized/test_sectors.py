@@ -4,7 +4,8 @@ from factorizing import BEAMS, EXACT_IS_SLOW, around, over, swaying
 
 from clsas.core.geometry import bistatic_range_m
 from clsas.factorized import visibility
-from clsas.factorized.sector import Geometry
+from clsas.factorized.geometry import geometry_of
+from clsas.factorized.sectors import references, sector_of
 from clsas.factorized.surface import surface_of
 from clsas.planning.planner import plan
 from clsas.sonar.beam import BeamWindow
@@ -14,12 +15,18 @@ HANN = BEAMS[0]
 
 
 @pytest.fixture(scope="module")
-def wide():
+def wide_plan():
     """A beam that leaves most of the track unseen, over a scene beyond both ends of it."""
     case = cases.scaled(512)
     lines, grid = case.lines(), case.grid
-    chosen = plan(lines, grid, tolerance_db=-40, beam=case.beam, costs=EXACT_IS_SLOW)
-    return Geometry(lines, surface_of(grid), chosen)
+    return plan(lines, grid, tolerance_db=-40, beam=case.beam, costs=EXACT_IS_SLOW)
+
+
+@pytest.fixture(scope="module")
+def wide(wide_plan):
+    case, chosen = cases.scaled(512), wide_plan
+    lines, grid = case.lines(), case.grid
+    return geometry_of(lines, surface_of(grid), chosen.factorization, chosen.beam)
 
 
 def beside():
@@ -38,25 +45,25 @@ def any_track(request, wide):
     lines = lines.select(np.flatnonzero(np.abs(lines.tx_m[:, 0] - 2) > 8))
     beam = BeamWindow(3.0, "hann")
     chosen = plan(lines, case.grid, tolerance_db=-40, beam=beam, costs=EXACT_IS_SLOW)
-    return Geometry(lines, surface_of(case.grid), chosen)
+    return geometry_of(lines, surface_of(case.grid), chosen.factorization, chosen.beam)
 
 
 # What is formed
 
 
 @pytest.mark.slow
-def test_what_is_formed_is_what_was_planned(wide):
-    sector = wide.sector(wide.division.roots)
-    for level, (need, stage) in enumerate(zip(sector.needs, wide.plan.stages, strict=False)):
+def test_what_is_formed_is_what_was_planned(wide, wide_plan):
+    sector = sector_of(wide, wide.division.roots)
+    for level, (need, stage) in enumerate(zip(sector.needs, wide_plan.stages, strict=False)):
         formed = (need.end - need.begin).sum() * stage.samples
         assert 0.75 <= formed / stage.operations <= 1.35, f"stage {level + 1}"
-    pixels = np.prod(wide.plan.sides[-1]) * (need.last - need.first).sum()
-    assert 0.75 <= pixels / wide.plan.stages[-1].operations <= 1.35
+    pixels = np.prod(wide_plan.sides[-1]) * (need.last - need.first).sum()
+    assert 0.75 <= pixels / wide_plan.stages[-1].operations <= 1.35
 
 
 @pytest.mark.slow
 def test_both_ends_of_the_track_are_alike(wide):
-    sector = wide.sector(wide.division.roots)
+    sector = sector_of(wide, wide.division.roots)
     need = sector.needs[-1]
     x_m = sector.root_m[:, 0]
     assert abs(x_m.min() + x_m.max()) < 0.1  # metres: pixels are mirrored but for half of one
@@ -65,7 +72,7 @@ def test_both_ends_of_the_track_are_alike(wide):
 
 
 def test_nothing_is_formed_that_no_channel_reaches(wide):
-    sector = wide.sector(wide.division.roots)
+    sector = sector_of(wide, wide.division.roots)
     counts = np.full(len(sector.roots), sector.coordinate.shape[1])
     for nodes, need in zip(sector.nodes, sector.needs, strict=True):
         assert (need.end <= counts[:, None]).all()
@@ -76,7 +83,7 @@ def test_nothing_is_formed_that_no_channel_reaches(wide):
 @pytest.mark.slow
 def test_subimages_use_what_their_parents_have(any_track):
     wide = any_track
-    sector = wide.sector(wide.division.roots)
+    sector = sector_of(wide, wide.division.roots)
     for level in range(1, len(sector.needs)):
         need, above = sector.needs[level], sector.needs[level - 1]
         parents, used = wide.division.parents(level), need.end > need.begin
@@ -91,11 +98,11 @@ def test_subimages_use_what_their_parents_have(any_track):
 def test_roots_do_not_depend_on_those_prepared_beside_them(case):
     lines, grid = case()
     chosen = plan(lines, grid, tolerance_db=-40, costs=EXACT_IS_SLOW)
-    geometry = Geometry(lines, surface_of(grid), chosen)
+    geometry = geometry_of(lines, surface_of(grid), chosen.factorization, chosen.beam)
     roots = geometry.division.roots
-    together = geometry.sector(roots)
+    together = sector_of(geometry, roots)
     for index in range(len(roots)):
-        alone = geometry.sector(roots[index : index + 1])
+        alone = sector_of(geometry, roots[index : index + 1])
         for level, nodes in enumerate(alone.nodes):
             count = int(alone.needs[level].last.max())
             for name in ("first", "last", "begin", "end"):
@@ -111,11 +118,11 @@ def test_roots_do_not_depend_on_those_prepared_beside_them(case):
 def test_leaves_are_seen_from_wherever_they_are_seen_alone():
     lines, grid = beside()
     chosen = plan(lines, grid, tolerance_db=-40, beam=HANN, costs=EXACT_IS_SLOW)
-    geometry = Geometry(lines, surface_of(grid), chosen)
-    sector = geometry.sector(geometry.division.roots)
-    last = len(geometry.plan.sides) - 1
+    geometry = geometry_of(lines, surface_of(grid), chosen.factorization, chosen.beam)
+    sector = sector_of(geometry, geometry.division.roots)
+    last = len(chosen.sides) - 1
     leaves = geometry.division.corners(last, sector.roots)
-    half_m = np.array(geometry.plan.sides[-1])[:, None] / 2
+    half_m = np.array(chosen.sides[-1])[:, None] / 2
     half_m = half_m * [grid.row_step_m, grid.column_step_m]
     start, stop = visibility.visible_stretches(
         chosen.factorization.limits,
@@ -143,8 +150,8 @@ def test_leaves_are_seen_from_wherever_they_are_seen_alone():
 
 def test_references_are_ranges_and_phases(wide):
     lines, resampling = wide.lines, wide.factorization.resampling
-    sector = wide.sector(wide.division.roots[:3])
-    found = wide.references(sector)
+    sector = sector_of(wide, wide.division.roots[:3])
+    found = references(wide, sector)
     line = found["order"]
     range_m = bistatic_range_m(sector.root_m[:, None], lines.tx_m[line], lines.rx_m[line])
     index = (range_m - lines.first_range_m[line]) / lines.range_step_m

@@ -1,21 +1,26 @@
-"""Predictions of an image before it is formed: its work, its channels and its errors."""
+"""Predicted work, errors, time and memory of an image, before it is formed."""
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, fields
-from typing import TypeAlias
+import dataclasses
+from dataclasses import asdict, fields
+from typing import Annotated, Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
+from pydantic.dataclasses import dataclass
 
+from clsas.core import reprs
 from clsas.core.decibels import in_db
-from clsas.signal.interpolation import COST
+from clsas.core.fields import CONFIG, Number, StoredAs
+from clsas.core.fields import Amount as StoredAmount
 
 Amount: TypeAlias = float | NDArray[np.float64]
 """A number, or one for each of some sizes of subimages."""
 
 
-@dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True)
 class Work:
     """Counted operations of a device and its host.
 
@@ -84,73 +89,7 @@ class Work:
         return Work(*(getattr(self, f.name) + getattr(other, f.name) for f in fields(self)))
 
 
-def upsampling(samples: Amount, *, filtered: bool) -> Work:
-    """Return the work of making so many samples of upsampled lines."""
-    return Work(filtered_sample=samples) if filtered else Work(upsampled_sample=samples)
-
-
-def combining(
-    lines: Amount, samples: Amount, taps: int, *, given: bool, half_precision: bool = True
-) -> Work:
-    """Return the work of aligning and combining lines of so many samples in a stage.
-
-    `taps` are those of both filters; `given` is whether it is the first stage.
-    """
-    aligned = lines * samples
-    return Work(
-        line=lines,
-        sample=aligned,
-        sample_tap=aligned * taps,
-        single_sample=aligned * (not half_precision),
-        given_sample=aligned * given,
-    )
-
-
-def adding_in_rows(lines: Amount, samples: Amount, taps: Amount) -> Work:
-    """Return the work of adding to lines of a sheet, which many bands read and write in turn."""
-    return Work(given_sample=2 * lines * samples * taps)
-
-
-def backprojecting_leaves(
-    lines: Amount,
-    pixels: Amount,
-    taps: int,
-    *,
-    tiled: bool,
-    weighted: bool,
-    gathered: bool = False,
-) -> Work:
-    """Return the work of backprojecting the lines of leaves of so many pixels.
-
-    `gathered` is whether samples are not looked up in registers.
-    """
-    pairs = lines * pixels
-    weighted_pairs = pairs * weighted
-    if tiled:
-        return Work(leaf_channel=lines, leaf=pairs * COST[taps], beam=weighted_pairs)
-    of_taps = pairs * COST[taps]
-    return Work(
-        leaf_channel=lines,
-        leaf_point=of_taps,
-        leaf_gathered=of_taps * gathered,
-        beam=weighted_pairs,
-    )
-
-
-def backprojecting(
-    parts: int, part_pixels: int, channels: float, taps: int, *, tiled: bool, weighted: bool
-) -> Work:
-    """Return the work of an exact image whose parts see so many channels each."""
-    pairs = parts * part_pixels * channels
-    of_taps, weighted_pairs = pairs * COST[taps], pairs * weighted
-    if tiled:
-        return Work(part=parts * channels, pixel=of_taps, beam=weighted_pairs)
-    return Work(
-        part=parts * channels, point=of_taps, beam=weighted_pairs, group=parts * part_pixels
-    )
-
-
-@dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True)
 class ErrorBudget:
     """Relative error powers that add up to the prediction, by cause.
 
@@ -222,3 +161,81 @@ class ErrorBudget:
 
 
 _NEGLIGIBLE = 1e-3  # of the total
+
+
+CostSource: TypeAlias = Literal["given", "calibrated", "scaled", "default"]
+"""Origin of the costs that make a prediction: see `clsas.planning.costs.KnownCosts`."""
+
+
+@dataclass(frozen=True, config=CONFIG)
+class Stage:
+    """Predicted work of one stage.
+
+    Attributes
+    ----------
+    rows, columns : int
+        Pixels of its subimages.
+    subimages : int
+        Their number in the grid.
+    channels : int
+        Virtual channels of each, on average.
+    samples : int
+        Range samples of each line.
+    operations : float
+        Samples times channels that are aligned and combined; for the last row of a plan pixels
+        times channels that are backprojected.
+    error_db : float
+        Relative rms error that its interpolations add.
+    seconds : float
+        Expected time.
+    """
+
+    rows: int
+    columns: int
+    subimages: int
+    channels: int
+    samples: int
+    operations: float
+    error_db: float
+    seconds: float
+
+
+@dataclass(frozen=True, eq=False, config=CONFIG)
+class Prediction:
+    """Error, time and memory that an image is predicted to take.
+
+    Attributes
+    ----------
+    error_db : float
+        Relative rms error against the exact image, as a bound.
+    seconds, exact_seconds : float
+        Time of the image, and of `clsas.backproject`.
+    memory_bytes : int
+        Largest amount of device memory needed.
+    device : str
+        Device whose times these are.
+    cost_source : str
+        Origin of the costs that make the times: "given", "calibrated" on the device, "scaled" to it
+        by a short measurement, or "default".
+    costs_measured : str
+        Time of that measurement, UTC, in ISO 8601; "" without one.
+    stages : tuple of Stage
+        Every stage, and the backprojection at the end. Empty for an exact image.
+    work : Work
+        Counted operations, which make the time.
+    errors : ErrorBudget
+        Contributions, which make the error.
+    """
+
+    error_db: Number
+    seconds: Number
+    exact_seconds: Number
+    memory_bytes: Annotated[int, Field(ge=0)]
+    device: str
+    stages: tuple[Stage, ...]
+    work: Annotated[Work, StoredAs(dict[str, StoredAmount])]
+    errors: Annotated[ErrorBudget, StoredAs(dict[str, StoredAmount])]
+    cost_source: CostSource = "given"
+    costs_measured: str = ""
+
+    __repr__ = reprs.of_fields

@@ -1,11 +1,11 @@
-"""Factorized backprojection at work on a device, stage by stage."""
+"""One factorized image at work on a device, stage by stage."""
 
 from __future__ import annotations
 
 import itertools
 import math
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,18 +15,12 @@ from numpy.typing import NDArray
 
 from clsas.aperture.dense_channels import band_table
 from clsas.core import validate
-from clsas.core.grid import Grid
-from clsas.core.image import Image, holds_any
 from clsas.core.lines import RangeLines
-from clsas.exact.backprojection import form_exactly
-from clsas.exact.checks import check_numbers
 from clsas.factorized.buffers import CHUNK, Level, row_pitch, stage_lines, stage_tables
-from clsas.factorized.factorization import ExactImage
+from clsas.factorized.geometry import imaged_rms
 from clsas.factorized.leaves import Finish
-from clsas.factorized.plan import Plan
 from clsas.factorized.plane_leaves import PlaneLeaves
-from clsas.factorized.sector import Geometry, Sector
-from clsas.factorized.surface import surface_of
+from clsas.factorized.sectors import Roots, Sector, references
 from clsas.factorized.surface_leaves import SurfaceLeaves
 from clsas.opencl import phases
 from clsas.opencl.buffers import (
@@ -39,9 +33,9 @@ from clsas.opencl.buffers import (
     phase_polynomials,
     upsampled_lines,
 )
-from clsas.opencl.device import Device, aligned
+from clsas.opencl.device import Device
 from clsas.opencl.upsampling import upsample
-from clsas.sonar.coverage import reaches, warn_unreached
+from clsas.plans.plan import Plan
 
 _GROUP = 64  # work-items that share a subimage where each has one lane
 _AHEAD_S = 0.1  # of enqueued work: hides the preparation of roots; an interruption waits for it
@@ -50,49 +44,6 @@ _LARGEST_HALF, _LEAST_HALF = 65504.0, 2.0**-13  # below twice the latter, half p
 _FILTERS_SUM = 8.0  # bounds the sum of absolute values of upsampling and aligning filters
 _MOST_EXPONENT = 100  # of a gain: float32 holds filters multiplied and divided by it
 _GROUPS_PER_UNIT = 3  # work-groups per compute unit, at least, so that all end together
-
-
-def form(
-    lines: RangeLines,
-    grid: Grid,
-    chosen: Plan,
-    device: Device,
-    progress: Callable[[int, int], None] | None,
-) -> Image:
-    """Return the image of a plan that was checked against lines and grid."""
-    warned = chosen.kept.get("warned", False)  # not where the plan comes from a file
-    if isinstance(chosen.image, ExactImage):
-        # The plan has warned of ends of lines.
-        return form_exactly(
-            lines,
-            grid,
-            device=device,
-            accuracy_db=chosen.image.accuracy_db,
-            beam=chosen.beam,
-            progress=progress,
-            warned=warned,
-        )
-    largest = check_numbers(lines, chosen.beam)
-    along = None if chosen.beam is None else chosen.beam.directions(lines)
-    if "reached" not in chosen.kept:
-        chosen.kept["reached"] = reaches(lines, grid, chosen.beam, along)
-    if not chosen.kept["reached"]:
-        if not warned:
-            warn_unreached(lines, grid, chosen.beam, along)
-        return Image(np.zeros(grid.shape, np.complex64), grid)
-    pixels, done = aligned(np.empty, grid.shape, np.complex64), 0
-    try:
-        run = _Run(lines, grid, chosen, device.for_stages(), pixels, largest)
-        for formed in run.parts():
-            done += formed
-            if progress is not None:
-                progress(done, grid.size)
-    finally:
-        device.finish()  # an interrupted run leaves nothing in use
-    image = Image(pixels, grid)
-    if not warned and not holds_any(pixels):
-        warn_unreached(lines, grid, chosen.beam, along)
-    return image
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,27 +68,27 @@ class _Tables:
     bands: list[int]
 
 
-class _Run:
-    """A plan at work on a device."""
+class Run:
+    """An image of some lines at work on a device: its kernels, tables and buffers."""
 
     def __init__(
         self,
         lines: RangeLines,
-        grid: Grid,
-        chosen: Plan,
+        plan: Plan,
+        roots: Roots,
         device: Device,
         pixels: NDArray[np.complex64],
         largest: float,
     ) -> None:
-        image = chosen.factorization
-        self.lines, self.plan, self.factorization, self.device = lines, chosen, image, device
+        image = plan.factorization
+        self.lines, self.plan, self.factorization, self.device = lines, plan, image, device
         self.width, self.pitch = device.info.width, padded_length(image.resampling)
         self.half_precision = image.half_precision
         self.gain = _gain(largest, lines.channels) if self.half_precision and largest > 0 else 1.0
         self.samples = self._upload_lines()  # early: a device upsamples them beside what follows
-        self.geometry = _geometry(lines, grid, chosen)
+        self.roots, self.geometry = roots, roots.geometry
         self.division = self.geometry.division
-        if self.half_precision and not _holds(self.gain * self.geometry.rms(lines)):
+        if self.half_precision and not _holds(self.gain * imaged_rms(self.geometry, lines)):
             device.finish()  # the buffer given up may still be written
             self.half_precision, self.gain = False, 1.0
             self.samples = self._upload_lines()
@@ -161,7 +112,7 @@ class _Run:
         self.later_stage = device.kernel("stage", SHIFTS_GIVEN=0, RAMP=0, ROWS=2 * rows, **options)
         kind = PlaneLeaves if self.geometry.surface.is_plane else SurfaceLeaves
         self.leaves = kind(
-            lines, self.geometry, self.levels[-1], device, pixels, self.half_precision, self.gain
+            lines, roots, plan, self.levels[-1], device, pixels, self.half_precision, self.gain
         )
         later = range(1, len(self.levels))
         self.parents = {
@@ -219,7 +170,7 @@ class _Run:
     def _sectors(self) -> Iterator[tuple[Sector, _Tables]]:
         """Prepare sectors of roots; the first is small, for the device to begin with."""
         first = _PREPARED_FIRST * self.factorization.roots_at_once
-        for sector in self.geometry.sectors(first, self.factorization.roots_prepared):
+        for sector in self.roots.sectors(first, self.factorization.roots_prepared):
             yield sector, self._upload_tables(sector)
 
     def _start(self, sector: Sector, tables: _Tables, first: int) -> Finish:
@@ -272,7 +223,7 @@ class _Run:
             values[f"offsets{level}"] = np.concatenate(offsets_m, axis=-1)
             values[f"positions{level}"] = sector.positions_m(level - 1).swapaxes(1, 2)
         else:
-            values |= self.geometry.references(sector)
+            values |= references(self.geometry, sector)
         values[f"bands{level}"] = band_table(nodes.bands, need, first_of_parent)
         if nodes.bands is not None and nodes.bands.between is not None:
             values[f"rows{level}"] = nodes.bands.between
@@ -347,14 +298,6 @@ class _Run:
             "cycles_per_m": geometry.cycles_per_m,
             "parent_centre": before.centre,
         }
-
-
-def _geometry(lines: RangeLines, grid: Grid, chosen: Plan) -> Geometry:
-    """Return the geometry of a plan's image, kept from the image before if there was one."""
-    if "geometry" not in chosen.kept:
-        surface = chosen.kept.get("surface") or surface_of(grid)
-        chosen.kept["geometry"] = Geometry(lines, surface, chosen)
-    return chosen.kept["geometry"]
 
 
 def _gain(largest: float, channels: int) -> float:

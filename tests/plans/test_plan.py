@@ -9,6 +9,7 @@ from factorizing import (
     BEAMS,
     EXACT_IS_SLOW,
     around,
+    changed,
     made,
     moving_array,
     over,
@@ -20,13 +21,12 @@ from factorizing import (
 
 from clsas.core.digests import grid_digest, lines_digest
 from clsas.core.grid import Grid
-from clsas.core.image_error import relative_error_db
-from clsas.exact.backprojection import backproject, form_exactly
-from clsas.factorized.plan import VERSION, Plan, _json_digest
+from clsas.exact.backprojection import form_exactly
 from clsas.opencl.device import open_device
 from clsas.planning import costs
 from clsas.planning.factorize import factorize
 from clsas.planning.planner import plan
+from clsas.plans.plan import VERSION, Plan, _json_digest
 from clsas.sonar.beam import BeamWindow
 
 
@@ -66,7 +66,7 @@ def signed(values):
 
 
 def replaced(plan, path, value):
-    """A plan's JSON with another value at a path such as "image.sides"."""
+    """A plan's JSON with another value at a path such as "method.sides"."""
     values = changeable(plan)
     *tables, name = path.split(".")
     table = values
@@ -79,7 +79,7 @@ def replaced(plan, path, value):
 def test_text_gives_the_same_plan(any_plan):
     again = Plan.from_json(any_plan.to_json())
     assert again.to_json() == any_plan.to_json()
-    for one, other in ((again, any_plan), (again.image, any_plan.image)):
+    for one, other in ((again, any_plan), (again.method, any_plan.method)):
         for field in dataclasses.fields(other):
             value = getattr(other, field.name)
             if not dataclasses.is_dataclass(value):
@@ -113,63 +113,63 @@ def test_text_that_is_no_plan_is_refused(text):
 @pytest.mark.parametrize(
     ("field", "value"),
     [
-        ("image", None),
-        ("image", {}),
-        ("image.method", "exact"),
-        ("image.method", "guess"),
-        ("image.sides", "ab"),
-        ("image.sides", []),
-        ("image.sides", [[0, 0]]),
-        ("image.sides", [[64, 64], [48, 16]]),
-        ("image.sides", None),
-        ("image.tile", [3, 3]),
-        ("image.tile", [16]),
-        ("image.align", "filter"),
-        ("image.align", None),
-        ("image.aperture", None),
-        ("image.aperture.filter", None),
-        ("image.aperture.filter.taps", 1),
-        ("image.aperture.filter.taps", 10),
-        ("image.align.upsampling", 0.5),
-        ("image.final", None),
-        ("image.resampling", None),
-        ("image.resampling", {}),
-        ("image.resampling.length", 0),
-        ("image.resampling.period", 2**31),
-        ("image.resampling.shift", 2**40),
-        ("image.resampling.first", -(2**21)),
-        ("image.resampling.lead", -1),
-        ("image.resampling.upsampled_period", 7),
-        ("image.upsampler", 3),
-        ("image.upsampler", {}),
-        ("image.upsampler", {"step": 0, "coefficients": [[0.0] * 16] * 32, "error_db": -60.0}),
-        ("image.upsampler", {"step": 20, "coefficients": [[0.0] * 16] * 31, "error_db": -60.0}),
+        ("method", None),
+        ("method", {}),
+        ("method.kind", "exact"),
+        ("method.kind", "guess"),
+        ("method.sides", "ab"),
+        ("method.sides", []),
+        ("method.sides", [[0, 0]]),
+        ("method.sides", [[64, 64], [48, 16]]),
+        ("method.sides", None),
+        ("method.tile", [3, 3]),
+        ("method.tile", [16]),
+        ("method.align", "filter"),
+        ("method.align", None),
+        ("method.aperture", None),
+        ("method.aperture.filter", None),
+        ("method.aperture.filter.taps", 1),
+        ("method.aperture.filter.taps", 10),
+        ("method.align.upsampling", 0.5),
+        ("method.final", None),
+        ("method.resampling", None),
+        ("method.resampling", {}),
+        ("method.resampling.length", 0),
+        ("method.resampling.period", 2**31),
+        ("method.resampling.shift", 2**40),
+        ("method.resampling.first", -(2**21)),
+        ("method.resampling.lead", -1),
+        ("method.resampling.upsampled_period", 7),
+        ("method.upsampler", 3),
+        ("method.upsampler", {}),
+        ("method.upsampler", {"step": 0, "coefficients": [[0.0] * 16] * 32, "error_db": -60.0}),
+        ("method.upsampler", {"step": 20, "coefficients": [[0.0] * 16] * 31, "error_db": -60.0}),
         (
-            "image.upsampler",
+            "method.upsampler",
             {"step": 20, "coefficients": [[float("nan")] * 16] * 32, "error_db": 0.0},
         ),
-        ("image.half_precision", 1),
-        ("image.half_precision", None),
-        ("image.limits", [0.1, 0.2]),
-        ("image.aperture.oversampling", [1e9, 1e9, 1e9]),
-        ("image.aperture.oversampling", [1.0]),
-        ("image.aperture.oversampling", [float("nan")] * 3),
-        ("image.aperture.beam_cycles", 1e9),
-        ("image.aperture.band", None),
-        ("image.aperture.band", [0.0, 3.0]),
-        ("image.aperture", {"method": "nearest", "factors": ["x"]}),
-        ("image.aperture", {"method": "nearest", "factors": [0, 0]}),
-        ("image.aperture", {"method": "nearest", "factors": [2]}),
-        ("image.tile", [16, 4]),
-        ("image.half_lengths", []),
-        ("image.half_lengths", "ab"),
-        ("image.half_lengths", [-5, -5, -5]),
-        ("image.most_channels", [1]),
-        ("image.highest_cycles_per_m", "many"),
-        ("image.closest_m", float("inf")),
-        ("image.roots_at_once", 0),
-        ("image.roots_at_once", True),
-        ("image.roots_prepared", 2**40),
+        ("method.half_precision", 1),
+        ("method.half_precision", None),
+        ("method.limits", [0.1, 0.2]),
+        ("method.aperture.oversampling", [1e9, 1e9, 1e9]),
+        ("method.aperture.oversampling", [1.0]),
+        ("method.aperture.oversampling", [float("nan")] * 3),
+        ("method.aperture.beam_cycles", 1e9),
+        ("method.aperture.band", None),
+        ("method.aperture.band", [0.0, 3.0]),
+        ("method.aperture", {"method": "nearest", "factors": ["x"]}),
+        ("method.aperture", {"method": "nearest", "factors": [0, 0]}),
+        ("method.aperture", {"method": "nearest", "factors": [2]}),
+        ("method.tile", [16, 4]),
+        ("method.half_lengths", []),
+        ("method.half_lengths", "ab"),
+        ("method.half_lengths", [-5, -5, -5]),
+        ("method.most_channels", [1]),
+        ("method.highest_cycles_per_m", "many"),
+        ("method.closest_m", float("inf")),
+        ("method.roots_at_once", 0),
+        ("method.roots_at_once", True),
+        ("method.roots_prepared", 2**40),
         ("prediction.stages", [1]),
         ("prediction.memory_bytes", -1),
         ("prediction.error_db", "low"),
@@ -196,16 +196,20 @@ def test_a_plan_with_a_wrong_value_is_refused(chosen, field, value):
 @pytest.mark.parametrize(
     ("field", "value", "message"),
     [
-        ("image.roots_at_once", 0, "image.roots_at_once must be greater than or equal to 1, got 0"),
-        ("image.half_precision", 1, "image.half_precision must be a valid boolean, got 1"),
-        ("image.colour", 1, "image.colour is unknown"),
-        ("image", {}, "image.method must be given, got None"),
-        ("image", {"method": "x"}, "image.method must be 'factorized', 'exact', got 'x'"),
+        (
+            "method.roots_at_once",
+            0,
+            "method.roots_at_once must be greater than or equal to 1, got 0",
+        ),
+        ("method.half_precision", 1, "method.half_precision must be a valid boolean, got 1"),
+        ("method.colour", 1, "method.colour is unknown"),
+        ("method", {}, "method.kind must be given, got None"),
+        ("method", {"kind": "x"}, "method.kind must be 'factorized', 'exact', got 'x'"),
         ("tolerance_db", float("nan"), "tolerance_db must be a number, got nan"),
         (
-            "image.half_lengths",
+            "method.half_lengths",
             [1],
-            r"image: half_lengths must be \d numbers, one for each stage, ",
+            r"method: half_lengths must be \d numbers, one for each stage, ",
         ),
     ],
 )
@@ -218,24 +222,41 @@ def test_what_is_wrong_is_told(chosen, field, value, message):
 def test_a_plan_of_another_version_is_refused(chosen, version):
     values = changeable(chosen) | {"version": version}
     if version == 1:  # its fields were flat, and had no number
-        values = values["image"] | {"tolerance_db": -50.0}
+        values = values["method"] | {"tolerance_db": -50.0}
     with pytest.raises(ValueError, match=r"made by .*: make it anew with clsas\.plan"):
         Plan.from_json(json.dumps(values))
+
+
+def test_a_plan_of_version_4_is_read(any_plan):
+    values = changeable(any_plan)
+    image = values.pop("method")
+    image["method"] = image.pop("kind")
+    again = Plan.from_json(signed(values | {"version": 4, "image": image}))
+    assert again.to_json() == any_plan.to_json()
+
+
+@pytest.mark.parametrize("image", [None, [], {}, "x"])
+def test_a_wrong_plan_of_version_4_is_refused(chosen, image):
+    values = changeable(chosen)
+    del values["method"]
+    for each in (values, values | {"image": image}):
+        with pytest.raises(ValueError, match=r"text must be a plan as of Plan\.to_json: .*method"):
+            Plan.from_json(signed(each | {"version": 4}))
 
 
 @pytest.mark.parametrize("coefficients", ["none", [[1.0]], [[[None]]], []])
 @pytest.mark.parametrize("name", ["align", "aperture.filter", "final"])
 def test_a_filter_that_is_none_is_refused(chosen, name, coefficients):
     with pytest.raises(ValueError, match="coefficients"):
-        Plan.from_json(replaced(chosen, f"image.{name}.coefficients", coefficients))
+        Plan.from_json(replaced(chosen, f"method.{name}.coefficients", coefficients))
 
 
 def test_a_plan_with_a_field_too_many_or_too_few_is_refused(chosen):
     values = changeable(chosen)
     with pytest.raises(ValueError, match="unknown"):
         Plan.from_json(signed(values | {"unknown": 1}))
-    del values["image"]["sides"]
-    with pytest.raises(ValueError, match="image lacks 'sides'"):
+    del values["method"]["sides"]
+    with pytest.raises(ValueError, match="method lacks 'sides'"):
         Plan.from_json(signed(values))
 
 
@@ -246,14 +267,14 @@ def test_it_is_immutable(any_plan):
     with pytest.raises(dataclasses.FrozenInstanceError):
         any_plan.tolerance_db = -20.0
     for each in (any_plan, Plan.from_json(any_plan.to_json())):
-        for part in (each, each.image, each.prediction):
+        for part in (each, each.method, each.prediction):
             with pytest.raises(dataclasses.FrozenInstanceError):
-                part.method = "guess"
+                part.kind = "guess"
         assert isinstance(each.sides, tuple)
         assert isinstance(each.stages, tuple)
         if not each.is_exact:
             for name in ("tile", "half_lengths", "most_channels"):
-                assert isinstance(getattr(each.image, name), tuple), name
+                assert isinstance(getattr(each.method, name), tuple), name
 
 
 def test_a_changed_number_is_found(chosen):
@@ -401,7 +422,7 @@ def test_a_frequency_that_lines_cannot_hold_is_refused(chosen):
     """It would take memory without bounds."""
     lines, grid = made(swaying)
     with pytest.raises(ValueError, match=r"highest_cycles_per_m must be .* cycles/m, got 1e\+09"):
-        factorize(lines, grid, chosen.changed(highest_cycles_per_m=1e9))
+        factorize(lines, grid, changed(chosen, highest_cycles_per_m=1e9))
 
 
 def test_it_says_whether_times_are_of_this_device(chosen, monkeypatch, tmp_path):
@@ -443,18 +464,3 @@ def test_json_may_leave_out_filters(chosen):
     assert json.loads(short) == without(values)
     with pytest.raises(ValueError, match=r"lacks 'digest', as .* without filters"):
         Plan.from_json(short)
-
-
-# Moved
-
-
-def test_a_plan_serves_a_track_beside_its_own(chosen, platform):
-    lines, grid = made(swaying)
-    along = np.linspace(0, 2 * np.pi, lines.channels)
-    away_m = 0.01 * np.sin(along)[:, None] * [0.0, 1.0, 0.0]
-    moved = dataclasses.replace(lines, tx_m=lines.tx_m + away_m, rx_m=lines.rx_m + away_m)
-    with pytest.raises(ValueError, match="another line geometry"):
-        chosen.check(moved, grid)
-    image = factorize(moved, grid, chosen.moved(moved), device=platform)
-    ideal = backproject(moved, grid, accuracy_db=-75, device=platform)
-    assert relative_error_db(image, ideal) <= chosen.tolerance_db

@@ -1,0 +1,98 @@
+"""A factorization at work: images of any samples of one geometry."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from clsas.aperture.mean_track import MeanTrack
+from clsas.core.grid import Grid
+from clsas.core.image import Image, holds_any
+from clsas.core.lines import RangeLines
+from clsas.exact.checks import check_numbers
+from clsas.factorized.sectors import Roots
+from clsas.factorized.stages import Run
+from clsas.factorized.surface import Surface
+from clsas.opencl.device import Device, aligned
+from clsas.plans.plan import Plan
+from clsas.sonar.coverage import reaches, warn_unreached
+from clsas.sonar.simplify import Model, leave_out
+
+
+class FactorizedImager:
+    """Forms images by a plan that factorizes, of any samples of the plan's lines.
+
+    Parameters
+    ----------
+    lines : RangeLines
+        Lines of the geometry. Their samples do not matter.
+    grid : Grid
+    plan : Plan
+        A plan that factorizes, made for this geometry or for one that hardly differs.
+    device : Device
+    track, surface : optional
+        Results of planning: see `clsas.factorized.geometry.geometry_of`.
+    warned : bool
+        True if the user has been warned already that no line adds anything to the image.
+    """
+
+    def __init__(
+        self,
+        lines: RangeLines,
+        grid: Grid,
+        plan: Plan,
+        device: Device,
+        *,
+        track: MeanTrack | None = None,
+        surface: Surface | None = None,
+        warned: bool = False,
+    ) -> None:
+        model = Model(lines, grid, plan.beam)
+        if plan.left_out:
+            model = leave_out(lines, grid, plan.beam, plan.left_out)
+        self.grid, self.plan, self.device = grid, plan, device.for_stages()
+        self._model, self._warned = model, warned
+        self._along = None if model.beam is None else model.beam.directions(model.lines)
+        self._reached = reaches(model.lines, model.grid, model.beam, self._along)
+        self._roots = Roots(
+            model.lines, model.grid, plan.factorization, model.beam, track=track, surface=surface
+        )
+
+    def form(self, lines: RangeLines, progress: Callable[[int, int], None] | None = None) -> Image:
+        """Return the image of lines of the same geometry.
+
+        Parameters
+        ----------
+        lines : RangeLines
+        progress : callable, optional
+            Called as progress(pixels done, pixels).
+        """
+        model, grid = self._model, self.grid
+        if self.plan.left_out and lines.samples is not model.lines.samples:
+            lines = replace(model.lines, samples=lines.samples)
+        elif self.plan.left_out:
+            lines = model.lines
+        largest = check_numbers(lines, model.beam)
+        if not self._reached:
+            self._warn_unreached(lines)
+            return Image(np.zeros(grid.shape, np.complex64), grid)
+        pixels, done = aligned(np.empty, grid.shape, np.complex64), 0
+        try:
+            run = Run(lines, self.plan, self._roots, self.device, pixels, largest)
+            for formed in run.parts():
+                done += formed
+                if progress is not None:
+                    progress(done, grid.size)
+        finally:
+            self.device.finish()  # an interrupted run leaves nothing in use
+        if not holds_any(pixels):
+            self._warn_unreached(lines)
+        return Image(pixels, grid)
+
+    def _warn_unreached(self, lines: RangeLines) -> None:
+        """Warn once that no line adds anything to the image."""
+        if not self._warned:
+            self._warned = True
+            warn_unreached(lines, self._model.grid, self._model.beam, self._along)

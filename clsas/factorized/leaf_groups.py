@@ -1,0 +1,78 @@
+"""Groups of points off a plane, leaf by leaf."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsas.exact.groups import Groups, groups_within
+from clsas.exact.tiles import BLOCKS
+from clsas.factorized.geometry import Geometry
+
+
+@dataclass(frozen=True, eq=False)
+class LeafGroups:
+    """Groups of points in the leaves of all roots.
+
+    Attributes
+    ----------
+    groups : Groups
+        In the order of their leaves.
+    leaf : int64 [groups]
+        The leaf of each, numbered root by root.
+    ends : int64 [roots + 1]
+        Groups before each root, and of all.
+    pixels_before : int64 [roots + 1]
+        Pixels of the grid before each root, and of all.
+    """
+
+    groups: Groups
+    leaf: NDArray[np.int64]
+    ends: NDArray[np.int64]
+    pixels_before: NDArray[np.int64]
+
+    @property
+    def nbytes(self) -> int:
+        """Memory of the groups."""
+        return self.groups.index.nbytes + self.groups.offset_m.nbytes
+
+
+def leaf_groups(geometry: Geometry, width: int) -> LeafGroups:
+    """Return the groups of points in the leaves of all roots, for a device of some width."""
+    division, surface = geometry.division, geometry.surface
+    roots, last = geometry.roots, len(division.sides) - 1
+    corners = division.corners(last, roots)
+    middles_m = division.centres_m(last, corners).reshape(-1, 3)
+    leaves = _cells(geometry, corners, width)
+    leaf, place = (each.ravel()[surface.cell] for each in leaves)
+    groups, of_leaf = groups_within(surface.grid, leaf, place, middles_m, width)
+    held = np.bincount(leaf // corners.shape[1], minlength=len(roots))
+    return LeafGroups(
+        groups,
+        of_leaf,
+        ends=np.searchsorted(of_leaf, np.arange(len(roots) + 1) * corners.shape[1]),
+        pixels_before=np.concatenate([[0], np.cumsum(held)]),
+    )
+
+
+def _cells(
+    geometry: Geometry, corners: NDArray[np.int64], width: int
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return the leaf of every cell, and the cell's number in it, [rows, columns] each.
+
+    Leaves are numbered in the order of their corners, [roots, leaves, 2], cells block by block.
+    """
+    side = geometry.division.sides[-1]
+    number = np.empty(corners.max(axis=(0, 1)) // side + 1, np.int64)
+    count = corners[..., 0].size
+    number[tuple(np.moveaxis(corners // side, -1, 0))] = np.arange(count).reshape(
+        corners.shape[:-1]
+    )
+    row, column = (np.arange(n) for n in geometry.surface.plane.shape)
+    high, wide = BLOCKS[width]
+    down = row % side[0] // high * side[1] * high + row % high * wide
+    across = column % side[1] // wide * high * wide + column % wide
+    leaf = number[np.ix_(row // side[0], column // side[1])]
+    return leaf, down[:, None] + across

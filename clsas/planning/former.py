@@ -1,0 +1,45 @@
+"""What forms images by a plan, whichever method it chose."""
+
+from __future__ import annotations
+
+from clsas.aperture.mean_track import MeanTrack
+from clsas.core.grid import Grid
+from clsas.core.lines import RangeLines
+from clsas.exact.backprojection import prepare
+from clsas.exact.run import ExactImager
+from clsas.factorized.imager import FactorizedImager
+from clsas.factorized.surface import Surface
+from clsas.opencl.device import Device
+from clsas.plans.factorization import ExactImage
+from clsas.plans.plan import Plan
+
+Former = ExactImager | FactorizedImager
+"""Forms images of any samples of one geometry, without checks."""
+
+
+def former(
+    lines: RangeLines,
+    grid: Grid,
+    plan: Plan,
+    device: Device,
+    *,
+    track: MeanTrack | None = None,
+    surface: Surface | None = None,
+    warned: bool = False,
+) -> Former:
+    """Return what forms images by a plan, without checks and without warnings of ambiguous lines.
+
+    Parameters
+    ----------
+    lines, grid, plan, device
+        The plan may have been made for lines whose channels lie a little beside these.
+    track, surface : optional
+        Results of planning: see `clsas.planning.planner.Planned`.
+    warned : bool
+        True if the user has been warned already that no line adds anything to the image.
+    """
+    if isinstance(plan.method, ExactImage):
+        accuracy_db = plan.method.accuracy_db
+        preparation = prepare(lines, grid, accuracy_db=accuracy_db, beam=plan.beam, device=device)
+        return ExactImager(preparation, warned=warned)
+    return FactorizedImager(lines, grid, plan, device, track=track, surface=surface, warned=warned)

@@ -1,0 +1,254 @@
+"""The imager: any number of images of one geometry, exact or by a plan."""
+
+from __future__ import annotations
+
+import weakref
+from collections.abc import Callable
+from types import TracebackType
+
+from clsas.core import reprs, validate
+from clsas.core.decibels import in_db
+from clsas.core.digests import lines_digest
+from clsas.core.grid import Grid
+from clsas.core.image import Image
+from clsas.core.lines import RangeLines
+from clsas.exact.backprojection import prepare
+from clsas.exact.checks import check_accumulate
+from clsas.exact.run import ExactImager
+from clsas.opencl.device import Device, open_device
+from clsas.planning.former import Former, former
+from clsas.planning.planner import planned
+from clsas.plans.plan import Plan
+from clsas.signal.spectrum import FEW_CHANNELS, MEASURED_CHANNELS, power_outside
+from clsas.sonar.beam import BeamWindow
+
+Progress = Callable[[int, int], None]
+
+
+class Imager:
+    """Images of one geometry: everything that does not depend on samples is done once.
+
+    Exactly one of `plan`, `tolerance_db` and `accuracy_db` must be given.
+
+    Parameters
+    ----------
+    lines : RangeLines
+        Lines to image. Later ones may have other samples, but must have the same antennas, ranges
+        and carrier, and samples of about the same band.
+    grid : Grid
+        Pixels of the images.
+    plan : Plan, optional
+        A plan made by `clsas.plan` for these lines and this grid.
+    tolerance_db : float, optional
+        Relative rms error allowed against the exact image, dB, from -75 to -10: the fastest way to
+        form the images is then planned, as `clsas.plan` does.
+    accuracy_db : float, optional
+        Relative rms error allowed against the ideal sum, dB, from -85 to below 0: the images are
+        exact, as those of `clsas.backproject`.
+    beam : BeamWindow, optional
+        Weights of the channels; a plan holds its own.
+    device : Device, str or int, optional
+        See `clsas.opencl.device.choose`.
+
+    Attributes
+    ----------
+    plan : Plan or None
+        How the images are formed; None if `accuracy_db` was given.
+    grid : Grid
+    beam : BeamWindow or None
+    device : Device
+
+    Raises
+    ------
+    TypeError, ValueError
+        If an argument is not what is allowed, the plan was made for other lines or another grid, or
+        `beam` is given beside a plan.
+    DeviceError
+        If there is no such device.
+
+    Warns
+    -----
+    ClsasWarning
+        As `clsas.plan` or `clsas.backproject` does; once, however many images are formed.
+
+    See Also
+    --------
+    clsas.factorize, clsas.backproject : one image.
+
+    Notes
+    -----
+    Between images the imager keeps the geometry of a factorization, or the references of an exact
+    image, up to 256 MiB of host memory. It is freed with the imager, or at the end of a `with`
+    block. An imager must not be shared by threads.
+
+    Examples
+    --------
+    Two images of the same geometry, for example of two looks or two polarisations:
+
+    >>> import numpy as np, clsas
+    >>> track_m = np.c_[np.linspace(-2, 2, 64), np.zeros((64, 2))]
+    >>> noise = np.random.default_rng(0).normal(size=(2, 64, 200)) + 0j
+    >>> noise *= np.hanning(200)
+    >>> looks = [
+    ...     clsas.RangeLines(samples, 18.0, 0.02, track_m, track_m, 100e3, 1500.0)
+    ...     for samples in noise
+    ... ]
+    >>> grid = clsas.Grid.plane((-0.5, 0.5, 32), (19.5, 20.5, 32))
+    >>> with clsas.Imager(looks[0], grid, accuracy_db=-40) as imager:
+    ...     images = [imager(look) for look in looks]
+    >>> [image.shape for image in images]
+    [(32, 32), (32, 32)]
+    """
+
+    def __init__(
+        self,
+        lines: RangeLines,
+        grid: Grid,
+        plan: Plan | None = None,
+        *,
+        tolerance_db: float | None = None,
+        accuracy_db: float | None = None,
+        beam: BeamWindow | None = None,
+        device: Device | str | int | None = None,
+    ) -> None:
+        validate.instance("lines", lines, RangeLines)
+        validate.instance("grid", grid, Grid)
+        given = [plan, tolerance_db, accuracy_db]
+        if sum(value is not None for value in given) != 1:
+            raise ValueError(
+                "exactly one of plan, tolerance_db and accuracy_db must be given, got "
+                + ", ".join(validate.shown(value) for value in given)
+            )
+        validate.memory("grid", 8 * grid.size)
+        self.grid, self.plan, self.beam = grid, plan, beam
+        self.device = open_device(device)
+        self._former: Former | None
+        if accuracy_db is not None:
+            preparation = prepare(
+                lines, grid, accuracy_db=accuracy_db, beam=beam, device=self.device
+            )
+            preparation.warn_of_ambiguity()
+            self._former = ExactImager(preparation)
+        elif plan is None:
+            found = planned(lines, grid, tolerance_db=tolerance_db, beam=beam, device=self.device)
+            self.plan = found.plan
+            self._former = former(
+                lines,
+                grid,
+                found.plan,
+                self.device,
+                track=found.track,
+                surface=found.surface,
+                warned=True,
+            )
+        else:
+            validate.instance("plan", plan, Plan)
+            if beam is not None:
+                raise ValueError("beam must be left out with a plan, which holds its own")
+            plan.check(lines, grid)
+            self.beam = plan.beam
+            self._former = former(lines, grid, plan, self.device)
+        self._lines_digest = lines_digest(lines)
+        self._warned_of_band = False
+        self._checked = weakref.ref(lines)
+        if plan is not None and not plan.is_exact:
+            self._check_band(lines)
+
+    def __call__(
+        self,
+        lines: RangeLines,
+        *,
+        accumulate: Image | None = None,
+        progress: Progress | None = None,
+    ) -> Image:
+        """Form the image of lines of the imager's geometry.
+
+        Parameters
+        ----------
+        lines : RangeLines
+        accumulate : Image, optional
+            Image on the same grid to which this one is added, so that data may arrive in pieces.
+        progress : callable, optional
+            Called as progress(done, total).
+
+        Returns
+        -------
+        Image
+            complex64, phase-preserving.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If an argument is not what is allowed, the lines have another geometry, or the imager
+            was closed.
+
+        Warns
+        -----
+        ClsasWarning
+            If the lines have power outside the band that the imager was made for, so that the
+            error may be larger; or if no line adds anything to the image.
+        """
+        validate.instance("lines", lines, RangeLines)
+        validate.progress(progress)
+        if self._former is None:
+            raise ValueError("the imager was closed; make another one")
+        if accumulate is not None:
+            check_accumulate(accumulate, self.grid, self.beam)
+        if self._checked() is not lines:
+            if lines_digest(lines) != self._lines_digest:
+                raise ValueError(
+                    "lines must have the antennas, ranges, carrier and number of samples of those "
+                    "that the imager was made for; make another Imager for these"
+                )
+            self._check_band(lines)
+            self._checked = weakref.ref(lines)
+        image = self._former.form(lines, progress)
+        if accumulate is None:
+            return image
+        return Image(image.pixels + accumulate.pixels, self.grid)
+
+    def _check_band(self, lines: RangeLines) -> None:
+        """Warn once of lines with power outside the band that the images are made for."""
+        band: tuple[float, float] | None
+        allowed_db: float | None
+        if isinstance(self._former, ExactImager):
+            preparation = self._former.preparation
+            band, allowed_db = preparation.band, preparation.requested_db
+        else:
+            assert self.plan is not None
+            band, allowed_db = self.plan.factorization.band, self.plan.tolerance_db
+        if band is None or allowed_db is None or self._warned_of_band:
+            return
+        for channels in (FEW_CHANNELS, MEASURED_CHANNELS):
+            outside_db = in_db(power_outside(lines, *band, channels))
+            if outside_db <= allowed_db:
+                return
+        if lines.samples.any():
+            self._warned_of_band = True
+            validate.warn(
+                f"the lines have {outside_db:.0f} dB of their power outside the band that the "
+                f"plan was made for, so the error may exceed {allowed_db:g} dB: plan anew with "
+                "clsas.plan, or make another clsas.Imager"
+            )
+
+    def close(self) -> None:
+        """Free what is kept between images; no image can be formed afterwards."""
+        self._former = None
+
+    def __enter__(self) -> Imager:
+        """Return the imager."""
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        """Free what is kept between images."""
+        self.close()
+
+    def __repr__(self) -> str:
+        """Return the grid, the method and the device."""
+        how = "exact" if self.plan is None else repr(self.plan)
+        return reprs.summary(self, reprs.by(self.grid.shape), how, self.device.info.label)
