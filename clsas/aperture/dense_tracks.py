@@ -53,7 +53,7 @@ _RIDGE = 1e-10  # of the normal equations, where no channel determines a coeffic
 def mean_track_of(lines: RangeLines, shape: Shape, wavelength_m: float) -> MeanTrack | None:
     """Return the mean track of some shape, None if channels have none such.
 
-    Equal geometry and an equal wavelength (see `clsas.signal.spectrum.band_wavelength_m`) give
+    Equal geometry and an equal wavelength (see `clsas.core.wavelengths.band_wavelength_m`) give
     equal tracks: a plan holds the shape only.
     """
     of_shape = {"track": mean_track, "strips": strips, "sheet": sheet}

@@ -16,14 +16,14 @@ PACKAGES = {
     ),
     "radar": ("sarkit>=1.8",),
 }
-"""Requirements of every extra, as `pyproject.toml` has them."""
+"""Requirements of every extra, as in `pyproject.toml`."""
 
 
 def install_command(extra: str) -> str:
     """Return the command that installs the packages of an extra.
 
-    It names the packages, since pip would look for `clsas[extra]` on a package index, also if clsas
-    runs from a checkout.
+    The command names the packages, because pip would look for `clsas[extra]` on a package index
+    even if clsas runs from a checkout.
     """
     return "pip install " + " ".join(f"'{package}'" for package in PACKAGES[extra])
 

@@ -1,7 +1,7 @@
-"""Types of fields that JSON holds: the values they may have, and how they are stored.
+"""Types of fields that are stored as JSON: their allowed values, and how they are stored.
 
-Everything that sizes a buffer or an index has bounds, so that no file makes a kernel read what is
-not there. Pydantic checks them when an object is made or read.
+Every number that sizes a buffer or an index is bounded, so that a damaged file cannot make a kernel
+read beyond its buffers. Pydantic checks the bounds when an object is created or read.
 """
 
 from __future__ import annotations
@@ -29,18 +29,18 @@ Size = tuple[Whole, Whole]
 
 @dataclass(frozen=True)
 class StoredAs:
-    """Annotation of a class of another room, which JSON holds as a table of its fields.
+    """Annotation of a class that is stored in JSON as a table of its fields.
 
     Attributes
     ----------
     table : type
-        What pydantic checks the table with: a dataclass of the same fields, or a dict.
+        Type with which pydantic checks the table: a dataclass with the same fields, or a dict.
     """
 
     table: Any
 
     def __get_pydantic_core_schema__(self, kind: type, handler: GetCoreSchemaHandler) -> CoreSchema:
-        """Return pydantic's schema: instances are taken as they are, tables are built."""
+        """Return pydantic's schema: instances are accepted as they are, tables are converted."""
 
         def build(value: Any, check: Any) -> Any:
             if isinstance(value, kind):
@@ -59,7 +59,7 @@ class StoredAs:
 
 
 def _plain(stored: Any) -> dict[str, Any] | None:
-    """Return the fields of an instance as numbers, texts and lists."""
+    """Return the fields of an instance as numbers, strings and lists."""
     if stored is None:
         return None
     fields = {field.name: getattr(stored, field.name) for field in dataclasses.fields(stored)}
@@ -83,13 +83,13 @@ Array = Annotated[Any, BeforeValidator(_finite)]
 
 
 def explained(error: ValidationError, values: Any) -> str:
-    """Return the first mistake that pydantic found in the values of a JSON text.
+    """Return a message for the first mistake that pydantic found in the values of a JSON text.
 
-    It names the field, what is allowed, and what was given.
+    The message names the field, what is allowed, and what was given.
     """
     mistake = error.errors(include_url=False)[0]
     path, here = [], values
-    for part in mistake["loc"]:  # which also names the members of unions
+    for part in mistake["loc"]:  # some parts are names of union members, not keys
         try:
             here = here[part]
         except (KeyError, IndexError, TypeError):

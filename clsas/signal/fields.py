@@ -1,4 +1,4 @@
-"""Types of fields that hold filters and resamplings: see `clsas.core.fields`."""
+"""Types of fields for filters and resamplings that are stored as JSON; see `clsas.core.fields`."""
 
 from __future__ import annotations
 

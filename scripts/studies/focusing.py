@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
 from clsas.core.grid import Grid
-from clsas.core.lines import RangeLines, wavelength_m
+from clsas.core.lines import RangeLines
+from clsas.core.wavelengths import wavelength_m
 from clsas.exact.backprojection import form_exactly
 from clsas.files.phase_histories import read_phase_history
 from clsas.navigation.autofocus import IMAGE_TOLERANCE_DB, Autofocus, autofocus

@@ -77,7 +77,7 @@ def test_a_folder_that_others_can_write_to_is_refused(shared, monkeypatch, mode)
 
 
 def test_a_folder_in_one_that_others_can_write_to_is_refused(shared, monkeypatch):
-    """They could rename it and put theirs in its place, unless the outer one is sticky."""
+    """Others could replace the folder by their own, unless the outer folder is sticky."""
     shared.chmod(0o777)
     (shared / "cache").mkdir(0o700)
     refused(shared / "cache", monkeypatch, f"other users can write to {shared}")
@@ -86,7 +86,7 @@ def test_a_folder_in_one_that_others_can_write_to_is_refused(shared, monkeypatch
 
 
 def test_what_lies_in_a_closed_folder_may_have_any_mode(shared, monkeypatch):
-    """As ~/.cache of mode 0775 in a home of mode 0700."""
+    """An example is ~/.cache with mode 0775 in a home folder with mode 0700."""
     shared.chmod(0o700)
     (shared / "cache").mkdir()
     (shared / "cache").chmod(0o775)
@@ -113,7 +113,7 @@ def test_a_folder_in_one_of_another_user_is_refused(shared, monkeypatch):
 
 @as_root
 def test_a_symbolic_link_of_another_user_is_refused(shared, tmp_path, monkeypatch):
-    """It could lead to another folder by the time that the cache is used."""
+    """The link could point to another folder by the time that the cache is used."""
     own = tmp_path / "own"
     own.mkdir(0o700)
     (shared / "link").symlink_to(own)
@@ -143,7 +143,7 @@ def test_a_loop_of_symbolic_links_ends(shared, monkeypatch):
 
 @as_root
 def test_a_folder_made_by_another_user_meanwhile_is_refused(shared, monkeypatch):
-    """Between the check and the creation."""
+    """The other user creates it between the check and the creation."""
     make = Path.mkdir
 
     def raced(path, *args, **options):
@@ -159,7 +159,7 @@ def test_a_folder_made_by_another_user_meanwhile_is_refused(shared, monkeypatch)
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="becomes another user")
 def test_another_users_private_cache_is_named(shared, monkeypatch):
-    """Where the next user got nothing but 'Permission denied'."""
+    """The message names the folder, where the system says only 'Permission denied'."""
     (shared / "cache").mkdir(0o700)
     os.setegid(OTHER)
     os.seteuid(OTHER)

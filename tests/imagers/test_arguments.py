@@ -50,9 +50,9 @@ REFUSED = [
     (("wavenumber",), "grid", GRID.with_height(np.zeros(GRID.shape)), ValueError,
      "a plane .*got heights"),
     (("wavenumber",), "grid", turned([0, 0.1, 0], [0.1, 0.01, 0]), ValueError,
-     "angle of grid's rows to the track must be .*<= 5 degrees, got 5.7"),
+     "angle between the grid's rows and the track must be .*<= 5 degrees, got 5.7"),
     (("wavenumber",), "grid", turned([0.1, 0, 0], [0, 0.1, 0]), ValueError,
-     "angle of grid's rows to the track .*got 90"),
+     "angle between the grid's rows and the track .*got 90"),
     (("wavenumber",), "grid", Grid.plane((0, 1, 5), (0, 1, 5)), ValueError,
      "distance of grid .*>= 0.0075.* m"),
     # Accuracy
