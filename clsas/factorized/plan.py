@@ -6,16 +6,15 @@ import functools
 import hashlib
 import json
 import weakref
-from dataclasses import replace
-from typing import Annotated, Any, Literal, TypeAlias
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias
 
 import numpy as np
-from pydantic import Field, TypeAdapter, ValidationError
-from pydantic.dataclasses import dataclass
 
 from clsas.core import reprs, validate
 from clsas.core.digests import grid_digest, lines_digest
-from clsas.core.fields import CONFIG, Number, explained
+from clsas.core.extras import needed
+from clsas.core.fields import CONFIG, Constraint, Number, explained
 from clsas.core.grid import Grid
 from clsas.core.lines import RangeLines
 from clsas.core.reading import parse_json
@@ -24,6 +23,9 @@ from clsas.factorized.estimates import ErrorBudget, Work
 from clsas.factorized.factorization import ExactImage, Factorization
 from clsas.factorized.fields import StoredBeam, StoredErrors, StoredWork
 from clsas.sonar.simplify import EFFECTS
+
+if TYPE_CHECKING:
+    from pydantic import TypeAdapter
 
 COVERAGE = ("reached", "warned")
 """Entries of `Plan.kept`: whether any line reaches the grid, and whether a warning said no."""
@@ -36,7 +38,7 @@ CostSource: TypeAlias = Literal["given", "calibrated", "scaled", "default"]
 """Origin of the costs that make a prediction: see `clsas.planning.costs.KnownCosts`."""
 
 
-@dataclass(frozen=True, config=CONFIG)
+@dataclass(frozen=True)
 class Stage:
     """Predicted work of one stage.
 
@@ -68,8 +70,10 @@ class Stage:
     error_db: float
     seconds: float
 
+    __pydantic_config__ = CONFIG
 
-@dataclass(frozen=True, eq=False, config=CONFIG)
+
+@dataclass(frozen=True, eq=False)
 class Prediction:
     """Error, time and memory that an image is predicted to take.
 
@@ -99,7 +103,7 @@ class Prediction:
     error_db: Number
     seconds: Number
     exact_seconds: Number
-    memory_bytes: Annotated[int, Field(ge=0)]
+    memory_bytes: Annotated[int, Constraint(ge=0)]
     device: str
     stages: tuple[Stage, ...]
     work: StoredWork
@@ -107,10 +111,11 @@ class Prediction:
     cost_source: CostSource = "given"
     costs_measured: str = ""
 
+    __pydantic_config__ = CONFIG
     __repr__ = reprs.of_fields
 
 
-@dataclass(frozen=True, eq=False, config=CONFIG)
+@dataclass(frozen=True, eq=False)
 class Plan:
     """An image, decided before the device starts; made by `plan`, used by `factorize`.
 
@@ -132,12 +137,14 @@ class Plan:
     """
 
     tolerance_db: Number | None
-    image: Annotated[Factorization | ExactImage, Field(discriminator="method")]
+    image: Annotated[Factorization | ExactImage, Constraint(discriminator="method")]
     prediction: Prediction
     beam: StoredBeam | None
     lines_digest: str
     grid_digest: str
     left_out: tuple[str, ...] = ()
+
+    __pydantic_config__ = CONFIG
 
     def __post_init__(self) -> None:
         """Check that the fields fit each other."""
@@ -233,12 +240,19 @@ class Plan:
         ------
         TypeError, ValueError
             If there is no such field, or its value is not allowed.
+        ImportError
+            If pydantic, which checks the values, is not installed (extra `files`).
         """
+        with needed("Plan.changed"):
+            from pydantic import ValidationError
+            from pydantic.dataclasses import dataclass as checking
         plain = {name: _without_numpy(value) for name, value in fields.items()}
+        kind = type(self.image)
         try:
-            return replace(self, image=replace(self.image, **plain))
+            checked = checking(kind, frozen=True, eq=False)(**vars(self.image) | plain)
         except ValidationError as error:
             raise ValueError(explained(error, fields)) from None
+        return replace(self, image=kind(**vars(checked)))
 
     def moved(self, lines: RangeLines) -> Plan:
         """Return this plan for lines whose channels lie a little beside those it was made for.
@@ -265,6 +279,11 @@ class Plan:
         filters : bool
             False leaves out the hundreds of coefficients of the filters. The text is then short,
             for people and logs, but no plan that `from_json` reads.
+
+        Raises
+        ------
+        ImportError
+            If pydantic is not installed (extra `files`).
         """
         validate.flag("filters", filters)
         # Lists and numbers as JSON has them.
@@ -284,7 +303,11 @@ class Plan:
         ValueError
             If the text is not such a plan, was written by another version, or its digest is not
             that of what it says.
+        ImportError
+            If pydantic is not installed (extra `files`).
         """
+        with needed("plans as JSON"):
+            from pydantic import ValidationError
         try:
             values = parse_json(text)
             if not isinstance(values, dict):
@@ -349,6 +372,8 @@ def _check_digest(values: dict[str, Any]) -> None:
 @functools.cache
 def _stored() -> TypeAdapter[Plan]:
     """Return pydantic's reader and writer of plans."""
+    with needed("plans as JSON"):
+        from pydantic import TypeAdapter
     return TypeAdapter(Plan)
 
 

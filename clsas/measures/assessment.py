@@ -119,7 +119,8 @@ def assess(
     seconds = {name: image.plan.predicted_seconds for name, image in images.items()}
     if repeats:
         if full.half_precision:
-            images[SINGLE] = replace(images[_FULL], plan=full.changed(half_precision=False))
+            single = replace(full, image=replace(full.factorization, half_precision=False))
+            images[SINGLE] = replace(images[_FULL], plan=single)
         seconds = _measured(images, device, repeats)
     errors, modelled = errors_without(survey), survey.modelled
     if not full.is_exact and device.info.half_precision:

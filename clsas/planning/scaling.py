@@ -255,7 +255,10 @@ def _built(device: Device, side: int) -> tuple[_Images, float]:
     found = fastest(model, conditions, math.inf, _ALLOWED).plan
     assert found is not None  # the scene is made so
     # Kernels that touch a buffer first take twice as long. Large images have many batches.
-    found = found.changed(roots_at_once=_ROOTS, roots_prepared=8 * _ROOTS)
+    found = replace(
+        found,
+        image=replace(found.factorization, roots_at_once=_ROOTS, roots_prepared=8 * _ROOTS),
+    )
     factorized = planned_image(device, lines, grid, found)
     resampling = interpolation.resampling(lines.length, found.factorization.final, model.spectrum)
     images = _Images(exact, points, factorized, lines, resampling)
