@@ -13,7 +13,7 @@ from typing import Any
 import click
 
 from clsas.core import validate
-from clsas.core.extras import install_command, is_installed
+from clsas.core.extras import check_installed
 from clsas.core.reading import check_ordinary
 
 
@@ -222,5 +222,4 @@ def _exists(path: Path) -> bool:
 
 def need_matplotlib() -> None:
     """End the command if pictures cannot be drawn."""
-    if not is_installed("matplotlib"):
-        raise click.ClickException(f"pictures need matplotlib: {install_command('plot')}")
+    check_installed("matplotlib", "pictures")

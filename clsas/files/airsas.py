@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from scipy import fft
 
 from clsas.core import reading, validate
+from clsas.core.extras import needed
 from clsas.core.lines import RangeLines
 from clsas.files import hdf5
 from clsas.files.hdf5 import FileFormatError
@@ -153,7 +154,8 @@ def at_one_speed(lines: RangeLines, speed_m_s: NDArray[np.float64]) -> RangeLine
     Fourier series, and turned by the phase 4 pi fc r (1/c_i - 1/c): a point at rho then has the
     phase exp(-j 4 pi fc rho/c).
     """
-    import finufft  # slow to import
+    with needed("channels that differ in the speed of sound"):
+        import finufft  # slow to import
 
     validate.memory("lines at one speed of sound", lines.samples.nbytes)
     speed = lines.sound_speed_m_s

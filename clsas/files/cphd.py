@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from scipy.constants import speed_of_light
 
 from clsas.core import reading, validate
-from clsas.core.extras import install_command
+from clsas.core.extras import needed
 from clsas.core.lines import RangeLines
 from clsas.files.hdf5 import FileFormatError
 from clsas.files.positions import checked_positions
@@ -38,10 +38,8 @@ _BYTES = 24  # memory per sample while a signal becomes lines: as read, as compl
 
 def sarkit_cphd() -> ModuleType:
     """Import `sarkit.cphd`, or raise ImportError with the command that installs it."""
-    try:
+    with needed("CPHD files"):
         import sarkit.cphd
-    except ImportError as error:
-        raise ImportError(f"CPHD files need sarkit: {install_command('radar')}") from error
     return sarkit.cphd
 
 

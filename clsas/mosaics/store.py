@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from clsas.core import reprs, validate
 from clsas.core.atomic import sync_folder
 from clsas.core.digests import grid_digest
-from clsas.core.extras import install_command
+from clsas.core.extras import needed
 from clsas.core.grid import Grid
 from clsas.core.image import Image
 from clsas.core.reading import check_ordinary
@@ -435,8 +435,6 @@ class Store:
 
 def _arrays() -> ModuleType:
     """Return the module that needs Zarr."""
-    try:
+    with needed("stores of mosaics"):
         from clsas.mosaics import arrays
-    except ModuleNotFoundError:
-        raise ImportError(f"stores of mosaics need Zarr: {install_command('mosaic')}") from None
     return arrays

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from clsas.core import validate
 from clsas.core.atomic import replacing
-from clsas.core.extras import install_command
+from clsas.core.extras import needed
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -98,10 +98,8 @@ def figure_class() -> type[Figure]:
     ImportError
         If matplotlib is not installed; the message says how to install it.
     """
-    try:
+    with needed("pictures"):
         from matplotlib.figure import Figure
-    except ImportError:
-        raise ImportError(f"pictures need matplotlib: {install_command('plot')}") from None
     return Figure
 
 
@@ -136,8 +134,9 @@ def drawable(name: str, value: object) -> str:
 
     Between dollar signs matplotlib reads mathematics, and control characters have no glyph.
     """
-    from matplotlib import cbook
-    from matplotlib.mathtext import MathTextParser
+    with needed("pictures"):
+        from matplotlib import cbook
+        from matplotlib.mathtext import MathTextParser
 
     given = validate.text(name, value)
     if cbook.is_math_text(given):
