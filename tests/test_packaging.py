@@ -239,3 +239,17 @@ def test_scripts_without_a_python_say_so(script, tmp_path):
     assert done.returncode == 1
     assert "Python 3.11 or later is needed" in done.stderr
     assert "apt install python3 python3-venv" in done.stderr
+
+
+def test_the_table_of_dependencies_names_each_with_its_extra():
+    text = (ROOT / "docs" / "contributing.md").read_text()
+    rows = re.findall(r"^\| ([\w-]+) \|.*\| (.+) \|$", text, re.MULTILINE)
+    table = {name: needs.strip("`") for name, needs in rows if name != "dependency"}
+    bare = {re.split(r"[^\w-]", each)[0] for each in PROJECT["dependencies"]}
+    assert {name for name, needs in table.items() if needs == "everyone"} == bare
+    for extra, requirements in PROJECT["optional-dependencies"].items():
+        names = {re.split(r"[^\w-]", each)[0] for each in requirements} - {"clsas"}
+        if extra == "pocl":
+            assert table["pocl"] == "pocl"
+        elif extra not in ("all", "test", "docs"):
+            assert {name for name, needs in table.items() if needs == extra} == names
