@@ -92,7 +92,7 @@ def test_installation_hints_name_what_the_project_asks_for():
     assert extras.PACKAGES.keys() == asked.keys() - {"all", "test", "docs"}
     for extra, packages in extras.PACKAGES.items():
         assert packages == tuple(with_included(asked[extra]))
-    assert extras.install_command("plot") == "pip install 'matplotlib>=3.8'"
+    assert extras.install_command("plot") == "pip install 'matplotlib>=3.10'"
 
 
 def test_a_missing_package_is_named_with_the_extra_that_brings_it(monkeypatch):

@@ -13,10 +13,10 @@ _XARRAY = ("xarray>=2024.1",)
 _MOSAIC = (*_FILES, *_XARRAY, "zarr>=3.1.3", "numcodecs>=0.16.6,!=0.17.0")
 
 PACKAGES = {
-    "pocl": ("pyopencl[pocl]>=2024.1",),
+    "pocl": ("pyopencl[pocl]>=2024.2.7",),
     "files": _FILES,
     "signal": _SIGNAL,
-    "plot": ("matplotlib>=3.8",),
+    "plot": ("matplotlib>=3.10",),
     "xarray": _XARRAY,
     "cli": (*_FILES, *_SIGNAL, "click>=8.1", "rich>=13.0"),
     "mosaic": _MOSAIC,
