@@ -9,7 +9,7 @@ from contextlib import contextmanager
 
 _FILES = ("h5py>=3.16", "pydantic>=2.6")
 _SIGNAL = ("finufft>=2.2",)
-_XARRAY = ("xarray>=2024.1",)
+_XARRAY = ("xarray>=2024.11",)
 _MOSAIC = (*_FILES, *_XARRAY, "zarr>=3.1.3", "numcodecs>=0.16.6,!=0.17.0")
 
 PACKAGES = {
