@@ -8,12 +8,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Annotated, ClassVar, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
-from pydantic.dataclasses import dataclass
 
 from clsas.aperture.dense_channels import (
     SheetChannels,
@@ -28,14 +27,14 @@ from clsas.aperture.mean_track import MeanTrack
 from clsas.aperture.predicted_channels import StageChannels, VisiblePhases
 from clsas.aperture.virtual_channels import VirtualChannels, interpolated_channels
 from clsas.core import reprs
-from clsas.core.fields import CONFIG
+from clsas.core.fields import CONFIG, Constraint
 from clsas.signal.fields import RangeFilter
 from clsas.signal.interpolation import Gain, Interpolator
 
 BEAM_MARGIN = 1 / 16
 """Width of the beam by which a rectangle of leaves may widen what is visible from one of them."""
 
-_Cycles = Annotated[float, Field(ge=-0.5, le=0.5)]
+_Cycles = Annotated[float, Constraint(ge=-0.5, le=0.5)]
 
 
 class _Overhang(NamedTuple):
@@ -73,7 +72,7 @@ class _Overhang(NamedTuple):
         return cls(columns, rows, along, across)
 
 
-@dataclass(frozen=True, eq=False, config=CONFIG)
+@dataclass(frozen=True, eq=False)
 class InterpolatedAperture:
     """Virtual channels between which steering functions are interpolated.
 
@@ -94,8 +93,8 @@ class InterpolatedAperture:
     """
 
     filter: RangeFilter
-    oversampling: tuple[Annotated[float, Field(ge=1.0, le=100.0)], ...]
-    beam_cycles: Annotated[float, Field(ge=0.0, le=1e3)]
+    oversampling: tuple[Annotated[float, Constraint(ge=1.0, le=100.0)], ...]
+    beam_cycles: Annotated[float, Constraint(ge=0.0, le=1e3)]
     band: tuple[_Cycles, _Cycles]
     shape: Shape = "track"
     method: Literal["interpolated"] = "interpolated"
@@ -106,6 +105,7 @@ class InterpolatedAperture:
     splits_leaves: ClassVar[bool] = False
     """Leaves are small enough for the expansion of ranges about their centres."""
 
+    __pydantic_config__ = CONFIG
     __repr__ = reprs.of_fields
 
     @property

@@ -4,24 +4,23 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pydantic import Field
-from pydantic.dataclasses import dataclass
 
 from clsas.aperture.dense_tracks import Shape
 from clsas.aperture.predicted_channels import StageChannels, VisiblePhases
 from clsas.aperture.virtual_channels import VirtualChannels, nearest_nodes
-from clsas.core.fields import CONFIG, Whole
+from clsas.core.fields import CONFIG, Constraint, Whole
 from clsas.signal.interpolation import Gain, Interpolator
 
 Stages = Sequence[tuple[int, int]]
 """(QR, QI) of every stage: how many lines are summed, and the division of either image side."""
 
 
-@dataclass(frozen=True, config=CONFIG)
+@dataclass(frozen=True)
 class NearestBeams:
     """Virtual channels that are sums of neighbours as they are, at their mean position [43].
 
@@ -33,7 +32,7 @@ class NearestBeams:
         Neighbours that are summed into one beam, QR, stage by stage.
     """
 
-    factors: Annotated[tuple[Whole, ...], Field(min_length=1)]
+    factors: Annotated[tuple[Whole, ...], Constraint(min_length=1)]
     method: Literal["nearest"] = "nearest"
 
     filter: ClassVar[Interpolator] = Interpolator(1, 1.0, np.zeros((0, 2, 0)), -math.inf, -math.inf)
@@ -47,6 +46,8 @@ class NearestBeams:
     aligns_phases: ClassVar[bool] = False
     splits_leaves: ClassVar[bool] = True
     """Leaves as large as the stages ask for are backprojected in tiles."""
+
+    __pydantic_config__ = CONFIG
 
     @property
     def stages(self) -> int:

@@ -12,10 +12,9 @@ import grp
 import os
 import pwd
 import stat
+import sys
 from contextlib import suppress
 from pathlib import Path
-
-from platformdirs import user_cache_path
 
 _MODE = 0o700  # of folders that are created here
 
@@ -25,7 +24,14 @@ def cache_folder() -> Path:
 
     The folder is not checked and may not exist; see `trusted_cache` and `private_folder`.
     """
-    return Path(os.environ.get("CLSAS_CACHE") or user_cache_path("clsas"))
+    return Path(os.environ.get("CLSAS_CACHE") or _user_caches() / "clsas")
+
+
+def _user_caches() -> Path:
+    """Return the user's cache folder for all programs, by the XDG specification or as on macOS."""
+    if os.path.isabs(given := os.environ.get("XDG_CACHE_HOME", "")):
+        return Path(given)  # the specification tells programs to ignore relative paths
+    return Path.home() / ("Library/Caches" if sys.platform == "darwin" else ".cache")
 
 
 def trusted_cache() -> Path:

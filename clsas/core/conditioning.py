@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import fft
 
 from clsas.core import decibels, pings, validate
+from clsas.core.fourier import EDGE_PRODUCT, smooth_edge
 
 if TYPE_CHECKING:
     from clsas.core.lines import RangeLines
@@ -36,8 +37,6 @@ def high_passed(lines: RangeLines, cutoff_hz: float, name: str = "cutoff_hz") ->
 
     Messages call the cutoff by `name`.
     """
-    from clsas.core.fourier import EDGE_PRODUCT, smooth_edge  # imports finufft, which is slow
-
     rate = lines.sound_speed_m_s / (2 * lines.range_step_m)
     lowest = max(0.0, lines.carrier_hz - rate / 2)
     cutoff = validate.positive(name, cutoff_hz, "Hz")

@@ -1,29 +1,57 @@
 """Types of fields that are stored as JSON: their allowed values, and how they are stored.
 
 Every number that sizes a buffer or an index is bounded, so that a damaged file cannot make a kernel
-read beyond its buffers. Pydantic checks the bounds when an object is created or read.
+read beyond its buffers. Pydantic checks the bounds when an object is read from JSON. It is imported
+only then, because forming an image does not require it.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BeforeValidator, ConfigDict, Field, GetCoreSchemaHandler, ValidationError
-from pydantic_core import CoreSchema, core_schema
 
 from clsas.core import validate
 
-CONFIG = ConfigDict(strict=True, extra="forbid", arbitrary_types_allowed=True)
+if TYPE_CHECKING:
+    from pydantic import ConfigDict, GetCoreSchemaHandler, ValidationError
+    from pydantic_core import CoreSchema
 
-Whole = Annotated[int, Field(ge=1, lt=2**31)]
-Count = Annotated[int, Field(ge=0, lt=2**31)]
-Number = Annotated[float, Field(lt=math.inf)]  # no NaN either, which fails every comparison
-Amount = Annotated[float, Field(ge=0.0, lt=math.inf)]
+CONFIG: ConfigDict = {"strict": True, "extra": "forbid", "arbitrary_types_allowed": True}
+"""Value of `__pydantic_config__` in dataclasses that JSON holds."""
+
+
+class Constraint:
+    """Annotation of the values that a field may have, in the words of pydantic's `Field`.
+
+    Parameters
+    ----------
+    convert : callable, optional
+        Converts a value before it is checked; raises ValueError if it cannot.
+    **limits
+        Keyword arguments of `Field`, such as `ge=1`.
+    """
+
+    def __init__(self, convert: Callable[[Any], Any] | None = None, **limits: Any) -> None:
+        self.convert, self.limits = convert, limits
+
+    def __get_pydantic_core_schema__(self, kind: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        """Return pydantic's schema of the annotated type with these limits."""
+        from pydantic import BeforeValidator, Field
+
+        check = Field(**self.limits) if self.convert is None else BeforeValidator(self.convert)
+        return handler.generate_schema(Annotated[kind, check])
+
+
+Whole = Annotated[int, Constraint(ge=1, lt=2**31)]
+Count = Annotated[int, Constraint(ge=0, lt=2**31)]
+Number = Annotated[float, Constraint(lt=math.inf)]  # no NaN either, which fails every comparison
+Amount = Annotated[float, Constraint(ge=0.0, lt=math.inf)]
 Size = tuple[Whole, Whole]
 
 
@@ -41,6 +69,7 @@ class StoredAs:
 
     def __get_pydantic_core_schema__(self, kind: type, handler: GetCoreSchemaHandler) -> CoreSchema:
         """Return pydantic's schema: instances are accepted as they are, tables are converted."""
+        from pydantic_core import core_schema
 
         def build(value: Any, check: Any) -> Any:
             if isinstance(value, kind):
@@ -79,7 +108,7 @@ def _finite(value: Any) -> NDArray[np.float64]:
     return array
 
 
-Array = Annotated[Any, BeforeValidator(_finite)]
+Array = Annotated[Any, Constraint(_finite)]
 
 
 def explained(error: ValidationError, values: Any) -> str:

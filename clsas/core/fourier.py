@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-import finufft
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import erfc
 
 from clsas.core import validate
+from clsas.core.extras import needed
 
 # Half the width of a smooth edge in standard deviations. At its ends 6e-8 (-145 dB) remains.
 _EDGE_SIGMAS = 5.3
@@ -63,6 +63,9 @@ def fourier_integral(
     The integral is a Gauss-Legendre quadrature with 16 points per panel of at most two cycles. A
     type-3 non-uniform FFT computes the sum.
     """
+    with needed("simulation and pulse compression"):
+        import finufft  # slow to import
+
     edges = np.asarray(edges, dtype=np.float64)
     at = np.asarray(at, dtype=np.float64)
     fastest = rate + np.max(np.abs(at), initial=0.0)

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-import finufft
 import numpy as np
 import scipy.fft
 from numpy.typing import ArrayLike, NDArray
 
 from clsas.core import validate
+from clsas.core.extras import needed
 from clsas.core.geometry import pairwise_range_m
 from clsas.core.image import Image
 from clsas.core.image_error import relative_error_db
@@ -109,6 +109,9 @@ def ideal(
     spectral centre of the lines. A line does not contribute to points beyond its first or last
     sample. A type-2 non-uniform FFT evaluates the polynomial to twelve digits.
     """
+    with needed("the float64 reference"):
+        import finufft  # slow to import
+
     validate.instance("lines", lines, RangeLines)
     padding = validate.count("padding", padding, least=0)
     if beam is not None:

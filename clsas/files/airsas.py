@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from scipy import fft
 
 from clsas.core import reading, validate
+from clsas.core.extras import needed
 from clsas.core.lines import RangeLines
 from clsas.files import hdf5
 from clsas.files.hdf5 import FileFormatError
@@ -166,7 +167,8 @@ def at_one_speed(lines: RangeLines, speed_m_s: NDArray[np.float64]) -> RangeLine
     interpolated at these times, by a Fourier series, and multiplied by a phasor of phase
     4 pi fc r (1/c_i - 1/c). A point at rho then has the phase exp(-j 4 pi fc rho/c).
     """
-    import finufft  # slow to import
+    with needed("channels that differ in the speed of sound"):
+        import finufft  # slow to import
 
     validate.memory("lines at one speed of sound", lines.samples.nbytes)
     speed = lines.sound_speed_m_s

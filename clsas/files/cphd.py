@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from scipy.constants import speed_of_light
 
 from clsas.core import reading, validate
-from clsas.core.extras import install_command
+from clsas.core.extras import needed
 from clsas.core.lines import RangeLines
 from clsas.files.hdf5 import FileFormatError
 from clsas.files.positions import checked_positions
@@ -37,11 +37,9 @@ _BYTES = 24  # per sample while a signal becomes lines: as read, as complex64, a
 
 
 def sarkit_cphd() -> ModuleType:
-    """Return the module `sarkit.cphd`, or raise ImportError with the command that installs it."""
-    try:
+    """Import `sarkit.cphd`, or raise ImportError with the command that installs it."""
+    with needed("CPHD files"):
         import sarkit.cphd
-    except ImportError as error:
-        raise ImportError(f"CPHD files need sarkit: {install_command('radar')}") from error
     return sarkit.cphd
 
 

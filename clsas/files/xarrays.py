@@ -10,6 +10,7 @@ import numpy as np
 
 from clsas.core import validate
 from clsas.core.decibels import largest_amplitude
+from clsas.core.extras import needed
 from clsas.core.grid import Grid
 from clsas.core.image import Image
 from clsas.core.lines import RangeLines
@@ -80,10 +81,8 @@ def to_xarray(obj: Grid | RangeLines | Image | Echoes) -> xarray.DataArray | xar
     >>> float(data.y.max()), data.y.units
     (40.0, 'm')
     """
-    try:
+    with needed("to_xarray"):
         import xarray
-    except ImportError:
-        raise ImportError("to_xarray needs xarray: pip install xarray") from None
     validate.instance("obj", obj, *_KINDS)
     match obj:
         case Grid():

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from clsas.core import reprs, validate
 from clsas.core.atomic import sync_folder
 from clsas.core.digests import grid_digest
-from clsas.core.extras import install_command
+from clsas.core.extras import needed
 from clsas.core.grid import Grid
 from clsas.core.image import Image
 from clsas.core.reading import check_ordinary
@@ -485,9 +485,7 @@ class Store:
 
 
 def _arrays() -> ModuleType:
-    """Return the module that needs Zarr, which is an optional dependency."""
-    try:
+    """Return the module that needs Zarr."""
+    with needed("stores of mosaics"):
         from clsas.mosaics import arrays
-    except ModuleNotFoundError:
-        raise ImportError(f"a mosaic in a store needs Zarr: {install_command('mosaic')}") from None
     return arrays

@@ -24,6 +24,7 @@ from distributed.comm.core import CommClosedError
 from distributed.system import MEMORY_LIMIT
 
 from clsas.core.cache import private_folder
+from clsas.core.extras import needed
 from clsas.core.threads import uninterrupted
 
 _SAFE_PATH = "PYTHONSAFEPATH"
@@ -142,13 +143,9 @@ def _environment_of_workers() -> Iterator[None]:
 
 
 def _certificate() -> Security:
-    try:
-        return Security.temporary()
-    except ImportError:
-        raise ImportError(
-            "worker processes need the package cryptography for the certificate that keeps other "
-            "users out: pip install 'clsas[mosaic]'"
-        ) from None
+    with needed("the certificate that keeps other users out of worker processes"):
+        import cryptography  # noqa: F401 (Dask imports it, and reports its absence otherwise)
+    return Security.temporary()
 
 
 def _cause(error: BaseException) -> str:

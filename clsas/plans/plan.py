@@ -5,14 +5,13 @@ from __future__ import annotations
 import functools
 import hashlib
 import json
-from typing import Annotated, Any
-
-from pydantic import Field, TypeAdapter, ValidationError
-from pydantic.dataclasses import dataclass
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated, Any
 
 from clsas.core import reprs, validate
 from clsas.core.digests import grid_digest, lines_digest
-from clsas.core.fields import CONFIG, Number, StoredAs, explained
+from clsas.core.extras import needed
+from clsas.core.fields import CONFIG, Constraint, Number, StoredAs, explained
 from clsas.core.grid import Grid
 from clsas.core.lines import RangeLines
 from clsas.core.reading import parse_json
@@ -23,12 +22,15 @@ from clsas.plans.predictions import ErrorBudget, Prediction, Stage, Work
 from clsas.sonar.beam import BeamWindow
 from clsas.sonar.simplify import EFFECTS
 
+if TYPE_CHECKING:
+    from pydantic import TypeAdapter
+
 VERSION = 5
 """Version of a plan's JSON. Version 1, of clsas before 0.1.0, had no number; version 2 had a single
 mean track; version 3 lacked the origin of costs; in version 4 `method` was `image`."""
 
 
-@dataclass(frozen=True, eq=False, config=CONFIG)
+@dataclass(frozen=True, eq=False)
 class Plan:
     """An image, decided before the device starts; made by `plan`, used by `factorize`.
 
@@ -50,12 +52,14 @@ class Plan:
     """
 
     tolerance_db: Number | None
-    method: Annotated[Factorization | ExactImage, Field(discriminator="kind")]
+    method: Annotated[Factorization | ExactImage, Constraint(discriminator="kind")]
     prediction: Prediction
     beam: Annotated[BeamWindow, StoredAs(dict[str, Any])] | None
     lines_digest: str
     grid_digest: str
     left_out: tuple[str, ...] = ()
+
+    __pydantic_config__ = CONFIG
 
     def __post_init__(self) -> None:
         """Check that the fields fit each other."""
@@ -144,6 +148,11 @@ class Plan:
         filters : bool
             False leaves out the hundreds of coefficients of the filters. The text is then short,
             for people and logs, but no plan that `from_json` reads.
+
+        Raises
+        ------
+        ImportError
+            If pydantic is not installed (extra `files`).
         """
         validate.flag("filters", filters)
         # Lists and numbers as JSON has them.
@@ -163,7 +172,11 @@ class Plan:
         ValueError
             If the text is not such a plan, was written by another version, or its digest is not
             that of what it says.
+        ImportError
+            If pydantic is not installed (extra `files`).
         """
+        with needed("plans as JSON"):
+            from pydantic import ValidationError
         try:
             values = parse_json(text)
             if not isinstance(values, dict):
@@ -237,6 +250,8 @@ def _check_digest(values: dict[str, Any]) -> None:
 @functools.cache
 def _stored() -> TypeAdapter[Plan]:
     """Return pydantic's reader and writer of plans."""
+    with needed("plans as JSON"):
+        from pydantic import TypeAdapter
     return TypeAdapter(Plan)
 
 

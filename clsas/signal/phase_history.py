@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import fft
 
 from clsas.core import validate
+from clsas.core.extras import needed
 from clsas.core.lines import RangeLines
 from clsas.signal.compression import Window, band_window
 
@@ -197,7 +198,8 @@ def _at_own_steps(
     spectrum: NDArray[np.complex128], ratio: NDArray[np.float64], length: int
 ) -> NDArray[np.complex128]:
     """Return the sum over m of S_m exp(j 2 pi m n ratio/length), n from -length/2, per channel."""
-    import finufft  # slow to import
+    with needed("channels that differ in their frequency step"):
+        import finufft  # slow to import
 
     number = np.arange(length) - length // 2
     middle = spectrum.shape[1] // 2

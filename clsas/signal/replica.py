@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from clsas.core import reprs, validate
+from clsas.core.extras import needed
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,7 +94,8 @@ class Replica:
         TypeError, ValueError
             If the frequencies are not finite real numbers.
         """
-        import finufft  # slow to import
+        with needed("pulse compression"):
+            import finufft  # slow to import
 
         frequency = validate.array("frequency_hz", frequency_hz, np.float64, None)
         cycles = frequency.ravel() / self.sample_rate_hz

@@ -671,7 +671,7 @@ def test_pictures_without_matplotlib_are_refused_before_any_work(made, tmp_path,
     scene = made[0] / "scene.toml"
     png = ("--png", tmp_path / "x.png")
     _, stderr = run("simulate", scene, "-o", tmp_path / "echoes.h5", *png, code=1)
-    assert "pip install 'matplotlib>=3.8'" in stderr
+    assert "pip install 'matplotlib>=3.10'" in stderr
     run("demo", "--out", tmp_path / "out", code=1)
     assert not any(tmp_path.iterdir())
 

@@ -50,6 +50,28 @@ def test_folders_are_made_for_their_user_alone(folder, umask):
         assert stat.S_IMODE((folder / each).stat().st_mode) == 0o700
 
 
+@pytest.mark.parametrize(
+    ("platform", "given", "expected"),
+    [
+        ("linux", None, "home/.cache/clsas"),
+        ("linux", "", "home/.cache/clsas"),
+        ("linux", "relative", "home/.cache/clsas"),
+        ("linux", "/caches", "/caches/clsas"),
+        ("darwin", None, "home/Library/Caches/clsas"),
+    ],
+)
+def test_without_a_variable_it_lies_where_the_system_keeps_caches(
+    tmp_path, monkeypatch, platform, given, expected
+):
+    monkeypatch.delenv("CLSAS_CACHE", raising=False)
+    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    monkeypatch.setattr("sys.platform", platform)
+    if given is not None:
+        monkeypatch.setenv("XDG_CACHE_HOME", given)
+    assert cache.cache_folder() == tmp_path / expected
+
+
 def test_a_folder_that_does_not_exist_is_trusted_and_not_made(folder):
     assert cache.trusted_cache() == folder
     assert not folder.parent.exists()

@@ -240,7 +240,8 @@ import clsas
 clsas.load({str(tmp_path / "pass.cphd")!r})
 """
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
-    assert "CPHD files need sarkit: pip install 'sarkit>=" in done.stderr
+    assert "sarkit is not installed, and is needed for CPHD files: pip install " in done.stderr
+    assert "'sarkit>=" in done.stderr
 
 
 @pytest.mark.parametrize(
