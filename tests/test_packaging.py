@@ -173,7 +173,6 @@ def test_calls_say_what_to_install():
     calls = {
         "plan.to_json()": "pydantic is not installed, and is needed for plans as JSON: ",
         "clsas.Plan.from_json('')": "pydantic is not installed, and is needed for plans as JSON: ",
-        "plan.changed(reason='')": "pydantic is not installed, and is needed for Plan.changed: ",
         "clsas.compress(echoes)": "finufft is not installed, and is needed for simulation and",
         "clsas.to_xarray(grid)": "xarray is not installed, and is needed for to_xarray: ",
         "image.plot()": "matplotlib is not installed, and is needed for pictures: ",

@@ -288,7 +288,7 @@ def test_plan(made):
     assert plan.factorization.aperture.factors == (2,)
     short = run_json(*args)
     assert "coefficients" not in json.dumps(short)
-    assert short["image"]["align"]["taps"] == 2
+    assert short["method"]["align"]["taps"] == 2
     assert short["prediction"]["error_db"] == plan.predicted_error_db
     assert "--filters requires --json" in run(*args, "--filters", code=2)[1]
     assert not (made[0] / "plan.json").exists()
