@@ -22,7 +22,12 @@ if TYPE_CHECKING:
     from pydantic import ConfigDict, GetCoreSchemaHandler, ValidationError
     from pydantic_core import CoreSchema
 
-CONFIG: ConfigDict = {"strict": True, "extra": "forbid", "arbitrary_types_allowed": True}
+CONFIG: ConfigDict = {
+    "strict": True,
+    "extra": "forbid",
+    "arbitrary_types_allowed": True,
+    "revalidate_instances": "always",
+}
 """Value of `__pydantic_config__` in dataclasses that JSON holds."""
 
 
@@ -120,8 +125,8 @@ def explained(error: ValidationError, values: Any) -> str:
     path, here = [], values
     for part in mistake["loc"]:  # some parts are names of union members, not keys
         try:
-            here = here[part]
-        except (KeyError, IndexError, TypeError):
+            here = getattr(here, part) if dataclasses.is_dataclass(here) else here[part]
+        except (AttributeError, KeyError, IndexError, TypeError):
             continue
         path.append(part)
     where = ".".join(map(str, path)) or "it"

@@ -136,7 +136,7 @@ class Factorization:
             check(len(getattr(self, name)) == levels, name, f"{levels} numbers, one for each stage")
         ascend = self.limits is None or self.limits[0] < self.limits[1]
         check(ascend, "limits", "two ascending sines")
-        together = self.roots_prepared % self.roots_at_once == 0
+        together = self.roots_at_once > 0 and self.roots_prepared % self.roots_at_once == 0
         check(together, "roots_prepared", f"a multiple of roots_at_once, {self.roots_at_once}")
         made = self.upsampler is not None
         check(made or not self.half_precision, "half_precision", "false without an upsampler")

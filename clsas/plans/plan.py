@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from clsas.core import reprs, validate
 from clsas.core.digests import grid_digest, lines_digest
-from clsas.core.extras import needed
+from clsas.core.extras import is_installed, needed
 from clsas.core.fields import CONFIG, Constraint, Number, StoredAs, explained
 from clsas.core.grid import Grid
 from clsas.core.lines import RangeLines
@@ -193,9 +193,14 @@ class Plan:
             raise ValueError(f"text must be a plan as of Plan.to_json: {error}") from error
 
     def check(self, lines: RangeLines, grid: Grid) -> None:
-        """Raise TypeError or ValueError unless this plan was made for these lines and this grid."""
+        """Raise TypeError or ValueError unless this plan was made for these lines and this grid.
+
+        If pydantic is installed (extra `files`), values that no plan may have are refused too.
+        """
         validate.instance("lines", lines, RangeLines)
         validate.instance("grid", grid, Grid)
+        if is_installed("pydantic"):
+            _check_values(self)
         for name, mine, theirs in (
             ("lines", self.lines_digest, lines_digest(lines)),
             ("grid", self.grid_digest, grid_digest(grid)),
@@ -210,6 +215,16 @@ class Plan:
             most = abs(lines.carrier_cycles_per_m) + 1 / lines.range_step_m
             given = self.factorization.highest_cycles_per_m
             validate.number("highest_cycles_per_m", given, "cycles/m", most=most)
+
+
+def _check_values(plan: Plan) -> None:
+    """Raise ValueError if a field has a value that it may not have, for example by `replace`."""
+    from pydantic import ValidationError
+
+    try:
+        _stored().validate_python(plan)
+    except ValidationError as error:
+        raise ValueError(f"the plan is invalid: {explained(error, vars(plan))}") from None
 
 
 def _check_version(values: dict[str, Any]) -> None:

@@ -20,7 +20,7 @@ from clsas.planning.costs import Costs
 
 RESULTS = (
     "Assessment", "Autofocus", "Calibration", "Effect", "Finding", "Inspection", "Micronavigation",
-    "Mosaic", "Patch", "PhaseSign", "Processed", "Tradeoff",
+    "Mosaic", "Patch", "PhaseSign", "Plan", "Processed", "Tradeoff",
 )  # fmt: skip
 """Classes whose constructors check nothing, since only clsas calls them."""
 
